@@ -1,0 +1,56 @@
+# canductor: every target sets up what it needs in .venv. Needs python3 >= 3.11 with venv and headers, gcc, make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+C_SOURCES := $(shell git ls-files '*.c' '*.h' 2>/dev/null || find firmware nodes coordinator -name '*.[ch]')
+NATIVE_INPUTS := $(C_SOURCES) $(wildcard firmware/Makefile firmware/tools/*.py) setup.py pyproject.toml \
+	$(shell find nodes coordinator -name 'build_*.py')
+
+C_WARNINGS := -std=gnu11 -Wall -Wextra -Wconversion -Werror -I. -Ifirmware
+
+.PHONY: demo test check pytest ctest bench clean setup format
+.DEFAULT_GOAL := test
+
+setup: $(VENV)/.installed
+
+$(VENV)/.python: pyproject.toml .ci/prerequisites
+	@sh .ci/prerequisites $(PYTHON)
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install -q --disable-pip-version-check 'setuptools>=77' 'cffi>=2.0'
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.python $(NATIVE_INPUTS)
+	$(BIN)/pip install -q --disable-pip-version-check --no-build-isolation -e '.[dev]'
+	@touch $@
+
+demo: setup
+	$(BIN)/canductor demo
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/clang-format --dry-run --Werror $(C_SOURCES)
+	@for c in $(filter %.c,$(filter firmware/% nodes/% coordinator/%,$(C_SOURCES))); do \
+	  gcc $(C_WARNINGS) -fsyntax-only $$c || exit 1; done
+	$(BIN)/pytest tests/test_import_floors.py
+
+ctest: setup
+	$(MAKE) -C tests PYTHON=$(abspath $(BIN)/python)
+
+pytest: setup
+	$(BIN)/pytest
+
+test: check ctest pytest
+
+bench: setup
+	@for b in bench/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
+
+format: setup
+	$(BIN)/ruff check --fix . ; $(BIN)/ruff format .
+	$(BIN)/clang-format -i $(C_SOURCES)
+
+clean:
+	rm -rf $(VENV) build *.egg-info nodes/virtual/bin .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find nodes coordinator \( -name '_*.c' -o -name '*.so' -o -name '*.o' \) -delete
+	$(MAKE) -C firmware clean

@@ -1,0 +1,1 @@
+"""Tools on a live or virtual CAN bus."""

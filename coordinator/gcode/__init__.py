@@ -1,0 +1,1 @@
+"""G-code: lines, state and commands."""

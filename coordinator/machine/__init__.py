@@ -1,0 +1,1 @@
+"""The machine: configuration, pins and states."""

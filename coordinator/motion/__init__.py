@@ -1,0 +1,1 @@
+"""From G-code moves to compressed step commands."""

@@ -1,0 +1,1 @@
+"""What a node carries, as the host drives it."""

@@ -1,0 +1,46 @@
+// SPDX-License-Identifier: Apache-2.0
+// Batches of timed commands: how motion hands a node's commands to the link without Python touching each.
+//
+// A batch is a byte string of records, one behind the other, in the order in which the node must receive
+// them:
+//     <u64 min_clock> <u64 req_clock> <u8 size> <size bytes: one encoded command>
+// in the host's byte order, unaligned. Clocks are the node's ticks in 64 bits. min_clock: the node's queue
+// has no room before; do not send earlier (0: at once). req_clock: when the command is due; queues are
+// ordered by it.
+#ifndef LINK_BATCH_H
+#define LINK_BATCH_H
+
+#include <stdint.h>
+#include <string.h>
+
+enum { BATCH_HEADER = 17 };
+
+struct batch_record {
+    uint64_t min_clock, req_clock;
+    uint8_t size;
+    const uint8_t *payload;
+};
+
+// Reads the record at AT, which has ROOM bytes behind it. Returns its whole length, or 0 when it is cut
+// short.
+static inline size_t batch_read(const uint8_t *at, size_t room, struct batch_record *out) {
+    if (room < BATCH_HEADER || room - BATCH_HEADER < at[16])
+        return 0;
+    memcpy(&out->min_clock, at, 8);
+    memcpy(&out->req_clock, at + 8, 8);
+    out->size = at[16];
+    out->payload = at + BATCH_HEADER;
+    return (size_t)BATCH_HEADER + out->size;
+}
+
+// Writes a record whose PAYLOAD is SIZE bytes; the caller saw to the room. Returns its whole length.
+static inline size_t batch_write(uint8_t *at, uint64_t min_clock, uint64_t req_clock, const uint8_t *payload,
+                                 uint8_t size) {
+    memcpy(at, &min_clock, 8);
+    memcpy(at + 8, &req_clock, 8);
+    at[16] = size;
+    memcpy(at + BATCH_HEADER, payload, size);
+    return (size_t)BATCH_HEADER + size;
+}
+
+#endif

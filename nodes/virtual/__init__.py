@@ -1,0 +1,1 @@
+"""Nodes and buses without hardware."""
