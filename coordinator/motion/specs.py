@@ -1,4 +1,4 @@
-"""What motion is told about the machine: plain values, checked by whoever builds them from the configuration."""
+"""What motion is told about the machine: plain values, checked by whoever builds them."""
 
 from dataclasses import dataclass
 
@@ -25,7 +25,7 @@ class MotionLimits:
     max_extrude_only_distance: float
     """mm of filament in one move of E alone."""
     max_extrude_ratio: float
-    """mm of filament per mm of path beside which a printing move is refused (cross section / filament area)."""
+    """mm of filament per mm of path above which a printing move is refused (cross section over area)."""
     instantaneous_corner_velocity: float
     """mm/s by which the filament's speed may jump at a junction."""
 
@@ -59,4 +59,4 @@ class StepperSpec:
     invert_dir: bool
     """Whether set_next_step_dir takes 0 for a positive step."""
     step_pulse_s: float
-    """Shortest high time of the step pin; successive steps are never closer than two of them. 0: both edges step."""
+    """Shortest high time of the step pin; steps are never closer than two of them. 0: both edges step."""
