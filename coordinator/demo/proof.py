@@ -1,8 +1,8 @@
 """The proof: what every stepper's pins did, against an independent evaluation of the plan.
 
-Executed steps come from the log of pin levels that each virtual node kept, with the node's true clock; expected ones
-from numpy (`coordinator.demo.expected`). Steps are paired in order, so a lost, doubled or reversed step shows as
-a difference in number, direction or time.
+Executed steps come from the log of pin levels that each virtual node kept, with the node's true clock; expected
+ones from numpy (`coordinator.demo.expected`). Steps are paired in order, so a lost, doubled or reversed step
+shows as a difference in number, direction or time.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -166,7 +166,7 @@ def prove_clock(
     primary: PrimaryClock,
     span: Sequence[float],
 ) -> ClockProof:
-    """Compare the map that the host used with the truth, every 10 ms of the print times SPAN = (begin, end)."""
+    """Compare the map that the host used with the truth, every 10 ms of print time in SPAN (begin, end)."""
     moments = np.arange(span[0], span[1], 0.01)
     if not len(moments):
         return ClockProof(node, 0.0, 0.0)

@@ -1,0 +1,129 @@
+"""Print time, and its conversion to host time and to every node's ticks.
+
+Print time is seconds of the primary node's clock at its nominal frequency. The primary's ticks follow from it
+by a constant factor; those of a secondary node are steered: its map is made of straight pieces that join without
+a jump, each aimed at where the two clock estimators say the node's clock will be a moment later.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.errors import CanductorError
+
+STEER_HORIZON_S = 1.0
+"""A difference to the estimate is worked off over this long: shorter follows faster, longer is smoother."""
+
+SLEW_LIMIT = 500e-6
+"""By how much of its rate a map may deviate to work off a difference: 0.5 µs per ms."""
+
+JUMP_LIMIT_S = 0.005
+"""A node whose clock is further off than this cannot be steered without late or early steps."""
+
+
+class EstimatedClock(Protocol):
+    """A node's clock as far as the host knows it."""
+
+    def ticks_at(self, host_ns: int) -> float:
+        """Return the node's 64-bit ticks at a moment of host time."""
+        ...
+
+    def ns_at(self, ticks: float) -> int:
+        """Return the host time at which the node's clock stands at TICKS."""
+        ...
+
+
+class ClockJumpError(CanductorError):
+    """A node's clock is not where it can be followed to."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClockPiece:
+    """One straight piece of a map, valid from its print time on."""
+
+    print_time: float
+    ticks: float
+    ticks_per_s: float
+
+
+class ClockMap:
+    """From print time to one node's ticks: continuous, made of straight pieces."""
+
+    def __init__(self, clock_freq: float, first: ClockPiece) -> None:
+        self.clock_freq = clock_freq
+        self._pieces = [first]
+
+    @property
+    def last(self) -> ClockPiece:
+        """The piece in force."""
+        return self._pieces[-1]
+
+    def bend(self, print_time: float, ticks_per_s: float) -> ClockPiece:
+        """Go on from PRINT_TIME (not before the last piece) at another rate; return the new piece."""
+        last = self.last
+        assert print_time >= last.print_time
+        ticks = last.ticks + (print_time - last.print_time) * last.ticks_per_s
+        piece = ClockPiece(print_time, ticks, ticks_per_s)
+        if print_time == last.print_time:
+            self._pieces[-1] = piece
+        else:
+            self._pieces.append(piece)
+        return piece
+
+    def ticks(self, print_time: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the node's ticks at these print times, none before the first piece."""
+        begins = np.array([p.print_time for p in self._pieces])
+        ticks = np.array([p.ticks for p in self._pieces])
+        rates = np.array([p.ticks_per_s for p in self._pieces])
+        which = np.clip(np.searchsorted(begins, print_time, side="right") - 1, 0, None)
+        mapped: NDArray[np.float64] = ticks[which] + (print_time - begins[which]) * rates[which]
+        return mapped
+
+
+class TimeBase:
+    """Print time of a machine whose primary node has this clock."""
+
+    def __init__(self, primary: EstimatedClock, clock_freq: float) -> None:
+        self._primary = primary
+        self._clock_freq = clock_freq
+
+    def print_time_at(self, host_ns: int) -> float:
+        """Return the print time at a moment of host time, in s."""
+        return self._primary.ticks_at(host_ns) / self._clock_freq
+
+    def host_ns_at(self, print_time: float) -> int:
+        """Return the host time of a print time."""
+        return self._primary.ns_at(print_time * self._clock_freq)
+
+    def primary_map(self, print_time: float) -> ClockMap:
+        """Return the primary node's own map, which never bends."""
+        ticks = print_time * self._clock_freq
+        return ClockMap(self._clock_freq, ClockPiece(print_time, ticks, self._clock_freq))
+
+    def secondary_map(self, clock: EstimatedClock, clock_freq: float, print_time: float) -> ClockMap:
+        """Return a secondary node's map, beginning at PRINT_TIME where the estimators see its clock."""
+        ticks = clock.ticks_at(self.host_ns_at(print_time))
+        ahead = clock.ticks_at(self.host_ns_at(print_time + STEER_HORIZON_S))
+        return ClockMap(clock_freq, ClockPiece(print_time, ticks, (ahead - ticks) / STEER_HORIZON_S))
+
+    def steer(self, name: str, clock_map: ClockMap, clock: EstimatedClock, print_time: float) -> ClockPiece:
+        """Bend a secondary node's map at PRINT_TIME towards the estimate; return the new piece.
+
+        Raises ClockJumpError when the estimate is beyond what slewing can follow.
+        """
+        last = clock_map.last
+        mapped = last.ticks + (print_time - last.print_time) * last.ticks_per_s
+        here = clock.ticks_at(self.host_ns_at(print_time))
+        ahead = clock.ticks_at(self.host_ns_at(print_time + STEER_HORIZON_S))
+        off_s = (here - mapped) / clock_map.clock_freq
+        if abs(off_s) > JUMP_LIMIT_S:
+            raise ClockJumpError(
+                f"the clock of node {name} is {off_s * 1e3:+.1f} ms from where its steps were timed; "
+                "its oscillator or its link is failing: check the board's supply and the wiring",
+            )
+        rate = (ahead - here) / STEER_HORIZON_S
+        slew = (here - mapped) / STEER_HORIZON_S
+        limit = SLEW_LIMIT * rate
+        return clock_map.bend(print_time, rate + min(max(slew, -limit), limit))

@@ -1,0 +1,66 @@
+"""Print time against exactly known clocks."""
+
+import numpy as np
+import pytest
+
+from coordinator.timebase import SLEW_LIMIT, ClockJumpError, ClockPiece, TimeBase
+
+
+class Clock:
+    """An ideal estimate: exactly ticks = ticks0 + rate * (host time)."""
+
+    def __init__(self, ticks0: float, rate: float) -> None:
+        self.ticks0 = ticks0
+        self.rate = rate
+
+    def ticks_at(self, host_ns: int) -> float:
+        return self.ticks0 + self.rate * host_ns * 1e-9
+
+    def ns_at(self, ticks: float) -> int:
+        return round((ticks - self.ticks0) / self.rate * 1e9)
+
+
+PRIMARY_FREQ = 168e6
+SECONDARY_FREQ = 64e6
+
+
+def base() -> TimeBase:
+    return TimeBase(Clock(1e9, PRIMARY_FREQ * (1 - 20e-6)), PRIMARY_FREQ)
+
+
+def test_print_time_is_the_primary_at_nominal_frequency() -> None:
+    time_base = base()
+    assert time_base.print_time_at(0) == pytest.approx(1e9 / PRIMARY_FREQ)
+    assert time_base.host_ns_at(time_base.print_time_at(123_456_789)) == pytest.approx(123_456_789, abs=1)
+
+
+def test_secondary_map_follows_a_clock_that_was_seen_wrong_without_a_jump() -> None:
+    time_base = base()
+    seen = Clock(5e9, SECONDARY_FREQ * (1 + 200e-6))
+    clock_map = time_base.secondary_map(seen, SECONDARY_FREQ, 100.0)
+    seen.ticks0 += SECONDARY_FREQ * 400e-6  # the estimate improves by 400 µs
+    moments = np.linspace(100.0, 106.0, 601)
+    for moment in moments[::25]:
+        time_base.steer("toolhead", clock_map, seen, float(moment))
+    truth = np.array([seen.ticks_at(time_base.host_ns_at(float(m))) for m in moments])
+    mapped = clock_map.ticks(moments)
+    error_s = (mapped - truth) / SECONDARY_FREQ
+    assert error_s[0] == pytest.approx(-400e-6, abs=1e-8)
+    assert abs(error_s[-1]) < 2e-6
+    slope = np.diff(mapped) / np.diff(moments) / (seen.rate * PRIMARY_FREQ / time_base._primary.rate)  # type: ignore[attr-defined]
+    assert np.abs(slope - 1).max() <= SLEW_LIMIT * 1.001
+    assert np.all(np.abs(np.diff(error_s)) < SLEW_LIMIT * 0.0101)
+
+
+def test_a_clock_that_jumps_is_refused() -> None:
+    time_base = base()
+    seen = Clock(5e9, SECONDARY_FREQ)
+    clock_map = time_base.secondary_map(seen, SECONDARY_FREQ, 100.0)
+    seen.ticks0 += SECONDARY_FREQ * 0.02
+    with pytest.raises(ClockJumpError, match=r"node toolhead is \+20\.0 ms"):
+        time_base.steer("toolhead", clock_map, seen, 101.0)
+
+
+def test_primary_map_is_exact() -> None:
+    clock_map = base().primary_map(50.0)
+    assert clock_map.last == ClockPiece(50.0, 50.0 * PRIMARY_FREQ, PRIMARY_FREQ)
