@@ -1,8 +1,8 @@
 """Print time, and its conversion to host time and to every node's ticks.
 
-Print time is seconds of the primary node's clock at its nominal frequency. The primary's ticks follow from it
-by a constant factor; those of a secondary node are steered: its map is made of straight pieces that join without
-a jump, each aimed at where the two clock estimators say the node's clock will be a moment later.
+Print time is seconds of the primary node's clock at its nominal frequency. The primary's ticks follow from
+it by a constant factor; those of a secondary node are steered: its map is made of straight pieces that join
+without a jump, each aimed at where the two clock estimators say the node's clock will be a moment later.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,8 @@
 """The proof: what every stepper's pins did, against an independent evaluation of the plan.
 
-Executed steps come from the log of pin levels that each virtual node kept, with the node's true clock; expected
-ones from numpy (`coordinator.demo.expected`). Steps are paired in order, so a lost, doubled or reversed step
-shows as a difference in number, direction or time.
+Executed steps come from the log of pin levels that each virtual node kept, with the node's true clock;
+expected ones from numpy (`coordinator.demo.expected`). Steps are paired in order, so a lost, doubled or
+reversed step shows as a difference in number, direction or time.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
