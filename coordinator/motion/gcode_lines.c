@@ -218,6 +218,8 @@ int gcode_feed(struct gcode_state *state, struct planner *planner, const char *t
         state->lines++;
         line = stop ? stop + 1 : end;
     }
+    if (status == GCODE_NEED_DATA)
+        planner_plan(planner);
     *offset = (size_t)(line - text);
     return status;
 }
