@@ -1,1 +1,1 @@
-"""G-code: lines, state and commands."""
+"""G-code programs: reading them, acting on their lines, and what they tell whoever drives them."""

@@ -1,0 +1,86 @@
+"""What a ``Job`` tells whoever drives it. Lines count from 1; print times are seconds (docs/architecture.md).
+
+==============  ==========================================================================================
+event           what the driver does before it calls ``step`` again
+==============  ==========================================================================================
+Progress        nothing
+Full            takes and releases trapezoids (a streamer: waits until there is room, or raises plan_until_s)
+Wait            takes all trapezoids; in real time, waits until PRINT_TIME_S has been executed
+PositionSet     takes all trapezoids, then tells step generation where the machine stands
+Reply, Notice   shows the text
+Emergency       stops the machine at once; the job is over
+End             takes all trapezoids; the job is over
+==============  ==========================================================================================
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """A piece of the program was read."""
+
+    line: int
+    done_bytes: int
+    size_bytes: int | None
+    """None where the length is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Full:
+    """The planner has no room for the next line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """M400: all moves are planned to a standstill that is reached at PRINT_TIME_S."""
+
+    line: int
+    print_time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PositionSet:
+    """G28: from PRINT_TIME_S the machine stands at POSITION (X Y Z E, mm); AXES (letters) were set.
+
+    All earlier trapezoids end in the old position, all later ones begin in the new one.
+    """
+
+    line: int
+    axes: str
+    position: tuple[float, float, float, float]
+    print_time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """An answer that the program asked for (M114)."""
+
+    line: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """Something the user should know; each is told once per job."""
+
+    line: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Emergency:
+    """M112."""
+
+    line: int
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """The program has ended; the machine comes to a standstill at PRINT_TIME_S."""
+
+    lines: int
+    print_time_s: float
+
+
+Event = Progress | Full | Wait | PositionSet | Reply | Notice | Emergency | End

@@ -1,0 +1,389 @@
+"""Runs a G-code program: moves go through the planner's hot path, every other line through the table here.
+
+``Job`` does no I/O but reading its program, keeps no clock and never sleeps: the batch planner and the
+real-time streamer drive the same ``step`` and act on its events (events.py).
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from coordinator.gcode.errors import GCodeError
+from coordinator.gcode.events import (
+    Emergency,
+    End,
+    Event,
+    Full,
+    Notice,
+    PositionSet,
+    Progress,
+    Reply,
+    Wait,
+)
+from coordinator.gcode.program import Program
+from coordinator.gcode.words import Command, WordError, number, parse, quoted
+from coordinator.motion.planner import AXIS_LETTERS, WORD_LETTERS, Fault, FeedStatus, Planner
+
+MAX_NOTICES = 100
+"""Different notices a job gives; a file of garbage must not flood the screen."""
+MAX_DWELL_S = 86400.0
+
+Handler = Callable[["Job", Command], bool]
+"""Acts on a command; False when the planner must be emptied first and the line comes again. Before it returns
+False it changes nothing but the planner's queue."""
+
+
+@dataclass(slots=True)
+class Recorded:
+    """Commands of one name that wait for a module which does not exist yet."""
+
+    count: int
+    first_line: int
+    last_line: int
+    last_text: str
+
+
+class Job:
+    """One run of PROGRAM through PLANNER.
+
+    HOMED_POSITION: where each axis (letter) stands after G28, mm; these are the axes that exist.
+    ``step`` raises GCodeError at a line that cannot be carried out, and again when called again; the moves
+    before that line are still in the planner, to be flushed or dropped by the driver.
+    """
+
+    def __init__(self, program: Program, planner: Planner, homed_position: Mapping[str, float]) -> None:
+        self.program = program
+        self.planner = planner
+        self.homed_position = dict(homed_position)
+        self.recorded: dict[str, Recorded] = {}
+        """By command name."""
+        self._events: deque[Event] = deque()
+        self._over: Event | GCodeError | None = None
+        self._told: set[str] = set()
+        self._accel_words: dict[str, float] = {}
+
+    @property
+    def line(self) -> int:
+        """Number of the line that comes next."""
+        return self.planner.lines + 1
+
+    def step(self) -> Event:
+        """Work until there is something to tell; at most one piece of the program (64 KiB)."""
+        while not self._events:
+            if isinstance(self._over, GCodeError):
+                raise self._over
+            if self._over is not None:
+                return self._over
+            try:
+                self._advance()
+            except GCodeError as error:
+                self._over = error
+        return self._events.popleft()
+
+    # ---- One piece ----
+
+    def _advance(self) -> None:
+        program = self.program
+        feed = self.planner.feed(program.data, program.start, len(program.data), final=program.final)
+        program.start = feed.offset
+        if feed.status is FeedStatus.OTHER_LINE:
+            self._other_line()
+        elif feed.status is FeedStatus.FULL:
+            self._events.append(Full())
+        elif feed.status is FeedStatus.LIMIT:
+            raise self._error(str(self.planner.fault))
+        elif program.final:
+            self._end()
+        else:
+            program.check_line_length(self.line)
+            program.refill()
+            self._events.append(Progress(self.planner.lines, program.done_bytes, program.size_bytes))
+
+    def _end(self) -> None:
+        if not self.planner.flush():
+            self._events.append(Full())
+            return
+        self._over = End(self.planner.lines, self.planner.print_time_end_s)
+
+    def _other_line(self) -> None:
+        program = self.program
+        end = program.line_end()
+        try:
+            command = parse(program.data[program.start : end])
+            done = command is None or self._act(command)
+        except (WordError, ValueError) as problem:
+            cut = program.final and end == len(program.data)
+            hint = "; the file ends within this line: it is cut short, copy it again" if cut else ""
+            raise self._error(f"{problem}{hint}") from None
+        if not done:
+            self._events.append(Full())
+            return
+        program.start = min(end + 1, len(program.data))
+        self.planner.line_done()
+
+    def _act(self, command: Command) -> bool:
+        handler = _HANDLERS.get(command.name)
+        if handler:
+            return handler(self, command)
+        if command.name[0] == "T" and command.name[1:].isdigit():
+            raise WordError(f"{command.name} selects a tool that does not exist; this machine has only T0")
+        what = quoted(command.name).strip("'")
+        self.notice(f"unknown command {what}", "unknown commands are skipped")
+        return True
+
+    # ---- For the handlers ----
+
+    def _error(self, problem: str) -> GCodeError:
+        return GCodeError(self.program.name, self.line, problem)
+
+    def notice(self, what: str, remark: str) -> None:
+        """Tell about WHAT, but only once in this job."""
+        if what in self._told or len(self._told) > MAX_NOTICES:
+            return
+        self._told.add(what)
+        text = f"{self.program.name}:{self.line}: {what}: {remark}"
+        if len(self._told) > MAX_NOTICES:
+            text = f"{self.program.name}:{self.line}: more than {MAX_NOTICES} notices: no more are shown"
+        self._events.append(Notice(self.line, text))
+
+    def record(self, command: Command) -> None:
+        """Count COMMAND; only its last parameters are kept, so memory stays flat."""
+        seen = self.recorded.setdefault(command.name, Recorded(0, self.line, self.line, ""))
+        seen.count += 1
+        seen.last_line = self.line
+        seen.last_text = command.text
+
+    def emit(self, event: Event) -> None:
+        """Tell EVENT with the next ``step``."""
+        self._events.append(event)
+
+    def end_with(self, event: Event) -> None:
+        """End the job with EVENT."""
+        self._over = event
+
+    @property
+    def accel_words(self) -> dict[str, float]:
+        """P and T of M204 since the last S."""
+        return self._accel_words
+
+
+# ---- The commands ----------------------------------------------------------------------------------------
+
+
+def _numbers(command: Command, allowed: str) -> dict[str, float]:
+    """Read COMMAND's words, all with numbers, and no others than ALLOWED."""
+    words = command.words()
+    for letter in words:
+        if letter not in allowed:
+            raise WordError(f"{command.name} has the word {letter}; it takes {' '.join(allowed)}")
+    return {letter: number(command.name, words, letter) for letter in words}
+
+
+def _positive(command: Command, words: Mapping[str, float]) -> None:
+    for letter, value in words.items():
+        if value <= 0:
+            raise WordError(f"{letter} of {command.name} is {value:g}; it must be above 0")
+
+
+def _move(job: Job, command: Command) -> bool:
+    """G0, G1 that the hot path refused: unusual words, or numbers of many digits."""
+    words = command.words()
+    for letter in words.keys() - set(WORD_LETTERS):
+        job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
+    numbers = {letter: number(command.name, words, letter) for letter in words if letter in WORD_LETTERS}
+    status = job.planner.move(numbers)
+    if status is FeedStatus.LIMIT:
+        raise WordError(str(job.planner.fault))
+    return status is not FeedStatus.FULL
+
+
+def _dwell(job: Job, command: Command) -> bool:
+    words = _numbers(command, "PS")
+    seconds = words.get("P", 0.0) / 1000 + words.get("S", 0.0)
+    if not 0 <= seconds <= MAX_DWELL_S:
+        raise WordError(f"G4 is to wait {seconds:g} s; 0 to {MAX_DWELL_S:g} s are possible")
+    if not job.planner.flush():
+        return False
+    job.planner.dwell(seconds)
+    return True
+
+
+def _unit(unit_mm: float) -> Handler:
+    def handle(job: Job, _command: Command) -> bool:
+        job.planner.unit_mm = unit_mm
+        return True
+
+    return handle
+
+
+def _relative(*, relative: bool) -> Handler:
+    def handle(job: Job, _command: Command) -> bool:
+        job.planner.relative = relative
+        return True
+
+    return handle
+
+
+def _relative_extrusion(*, relative: bool) -> Handler:
+    def handle(job: Job, _command: Command) -> bool:
+        job.planner.relative_extrusion = relative
+        return True
+
+    return handle
+
+
+def _home(job: Job, command: Command) -> bool:
+    named = [axis for axis in command.words() if axis in "XYZ"]
+    axes = "".join(sorted(named or job.homed_position))
+    for axis in axes:
+        if axis not in job.homed_position:
+            raise WordError(f"G28 names the axis {axis}, which this machine does not have")
+    planner = job.planner
+    if not planner.flush():
+        return False
+    x, y, z, e = (
+        job.homed_position[letter] if letter in axes else now
+        for letter, now in zip(AXIS_LETTERS, planner.toolhead_position, strict=True)
+    )
+    planner.set_position((x, y, z, e))
+    planner.clear_gcode_base(axes)
+    planner.homed = planner.homed + axes
+    job.notice("G28", "there are no endstops to look for; the axes are taken as already home")
+    job.emit(PositionSet(job.line, axes, (x, y, z, e), planner.print_time_end_s))
+    return True
+
+
+def _set_origin(job: Job, command: Command) -> bool:
+    words = _numbers(command, AXIS_LETTERS)
+    job.planner.set_gcode_position(words or dict.fromkeys(AXIS_LETTERS, 0.0))
+    return True
+
+
+def _set_accel(job: Job, command: Command) -> bool:
+    """S holds for everything; P (print) and T (travel) hold together as the lower of the two."""
+    words = _numbers(command, "SPTR")
+    words.pop("R", None)
+    _positive(command, words)
+    if not words:
+        raise WordError("M204 names no acceleration; give S, or P and T (mm/s²)")
+    kept = job.accel_words
+    if "S" in words:
+        kept.clear()
+        accel = words["S"]
+    else:
+        kept.update(words)
+        accel = min(kept.values())
+    _cap(job, "the acceleration", accel, job.planner.limits.max_accel)
+    job.planner.accel = accel
+    return True
+
+
+def _cap(job: Job, what: str, asked: float, limit: float) -> None:
+    if asked > limit:
+        job.notice(f"{what} {asked:g} is above the configured {limit:g}", f"{limit:g} is used")
+
+
+def _set_velocity_limit(job: Job, command: Command) -> bool:
+    planner, limits = job.planner, job.planner.limits
+    values = command.parameters()
+    known = {"VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"}
+    for key in values.keys() - known:
+        raise WordError(
+            f"SET_VELOCITY_LIMIT has no parameter {quoted(key)}; it takes {' '.join(sorted(known))}"
+        )
+    numbers = {key: number(command.name, values, key) for key in values}
+    for key, value in numbers.items():
+        low = 0.0 if key in {"SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"} else 1e-3
+        high = 0.999 if key == "MINIMUM_CRUISE_RATIO" else 1e9
+        if not low <= value <= high:
+            raise WordError(f"{key} of SET_VELOCITY_LIMIT is {value:g}; {low:g} to {high:g} are possible")
+    if "VELOCITY" in numbers:
+        _cap(job, "the velocity", numbers["VELOCITY"], limits.max_velocity)
+        planner.max_velocity = numbers["VELOCITY"]
+    if "ACCEL" in numbers:
+        job.accel_words.clear()
+        _cap(job, "the acceleration", numbers["ACCEL"], limits.max_accel)
+        planner.accel = numbers["ACCEL"]
+    if "SQUARE_CORNER_VELOCITY" in numbers:
+        asked = numbers["SQUARE_CORNER_VELOCITY"]
+        _cap(job, "the square corner velocity", asked, limits.square_corner_velocity)
+        planner.square_corner_velocity = asked
+    if "MINIMUM_CRUISE_RATIO" in numbers:
+        planner.minimum_cruise_ratio = numbers["MINIMUM_CRUISE_RATIO"]
+    return True
+
+
+def _factor(job: Job, command: Command) -> bool:
+    """M220, M221: percent in S; without it, nothing changes."""
+    percent = _numbers(command, "S").get("S")
+    if percent is None:
+        return True
+    if not 1 <= percent <= 1000:
+        raise WordError(f"S of {command.name} is {percent:g} %; 1 to 1000 % are possible")
+    if command.name == "M220":
+        job.planner.speed_factor = percent / 100
+    else:
+        job.planner.extrude_factor = percent / 100
+    return True
+
+
+def _wait_for_moves(job: Job, _command: Command) -> bool:
+    if not job.planner.flush():
+        return False
+    job.emit(Wait(job.line, job.planner.print_time_end_s))
+    return True
+
+
+def _tell_position(job: Job, _command: Command) -> bool:
+    position = zip(AXIS_LETTERS, job.planner.gcode_position, strict=True)
+    job.emit(Reply(job.line, " ".join(f"{letter}:{value:.3f}" for letter, value in position)))
+    return True
+
+
+def _emergency(job: Job, _command: Command) -> bool:
+    job.end_with(Emergency(job.line))
+    return True
+
+
+def _without_module(what: str) -> Handler:
+    def handle(job: Job, command: Command) -> bool:
+        job.record(command)
+        job.notice(what, "accepted and recorded, but without effect: no module acts on them yet")
+        return True
+
+    return handle
+
+
+def _ignore(_job: Job, _command: Command) -> bool:
+    return True
+
+
+def _refuse_arc(_job: Job, command: Command) -> bool:
+    raise WordError(f"{command.name} curves are not supported; have the slicer write straight moves (G1)")
+
+
+_heat = _without_module("heater and fan commands")
+_motors_off = _without_module("motor-off commands")
+_HANDLERS: Mapping[str, Handler] = {
+    "G0": _move,
+    "G1": _move,
+    **dict.fromkeys(("G2", "G3", "G5"), _refuse_arc),
+    "G4": _dwell,
+    "G20": _unit(25.4),
+    "G21": _unit(1.0),
+    "G28": _home,
+    "G90": _relative(relative=False),
+    "G91": _relative(relative=True),
+    "G92": _set_origin,
+    **dict.fromkeys(("M18", "M84"), _motors_off),
+    **dict.fromkeys(("M73", "M117", "M118", "T0"), _ignore),
+    "M82": _relative_extrusion(relative=False),
+    "M83": _relative_extrusion(relative=True),
+    **dict.fromkeys(("M104", "M105", "M106", "M107", "M109", "M140", "M190"), _heat),
+    "M112": _emergency,
+    "M114": _tell_position,
+    "M204": _set_accel,
+    **dict.fromkeys(("M220", "M221"), _factor),
+    "M400": _wait_for_moves,
+    "SET_VELOCITY_LIMIT": _set_velocity_limit,
+}

@@ -1,0 +1,132 @@
+"""The text of a G-code program, read in bounded pieces: memory does not grow with its length."""
+
+import sys
+from collections.abc import Iterable, Iterator
+from io import RawIOBase
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+from coordinator.gcode.errors import GCodeError
+from nodes.errors import CanductorError
+
+CHUNK_BYTES = 1 << 16
+MAX_LINE_BYTES = 1 << 20
+"""A longer line is not G-code; comments with pictures in them stay far below."""
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+
+
+class ByteSource(Protocol):
+    """What a program is read from: an open binary file, a pipe, standard input."""
+
+    def read(self, size: int, /) -> bytes | None:
+        """Return at most SIZE bytes; none at the end."""
+
+    def close(self) -> None:
+        """Release it."""
+
+
+class _Pieces:
+    """Lines (or larger pieces) of text as a byte source; a line feed is added where one is missing."""
+
+    def __init__(self, pieces: Iterable[str | bytes]) -> None:
+        self._pieces: Iterator[str | bytes] = iter(pieces)
+
+    def read(self, _size: int, /) -> bytes:
+        for piece in self._pieces:
+            data = piece.encode(errors="surrogateescape") if isinstance(piece, str) else bytes(piece)
+            return data if data.endswith(b"\n") else data + b"\n"
+        return b""
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+class Program:
+    """A program with a window on its text: ``data[start:]`` is what was not consumed yet.
+
+    The owner of the window moves ``start`` on and calls ``refill`` when no whole line is left.
+    """
+
+    def __init__(self, source: ByteSource, name: str, *, size_bytes: int | None = None) -> None:
+        self.name = name
+        self.size_bytes = size_bytes
+        """None where it is not known (pipes)."""
+        self.data = b""
+        self.start = 0
+        self.final = False
+        """Whether the window reaches the end of the program."""
+        self._source = source
+        self._read_bytes = 0
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """Open the file PATH, or standard input for ``-``. Raises CanductorError when that fails."""
+        if str(path) == "-":
+            # Unbuffered: what a person or a program typed is acted on at once, not when a block is full.
+            return cls(sys.stdin.buffer.raw, "standard input")
+        try:
+            source: RawIOBase = Path(path).open("rb", buffering=0)  # noqa: SIM115: close() closes it
+            size = source.seek(0, 2) if source.seekable() else None
+            if size is not None:
+                source.seek(0)
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise CanductorError(f"cannot read the G-code file {path}: {reason}; check the path") from error
+        return cls(source, str(path), size_bytes=size)
+
+    @classmethod
+    def from_lines(cls, lines: Iterable[str | bytes], name: str = "program") -> Self:
+        """Read from LINES, with or without line feeds."""
+        return cls(_Pieces(lines), name)
+
+    @property
+    def done_bytes(self) -> int:
+        """Bytes consumed."""
+        return self._read_bytes - (len(self.data) - self.start)
+
+    def refill(self) -> None:
+        """Drop what was consumed and read one piece more, waiting for it if need be.
+
+        Raises CanductorError when reading fails or a line is longer than MAX_LINE_BYTES.
+        """
+        try:
+            piece = self._source.read(CHUNK_BYTES)
+        except OSError as error:
+            reason = (error.strerror or str(error)).lower()
+            raise CanductorError(f"reading {self.name} failed: {reason}; copy the file again") from error
+        if piece is None:
+            raise CanductorError(f"reading {self.name} failed: it is non-blocking; give a file or a pipe")
+        if self._read_bytes == 0 and piece.startswith(_BYTE_ORDER_MARK):
+            self._read_bytes = len(_BYTE_ORDER_MARK)
+            piece = piece[len(_BYTE_ORDER_MARK) :]
+            self.final = False
+        else:
+            self.final = not piece
+        self._read_bytes += len(piece)
+        self.data = self.data[self.start :] + piece
+        self.start = 0
+
+    def line_end(self) -> int:
+        """Return where the line at ``start`` ends, line feed excluded."""
+        end = self.data.find(b"\n", self.start)
+        return len(self.data) if end < 0 else end
+
+    def check_line_length(self, line: int) -> None:
+        """Raise GCodeError when the window holds nothing but an endless LINE."""
+        if len(self.data) - self.start > MAX_LINE_BYTES:
+            raise GCodeError(
+                self.name, line, f"this line is longer than {MAX_LINE_BYTES} bytes; is this a G-code file?"
+            )
+
+    def close(self) -> None:
+        """Close the source."""
+        self._source.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

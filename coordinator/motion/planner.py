@@ -1,0 +1,348 @@
+"""From G-code text to trapezoids: the Python skin of the look-ahead and the G-code hot path.
+
+Text goes in by ``feed``, trapezoids come out by ``take`` and ``release``; everything between runs in C
+without the interpreter lock. Lengths in mm, times in s, speeds in mm/s, axes in the order X Y Z E.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+from coordinator.motion._planner import ffi, lib
+from coordinator.motion.planner_values import (
+    TRAPEZOID,
+    Fault,
+    FaultKind,
+    Feed,
+    FeedStatus,
+    Trapezoids,
+    check_limits,
+    check_number,
+)
+from coordinator.motion.specs import MotionLimits
+
+__all__ = [
+    "AXIS_LETTERS",
+    "DEFAULT_SPEED_MM_S",
+    "RING_TRAPEZOIDS",
+    "TRAPEZOID",
+    "WORD_LETTERS",
+    "Fault",
+    "FaultKind",
+    "Feed",
+    "FeedStatus",
+    "Planner",
+    "Position",
+    "Trapezoids",
+]
+
+Position = tuple[float, float, float, float]
+
+AXIS_LETTERS = "XYZE"
+WORD_LETTERS = "XYZEF"
+DEFAULT_SPEED_MM_S = 25.0
+"""Speed of moves before the first F word."""
+RING_TRAPEZOIDS = int(lib.PLANNER_RING)
+"""Most trapezoids that can wait for ``take``."""
+
+
+class Planner:
+    """Plans moves with look-ahead; begins at standstill at POSITION, print time 0, nothing homed.
+
+    Not thread-safe; ``feed`` releases the interpreter lock while C works. Raises ValueError when a limit is
+    not a number it can calculate with.
+    """
+
+    def __init__(self, limits: MotionLimits, *, position: Position = (0.0, 0.0, 0.0, 0.0)) -> None:
+        check_limits(limits)
+        self.limits = limits
+        """What was configured; ``max_accel`` and the like below never exceed it."""
+        self._limits: Any = ffi.new(
+            "struct planner_limits *", {field.name: getattr(limits, field.name) for field in fields(limits)}
+        )
+        self._core: Any = ffi.new("struct planner *")
+        self._memory: Any = ffi.buffer(self._core)
+        self._address = int(ffi.cast("uintptr_t", self._core))
+        lib.planner_init(self._core, self._limits, position)
+        self._state: Any = ffi.new(
+            "struct gcode_state *",
+            {
+                "position": position,
+                "unit": 1.0,
+                "speed": DEFAULT_SPEED_MM_S,
+                "speed_factor": 1.0,
+                "extrude_factor": 1.0,
+            },
+        )
+        self._offset: Any = ffi.new("size_t *")
+        self._count: Any = ffi.new("uint32_t *")
+        self._words: Any = ffi.new("struct gcode_words *")
+
+    # ---- Text in ----
+
+    def feed(self, data: bytes | bytearray | memoryview, start: int, end: int, *, final: bool) -> Feed:
+        """Plan the lines of DATA[start:end] up to the first that is not the planner's.
+
+        FINAL: no more text comes behind END, so the last line may lack its line feed.
+        """
+        if not 0 <= start <= end <= len(data):
+            raise ValueError(f"{start}..{end} is not a range of {len(data)} bytes")
+        self._offset[0] = start
+        with ffi.from_buffer(data) as text:
+            status = lib.gcode_feed(self._state, self._core, text, end, self._offset, final)
+        return Feed(FeedStatus(status), self._offset[0], self._state.lines + 1)
+
+    def line_done(self) -> None:
+        """Count a line that the caller consumed."""
+        self._state.lines += 1
+
+    def move(self, words: Mapping[str, float]) -> FeedStatus:
+        """Act on a G1 with these WORDS (letters of WORD_LETTERS); NEED_DATA says that it was done."""
+        if not lib.planner_ready(self._core):
+            return FeedStatus.FULL
+        self._words.given = 0
+        for letter, value in words.items():
+            index = WORD_LETTERS.index(letter)
+            self._words.value[index] = value
+            self._words.given |= 1 << index
+        refused = lib.gcode_move(self._state, self._core, self._words)
+        return FeedStatus.LIMIT if refused else FeedStatus.NEED_DATA
+
+    @property
+    def fault(self) -> Fault:
+        """Why the last refused move was refused."""
+        fault = self._core.fault
+        return Fault(FaultKind(fault.kind), AXIS_LETTERS[fault.axis], fault.value, fault.low, fault.high)
+
+    # ---- Trapezoids out ----
+
+    def plan(self) -> None:
+        """Hand out all that no later move can change; ``feed`` does so when it runs out of data."""
+        lib.planner_plan(self._core)
+
+    def take(self) -> Trapezoids:
+        """Return the oldest trapezoids that lie in one piece, without copying them; 0 when none waits."""
+        pointer = lib.planner_peek(self._core, self._count)
+        offset = int(ffi.cast("uintptr_t", pointer)) - self._address
+        return Trapezoids(pointer, self._count[0], self._memory, offset)
+
+    def release(self, count: int) -> None:
+        """Give the oldest COUNT trapezoids back."""
+        if count < 0 or lib.planner_release(self._core, count):
+            raise ValueError(f"{count} trapezoids released, but fewer were waiting")
+
+    # ---- Standstill ----
+
+    def flush(self) -> bool:
+        """Plan all moves to a standstill; False when the ring is full (take some, call again)."""
+        return bool(lib.planner_flush(self._core))
+
+    @property
+    def at_standstill(self) -> bool:
+        """Whether every move is handed out and the last ends at rest."""
+        return bool(self._core.head == self._core.tail)
+
+    def dwell(self, seconds: float) -> None:
+        """Stand still for SECONDS more; ``flush`` first."""
+        self._standing(lib.planner_wait(self._core, check_number("the dwell", seconds, 0)))
+
+    def begin_at(self, print_time_s: float) -> None:
+        """Begin the next move at PRINT_TIME_S, at the earliest ``print_time_end_s``; ``flush`` first."""
+        self._standing(lib.planner_begin_at(self._core, check_number("the print time", print_time_s, 0)))
+
+    def set_position(self, position: Sequence[float]) -> None:
+        """Declare that the machine stands at POSITION (X Y Z E); ``flush`` first."""
+        for value in position:
+            check_number("the position", value, -1e9, 1e9)
+        self._standing(lib.planner_set_position(self._core, position))
+        self._state.position = position
+
+    @staticmethod
+    def _standing(failed: int) -> None:
+        if failed:
+            raise RuntimeError("moves are still queued: flush() first")
+
+    # ---- Time ----
+
+    @property
+    def print_time_end_s(self) -> float:
+        """Print time at which the last trapezoid handed out ends."""
+        return float(self._core.print_time)
+
+    @property
+    def plan_until_s(self) -> float:
+        """Print time beyond which ``feed`` answers FULL although the ring has room; for streaming."""
+        return float(self._core.plan_until)
+
+    @plan_until_s.setter
+    def plan_until_s(self, print_time_s: float) -> None:
+        if math.isnan(print_time_s):
+            raise ValueError("plan_until_s is not a number")
+        self._core.plan_until = print_time_s
+
+    # ---- Where things are ----
+
+    @property
+    def toolhead_position(self) -> Position:
+        """End of the last move added, in the machine's frame."""
+        x, y, z, e = self._core.position
+        return (x, y, z, e)
+
+    @property
+    def gcode_position(self) -> Position:
+        """Last target in the frame and units of the G-code program."""
+        s = self._state
+        scale = (s.unit, s.unit, s.unit, s.unit * s.extrude_factor)
+        x, y, z, e = ((s.position[i] - s.base[i]) / scale[i] for i in range(4))
+        return (x, y, z, e)
+
+    @property
+    def gcode_base(self) -> Position:
+        """Machine position of the G-code origin."""
+        x, y, z, e = self._state.base
+        return (x, y, z, e)
+
+    def set_gcode_position(self, words: Mapping[str, float]) -> None:
+        """G92: the present position shall read as WORDS (axis letter to program units)."""
+        s = self._state
+        for letter, value in words.items():
+            axis = AXIS_LETTERS.index(letter)
+            scale = s.unit * (s.extrude_factor if letter == "E" else 1)
+            s.base[axis] = s.position[axis] - value * scale
+
+    def clear_gcode_base(self, axes: str) -> None:
+        """Put the G-code origin of AXES (letters) back to the machine's."""
+        for letter in axes:
+            self._state.base[AXIS_LETTERS.index(letter)] = 0.0
+
+    @property
+    def homed(self) -> str:
+        """Letters of the homed axes; only these may move. E needs no homing."""
+        return "".join(letter for i, letter in enumerate("XYZ") if self._core.homed >> i & 1)
+
+    @homed.setter
+    def homed(self, axes: str) -> None:
+        self._core.homed = sum(1 << "XYZ".index(letter) for letter in set(axes))
+
+    # ---- State of the G-code language ----
+
+    @property
+    def unit_mm(self) -> float:
+        """Length of a program unit, mm (G20, G21)."""
+        return float(self._state.unit)
+
+    @unit_mm.setter
+    def unit_mm(self, unit: float) -> None:
+        self._state.unit = check_number("the unit", unit, 0, 1e3, open_low=True)
+
+    @property
+    def relative(self) -> bool:
+        """G91: all axes, E too, count from where they are."""
+        return bool(self._state.relative)
+
+    @relative.setter
+    def relative(self, relative: bool) -> None:
+        self._state.relative = relative
+
+    @property
+    def relative_extrusion(self) -> bool:
+        """M83: E counts from where it is."""
+        return bool(self._state.relative_extrude)
+
+    @relative_extrusion.setter
+    def relative_extrusion(self, relative: bool) -> None:
+        self._state.relative_extrude = relative
+
+    @property
+    def speed_mm_s(self) -> float:
+        """The last F, before the speed factor."""
+        return float(self._state.speed)
+
+    @property
+    def speed_factor(self) -> float:
+        """M220 / 100."""
+        return float(self._state.speed_factor)
+
+    @speed_factor.setter
+    def speed_factor(self, factor: float) -> None:
+        self._state.speed_factor = check_number("the speed factor", factor, 0, 100, open_low=True)
+
+    @property
+    def extrude_factor(self) -> float:
+        """M221 / 100; changing it leaves the G-code position of E as it reads."""
+        return float(self._state.extrude_factor)
+
+    @extrude_factor.setter
+    def extrude_factor(self, factor: float) -> None:
+        check_number("the extrude factor", factor, 0, 100, open_low=True)
+        reads = self.gcode_position[3]
+        self._state.extrude_factor = factor
+        self.set_gcode_position({"E": reads})
+
+    # ---- Dynamics of the moves to come; never beyond what was configured ----
+
+    @property
+    def accel(self) -> float:
+        """mm/s² (M204)."""
+        return float(self._core.accel)
+
+    @accel.setter
+    def accel(self, accel: float) -> None:
+        self._core.accel = min(check_number("the acceleration", accel, 1e-3), self.limits.max_accel)
+
+    @property
+    def max_velocity(self) -> float:
+        """mm/s along the path."""
+        return float(self._core.limits.max_velocity)
+
+    @max_velocity.setter
+    def max_velocity(self, velocity: float) -> None:
+        velocity = check_number("the velocity", velocity, 1e-3)
+        self._core.limits.max_velocity = min(velocity, self.limits.max_velocity)
+
+    @property
+    def square_corner_velocity(self) -> float:
+        """mm/s."""
+        return float(self._core.limits.square_corner_velocity)
+
+    @square_corner_velocity.setter
+    def square_corner_velocity(self, velocity: float) -> None:
+        velocity = check_number("the square corner velocity", velocity, 0)
+        self._core.limits.square_corner_velocity = min(velocity, self.limits.square_corner_velocity)
+
+    @property
+    def minimum_cruise_ratio(self) -> float:
+        """0 <= ratio < 1."""
+        return float(self._core.limits.minimum_cruise_ratio)
+
+    @minimum_cruise_ratio.setter
+    def minimum_cruise_ratio(self, ratio: float) -> None:
+        self._core.limits.minimum_cruise_ratio = check_number("the minimum cruise ratio", ratio, 0, 0.999)
+
+    # ---- Counters ----
+
+    @property
+    def lines(self) -> int:
+        """Lines consumed."""
+        return int(self._state.lines)
+
+    @property
+    def moves(self) -> int:
+        """Moves added."""
+        return int(self._core.moves_added)
+
+    @property
+    def moves_dropped(self) -> int:
+        """Moves shorter than 1 nm, which were dropped."""
+        return int(self._core.moves_dropped)
+
+    @property
+    def moves_overflowed(self) -> int:
+        """Moves planned before they were settled because the queue was full."""
+        return int(self._core.moves_overflowed)
+
+    @property
+    def moves_queued(self) -> int:
+        """Moves that are not handed out yet."""
+        return int(self._core.tail - self._core.head)

@@ -1,0 +1,141 @@
+"""What the planner takes and gives: feed results, refusals, trapezoids as numpy sees them."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from coordinator.motion._planner import ffi, lib
+from coordinator.motion.specs import MotionLimits
+
+
+def _trapezoid_dtype() -> np.dtype[np.void]:
+    """Describe struct trapezoid to numpy, with the offsets the compiler chose."""
+    layout = dict(ffi.typeof("struct trapezoid").fields)
+    return np.dtype(
+        {
+            "names": list(layout),
+            "formats": [("f8", 4) if field.type.kind == "array" else "f8" for field in layout.values()],
+            "offsets": [field.offset for field in layout.values()],
+            "itemsize": ffi.sizeof("struct trapezoid"),
+        }
+    )
+
+
+TRAPEZOID = _trapezoid_dtype()
+"""struct trapezoid as a numpy dtype."""
+
+
+class FeedStatus(IntEnum):
+    """Why ``feed`` stopped."""
+
+    NEED_DATA = lib.GCODE_NEED_DATA
+    """No whole line is left."""
+    OTHER_LINE = lib.GCODE_OTHER_LINE
+    """The line at the offset is not the planner's: act on it, call ``line_done`` and feed on behind it."""
+    FULL = lib.GCODE_FULL
+    """The ring is full or reaches beyond ``plan_until``: take trapezoids, then feed on."""
+    LIMIT = lib.GCODE_LIMIT
+    """The move of the line at the offset is refused: see ``Planner.fault``."""
+
+
+class Feed(NamedTuple):
+    """Where ``feed`` stopped."""
+
+    status: FeedStatus
+    offset: int
+    """Behind the last byte consumed."""
+    line: int
+    """Number of the line at the offset, the first being 1."""
+
+
+class FaultKind(IntEnum):
+    """Why a move was refused."""
+
+    NOT_HOMED = lib.PLANNER_NOT_HOMED
+    OUTSIDE = lib.PLANNER_OUTSIDE
+    EXTRUDE_LONG = lib.PLANNER_EXTRUDE_LONG
+    EXTRUDE_RATIO = lib.PLANNER_EXTRUDE_RATIO
+    SPEED = lib.PLANNER_SPEED
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A move the machine must not make."""
+
+    kind: FaultKind
+    axis: str
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        """Say what is wrong and what to do, without the place."""
+        return _FAULTS[self.kind](self)
+
+
+_FAULTS: Mapping[FaultKind, Callable[[Fault], str]] = {
+    FaultKind.NOT_HOMED: lambda f: f"{f.axis} is to move before it is homed; home with G28 first",
+    FaultKind.OUTSIDE: lambda f: (
+        f"the move goes to {f.axis} {f.value:.6g} mm, outside {f.low:.6g} to {f.high:.6g} mm; "
+        f"correct the program or position_min and position_max of [stepper_{f.axis.lower()}]"
+    ),
+    FaultKind.EXTRUDE_LONG: lambda f: (
+        f"the move pushes {f.value:.6g} mm of filament at once, more than {f.high:.6g} mm; "
+        "check M82/M83 and G92 E, or raise max_extrude_only_distance of [extruder]"
+    ),
+    FaultKind.EXTRUDE_RATIO: lambda f: (
+        f"the move pushes {f.value:.4g} mm of filament per mm of path, more than {f.high:.4g}; "
+        "check M82/M83 and G92 E, or raise max_extrude_cross_section of [extruder]"
+    ),
+    FaultKind.SPEED: lambda f: (
+        f"the speed is {f.value:.4g} mm/s, which is not above 0; give a positive F (mm/min)"
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Trapezoids:
+    """Consecutive trapezoids in the planner's memory: valid until they are released."""
+
+    pointer: Any
+    """``struct trapezoid *``; another cffi module takes it through its own ``ffi.cast``."""
+    count: int
+    memory: Any
+    """Buffer of the whole planner; keeps it alive."""
+    offset: int
+    """Of the first trapezoid in ``memory``, bytes."""
+
+    def array(self) -> npt.NDArray[np.void]:
+        """Return a numpy view (dtype TRAPEZOID) of the same memory."""
+        return np.frombuffer(self.memory, TRAPEZOID, self.count, self.offset)
+
+
+def check_number(
+    what: str, value: float, low: float, high: float = math.inf, *, open_low: bool = False
+) -> float:
+    """Return VALUE when it is a finite number within the bounds, else raise ValueError naming WHAT."""
+    if not (math.isfinite(value) and low <= value <= high) or (open_low and value == low):
+        bound = f"above {low:g}" if open_low else f"at least {low:g}"
+        raise ValueError(f"{what} is {value!r}; it must be a number {bound} and at most {high:g}")
+    return value
+
+
+def check_limits(limits: MotionLimits) -> None:
+    """Refuse limits the arithmetic cannot stand: they would come out as NaN."""
+    may_be_zero = {"square_corner_velocity", "instantaneous_corner_velocity"}
+    for field in fields(limits):
+        value = getattr(limits, field.name)
+        if field.name in {"position_min", "position_max"}:
+            for bound in value:
+                check_number(field.name, bound, -1e6, 1e6)
+        elif field.name == "minimum_cruise_ratio":
+            check_number(field.name, value, 0, 0.999)
+        else:
+            # Within these every duration and square is far from overflow and underflow.
+            zero = field.name in may_be_zero
+            check_number(field.name, value, 0 if zero else 1e-3, 1e9)
