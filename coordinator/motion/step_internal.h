@@ -110,6 +110,13 @@ static inline double move_end(const struct trapezoid *m) {
     return m->print_time + m->accel_s + m->cruise_s + m->decel_s;
 }
 
+// Times that differ by less are the same: sums of durations round differently.
+#define ROUNDING_S 1e-9
+
+static inline bool is_over(double end, double until) {
+    return end <= until + ROUNDING_S;
+}
+
 // Ticks at PRINT_TIME relative to BASE.
 static inline double clock_relative(const struct clock_map *map, double print_time, int64_t base) {
     return (print_time - map->time) * map->ticks_per_s + map->part + (double)(map->whole - base);

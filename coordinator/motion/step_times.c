@@ -184,7 +184,7 @@ static int play(struct step_gen *gen, struct stepper *s, const struct trapezoid 
             continue;
         const double p_end = p->time + p->seconds;
         int64_t to = target;
-        if (until < p_end)
+        if (!is_over(p_end, until))
             to = reached(begin + ratio * way_at(p, until), direction, target);
         else if (i < last)
             to = reached(begin + ratio * (p->from + p->way), direction, target);
@@ -222,7 +222,7 @@ int step_times_advance(struct step_gen *gen, struct stepper *s, double until) {
             status = play(gen, s, m, until);
         if (status)
             return status;
-        if (move_end(m) > until)
+        if (!is_over(move_end(m), until))
             break;
     }
     return STEP_OK;

@@ -6,7 +6,6 @@
 
 static const double SLICE_S = 0.25;      // steppers of a node advance together by so much
 static const double GROW_S = 0.5;        // how long a segment may wait for more while more is to come
-static const double ROUNDING_S = 1e-9;   // by which moves may overlap
 static const double PIVOT_S = 600;       // after which a clock is measured from a newer time
 static const double LONGEST_S = 1e9;     // any time or duration
 static const double FASTEST_HZ = 1e10;   // any clock
@@ -207,7 +206,7 @@ static int advance(struct step_gen *gen, double force_s, bool flush) {
 static void finish_slice(struct step_gen *gen) {
     gen->until = gen->slice;
     while (gen->moves_from < gen->moves_to &&
-           move_end(&gen->moves[gen->moves_from % STEP_TRAPEZOIDS]) <= gen->until)
+           is_over(move_end(&gen->moves[gen->moves_from % STEP_TRAPEZOIDS]), gen->until))
         gen->moves_from++;
     for (int i = 0; i < gen->node_count; i++)
         if (gen->until - gen->nodes[i].clock.time > PIVOT_S)
