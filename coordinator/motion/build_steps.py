@@ -1,0 +1,20 @@
+"""Builds ``coordinator.motion._steps``: step generation, compression and the nodes' command streams."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from nodes.native_build import builder
+
+ffibuilder = builder(
+    "coordinator.motion._steps",
+    headers=["coordinator/motion/trapezoid.h", "coordinator/motion/steps.h"],
+    sources=[
+        "coordinator/motion/steps.c",
+        "coordinator/motion/step_times.c",
+        "coordinator/motion/step_compress.c",
+        "coordinator/motion/step_stream.c",
+        "firmware/wire/vlq.c",
+    ],
+)

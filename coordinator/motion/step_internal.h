@@ -1,0 +1,146 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the files of step generation share. The manual is steps.h.
+#ifndef MOTION_STEP_INTERNAL_H
+#define MOTION_STEP_INTERNAL_H
+
+#include "coordinator/motion/steps.h"
+
+#include <math.h>
+#include <stdbool.h>
+
+enum {
+    SEGMENT_COUNT_MAX = 65535,
+    PREFIX_MAX = 10,      // id and oid as VLQ
+    RESET_GAP = 1 << 30,  // ticks; longer rests are bridged by reset_step_clock, far from the 2^31 of the wire
+    BUFFER_PAD = 16,      // the loops over steps work in blocks and may write behind the end
+    STEP_STALLED = 1000,  // internal status: no room for a segment now
+    COMMANDS_PER_SEGMENT = 3,
+};
+
+// Ticks of a node: whole + part + (print time − time)·ticks_per_s.
+struct clock_map {
+    double time, part, ticks_per_s;
+    int64_t whole;
+};
+
+enum { SEGMENT_SET_DIR = 1, SEGMENT_DIR_VALUE = 2, SEGMENT_RESET = 4 };
+
+struct segment {
+    int64_t req, first, finish;
+    int64_t reset_clock, reset_min;
+    uint32_t interval;
+    uint16_t count;
+    int16_t add;
+    uint8_t flags;
+};
+
+struct prefix {
+    uint8_t bytes[PREFIX_MAX];
+    uint8_t size;
+};
+
+struct stepper {
+    struct step_stepper_config config;
+    const struct clock_map *clock;
+    double origin;    // steps
+    int64_t position; // steps generated (cancelled ones included)
+    uint64_t move;    // number of the trapezoid that is next
+    uint64_t begun;   // one more than the number of the last trapezoid whose begin was checked
+
+    // Steps that wait for compression: one direction, ticks relative to BASE. LOW and HIGH are their bands.
+    double *ticks, *low, *high;
+    size_t count;
+    int direction; // +1, -1
+    int64_t base;
+
+    // The last step sent: its true time (relative to BASE), its clock, its direction (0: none yet).
+    double sent_ticks;
+    int64_t sent_clock;
+    int sent_direction;
+    int guess_add;
+    size_t guess_count;
+
+    double max_error_ticks, closest_ticks;
+    int64_t pulse_ticks, lead_ticks, reset_margin_ticks;
+
+    struct segment *segments; // ring
+    uint32_t segment_head, segment_count;
+    struct prefix queue_step, set_dir, reset_clock;
+    struct step_stepper_stats stats;
+};
+
+struct heap {
+    uint64_t *at;
+    uint32_t count;
+};
+
+struct timed {
+    uint64_t req, finish;
+    uint8_t size, payload[STEP_PAYLOAD_MAX];
+};
+
+struct node {
+    struct step_node_config config;
+    struct clock_map clock;
+    struct heap slots; // finish clocks of the commands that may still hold a slot
+    struct heap busy;  // those of them that are unfinished at the newest req_clock
+    struct timed *timed;
+    uint32_t timed_count;
+    uint64_t last_req;
+    uint8_t *out;
+    size_t out_from, out_to;
+    uint32_t block_used;
+    bool jammed; // OUT had no room for a command that is ready
+    struct step_node_stats stats;
+};
+
+struct step_gen {
+    int32_t stepper_count, node_count;
+    struct stepper *steppers;
+    struct node *nodes;
+    struct trapezoid *moves; // ring
+    uint64_t moves_from, moves_to;
+    double until; // s, end of the last complete slice
+    double slice; // s, end of the slice in work; UNTIL when none is
+    double moves_end, max_error_s;
+    struct step_error error;
+};
+
+static inline double move_end(const struct trapezoid *m) {
+    return m->print_time + m->accel_s + m->cruise_s + m->decel_s;
+}
+
+// Times that differ by less are the same: sums of durations round differently.
+#define ROUNDING_S 1e-9
+
+static inline bool is_over(double end, double until) {
+    return end <= until + ROUNDING_S;
+}
+
+// Ticks at PRINT_TIME relative to BASE.
+static inline double clock_relative(const struct clock_map *map, double print_time, int64_t base) {
+    return (print_time - map->time) * map->ticks_per_s + map->part + (double)(map->whole - base);
+}
+
+static inline double clock_print_time(const struct clock_map *map, double ticks, int64_t base) {
+    return (ticks - (double)(map->whole - base) - map->part) / map->ticks_per_s + map->time;
+}
+
+int step_fail(struct step_gen *gen, enum step_status status, const struct stepper *stepper, double print_time,
+              double value);
+
+// step_times.c: appends the stepper's steps before UNTIL to its buffer, compressing when it fills.
+int step_times_advance(struct step_gen *gen, struct stepper *stepper, double until);
+
+void step_rebase(struct stepper *stepper, int64_t base);
+
+// step_compress.c: turns the first FINAL waiting steps, which can no longer change, into segments. NEXT: when
+// the step behind them comes at the earliest. A segment that might still grow is kept, unless its first step
+// comes before FORCE. Times in ticks from the stepper's base.
+int step_compress(struct step_gen *gen, struct stepper *stepper, size_t final, double next, double force);
+
+// step_stream.c: moves what is certain from the steppers to the nodes' batches; returns the commands moved.
+size_t step_merge(struct step_gen *gen, bool flush);
+void step_make_prefix(struct prefix *prefix, int32_t id, int32_t oid);
+
+#endif

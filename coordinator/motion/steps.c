@@ -1,0 +1,345 @@
+// SPDX-License-Identifier: Apache-2.0
+// The generator as a whole: memory, moves in, time forward, clocks.
+#include "coordinator/motion/step_internal.h"
+
+#include <string.h>
+
+static const double SLICE_S = 0.25;      // steppers of a node advance together by so much
+static const double GROW_S = 0.5;        // how long a segment may wait for more while more is to come
+static const double PIVOT_S = 600;       // after which a clock is measured from a newer time
+static const double LONGEST_S = 1e9;     // any time or duration
+static const double FASTEST_HZ = 1e10;   // any clock
+
+// ------------------------------------------------------------------------------------------------ memory
+
+static bool in_range(double value, double low, double high) {
+    return value > low && value <= high; // false for NaN
+}
+
+static bool is_legal(const struct step_config *c) {
+    bool ok = c->stepper_count >= 0 && c->stepper_count <= STEP_MAX_STEPPERS && c->node_count >= 1 &&
+              c->node_count <= STEP_MAX_NODES && in_range(c->max_error_s, 0, 1);
+    for (int i = 0; ok && i < AXES; i++)
+        ok = fabs(c->start[i]) < LONGEST_S;
+    for (int i = 0; ok && i < c->node_count; i++)
+        ok = in_range(c->nodes[i].clock_freq, 0, FASTEST_HZ) && c->max_error_s * c->nodes[i].clock_freq >= 1 &&
+             in_range(c->nodes[i].move_count, 0, STEP_MOVE_COUNT_MAX);
+    for (int i = 0; ok && i < c->stepper_count; i++) {
+        const struct step_stepper_config *s = &c->steppers[i];
+        ok = s->node >= 0 && s->node < c->node_count && in_range(s->step_distance, 0, LONGEST_S) &&
+             in_range(s->step_pulse_s, -1e-300, 1) && s->oid >= 0 && s->oid <= UINT8_MAX;
+        for (int j = 0; ok && j < AXES; j++)
+            ok = fabs(s->weights[j]) < LONGEST_S;
+    }
+    return ok;
+}
+
+// Hands out pieces of one block of memory, or only counts when AT is NULL.
+struct arena {
+    uint8_t *at;
+    size_t used;
+};
+
+static void *piece(struct arena *arena, size_t count, size_t size) {
+    void *p = arena->at ? arena->at + arena->used : NULL;
+    arena->used += (count * size + 15) & ~(size_t)15;
+    return p;
+}
+
+static void carve_stepper(struct arena *arena, struct stepper *s) {
+    double *ticks = piece(arena, STEP_BUFFER + BUFFER_PAD, sizeof(double));
+    double *low = piece(arena, STEP_BUFFER + BUFFER_PAD, sizeof(double));
+    double *high = piece(arena, STEP_BUFFER + BUFFER_PAD, sizeof(double));
+    struct segment *segments = piece(arena, STEP_SEGMENTS, sizeof(struct segment));
+    if (s)
+        s->ticks = ticks, s->low = low, s->high = high, s->segments = segments;
+}
+
+static void carve_node(struct arena *arena, struct node *node, size_t slots) {
+    uint64_t *slot = piece(arena, slots, sizeof(uint64_t));
+    uint64_t *busy = piece(arena, slots, sizeof(uint64_t));
+    struct timed *timed = piece(arena, STEP_TIMED, sizeof(struct timed));
+    uint8_t *out = piece(arena, STEP_OUT_BYTES, 1);
+    if (node)
+        node->slots.at = slot, node->busy.at = busy, node->timed = timed, node->out = out;
+}
+
+static struct step_gen *carve(struct arena *arena, const struct step_config *c) {
+    struct step_gen *gen = piece(arena, 1, sizeof(*gen));
+    struct stepper *steppers = piece(arena, (size_t)c->stepper_count, sizeof(*steppers));
+    struct node *nodes = piece(arena, (size_t)c->node_count, sizeof(*nodes));
+    struct trapezoid *moves = piece(arena, STEP_TRAPEZOIDS, sizeof(*moves));
+    if (gen) {
+        memset(gen, 0, (size_t)((uint8_t *)moves - (uint8_t *)gen));
+        gen->steppers = steppers, gen->nodes = nodes, gen->moves = moves;
+    }
+    for (int i = 0; i < c->stepper_count; i++)
+        carve_stepper(arena, gen ? &steppers[i] : NULL);
+    for (int i = 0; i < c->node_count; i++)
+        carve_node(arena, gen ? &nodes[i] : NULL, (size_t)c->nodes[i].move_count);
+    return gen;
+}
+
+size_t step_gen_size(const struct step_config *config) {
+    struct arena counter = {NULL, 0};
+    if (!is_legal(config))
+        return 0;
+    carve(&counter, config);
+    return counter.used;
+}
+
+static double mix(const double *weights, const double *position) {
+    double sum = 0;
+    for (int i = 0; i < AXES; i++)
+        sum += weights[i] * position[i];
+    return sum;
+}
+
+// What depends on how fast the stepper's node counts.
+static void set_tick_limits(struct stepper *s, double max_error_s) {
+    const double rate = s->clock->ticks_per_s;
+    s->max_error_ticks = max_error_s * rate;
+    s->pulse_ticks = (int64_t)ceil(2 * s->config.step_pulse_s * rate);
+    s->pulse_ticks = s->pulse_ticks > 1 ? s->pulse_ticks : 1;
+    s->closest_ticks = (double)(s->pulse_ticks + STEP_SLACK_TICKS);
+    s->lead_ticks = (int64_t)fmin(STEP_LEAD_S * rate, RESET_GAP / 2);
+    s->reset_margin_ticks = (int64_t)fmin(STEP_RESET_MARGIN_S * rate, RESET_GAP / 4);
+}
+
+struct step_gen *step_gen_init(void *memory, const struct step_config *config) {
+    struct arena arena = {memory, 0};
+    if (!is_legal(config))
+        return NULL;
+    struct step_gen *gen = carve(&arena, config);
+    gen->stepper_count = config->stepper_count;
+    gen->node_count = config->node_count;
+    gen->max_error_s = config->max_error_s;
+    gen->moves_end = -LONGEST_S;
+    gen->error.stepper = -1;
+    for (int i = 0; i < gen->node_count; i++) {
+        gen->nodes[i].config = config->nodes[i];
+        gen->nodes[i].clock.ticks_per_s = config->nodes[i].clock_freq;
+    }
+    for (int i = 0; i < gen->stepper_count; i++) {
+        struct stepper *s = &gen->steppers[i];
+        s->config = config->steppers[i];
+        struct node *node = &gen->nodes[s->config.node];
+        s->clock = &node->clock;
+        s->origin = mix(s->config.weights, config->start) / s->config.step_distance;
+        set_tick_limits(s, config->max_error_s);
+        step_make_prefix(&s->queue_step, node->config.queue_step_id, s->config.oid);
+        step_make_prefix(&s->set_dir, node->config.set_next_step_dir_id, s->config.oid);
+        step_make_prefix(&s->reset_clock, node->config.reset_step_clock_id, s->config.oid);
+    }
+    return gen;
+}
+
+int step_fail(struct step_gen *gen, enum step_status status, const struct stepper *stepper, double print_time,
+              double value) {
+    gen->error = (struct step_error){(int32_t)status, stepper ? (int32_t)(stepper - gen->steppers) : -1,
+                                     print_time, value};
+    return (int)status;
+}
+
+// ----------------------------------------------------------------------------------------------- moves in
+
+static bool move_is_legal(const struct trapezoid *m) {
+    const double *durations[] = {&m->accel_s, &m->cruise_s, &m->decel_s};
+    bool ok = fabs(m->print_time) < LONGEST_S;
+    for (int i = 0; i < 3; i++)
+        ok = ok && *durations[i] >= 0 && *durations[i] < LONGEST_S;
+    for (int i = 0; i < AXES; i++)
+        ok = ok && fabs(m->start[i]) < LONGEST_S && fabs(m->ratio[i]) < LONGEST_S;
+    return ok && m->start_v >= 0 && m->start_v < LONGEST_S && m->cruise_v >= 0 && m->cruise_v < LONGEST_S &&
+           m->accel >= 0 && m->accel < LONGEST_S &&
+           m->cruise_v - m->accel * m->decel_s >= -1e-6 * (1 + m->cruise_v);
+}
+
+int step_append(struct step_gen *gen, const struct trapezoid *moves, int n) {
+    int taken = 0;
+    for (; taken < n && gen->moves_to - gen->moves_from < STEP_TRAPEZOIDS; taken++) {
+        const struct trapezoid *m = &moves[taken];
+        if (!move_is_legal(m))
+            return -step_fail(gen, STEP_BAD_MOVE, NULL, m->print_time, taken);
+        const double earliest = fmax(gen->moves_end, gen->slice);
+        if (m->print_time < earliest - ROUNDING_S)
+            return -step_fail(gen, STEP_BAD_ORDER, NULL, m->print_time, earliest);
+        gen->moves[gen->moves_to++ % STEP_TRAPEZOIDS] = *m;
+        gen->moves_end = move_end(m);
+    }
+    return taken;
+}
+
+// -------------------------------------------------------------------------------------------- time forward
+
+// Compresses what waits once the steps before UNTIL are there: all of it (FLUSH), or what comes before FORCE.
+static int settle(struct step_gen *gen, struct stepper *s, double until_s, double force_s, bool flush) {
+    if (!s->count)
+        return STEP_OK;
+    const double until = clock_relative(s->clock, until_s, s->base), last = s->ticks[s->count - 1];
+    if (flush)
+        return step_compress(gen, s, s->count, fmax(until, last + s->closest_ticks), HUGE_VAL);
+    const double force = clock_relative(s->clock, force_s, s->base);
+    if (s->ticks[0] >= force)
+        return STEP_OK;
+    // The last step may still cancel, or get a close neighbour.
+    if (until - last >= 2 * s->max_error_ticks + s->closest_ticks)
+        return step_compress(gen, s, s->count, until, force);
+    return step_compress(gen, s, s->count - 1, last, force);
+}
+
+// Brings every stepper to the slice's end. Returns an error, or STEP_STALLED when one has no room.
+static int advance(struct step_gen *gen, double force_s, bool flush) {
+    int result = STEP_OK;
+    for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++) {
+        int status = step_times_advance(gen, s, gen->slice);
+        if (!status)
+            status = settle(gen, s, gen->slice, force_s, flush);
+        if (status && status != STEP_STALLED)
+            return status;
+        if (status)
+            result = status;
+    }
+    return result;
+}
+
+static void finish_slice(struct step_gen *gen) {
+    gen->until = gen->slice;
+    while (gen->moves_from < gen->moves_to &&
+           is_over(move_end(&gen->moves[gen->moves_from % STEP_TRAPEZOIDS]), gen->until))
+        gen->moves_from++;
+    for (int i = 0; i < gen->node_count; i++)
+        if (gen->until - gen->nodes[i].clock.time > PIVOT_S)
+            step_set_clock(gen, i, gen->nodes[i].clock.ticks_per_s);
+}
+
+static bool jammed(const struct step_gen *gen) {
+    bool any = false;
+    for (int i = 0; i < gen->node_count; i++)
+        any |= gen->nodes[i].jammed;
+    return any;
+}
+
+// One slice up to gen->slice. A stepper without room for segments waits for slower ones of its node, whose
+// segments are then cut short.
+static int run_slice(struct step_gen *gen, double force_s, bool flush) {
+    for (;;) {
+        const int status = advance(gen, force_s, flush);
+        if (status && status != STEP_STALLED)
+            return status;
+        const size_t moved = step_merge(gen, flush && !status);
+        if (!status)
+            return STEP_OK;
+        if (moved)
+            continue;
+        if (jammed(gen))
+            return STEP_FULL;
+        if (force_s >= gen->slice)
+            return step_fail(gen, STEP_TOO_DENSE, NULL, gen->slice, 0);
+        force_s = gen->slice;
+    }
+}
+
+// The end of the next slice: a long rest is one slice.
+static double next_slice(const struct step_gen *gen, double until) {
+    double end = gen->until + SLICE_S;
+    if (gen->moves_from == gen->moves_to)
+        end = until;
+    else
+        end = fmax(end, gen->moves[gen->moves_from % STEP_TRAPEZOIDS].print_time);
+    return fmax(fmin(end, until), gen->until);
+}
+
+int step_generate(struct step_gen *gen, double until, int flush) {
+    if (!(fabs(until) < LONGEST_S))
+        return step_fail(gen, STEP_BAD_ORDER, NULL, until, gen->until);
+    if (gen->error.status)
+        return gen->error.status;
+    for (;;) {
+        if (gen->slice <= gen->until)
+            gen->slice = next_slice(gen, until);
+        const bool last = gen->slice >= until;
+        const int status = run_slice(gen, gen->slice - (last ? STEP_HOLD_S : GROW_S), last && flush);
+        if (status)
+            return status;
+        finish_slice(gen);
+        if (last)
+            return jammed(gen) ? STEP_FULL : STEP_OK;
+    }
+}
+
+double step_generated_until(const struct step_gen *gen) {
+    return gen->until;
+}
+
+// ------------------------------------------------------------------------------------------------- clocks
+
+static void set_rate(struct step_gen *gen, struct node *node, double ticks_per_s) {
+    node->clock.ticks_per_s = ticks_per_s;
+    for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
+        if (s->clock == &node->clock)
+            set_tick_limits(s, gen->max_error_s);
+}
+
+static bool is_clock(const struct step_gen *gen, int node, double ticks_per_s) {
+    return node >= 0 && node < gen->node_count && in_range(ticks_per_s, 0, FASTEST_HZ) &&
+           gen->max_error_s * ticks_per_s >= 1;
+}
+
+int step_set_clock_base(struct step_gen *gen, int index, double time, int64_t ticks, double ticks_per_s) {
+    if (!is_clock(gen, index, ticks_per_s) || !(fabs(time) < LONGEST_S) || ticks < 0)
+        return STEP_BAD_CLOCK;
+    struct node *node = &gen->nodes[index];
+    for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
+        if (s->clock == &node->clock && s->count)
+            return STEP_NOT_IDLE;
+    node->clock = (struct clock_map){time, 0, ticks_per_s, ticks};
+    set_rate(gen, node, ticks_per_s);
+    return STEP_OK;
+}
+
+int step_set_clock(struct step_gen *gen, int index, double ticks_per_s) {
+    if (!is_clock(gen, index, ticks_per_s))
+        return STEP_BAD_CLOCK;
+    if (gen->slice > gen->until)
+        return STEP_NOT_IDLE;
+    struct clock_map *map = &gen->nodes[index].clock;
+    const double passed = (gen->until - map->time) * map->ticks_per_s + map->part, whole = floor(passed);
+    map->whole += (int64_t)whole;
+    map->part = passed - whole;
+    map->time = gen->until;
+    set_rate(gen, &gen->nodes[index], ticks_per_s);
+    return STEP_OK;
+}
+
+int64_t step_clock_at(const struct step_gen *gen, int index, double print_time) {
+    const struct clock_map *map = &gen->nodes[index].clock;
+    return map->whole + (int64_t)floor(clock_relative(map, print_time, map->whole));
+}
+
+int step_set_axis_position(struct step_gen *gen, const double *position) {
+    if (gen->moves_from < gen->moves_to || gen->slice > gen->until)
+        return STEP_NOT_IDLE;
+    for (int i = 0; i < AXES; i++)
+        if (!(fabs(position[i]) < LONGEST_S))
+            return STEP_BAD_CONFIG;
+    for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
+        s->origin = mix(s->config.weights, position) / s->config.step_distance - (double)s->position;
+    return STEP_OK;
+}
+
+// --------------------------------------------------------------------------------------------- statistics
+
+void step_stepper_stats(const struct step_gen *gen, int stepper, struct step_stepper_stats *out) {
+    *out = gen->steppers[stepper].stats;
+    out->position = gen->steppers[stepper].position;
+}
+
+void step_node_stats(const struct step_gen *gen, int node, struct step_node_stats *out) {
+    *out = gen->nodes[node].stats;
+    out->waiting_bytes = (uint32_t)(gen->nodes[node].out_to - gen->nodes[node].out_from);
+}
+
+void step_last_error(const struct step_gen *gen, struct step_error *out) {
+    *out = gen->error;
+}

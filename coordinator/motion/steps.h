@@ -1,0 +1,155 @@
+// SPDX-License-Identifier: Apache-2.0
+// Step generation: planned moves in, one stream of timed commands per node out.
+//
+//   trapezoids ──► step times (closed form) ──► (interval, count, add) segments ──► merged per node ──► batch
+//
+// Where a stepper stands. With u = sum(weights·position)/step_distance − origin, a stepper whose axes rest at
+// u has done n = floor(snap(u) + ½) steps; snap rounds to 1/STEP_SNAP of a step, so that the noise of
+// floating point cannot decide a tie: a half goes up. A step is due when u crosses k + ½. Two opposite steps
+// closer than the stepper's pulses allow (a turn just behind a boundary) cancel out: neither is done. If the
+// first of them is already on its way (flushed), the second is put off until the pulses allow it.
+//
+// Segments. Step i (from 1) of a segment happens interval·i + add·i(i−1)/2 ticks after the last step before
+// it, and not further from its true time than max_error and half the distance to either neighbour.
+//
+// All functions work on a struct in memory the caller owns, are safe without the interpreter lock, and must
+// not be called for the same struct from two threads at once. None allocates or blocks.
+#ifndef MOTION_STEPS_H
+#define MOTION_STEPS_H
+
+#include "coordinator/motion/trapezoid.h"
+
+#include <stddef.h>
+#include <stdint.h>
+
+// cffi: begin
+enum {
+    STEP_MAX_STEPPERS = 64,
+    STEP_MAX_NODES = 32,
+    STEP_TRAPEZOIDS = 4096, // moves the generator holds
+    STEP_BUFFER = 8192,     // steps of one stepper that wait for compression
+    STEP_SEGMENTS = 8192,   // segments of one stepper that wait to be merged
+    STEP_TIMED = 1024,      // other timed commands of one node that wait to be merged
+    STEP_OUT_BYTES = 1 << 18,
+    STEP_PAYLOAD_MAX = 59,  // one command must fit into a block
+    STEP_MOVE_COUNT_MAX = 65535,
+    STEP_SNAP = 65536,
+    STEP_SLACK_TICKS = 2, // room for rounding that steps need beyond what the pulses need
+};
+
+enum step_status {
+    STEP_OK = 0,
+    STEP_FULL,       // batches wait to be taken; take them and repeat the call
+    STEP_BAD_MOVE,   // a trapezoid's numbers are no legal move
+    STEP_BAD_ORDER,  // a trapezoid begins before the last one ends, or in the time already generated
+    STEP_JUMP,       // a trapezoid begins elsewhere than the stepper stands
+    STEP_TOO_FAST,   // steps closer than the stepper's pulses allow
+    STEP_TOO_DENSE,  // more segments at once than STEP_SEGMENTS
+    STEP_NO_FIT,     // internal: a single step found no legal interval
+    STEP_BAD_CHECK,  // internal: a segment did not replay to its step times
+    STEP_NOT_IDLE,   // only possible when every appended move has been generated
+    STEP_BAD_CLOCK,  // a clock that is no clock, or a time that it does not reach
+    STEP_BAD_CONFIG, // see init
+};
+
+struct step_stepper_config {
+    int32_t node, oid;
+    double weights[4];
+    double step_distance; // mm, > 0
+    int32_t invert_dir;
+    double step_pulse_s;
+};
+
+struct step_node_config {
+    double clock_freq; // ticks/s
+    int32_t move_count;
+    int32_t queue_step_id, set_next_step_dir_id, reset_step_clock_id;
+};
+
+struct step_config {
+    int32_t stepper_count, node_count;
+    const struct step_stepper_config *steppers; // read by init only
+    const struct step_node_config *nodes;
+    double max_error_s;
+    double start[4]; // mm, where the axes stand; steppers count steps from here
+};
+
+// What went wrong, for the sentence the user reads. Fields that do not apply are -1 or 0.
+struct step_error {
+    int32_t status, stepper;
+    double print_time; // s
+    double value;      // STEP_TOO_FAST: s between steps; STEP_JUMP: steps
+};
+
+struct step_stepper_stats {
+    int64_t position; // steps since init, what the last generated time asks for
+    int64_t issued;   // steps since init, what the emitted commands add up to
+    uint64_t steps, queue_steps, direction_changes, commands, content_bytes;
+    uint64_t cancelled, put_off; // opposite steps closer than the pulses allow, see above
+    double worst_error_ticks;
+    double worst_error_s;
+    double max_step_rate; // steps/s
+};
+
+struct step_node_stats {
+    uint64_t commands, content_bytes;
+    uint64_t framed_bytes;  // content packed into blocks in this order, with their headers and trailers
+    uint64_t late_slots;    // commands whose slot becomes free only after they are due: move_count too small
+    int32_t max_slots;      // most slots in use at any command's req_clock
+    uint32_t waiting_bytes; // batch not yet taken
+};
+
+struct step_gen;
+
+// Bytes that init needs, or 0 when CONFIG is not legal: counts within the limits above, node indices in
+// range, every length, frequency and error finite and > 0, ids in 32 bits, max_error at least one tick.
+size_t step_gen_size(const struct step_config *config);
+
+// Prepares a generator in MEMORY of step_gen_size() bytes, aligned for a double. Node clocks begin as
+// ticks = print time · clock_freq.
+struct step_gen *step_gen_init(void *memory, const struct step_config *config);
+
+// Takes over up to N moves; returns how many had room (0..N), or a negative step_status.
+int step_append(struct step_gen *gen, const struct trapezoid *moves, int n);
+
+// Produces commands for everything before print time UNTIL; every move that begins before it must have been
+// appended. Without FLUSH the last STEP_HOLD_S may be held back, so that segments continue over the border.
+// STEP_FULL: take the batches and repeat with the same arguments.
+int step_generate(struct step_gen *gen, double until, int flush);
+
+// The time before which nothing more can be changed: UNTIL of the last complete step_generate.
+double step_generated_until(const struct step_gen *gen);
+
+// How a node's clock runs: ticks = ticks + (print time − time)·ticks_per_s. Only while no step waits.
+int step_set_clock_base(struct step_gen *gen, int node, double time, int64_t ticks, double ticks_per_s);
+
+// From the generated border on, NODE's clock runs with TICKS_PER_S; continuous at the border.
+int step_set_clock(struct step_gen *gen, int node, double ticks_per_s);
+
+// The node's clock at a print time, whole ticks rounded down.
+int64_t step_clock_at(const struct step_gen *gen, int node, double print_time);
+
+// The axes stand at POSITION (mm, X Y Z E) from now on, without a step.
+int step_set_axis_position(struct step_gen *gen, const double *position);
+
+// Merges another command of at most STEP_PAYLOAD_MAX bytes into a node's stream. It takes a slot until
+// FINISH_CLOCK. Returns STEP_FULL when STEP_TIMED wait already; STEP_BAD_CONFIG on a bad node or size.
+int step_add_timed(struct step_gen *gen, int node, uint64_t req_clock, uint64_t finish_clock,
+                   const uint8_t *payload, size_t size);
+
+// Copies whole records of NODE's batch (nodes/link/batch.h) to OUT and removes them; returns their bytes.
+size_t step_take_batch(struct step_gen *gen, int node, uint8_t *out, size_t room);
+
+void step_stepper_stats(const struct step_gen *gen, int stepper, struct step_stepper_stats *out);
+void step_node_stats(const struct step_gen *gen, int node, struct step_node_stats *out);
+void step_last_error(const struct step_gen *gen, struct step_error *out);
+// cffi: end
+
+// s: how much of the newest time is held back so that segments may grow
+#define STEP_HOLD_S 0.050
+// s: how early before its first step a command is due at the latest, when the stepper rested before
+#define STEP_LEAD_S 0.050
+// s: how long after a stepper's last step its clock may be reset
+#define STEP_RESET_MARGIN_S 0.010
+
+#endif
