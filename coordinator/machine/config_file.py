@@ -27,7 +27,7 @@ _MAX_NAME_CHARS = 200
 
 @dataclass(slots=True)
 class RawOption:
-    """One option as written; the value has no comments, no outer white space, its lines end in a line feed."""
+    """One option as written; the value has no comments and no outer white space; lines end in a line feed."""
 
     name: str
     """In lower case: names are read without regard to case."""
