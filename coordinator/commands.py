@@ -1,0 +1,96 @@
+"""What the command line hands to the parts that do the work, and what it expects back.
+
+Imports nothing that is slow: ``canductor plan`` is measured from its first instruction.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from nodes.errors import CanductorError
+
+EXAMPLES = Path(__file__).parent.parent / "config"
+"""The example machines."""
+DEMO_MACHINE = EXAMPLES / "demo" / "machine.cfg"
+
+
+class Report(Protocol):
+    """What a command hands back: shown as text, or as one JSON object on the last line."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the command reached what it is for; decides about the exit status."""
+
+    def to_json(self) -> Mapping[str, object]:
+        """Return figures by name, made of what JSON knows; "ok" is added by the command line."""
+
+    def to_text(self) -> str:
+        """Return the same for a reader; when not ok it says what failed and what to do."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoOptions:
+    """``canductor demo``."""
+
+    machine: Path = DEMO_MACHINE
+    """Configuration file whose nodes are played by virtual ones."""
+    gcode: Path | None = None
+    """None: the demo's own part."""
+    json: bool = False
+    """Only machine-readable output: no progress display."""
+    web: bool = True
+    """Serve the live page where that is installed."""
+    loss: float = 0.0
+    """Share of frames the virtual bus loses, 0 <= loss <= 0.5."""
+    seed: int = 1
+    """Decides which frames are lost."""
+    rate_ppm: Mapping[str, float] = field(default_factory=dict)
+    """By node: how much faster its clock runs than nominal."""
+    start_clock: Mapping[str, int] = field(default_factory=dict)
+    """By node: ticks its clock shows when the node starts."""
+    keep: Path | None = None
+    """Folder that keeps step logs and captures; None: they are removed at the end."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOptions:
+    """``canductor run``."""
+
+    config: Path
+    gcode: Path | None = None
+    """Printed once the machine is ready; None: commands come from elsewhere."""
+    json: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanOptions:
+    """``canductor plan``."""
+
+    config: Path
+    gcode: Path
+    output: Path | None = None
+    """Folder for each node's command stream; None: only the report."""
+    json: bool = False
+    dictionaries: Mapping[str, Path] = field(default_factory=dict)
+    """By node: its data dictionary as JSON; other nodes take the project's own firmware."""
+
+
+def find_machine(name: str) -> Path:
+    """Return the configuration file of a path or of an example's name; raises CanductorError."""
+    path = Path(name)
+    try:
+        if path.is_file():
+            return path
+        examples = {_example_name(p): p for p in sorted(EXAMPLES.rglob("*.cfg"))}
+    except (OSError, ValueError):  # a name too long, or with a NUL
+        examples = {}
+    if name in examples:
+        return examples[name]
+    known = f"; examples are {', '.join(examples)}" if examples else ""
+    raise CanductorError(f"there is no machine '{name}': neither a file nor an example{known}")
+
+
+def _example_name(path: Path) -> str:
+    """Return ``demo`` for demo/machine.cfg and the file's stem for all others."""
+    return path.parent.name if path.stem == "machine" else path.stem

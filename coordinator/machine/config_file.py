@@ -1,0 +1,206 @@
+"""The configuration file as text: sections, options and where each of them stands.
+
+Sections are ``[name]`` or ``[name instance]``, options ``option: value`` or ``option = value``; a value goes
+on over indented lines. ``#`` and ``;`` begin a comment at the begin of a line or after white space.
+``[include FILE]`` takes wildcards. A marked block at the end holds values the machine has saved; they
+override the user's own.
+
+Nothing here knows what an option means.
+"""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from coordinator.machine import config_text
+from coordinator.machine.config_text import ReadBudget
+from coordinator.machine.problem import ConfigError, Place, shown
+
+SAVED_PREFIX = "#*#"
+SAVED_HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
+_SAVED_HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>\s*")
+_COMMENT = re.compile(r"(?:^|\s)[#;].*")
+_SECTION = re.compile(r"\[([^\[\]]*)\]")
+_SEPARATOR = re.compile(r"[:=]")
+_MAX_NAME_CHARS = 200
+
+
+@dataclass(slots=True)
+class RawOption:
+    """One option as written; the value has no comments and no outer white space; lines end in a line feed."""
+
+    name: str
+    """In lower case: names are read without regard to case."""
+    value: str
+    place: Place
+
+
+@dataclass(slots=True)
+class RawSection:
+    """One section, merged from all places that name it."""
+
+    name: str
+    """As in the brackets, single blanks: ``stepper_x`` or ``mcu toolhead``."""
+    place: Place
+    """Where it is named first."""
+    options: dict[str, RawOption] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> str:
+        """The first word: which module the section is for."""
+        return self.name.partition(" ")[0]
+
+    @property
+    def instance(self) -> str:
+        """What follows the first word; empty for a plain section."""
+        return self.name.partition(" ")[2]
+
+
+@dataclass(slots=True)
+class ConfigFile:
+    """A parsed configuration."""
+
+    path: str
+    sections: dict[str, RawSection] = field(default_factory=dict)
+    """By name, in the order of their first mention."""
+    saved: dict[str, RawSection] = field(default_factory=dict)
+    """What the SAVE_CONFIG block alone says; already merged into sections."""
+    user_lines: list[str] = field(default_factory=list)
+    """The main file's text before the block, untouched, for writing it back."""
+    notes: list[str] = field(default_factory=list)
+    """Sentences about what was read but has no effect."""
+
+
+def parse_config(path: str) -> ConfigFile:
+    """Read a configuration file and all it includes; raises ConfigError."""
+    config = ConfigFile(path)
+    budget = ReadBudget()
+    place = Place(path, 0)
+    config_text.enter_file(path, place, budget)
+    lines = config_text.read_lines(path, place, budget)
+    header = _saved_header(lines)
+    config.user_lines = lines[:header]
+    _Parser(config.sections, config.notes, budget).parse(path, enumerate(config.user_lines, 1))
+    saved_lines = _saved_lines(path, lines, header)
+    _Parser(config.saved, config.notes, None).parse(path, saved_lines)
+    for saved in config.saved.values():
+        section = config.sections.setdefault(saved.name, RawSection(saved.name, saved.place))
+        section.options.update(saved.options)
+    return config
+
+
+def _saved_header(lines: list[str]) -> int:
+    """Return the index of the block's first line, or the number of lines when there is no block."""
+    return next((i for i, line in enumerate(lines) if _SAVED_HEADER.fullmatch(line)), len(lines))
+
+
+def _saved_lines(path: str, lines: list[str], header: int) -> list[tuple[int, str]]:
+    """Return the numbered lines of the block without their prefix."""
+    result = []
+    for index in range(header + 1, len(lines)):
+        line = lines[index]
+        if line.startswith(SAVED_PREFIX):
+            result.append((index + 1, line[len(SAVED_PREFIX) :].removeprefix(" ")))
+        elif line.strip():
+            raise ConfigError(
+                Place(path, index + 1),
+                f"text below the SAVE_CONFIG block of line {header + 1}; move it above the block",
+            )
+    # The notice that the block is written by the machine is the only prose in it.
+    return [(number, line) for number, line in result if not line.startswith("DO NOT EDIT")]
+
+
+class _Parser:
+    """Turns numbered lines into sections; follows includes as they come."""
+
+    def __init__(self, sections: dict[str, RawSection], notes: list[str], budget: ReadBudget | None) -> None:
+        self._sections = sections
+        self._notes = notes
+        self._budget = budget  # none: includes are refused
+
+    def parse(self, path: str, lines: Iterable[tuple[int, str]]) -> None:
+        """Read one file's lines; the sections may have been begun by another file."""
+        section: RawSection | None = None
+        here: dict[str, RawOption] = {}  # options under the last header, where a repeat is a mistake
+        option: RawOption | None = None
+        value: list[str] = []
+        option_indent = 0
+        for number, line in lines:
+            text = _COMMENT.sub("", line, count=1).rstrip()
+            if not text:
+                # A blank line may stand inside a value, a comment leaves no trace in it.
+                if option is not None and not line.strip():
+                    value.append("")
+                continue
+            indent = len(text) - len(text.lstrip())
+            text = text.strip()
+            if option is not None and indent > option_indent:
+                value.append(text)
+                continue
+            if option is not None:
+                option.value = "\n".join(value).strip()
+                option = None
+            place = Place(path, number)
+            if text.startswith("["):
+                name = _section_name(text, place)
+                if name.partition(" ")[0] == "include":
+                    self._include(name.partition(" ")[2], place)
+                    section = None
+                else:
+                    section = self._sections.setdefault(name, RawSection(name, place))
+                    here = {}
+                continue
+            option, first = _option(text, place)
+            value, option_indent = [first], indent
+            _add(section, here, option)
+        if option is not None:
+            option.value = "\n".join(value).strip()
+
+    def _include(self, pattern: str, place: Place) -> None:
+        if self._budget is None:
+            raise ConfigError(place, "the SAVE_CONFIG block cannot include files")
+        if not pattern:
+            raise ConfigError(place, "[include] needs a file name: [include other.cfg]")
+        for path in config_text.included_paths(pattern, place, self._budget):
+            config_text.enter_file(path, place, self._budget)
+            lines = config_text.read_lines(path, place, self._budget)
+            header = _saved_header(lines)
+            if header < len(lines):
+                self._notes.append(
+                    f"{Place(path, header + 1)}: the SAVE_CONFIG block of an included file is not read"
+                )
+            self.parse(path, enumerate(lines[:header], 1))
+            self._budget.open_files.pop()
+
+
+def _section_name(text: str, place: Place) -> str:
+    match = _SECTION.fullmatch(text)
+    name = " ".join(match[1].split()) if match else ""
+    if match is None or not name or len(name) > _MAX_NAME_CHARS:
+        raise ConfigError(place, f"{shown(text)} is not a section header; write [name] or [name instance]")
+    return name
+
+
+def _option(text: str, place: Place) -> tuple[RawOption, str]:
+    separator = _SEPARATOR.search(text)
+    name = text[: separator.start()].rstrip().lower() if separator else ""
+    if separator is None or not name or len(name) > _MAX_NAME_CHARS:
+        raise ConfigError(
+            place, f"{shown(text)} is neither a section header nor an option; write 'option: value'"
+        )
+    return RawOption(name, "", place), text[separator.end() :].lstrip()
+
+
+def _add(section: RawSection | None, here: dict[str, RawOption], option: RawOption) -> None:
+    if section is None:
+        raise ConfigError(
+            option.place,
+            f"option {shown(option.name)} stands outside of a section; put a [section] before it",
+        )
+    if option.name in here:
+        raise ConfigError(
+            option.place,
+            f"option {shown(option.name)} of [{section.name}] is given twice, first at"
+            f" {here[option.name].place}; remove one",
+        )
+    here[option.name] = section.options[option.name] = option

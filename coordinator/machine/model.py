@@ -1,0 +1,151 @@
+"""The machine as the configuration describes it: frozen, checked, ready to be built."""
+
+from dataclasses import dataclass
+
+from coordinator.machine.pins import PinDescription
+from coordinator.machine.problem import Place
+from coordinator.motion.specs import MotionLimits
+
+
+@dataclass(frozen=True, slots=True)
+class CanConnection:
+    """A node on a CAN bus."""
+
+    uuid: str
+    """12 lower-case hex digits."""
+    interface: str
+    """``can0`` (SocketCAN), ``virtual:PATH`` or ``INTERFACE:CHANNEL`` in python-can's words."""
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class UartConnection:
+    """A node on a serial line."""
+
+    path: str
+    baud: int
+    restart_method: str
+    """arduino, cheetah, rpi_usb or command."""
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class NodeDescription:
+    """One micro-controller; ``mcu`` is the primary whose clock is print time."""
+
+    name: str
+    connection: CanConnection | UartConnection
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class StepperDescription:
+    """One motor driver."""
+
+    name: str
+    """The section's name: stepper_x, stepper_z1, extruder."""
+    step_pin: PinDescription
+    dir_pin: PinDescription
+    """Inverted: the pin is high for a step in negative direction."""
+    enable_pin: PinDescription | None
+    weights: tuple[float, float, float, float]
+    """The stepper's position in mm is the sum of weights[i] * axis[i] over X Y Z E."""
+    step_distance: float
+    """mm per step."""
+    rotation_distance: float
+    """mm per turn of the output after the gears."""
+    full_steps_per_rotation: int
+    microsteps: int
+    gear_ratio: float
+    """Turns of the motor per turn of the output."""
+    step_pulse_s: float | None
+    """Shortest high time of the step pin; None: both edges step where the node can, else 2 µs."""
+    place: Place
+
+    @property
+    def node(self) -> str:
+        """The node that drives it."""
+        return self.step_pin.node
+
+
+@dataclass(frozen=True, slots=True)
+class HomingDescription:
+    """How a rail finds its origin; kept for the homing module: until then G28 takes the axis as home."""
+
+    endstop_pin: PinDescription | None
+    virtual_endstop: str
+    """Such as ``probe:z_virtual_endstop``; empty when there is a pin or nothing."""
+    position_endstop: float | None
+    """mm; None with a virtual endstop that knows its own position, or without endstop."""
+    speed: float
+    """mm/s."""
+    second_speed: float
+    """mm/s of the second approach."""
+    retract_distance: float
+    """mm; 0: no second approach."""
+    retract_speed: float
+    positive_dir: bool
+    """Whether the endstop stands at the upper end."""
+
+
+@dataclass(frozen=True, slots=True)
+class RailDescription:
+    """One axis with its steppers, which move together."""
+
+    axis: str
+    """x, y or z."""
+    steppers: tuple[StepperDescription, ...]
+    position_min: float
+    """mm."""
+    position_max: float
+    homing: HomingDescription
+    place: Place
+
+
+@dataclass(frozen=True, slots=True)
+class ExtruderDescription:
+    """The extruder's mechanics."""
+
+    stepper: StepperDescription
+    nozzle_diameter: float
+    """mm."""
+    filament_diameter: float
+    """mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class NotYetActing:
+    """What was recognised but belongs to a module that is not built yet."""
+
+    section: str
+    place: Place
+    options: tuple[str, ...]
+    """Their names; empty: the whole section."""
+
+    def __str__(self) -> str:
+        what = f"{', '.join(self.options)} of [{self.section}]" if self.options else f"[{self.section}]"
+        return f"{self.place}: {what} recognised, not yet acting"
+
+
+@dataclass(frozen=True, slots=True)
+class MachineDescription:
+    """Everything the configuration says about the machine."""
+
+    path: str
+    nodes: tuple[NodeDescription, ...]
+    """The primary first, then in the order of the file."""
+    kinematics: str
+    """cartesian or corexy."""
+    limits: MotionLimits
+    rails: tuple[RailDescription, RailDescription, RailDescription]
+    """X Y Z; of a corexy the rail x has the motor that moves x + y, the rail y the one that moves x - y."""
+    extruder: ExtruderDescription | None
+    not_yet_acting: tuple[NotYetActing, ...]
+    notes: tuple[str, ...]
+    """Sentences about what has no effect."""
+
+    @property
+    def steppers(self) -> tuple[StepperDescription, ...]:
+        """All steppers: rails X Y Z, then the extruder."""
+        extruder = (self.extruder.stepper,) if self.extruder else ()
+        return (*(stepper for rail in self.rails for stepper in rail.steppers), *extruder)

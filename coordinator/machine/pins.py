@@ -1,0 +1,164 @@
+"""Pins: how they are named, and that each is used once or shared on purpose.
+
+A pin is ``[!][^|~][node:]name``, or with the marks after the node as in ``toolhead:!^PA3``. ``!`` inverts,
+``^`` asks for a pull-up, ``~`` for a pull-down. Without a node the pin is one of the primary node, ``mcu``.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from coordinator.machine.config_file import RawOption, RawSection
+from coordinator.machine.options import BadValue, Option
+from coordinator.machine.problem import ConfigError, Place, nearest, shown
+
+PRIMARY_NODE = "mcu"
+_PIN = re.compile(r"([!^~ ]*)(?:([A-Za-z0-9_.-]+) *: *)?([!^~ ]*)([A-Za-z0-9_./-]+)", re.ASCII)
+_MAX_PIN_CHARS = 100
+_EXCLUSIVE = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PinName:
+    """A pin as written in an option."""
+
+    node: str
+    name: str
+    invert: bool = False
+    pull: int = 0
+    """1 pull-up, -1 pull-down, 0 none."""
+
+
+@dataclass(frozen=True, slots=True)
+class PinDescription:
+    """A pin with aliases resolved; whether the node has it only its dictionary knows: see ``number``."""
+
+    node: str
+    name: str
+    invert: bool
+    """The electrical level is the opposite of the logical one."""
+    pull: int
+    """1 pull-up, -1 pull-down, 0 none."""
+    purpose: str
+    """Which option it is for: "'step_pin' of [stepper_x]"."""
+    place: Place
+
+    def number(self, pins: Mapping[str, int]) -> int:
+        """Return the pin's number in the node's dictionary; raises ConfigError when it has no such pin."""
+        number = pins.get(self.name)
+        if number is None:
+            hint = nearest(self.name, pins) or "; see the board's documentation for its pins"
+            raise ConfigError(
+                self.place, f"{self.purpose}: node '{self.node}' has no pin {shown(self.name)}{hint}"
+            )
+        return number
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PinOption(Option[PinName]):
+    """A pin."""
+
+    invertible: bool = True
+    pullable: bool = False
+    """Whether ^ and ~ make sense: for inputs."""
+    share: str = _EXCLUSIVE
+    """Options with the same word here may name the same pin; empty: the pin is for this option alone."""
+
+    def parse(self, text: str) -> PinName:
+        """Return the parts of a pin's name."""
+        match = _PIN.fullmatch(text) if len(text) <= _MAX_PIN_CHARS else None
+        if match is None:
+            raise BadValue
+        marks = (match[1] + match[3]).replace(" ", "")
+        if len(set(marks)) != len(marks) or ("^" in marks and "~" in marks):
+            raise BadValue
+        if "!" in marks and not self.invertible:
+            raise BadValue("which cannot be inverted; remove the !")
+        if ("^" in marks or "~" in marks) and not self.pullable:
+            raise BadValue("which is an output; remove the ^ or ~")
+        pull = ("^" in marks) - ("~" in marks)
+        return PinName(match[2] or PRIMARY_NODE, match[4], "!" in marks, pull)
+
+    def rule(self) -> str:
+        """Return the values allowed."""
+        marks = ("!" if self.invertible else "") + ("^~" if self.pullable else "")
+        return "a pin as in PA3 or toolhead:PA3" + (f", with {' or '.join(marks)} before it" if marks else "")
+
+
+_ANY_PIN = PinOption(name="pin", help="any pin", pullable=True)
+
+
+@dataclass(slots=True)
+class PinRegistry:
+    """Who uses which pin."""
+
+    nodes: tuple[str, ...]
+    _aliases: dict[tuple[str, str], str] = field(default_factory=dict)
+    _shareable: set[tuple[str, str]] = field(default_factory=set)
+    _users: dict[tuple[str, str], tuple[PinDescription, str]] = field(default_factory=dict)
+
+    def add_alias(self, node: str, alias: str, name: str, option: RawOption) -> None:
+        """Give a pin a second name ([board_pins]); a name in angle brackets reserves the alias instead."""
+        if self._aliases.setdefault((node, alias), name) != name:
+            raise ConfigError(
+                option.place,
+                f"alias {shown(alias)} of node '{node}' already means {shown(self._aliases[node, alias])}",
+            )
+
+    def allow_sharing(self, pin: PinName) -> None:
+        """Let several options use one pin ([duplicate_pin_override])."""
+        self._shareable.add((pin.node, self._aliases.get((pin.node, pin.name), pin.name)))
+
+    def claim(self, pin: PinName, option: PinOption, section: RawSection) -> PinDescription:
+        """Take a pin for an option; raises ConfigError for an unknown node or a pin in use."""
+        place = section.options[option.name].place
+        purpose = f"'{option.name}' of [{section.name}]"
+        if pin.node not in self.nodes:
+            hint = nearest(pin.node, self.nodes, pattern="'{}'") or f"; add a section [mcu {pin.node}]"
+            raise ConfigError(place, f"{purpose}: there is no node {shown(pin.node)}{hint}")
+        name = self._resolve(pin, purpose, place)
+        claimed = PinDescription(pin.node, name, pin.invert, pin.pull, purpose, place)
+        user, share = self._users.setdefault((pin.node, name), (claimed, option.share))
+        if user is not claimed:
+            self._check_shared(claimed, option.share, user, share)
+        return claimed
+
+    def check_unclaimed(self, options: Iterable[RawOption], section: str) -> None:
+        """Raise ConfigError when a section that does not act yet names a pin that is not to be shared.
+
+        Pins it names wrongly are left to its module.
+        """
+        for option in options:
+            if option.name != "pin" and not option.name.endswith("_pin"):
+                continue
+            try:
+                pin = _ANY_PIN.parse(option.value)
+            except BadValue:
+                continue
+            key = (pin.node, self._aliases.get((pin.node, pin.name), pin.name))
+            user, share = self._users.get(key, (None, "anything"))
+            if user is not None and share == _EXCLUSIVE and key not in self._shareable:
+                raise _in_use(option.place, f"'{option.name}' of [{section}]", user)
+
+    def _resolve(self, pin: PinName, purpose: str, place: Place) -> str:
+        name = self._aliases.get((pin.node, pin.name), pin.name)
+        if name.startswith("<"):
+            raise ConfigError(place, f"{purpose}: pin {shown(pin.name)} is reserved for {name}; use another")
+        return name
+
+    def _check_shared(self, new: PinDescription, new_share: str, user: PinDescription, share: str) -> None:
+        if (new.node, new.name) in self._shareable:
+            return
+        if not new_share or new_share != share:
+            raise _in_use(new.place, new.purpose, user)
+        if (new.invert, new.pull) != (user.invert, user.pull):
+            raise ConfigError(
+                new.place,
+                f"{new.purpose}: pin {new.node}:{new.name} is shared with {user.purpose} ({user.place})"
+                " but has other marks (! ^ ~); make them the same",
+            )
+
+
+def _in_use(place: Place, purpose: str, user: PinDescription) -> ConfigError:
+    pin = f"{user.node}:{user.name}"
+    return ConfigError(place, f"{purpose}: pin {pin} is already used for {user.purpose} ({user.place})")

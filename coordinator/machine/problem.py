@@ -1,0 +1,48 @@
+"""How a mistake in a configuration is told: the place first, then what is wrong, then what to do."""
+
+import difflib
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from nodes.errors import CanductorError
+
+_SHOWN_CHARS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A line of a configuration file; prints as ``printer.cfg:12``."""
+
+    path: str
+    """The file as the user would type it, not resolved."""
+    line: int
+    """Counted from 1; 0 speaks of the file as a whole."""
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.line}" if self.line else self.path
+
+
+class ConfigError(CanductorError):
+    """A configuration that cannot be used; the sentence begins with the file and line."""
+
+    def __init__(self, place: Place, sentence: str) -> None:
+        super().__init__(f"{place}: {sentence}")
+        self.place = place
+        """Where the mistake stands, for front ends that mark the line."""
+
+
+def shown(text: str) -> str:
+    """Quote what the user wrote so that it fits into a sentence: one line, printable, not long."""
+    line = " ".join(text.split())
+    if len(line) > _SHOWN_CHARS:
+        line = line[: _SHOWN_CHARS - 1] + "…"
+    return "'" + "".join(c if c.isprintable() else "?" for c in line) + "'"
+
+
+def nearest(word: str, valid: Iterable[str], *, pattern: str = "{}") -> str:
+    """Return "; did you mean …?" when one of the valid names looks like the word, else nothing."""
+    if len(word) > _SHOWN_CHARS:
+        return ""
+    lower = {name.lower(): name for name in valid}
+    found = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
+    return f"; did you mean {pattern.format(lower[found[0]])}?" if found else ""
