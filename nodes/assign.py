@@ -99,7 +99,7 @@ class _Seen:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """How it ended. Ids are set for all wanted uuids; those UNHEARD still have to prove that they are there."""
+    """How it ended: ids are set for all wanted uuids; those UNHEARD have yet to prove that they are there."""
 
     nodeids: Mapping[Uuid, int]
     unheard: tuple[Uuid, ...]
@@ -114,7 +114,7 @@ class Assignment:
         for uuid in self.duplicates:
             if uuid in self.nodeids:
                 raise AssignError(
-                    f"two boards on bus {bus} have the uuid {uuid} (cloned chips?); take one of them off the bus"
+                    f"two boards on bus {bus} have the uuid {uuid} (cloned chips?); take one of them off"
                 )
         for uuid in self.in_bootloader:
             if uuid in self.nodeids:

@@ -150,7 +150,7 @@ class Dictionary:
 
     # --------------------------------------------------------------------------------------------- encode
 
-    def encode(self, name: str, **values: Value | str) -> bytes:
+    def encode(self, name: str, /, **values: Value | str) -> bytes:
         """Encode command NAME; a text as VALUE is a name of the parameter's enumeration. MessageError."""
         return encode_values(self, self.command(name), values)
 
