@@ -1,0 +1,71 @@
+"""A stepper motor on a node: its configuration, and where it stands."""
+
+from typing import Final
+
+from nodes.node import Node, NodeError
+from nodes.node_config import NodeConfig
+
+BOTH_EDGE_CONSTANTS: Final = ("STEPPER_BOTH_EDGE", "STEPPER_STEP_BOTH_EDGE")
+COMMANDS: Final = (
+    "config_stepper",
+    "queue_step",
+    "set_next_step_dir",
+    "reset_step_clock",
+    "stepper_get_position",
+)
+
+
+class Stepper:
+    """Stepper NAME, on the pins of its node.
+
+    INVERT_STEP: a step is a falling edge. STEP_PULSE_S > 0 is how long the driver needs the step pin held.
+    BOTH_EDGES: the driver steps on every edge, and pulses are left out where the firmware can.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        step_pin: str,
+        dir_pin: str,
+        invert_step: bool = False,
+        step_pulse_s: float = 2e-6,
+        both_edges: bool = False,
+    ) -> None:
+        self.name = name
+        self.oid: int | None = None
+        """Its object id; known when its node's configuration is built."""
+        self.steps_on_both_edges = False
+        """Whether its node was configured so."""
+        self.queue_step_id = self.set_next_step_dir_id = self.reset_step_clock_id = 0
+        """Ids of the commands that move it, for the step compressor; from its node's dictionary."""
+        self._step_pin = step_pin
+        self._dir_pin = dir_pin
+        self._invert_step = invert_step
+        self._step_pulse_s = step_pulse_s
+        self._both_edges = both_edges
+
+    def configure(self, config: NodeConfig) -> None:
+        """Add the stepper to its node's CONFIG; NodeConfigError when firmware or pins do not allow it."""
+        dictionary = config.dictionary
+        config.require(self.name, COMMANDS)
+        able = any(dictionary.int_constant(name, 0) == 1 for name in BOTH_EDGE_CONSTANTS)
+        self.steps_on_both_edges = self._both_edges and able
+        pulse_ticks = 0 if self.steps_on_both_edges else round(self._step_pulse_s * dictionary.clock_freq_hz)
+        invert = -1 if self.steps_on_both_edges else int(self._invert_step)
+        self.oid = config.create_oid()
+        self.queue_step_id = dictionary.command("queue_step").message_id
+        self.set_next_step_dir_id = dictionary.command("set_next_step_dir").message_id
+        self.reset_step_clock_id = dictionary.command("reset_step_clock").message_id
+        config.add_config(
+            self.name,
+            f"config_stepper oid={self.oid} step_pin={self._step_pin} dir_pin={self._dir_pin} "
+            f"invert_step={invert} step_pulse_ticks={pulse_ticks}",
+        )
+
+    async def position(self, node: Node) -> int:
+        """Ask NODE how many steps the stepper stands from where it began, as the node counts them."""
+        if self.oid is None:
+            raise NodeError(f"stepper {self.name} is not configured on any node")
+        answer = await node.query("stepper_get_position", "stepper_position", oid=self.oid)
+        return answer.integer("pos")

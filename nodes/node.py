@@ -1,0 +1,380 @@
+"""One node through its life: identified, configured, kept in time, and left in a known state."""
+
+import asyncio
+from collections.abc import Callable
+from typing import Final
+
+from nodes.clock import ClockEstimate, ClockEstimator
+from nodes.conversation import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, Callback, Conversation, QueryTimeout
+from nodes.dictionary import MAX_COMPRESSED_BYTES, Dictionary
+from nodes.dictionary_parts import DictionaryError
+from nodes.errors import CanductorError
+from nodes.load import NodeLoad, load_of
+from nodes.message_format import Message, Value
+from nodes.node_config import NodeConfig
+from nodes.node_states import NodeEvent, NodeState, following
+from nodes.seams import BuildConfig, Connector, LinkLike
+from nodes.vocabulary import check_vocabulary
+
+IDENTIFY_PIECE: Final = 40
+MAX_STARTS: Final = 3
+"""How often a node is connected anew in one start because only a reset rids it of an old configuration."""
+CONFIG_RESET_TRIES: Final = 4
+RESET_SETTLE_S: Final = 0.3
+"""For the reset command to arrive, repeated if need be, and the node to come up again."""
+CLOCK_TIMEOUT_S: Final = 5.0
+
+
+class NodeError(CanductorError):
+    """A node cannot be used, and why."""
+
+
+class NodeLost(NodeError):  # noqa: N818
+    """A node is gone: it does not answer, or it restarted by itself."""
+
+
+class NodeShutdown(NodeError):  # noqa: N818
+    """A node stopped itself; what it reported is part of the sentence."""
+
+
+OnState = Callable[["Node"], None]
+OnClock = Callable[["Node", ClockEstimate], None]
+
+
+def _ignore(*_: object) -> None:
+    pass
+
+
+class Node:
+    """Node NAME, reached through CONNECTOR and configured as BUILD_CONFIG says.
+
+    ON_STATE is called after every change of ``state``, ON_CLOCK with every new estimate of its clock, both on
+    the control loop. ``failure`` says why it is lost or shut down.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        connector: Connector,
+        build_config: BuildConfig,
+        *,
+        on_state: OnState = _ignore,
+        on_clock: OnClock = _ignore,
+    ) -> None:
+        self.name = name
+        self.state = NodeState.CONNECTING
+        self.failure: NodeError | None = None
+        self.move_count = 0
+        """Queue slots shared by all steppers and timed outputs; known when READY."""
+        self.load: NodeLoad | None = None
+        self._connector = connector
+        self._build_config = build_config
+        self._on_state = on_state
+        self._on_clock = on_clock
+        self._talk = Conversation(name)
+        self._clock: ClockEstimator | None = None
+        self._clock_ready = asyncio.Event()
+        self._clock_task: asyncio.Task[None] | None = None
+        self._starting_over = True  # until an old configuration is judged, old news mean nothing
+        self._generation = 0
+        for response, handler in (
+            ("stats", self._stats_came),
+            ("shutdown", self._shutdown_came),
+            ("is_shutdown", self._shutdown_came),
+            ("starting", self._starting_came),
+        ):
+            self._talk.on(response, None, handler)
+
+    # ------------------------------------------------------------------------------------------- looking at
+
+    @property
+    def dictionary(self) -> Dictionary:
+        """The node's dictionary; before it is read, one that knows only how to ask for it."""
+        return self._talk.dictionary
+
+    @property
+    def clock(self) -> ClockEstimator:
+        """The node's clock; NodeError before its first sample."""
+        if self._clock is None or not self._clock.accepted:
+            raise NodeError(f"the clock of node {self.name} is not known yet: the node is {self.state.value}")
+        return self._clock
+
+    @property
+    def link(self) -> LinkLike:
+        """The link, for batches of commands; NodeError unless the node can be talked to."""
+        self._check_usable()
+        return self._talk.link
+
+    @property
+    def undecodable(self) -> int:
+        """Responses dropped because nothing in the dictionary fits them."""
+        return self._talk.undecodable
+
+    # ---------------------------------------------------------------------------------------------- talking
+
+    def send(self, name: str, /, *, min_clock: int = 0, req_clock: int = 0, **args: Value | str) -> None:
+        """Send a command (clocks: ``nodes/link/batch.h``); NodeError when the node cannot take it."""
+        self._check_usable()
+        self._talk.send(name, min_clock=min_clock, req_clock=req_clock, **args)
+
+    async def query(
+        self,
+        name: str,
+        response: str,
+        /,
+        *,
+        timeout_s: float = QUERY_TIMEOUT_S,
+        tries: int = QUERY_TRIES,
+        **args: Value | str,
+    ) -> Message:
+        """Send a command and return its RESPONSE (of the same oid), asking again when it gets lost.
+
+        Raises QueryTimeout, or NodeLost or NodeShutdown when that happens meanwhile.
+        """
+        self._check_usable()
+        answer = await self._talk.ask(name, response, args, timeout_s=timeout_s, tries=tries)
+        return answer.message
+
+    def on(self, response: str, oid: int | None, callback: Callback) -> Callable[[], None]:
+        """Call CALLBACK for every RESPONSE (of OID, unless None); returns what ends it."""
+        return self._talk.on(response, oid, callback)
+
+    def emergency_stop(self) -> None:
+        """Stop the node ahead of everything queued for it; without effect on one that cannot be reached."""
+        if self._talk.connected and "emergency_stop" in self.dictionary.commands:
+            self._talk.link.send_urgent(self.dictionary.encode("emergency_stop"))
+
+    def _check_usable(self) -> None:
+        if self.failure is not None:
+            raise self.failure
+        if self.state not in (NodeState.CONFIGURING, NodeState.READY):
+            raise NodeError(f"node {self.name} is {self.state.value} and takes no commands")
+
+    # --------------------------------------------------------------------------------------------- starting
+
+    async def start(self) -> None:
+        """Bring the node to READY from CONNECTING; raises CanductorError, after which ``close`` is due."""
+        for _ in range(MAX_STARTS):
+            self._starting_over = True
+            link = await self._connector.connect(self._talk.receive, self._link_lost(self._generation))
+            self._talk.attach(link)
+            self._enter(NodeEvent.CONNECTED)
+            await self._identify()
+            self._enter(NodeEvent.IDENTIFIED)
+            self._start_clock()
+            if await self._configure(self._build_config(self.dictionary)):
+                await self._wait_for_clock()
+                self._enter(NodeEvent.CONFIGURED)
+                return
+            await self._disconnect()
+            self._connector.forget()
+            self._enter(NodeEvent.RESET)
+        raise NodeError(f"node {self.name} keeps its configuration after {MAX_STARTS} resets; power-cycle it")
+
+    async def restart(self) -> None:
+        """Start again, from READY, SHUTDOWN or LOST; raises like ``start``."""
+        await self._disconnect()
+        if following(self.state, NodeEvent.RESET) is None:
+            raise NodeError(f"node {self.name} is {self.state.value} and cannot be restarted")
+        if self.state is NodeState.LOST:
+            self._connector.forget()
+        self.failure = None
+        self._enter(NodeEvent.RESET)
+        await self.start()
+
+    async def close(self) -> None:
+        """End the conversation; the node itself is left as it is."""
+        await self._disconnect()
+        self._enter(NodeEvent.CLOSE)
+
+    async def _disconnect(self) -> None:
+        self._generation += 1
+        self._talk.fail(self.failure or NodeLost(f"the connection to node {self.name} was closed"))
+        task, self._clock_task = self._clock_task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+        link = self._talk.detach()
+        if link is not None:
+            link.close()
+
+    async def _identify(self) -> None:
+        data = bytearray()
+        while True:
+            try:
+                answer = await self._talk.ask(
+                    "identify",
+                    "identify_response",
+                    {"offset": len(data), "count": IDENTIFY_PIECE},
+                    matching={"offset": len(data)},
+                )
+            except (QueryTimeout, NodeLost):
+                better = None if data else self._connector.why_silent()
+                if better is not None:
+                    raise better from None
+                raise
+            piece = answer.message.data("data")
+            if not piece:
+                break
+            data += piece
+            if len(data) > MAX_COMPRESSED_BYTES:
+                raise DictionaryError(f"node {self.name}: its dictionary does not end; other firmware?")
+        try:
+            self._talk.dictionary = Dictionary.parse(bytes(data))
+            check_vocabulary(self.dictionary)
+            self._talk.link.set_receive_window(self.dictionary.receive_window)
+        except DictionaryError as error:
+            raise DictionaryError(f"node {self.name}: {error}") from None
+
+    # ------------------------------------------------------------------------------------------ configuring
+
+    async def _configure(self, wanted: NodeConfig) -> bool:
+        """Make the node what WANTED says; False when it had to be reset and must be connected anew."""
+        found = await self._get_config()
+        other = bool(found.integer("is_config")) and found.integer("crc") != wanted.crc
+        if other or found.integer("is_shutdown"):
+            if "config_reset" not in self.dictionary.commands:
+                await self._reset()
+                return False
+            found = await self._config_reset()
+        self._starting_over = False
+        if not found.integer("is_config"):
+            for command in wanted.config_commands:
+                self._talk.send_text(command)
+            self._talk.send("finalize_config", crc=wanted.crc)
+            found = await self._get_config()
+        self._check_configured(found, wanted)
+        self.move_count = found.integer("move_count")
+        for command in wanted.init_commands:
+            self._talk.send_text(command)
+        return True
+
+    def _check_configured(self, found: Message, wanted: NodeConfig) -> None:
+        if self.failure is not None:
+            raise self.failure
+        if found.integer("is_shutdown"):
+            raise NodeShutdown(f"node {self.name} shut down while being configured; see its pins and limits")
+        if not found.integer("is_config") or found.integer("crc") != wanted.crc:
+            raise NodeError(f"node {self.name} did not take its configuration; restart it and try again")
+
+    async def _get_config(self) -> Message:
+        return (await self._talk.ask("get_config", "config", survives_shutdown=True)).message
+
+    async def _reset(self) -> None:
+        if "reset" not in self.dictionary.commands:
+            raise NodeError(f"node {self.name} has another configuration and no way to reset; power-cycle it")
+        self._generation += 1  # that this link breaks is what we want
+        self._talk.send("reset")
+        await asyncio.sleep(RESET_SETTLE_S)
+
+    async def _config_reset(self) -> Message:
+        """Rid the node of its configuration. Firmware takes config_reset only when shut down."""
+        for _ in range(CONFIG_RESET_TRIES):
+            self._talk.send("emergency_stop")
+            self._talk.send("config_reset")
+            found = await self._get_config()
+            if found.integer("is_shutdown") and "clear_shutdown" in self.dictionary.commands:
+                self._talk.send("clear_shutdown")
+                found = await self._get_config()
+            if not found.integer("is_config") and not found.integer("is_shutdown"):
+                return found
+        raise NodeError(f"node {self.name} does not let go of its old configuration; power-cycle it")
+
+    # ------------------------------------------------------------------------------------------------ clock
+
+    def _start_clock(self) -> None:
+        self._clock = ClockEstimator(self.dictionary.clock_freq_hz)
+        self._clock_ready.clear()
+        self._clock_task = asyncio.get_running_loop().create_task(self._keep_clock(self._clock))
+
+    async def _keep_clock(self, clock: ClockEstimator) -> None:
+        """Ask for the clock for as long as the node can be talked to."""
+        while True:
+            try:
+                answer = await self._ask_clock(clock)
+            except QueryTimeout:
+                pass  # the link decides when a silent node is lost
+            except CanductorError as error:
+                self._fail(NodeEvent.LOST, NodeLost(f"lost node {self.name}: {error}"))
+                return
+            else:
+                self._sampled(clock, answer)
+            await asyncio.sleep(clock.next_sample_ns(0) * 1e-9)
+
+    def _sampled(self, clock: ClockEstimator, answer: Answer) -> None:
+        if not self._take_sample(clock, answer):
+            return
+        estimate = clock.estimate()
+        self._talk.link.set_clock(estimate.freq_hz, estimate.at_ns, estimate.at_ticks)
+        self._on_clock(self, estimate)
+        if clock.ready:
+            self._clock_ready.set()
+
+    async def _ask_clock(self, clock: ClockEstimator) -> Answer:
+        if clock.accepted:
+            return await self._talk.ask("get_clock", "clock", tries=1, survives_shutdown=True)
+        return await self._talk.ask("get_uptime", "uptime", tries=1, survives_shutdown=True)
+
+    @staticmethod
+    def _take_sample(clock: ClockEstimator, answer: Answer) -> bool:
+        message, sent_ns, received_ns = answer.message, answer.sent_ns, answer.received_ns
+        if message.name == "clock":
+            return clock.add(sent_ns, received_ns, message.integer("clock"))
+        return clock.begin(sent_ns, received_ns, message.integer("high"), message.integer("clock"))
+
+    async def _wait_for_clock(self) -> None:
+        try:
+            async with asyncio.timeout(CLOCK_TIMEOUT_S):
+                await self._clock_ready.wait()
+        except TimeoutError:
+            raise self.failure or NodeError(
+                f"node {self.name} answers too seldom to learn its clock; check the bus for errors and load"
+            ) from None
+        if self.failure is not None:
+            raise self.failure
+
+    # ------------------------------------------------------------------------------------------- what comes
+
+    def _enter(self, event: NodeEvent) -> bool:
+        after = following(self.state, event)
+        if after is None:
+            return False
+        self.state = after
+        self._on_state(self)
+        return True
+
+    def _fail(self, event: NodeEvent, failure: NodeError) -> None:
+        if following(self.state, event) is None:
+            return
+        self.failure = failure
+        self._enter(event)
+        self._talk.fail(failure, shutdown=event is NodeEvent.SHUTDOWN)
+        self._clock_ready.set()  # nobody needs to wait for it any more
+
+    def _link_lost(self, generation: int) -> Callable[[str], None]:
+        def lost(cause: str) -> None:
+            if generation == self._generation:
+                self._fail(NodeEvent.LOST, NodeLost(f"lost node {self.name}: {cause}"))
+
+        return lost
+
+    def _stats_came(self, stats: Message) -> None:
+        base = self.dictionary.int_constant("STATS_SUMSQ_BASE", 256)
+        self.load = load_of(stats, self.dictionary.clock_freq_hz, base)
+
+    def _shutdown_came(self, message: Message) -> None:
+        if self._starting_over or self.failure is not None or self.state not in _SHUTDOWN_MEANS:
+            return
+        value = message.integer("static_string_id")
+        text = self.dictionary.enum_name("static_string_id", value)
+        self._fail(NodeEvent.SHUTDOWN, NodeShutdown(f"node {self.name} shut down: {text}"))
+
+    def _starting_came(self, _: Message) -> None:
+        if not self._starting_over:
+            self._fail(
+                NodeEvent.LOST,
+                NodeLost(f"lost node {self.name}: it restarted by itself; check its power supply"),
+            )
+
+
+_SHUTDOWN_MEANS: Final = (NodeState.CONFIGURING, NodeState.READY)

@@ -1,0 +1,89 @@
+"""What nodes need of the link: the seam at which a simulation or a test takes its place.
+
+``nodes.link`` provides all of it; its classes are documented there.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from nodes.dictionary import Dictionary
+from nodes.node_config import NodeConfig
+
+
+class ResponseLike(Protocol):
+    """One message from a node. Times are HostTime; sent_ns 0: which sending it answers is not known."""
+
+    @property
+    def content(self) -> bytes: ...  # noqa: D102
+    @property
+    def sent_ns(self) -> int: ...  # noqa: D102
+    @property
+    def received_ns(self) -> int: ...  # noqa: D102
+
+
+class FrameLike(Protocol):
+    """A CAN frame that belongs to no link."""
+
+    @property
+    def can_id(self) -> int: ...  # noqa: D102
+    @property
+    def data(self) -> bytes: ...  # noqa: D102
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSettings:
+    """How to reach a node: its id on a CAN bus, or None on a UART."""
+
+    nodeid: int | None
+    receive_window: int = 192
+    lost_after_s: float = 1.0
+
+
+OnResponses = Callable[[Sequence[ResponseLike]], None]
+OnLost = Callable[[str], None]
+OnFrame = Callable[[FrameLike], None]
+
+
+class LinkLike(Protocol):
+    """The reliable way to one node. Callbacks run on the control loop."""
+
+    def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0) -> None: ...  # noqa: D102
+    def send_batch(self, buffer: bytes) -> None: ...  # noqa: D102
+    def send_urgent(self, content: bytes) -> None: ...  # noqa: D102
+    def set_receive_window(self, n: int) -> None: ...  # noqa: D102
+    def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> None: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+
+
+class LinkIOLike(Protocol):
+    """All links over one transport."""
+
+    def open_link(  # noqa: D102
+        self, settings: LinkSettings, *, on_responses: OnResponses, on_lost: OnLost
+    ) -> LinkLike: ...
+    def send_frame(self, can_id: int, data: bytes) -> None: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+
+
+class IoFactory(Protocol):
+    """Starts the I/O of a bus; on_frame is None on a UART."""
+
+    def __call__(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike: ...  # noqa: D102
+
+
+class Connector(Protocol):
+    """How a node gets its link; the bus provides it."""
+
+    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
+        """Open a link, giving the node its id first where it needs one."""
+
+    def forget(self) -> None:
+        """Take note that the node was reset: what it knew of the bus is gone."""
+
+    def why_silent(self) -> Exception | None:
+        """Return a better explanation than "no answer" when a node never answered at all."""
+
+
+BuildConfig = Callable[[Dictionary], NodeConfig]
+"""Makes a node's configuration when its dictionary is known; called again at every restart."""
