@@ -64,7 +64,8 @@ void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, s
 void io_end(struct io_bus *bus, int cause);
 void io_notify(struct io_bus *bus);
 
-// io_schedule.c: the link that shall send next, or NULL.
-struct io_link *io_next_link(struct io_bus *bus, uint64_t now);
+// io_schedule.c: the link that shall send its next block now, or NULL; and that it did.
+struct io_link *io_next_link(const struct io_bus *bus, uint64_t now);
+void io_served(struct io_bus *bus, const struct io_link *node);
 
 #endif

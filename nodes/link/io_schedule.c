@@ -3,19 +3,22 @@
 #include "nodes/link/io_bus.h"
 
 // Earliest deadline first; repeats and control are due at once. Among equals the turn goes round.
-struct io_link *io_next_link(struct io_bus *bus, uint64_t now) {
+struct io_link *io_next_link(const struct io_bus *bus, uint64_t now) {
     uint64_t earliest_ns = UINT64_MAX;
-    size_t chosen = IO_LINKS_MAX;
+    struct io_link *chosen = NULL;
     for (size_t i = 0; i < bus->link_count; i++) {
-        size_t at = (bus->turn + i) % bus->link_count;
-        uint64_t due_ns = link_next_due(&bus->links[at]->link, now);
+        struct io_link *node = bus->links[(bus->turn + i) % bus->link_count];
+        uint64_t due_ns = link_next_due(&node->link, now);
         if (due_ns < earliest_ns) {
             earliest_ns = due_ns;
-            chosen = at;
+            chosen = node;
         }
     }
-    if (chosen == IO_LINKS_MAX)
-        return NULL;
-    bus->turn = chosen + 1;
-    return bus->links[chosen];
+    return chosen;
+}
+
+void io_served(struct io_bus *bus, const struct io_link *node) {
+    for (size_t i = 0; i < bus->link_count; i++)
+        if (bus->links[i] == node)
+            bus->turn = i + 1;
 }

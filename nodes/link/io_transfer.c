@@ -139,6 +139,7 @@ static void fill_from(struct io_bus *bus, struct io_link *node, uint64_t now) {
     uint32_t can_id = DATA_ID + 2u * node->nodeid;
     while (frames_left(bus) * DATA_MAX >= sizeof bytes) {
         size_t size = link_next_block(&node->link, now, bytes + used);
+        io_served(bus, node);
         used += size;
         size_t at = 0;
         for (; used - at >= DATA_MAX; at += DATA_MAX)
