@@ -1,1 +1,26 @@
-"""The reliable, ordered byte link to one node, in C, and its I/O thread."""
+"""Links: reliable, ordered command streams to nodes, and the I/O thread of the bus they share."""
+
+from nodes.link.bus_io import Link, LinkIO
+from nodes.link.types import (
+    Frame,
+    IOStats,
+    LinkError,
+    LinkSettings,
+    LinkStats,
+    LinkTransport,
+    Response,
+    TransportKind,
+)
+
+__all__ = [
+    "Frame",
+    "IOStats",
+    "Link",
+    "LinkError",
+    "LinkIO",
+    "LinkSettings",
+    "LinkStats",
+    "LinkTransport",
+    "Response",
+    "TransportKind",
+]

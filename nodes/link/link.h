@@ -1,0 +1,163 @@
+// SPDX-License-Identifier: Apache-2.0
+// One node's link, host side, sans-IO: commands in, message blocks out; bytes in, responses out.
+//
+// Delivery to the node is reliable and in order, answers are checked but not repeated (they may get lost; who
+// asked asks again). The owner provides memory and time: NOW is the host's CLOCK_MONOTONIC in ns and never
+// steps back; clocks are the node's ticks in 64 bits. Nothing here blocks, allocates, or reads a clock. Use
+// from one thread at a time.
+//
+// The owner's loop, after any event:
+//     link_receive() until it returns 0, then link_handle_timer(), then link_next_block() until it returns 0
+//     or the line is full, then sleep until link_deadline().
+// Reading comes before the timer: an acknowledgement that waits in the kernel must not count as late.
+#ifndef LINK_LINK_H
+#define LINK_LINK_H
+
+#include "nodes/link/queue.h"
+
+// cffi: begin
+enum {
+    LINK_BLOCKS_MAX = 15,   // in flight: the 4-bit sequence cannot tell 16 from none
+    LINK_SLOTS = 16,        // remembered blocks, by the low four bits of their sequence
+    LINK_WINDOW_MIN = 64,   // smallest receive window: one whole block
+    LINK_WIRE_MAX = 128,    // most bytes link_next_block writes: sync bytes and one block
+    LINK_RX_MAX = 256,      // received bytes that wait for the rest of their block
+    LINK_LEAD_BUCKETS = 16, // late, < 1 ms, < 2 ms, < 4 ms, … >= 2^14 ms
+};
+
+enum link_status {
+    LINK_OK,
+    LINK_FULL,    // the queue has no room; nothing was taken
+    LINK_INVALID, // empty, longer than a block's content, or a batch cut short; nothing was taken
+    LINK_GONE,    // the link is lost
+};
+
+enum link_state { LINK_PROBING, LINK_RUNNING, LINK_LOST };
+
+enum link_cause {
+    LINK_CAUSE_NONE,
+    LINK_CAUSE_SILENT, // nothing at all was heard for lost_after_ns
+    LINK_CAUSE_STUCK,  // the node was heard, but did not acknowledge what it was sent
+};
+
+struct link_settings {
+    uint64_t receive_window; // bytes the node can buffer, >= LINK_WINDOW_MIN
+    uint64_t lost_after_ns;  // without an acknowledgement for so long, the link is lost; > 0
+};
+
+struct link_stats {
+    uint64_t blocks_sent, bytes_sent;         // everything on the wire, repeats and sync bytes included
+    uint64_t commands_sent, commands_dropped; // dropped: thrown away by link_send_urgent
+    uint64_t blocks_repeated, bytes_repeated; // of blocks_sent, bytes_sent
+    uint64_t naks, timeouts;                  // reasons to repeat (naks: heard, acted upon or not)
+    uint64_t blocks_received, bytes_received; // sound blocks; all bytes
+    uint64_t bytes_invalid;                   // received bytes of no sound block
+    uint64_t acks_duplicate;                  // repeated acks that told nothing new
+    uint64_t acks_never_sent;                 // acknowledge what was not sent: ignored
+    uint64_t srtt_ns, rttvar_ns, rto_ns;      // round trip; 0 until measured (rto: as in use now)
+    uint64_t lead_count;                      // motion commands whose lead is known
+    int64_t lead_min_ns;                      // smallest lead of all; valid when lead_count > 0
+    uint64_t lead_histogram[LINK_LEAD_BUCKETS];
+};
+
+// A block that was sent; stays readable until its slot is used again.
+struct link_block {
+    uint64_t sent_ns;    // last transmission
+    uint8_t repeated;    // sent more than once: its round trip is ambiguous (Karn)
+    uint8_t length;      // of the block
+    uint8_t wire_length; // of the last transmission: with the sync bytes in front
+    uint8_t commands;
+    uint8_t leads; // how many req_clocks follow
+    uint64_t req_clock[WIRE_CONTENT_MAX];
+    uint8_t bytes[WIRE_BLOCK_MAX];
+};
+
+// All fields are the link's own; read them through the functions.
+struct link {
+    struct link_settings settings;
+    enum link_state state;
+    enum link_cause cause;
+    uint8_t probe_answered; // LINK_PROBING: the first answer is in
+    struct link_queue control, motion;
+    struct link_block blocks[LINK_SLOTS];
+    uint64_t first, cursor, next; // first unacknowledged <= next to transmit (again) <= next new block
+    uint64_t flying_bytes;        // transmitted since the last rewind and not acknowledged
+    uint64_t flying_commands;     // in blocks [first, next)
+    uint64_t progress_ns;         // last acknowledgement, or when the line began to be busy
+    uint64_t heard_ns;            // last sound block
+    uint64_t last_ack;            // sequence of the last empty block
+    uint64_t naks_owed, owed_until_ns, owed_until_seq; // naks that the last repeats may still cause
+    uint64_t backoff;                                  // doublings of the timeout
+    uint8_t lead_in; // sync bytes before the next transmission: 0, 1, or LINK_FLUSH
+    double clock_hz; // 0: unknown
+    uint64_t clock_at_ns, clock_at_ticks;
+    uint8_t rx[LINK_RX_MAX];
+    size_t rx_used;
+    uint64_t rx_ns; // arrival of the newest byte in rx
+    struct wire_scanner scanner;
+    struct link_stats stats;
+};
+
+struct link_response {
+    uint64_t sent_ns;     // when the block it acknowledges was sent; 0: repeated, or unknown
+    uint64_t received_ns; // NOW of the call that completed it
+    uint8_t size;         // 1..59
+    uint8_t content[WIRE_CONTENT_MAX];
+};
+
+// Prepares a link over the two memories (sizes are powers of two, at least 256), which it uses until it is
+// forgotten. SETTINGS are in their ranges.
+void link_init(struct link *link, const struct link_settings *settings, uint8_t *control, size_t control_size,
+               uint8_t *motion, size_t motion_size);
+
+// ------------------------------------------------------------------------------------------------- commands
+
+// Queues one encoded command. Control commands go in order, before motion, as soon as the window allows, but
+// not before min_clock (0: at once).
+enum link_status link_send(struct link *link, const uint8_t *content, size_t size, uint64_t min_clock,
+                           uint64_t req_clock);
+
+// Queues the motion commands of a batch (batch.h), all or none.
+enum link_status link_send_batch(struct link *link, const uint8_t *batch, size_t size);
+
+// Drops all that is queued and not yet sent, and sends CONTENT next.
+enum link_status link_send_urgent(struct link *link, const uint8_t *content, size_t size);
+
+// Commands that are queued or not yet acknowledged.
+uint64_t link_pending(const struct link *link);
+
+// Returns LINK_INVALID below LINK_WINDOW_MIN. What is in flight stays.
+enum link_status link_set_receive_window(struct link *link, uint64_t size);
+
+// The node's clock as a line: it reads AT_TICKS at AT_NS and runs at FREQ_HZ (> 0, finite; else
+// LINK_INVALID). Until it is set, commands with a min_clock wait.
+enum link_status link_set_clock(struct link *link, double freq_hz, uint64_t at_ns, uint64_t at_ticks);
+
+// ------------------------------------------------------------------------------------------------- driving
+
+// Takes bytes from [*data, *data + *size) and moves both. Returns 1 with a response (call again) or 0 when
+// all is used up. Call it with size 0 when the deadline passes: a block that was cut off is given up then.
+int link_receive(struct link *link, const uint8_t **data, size_t *size, uint64_t now,
+                 struct link_response *response);
+
+// Acts on what time brings: repeats and the loss of the link (once: state becomes LINK_LOST, with a cause).
+void link_handle_timer(struct link *link, uint64_t now);
+
+// Writes the next transmission (at most LINK_WIRE_MAX bytes) and returns its size; 0: nothing to send now.
+size_t link_next_block(struct link *link, uint64_t now, uint8_t *out);
+
+// When the thing to be sent now is due, in host time: 0 for repeats and control, the req_clock of motion.
+// UINT64_MAX: nothing to send now.
+uint64_t link_next_due(const struct link *link, uint64_t now);
+
+// When link_handle_timer, link_receive or link_next_block has something to do that it has not now.
+// UINT64_MAX: nothing but an event changes anything.
+uint64_t link_deadline(const struct link *link, uint64_t now);
+
+// The counters, with those that are computed on demand.
+void link_get_stats(const struct link *link, struct link_stats *out);
+// cffi: end
+
+#define LINK_NEVER UINT64_MAX
+
+#endif

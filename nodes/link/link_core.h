@@ -1,0 +1,39 @@
+// SPDX-License-Identifier: Apache-2.0
+// Shared by the two halves of the link (link.c sends, link_receive.c listens); not for others.
+#ifndef LINK_CORE_H
+#define LINK_CORE_H
+
+#include "nodes/link/link.h"
+
+#define NS_PER_S 1000000000ULL
+#define NS_PER_MS 1000000ULL
+
+// Sync bytes in front of a repeat (they are legal anywhere before a block). A node that lost the end of a
+// block takes what follows for the missing bytes, finds the checksum wrong and drops everything to the next
+// 0x7E: without a 0x7E of its own the repeat would be what it drops, and a further round trip would pass.
+// That holds on CAN as on a UART, so every repeat gets one. After a timeout the node may still be waiting for
+// up to 59 bytes of a block whose length byte was damaged, and short repeats would vanish into it one by one;
+// LEAD_FLUSH pads the repeat so that it cannot wait longer.
+enum lead_in { LEAD_NONE, LEAD_SYNC, LEAD_FLUSH };
+
+static inline struct link_block *block_of(struct link *link, uint64_t sequence) {
+    return &link->blocks[sequence % LINK_SLOTS];
+}
+
+static inline const struct link_block *const_block_of(const struct link *link, uint64_t sequence) {
+    return &link->blocks[sequence % LINK_SLOTS];
+}
+
+// Host time at which the node's clock reads TICKS; saturates. The clock must be known.
+uint64_t link_clock_to_ns(const struct link *link, uint64_t ticks);
+
+// Everything from the first unacknowledged block on will be transmitted again.
+void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in);
+
+// The timeout in use: from the round trip, doubled for each timeout since the last measurement.
+uint64_t link_rto(const struct link *link);
+
+// When a partial block in the receive buffer is given up; LINK_NEVER without one.
+uint64_t link_partial_deadline(const struct link *link);
+
+#endif

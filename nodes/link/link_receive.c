@@ -1,0 +1,199 @@
+// SPDX-License-Identifier: Apache-2.0
+// The listening half of a link: blocks out of bytes, acknowledgements, naks, round trips, first contact.
+#include <string.h>
+
+#include "nodes/link/link_core.h"
+
+// A block whose bytes stop coming for so long was cut off or has a damaged length byte. It is given up so
+// that the sound blocks in its bytes, often the acknowledgement just waited for, do not wait for it to fill
+// up.
+#define GAP_NS (25 * NS_PER_MS)
+
+// --------------------------------------------------------------------------------------------
+// acknowledgement
+
+static void note_lead(struct link *link, uint64_t req_clock, uint64_t now) {
+    int64_t lead_ns = (int64_t)(link_clock_to_ns(link, req_clock) - now);
+    struct link_stats *stats = &link->stats;
+    if (!stats->lead_count++ || lead_ns < stats->lead_min_ns)
+        stats->lead_min_ns = lead_ns;
+    size_t bucket = 0;
+    if (lead_ns >= 0)
+        for (bucket = 1; bucket < LINK_LEAD_BUCKETS - 1; bucket++)
+            if ((uint64_t)lead_ns < NS_PER_MS << (bucket - 1))
+                break;
+    stats->lead_histogram[bucket]++;
+}
+
+static void measure_round_trip(struct link *link, const struct link_block *block, uint64_t now) {
+    if (block->repeated)
+        return;
+    struct link_stats *stats = &link->stats;
+    uint64_t sample_ns = now > block->sent_ns ? now - block->sent_ns : 1;
+    if (stats->srtt_ns) {
+        uint64_t error_ns =
+            sample_ns > stats->srtt_ns ? sample_ns - stats->srtt_ns : stats->srtt_ns - sample_ns;
+        stats->rttvar_ns = (3 * stats->rttvar_ns + error_ns) / 4;
+        stats->srtt_ns = (7 * stats->srtt_ns + sample_ns) / 8;
+    } else {
+        stats->srtt_ns = sample_ns;
+        stats->rttvar_ns = sample_ns / 2;
+    }
+    // Only now: were the doublings undone by any progress, a round trip that grew beyond the timeout would
+    // have every block repeated, and so never be measured.
+    link->backoff = 0;
+}
+
+// Everything before SEQUENCE has arrived.
+static void acknowledge(struct link *link, uint64_t sequence, uint64_t now) {
+    measure_round_trip(link, block_of(link, sequence - 1), now);
+    for (; link->first < sequence; link->first++) {
+        const struct link_block *block = block_of(link, link->first);
+        if (link->first < link->cursor)
+            link->flying_bytes -= block->wire_length;
+        link->flying_commands -= block->commands;
+        if (link->clock_hz > 0)
+            for (size_t i = 0; i < block->leads; i++)
+                note_lead(link, block->req_clock[i], now);
+    }
+    if (link->cursor < sequence)
+        link->cursor = sequence;
+    link->progress_ns = now;
+    if (sequence > link->owed_until_seq) // a block behind the repeats was answered: so were they
+        link->naks_owed = 0;
+}
+
+static void handle_nak(struct link *link, uint64_t now) {
+    link->stats.naks++;
+    if (link->cursor == link->first)
+        return; // the repeat is on its way already
+    if (link->naks_owed && now < link->owed_until_ns) {
+        link->naks_owed--;
+        return;
+    }
+    link_rewind(link, now, LEAD_SYNC);
+}
+
+// ---------------------------------------------------------------------------------------------- first
+// contact
+
+static void adopt(struct link *link, uint64_t sequence) {
+    link->first = link->cursor = link->next = sequence;
+    link->flying_bytes = link->naks_owed = 0;
+}
+
+// The first answer to an empty block tells the node's expected sequence: it was taken, or refused with that
+// answer. The node may still take a late repeat of the first one, so a second empty block, with the adopted
+// sequence, makes sure before commands are trusted to it.
+static void handle_probe_answer(struct link *link, unsigned answer, uint64_t now) {
+    if (link->cursor == link->first)
+        return; // nothing asked: a left-over from before
+    unsigned behind = (answer - (unsigned)link->first) & WIRE_SEQ_MASK;
+    if (!link->probe_answered) {
+        link->probe_answered = 1;
+        adopt(link, link->first + behind);
+    } else if (behind == 1) {
+        acknowledge(link, link->first + 1, now);
+        link->naks_owed = 0;
+        link->probe_answered = 0;
+        link->last_ack = link->first;
+        link->state = LINK_RUNNING;
+    } else if (behind) {
+        adopt(link, link->first + behind);
+    }
+}
+
+// -----------------------------------------------------------------------------------------------------
+// blocks
+
+static void handle_sequence(struct link *link, unsigned answer, int empty, uint64_t now) {
+    if (link->state == LINK_LOST)
+        return;
+    if (link->state == LINK_PROBING) {
+        handle_probe_answer(link, answer, now);
+        return;
+    }
+    uint64_t sequence = link->first + ((answer - (unsigned)link->first) & WIRE_SEQ_MASK);
+    if (sequence > link->next) {
+        link->stats.acks_never_sent++;
+        return;
+    }
+    if (sequence > link->first)
+        acknowledge(link, sequence, now);
+    else if (empty && link->last_ack == sequence && link->first < link->next)
+        handle_nak(link, now);
+    else if (empty && link->last_ack == sequence)
+        link->stats.acks_duplicate++;
+    // A response and the acknowledgement behind it carry the same sequence: only a second *empty* block is a
+    // nak.
+    if (empty)
+        link->last_ack = sequence;
+}
+
+static void handle_block(struct link *link, const uint8_t *bytes, size_t length, uint64_t now,
+                         struct link_response *response) {
+    unsigned answer = bytes[1] & WIRE_SEQ_MASK;
+    link->stats.blocks_received++;
+    link->heard_ns = now;
+    handle_sequence(link, answer, length == WIRE_BLOCK_MIN, now);
+    response->size = (uint8_t)(length - WIRE_BLOCK_MIN);
+    if (!response->size)
+        return;
+    memcpy(response->content, bytes + WIRE_HEADER, response->size);
+    const struct link_block *asked = const_block_of(link, link->first - 1);
+    int known =
+        link->state == LINK_RUNNING && ((link->first - answer) & WIRE_SEQ_MASK) == 0 && !asked->repeated;
+    response->sent_ns = known ? asked->sent_ns : 0;
+    response->received_ns = now;
+}
+
+// Takes one step through the receive buffer; returns 0 when it needs more bytes.
+static int scan_once(struct link *link, uint64_t now, struct link_response *response) {
+    size_t skip, length;
+    int hunting = link->scanner.hunting;
+    enum wire_scan found = wire_scan(&link->scanner, link->rx, link->rx_used, &skip, &length);
+    if (found == WIRE_LOST || hunting)
+        link->stats.bytes_invalid += skip;
+    if (found == WIRE_BLOCK)
+        handle_block(link, link->rx + skip, length, now, response);
+    link->rx_used -= skip + length;
+    memmove(link->rx, link->rx + skip + length, link->rx_used);
+    return found != WIRE_MORE;
+}
+
+// Drops the front of the buffer up to and including the next sync byte.
+static void give_up_partial(struct link *link) {
+    const uint8_t *sync = memchr(link->rx, WIRE_SYNC, link->rx_used);
+    size_t drop = sync ? (size_t)(sync - link->rx) + 1 : link->rx_used;
+    link->stats.bytes_invalid += drop;
+    link->rx_used -= drop;
+    memmove(link->rx, link->rx + drop, link->rx_used);
+}
+
+uint64_t link_partial_deadline(const struct link *link) {
+    return link->rx_used ? link->rx_ns + GAP_NS : LINK_NEVER;
+}
+
+int link_receive(struct link *link, const uint8_t **data, size_t *size, uint64_t now,
+                 struct link_response *response) {
+    response->size = 0;
+    int late = *size == 0 && now >= link_partial_deadline(link);
+    for (;;) {
+        size_t room = LINK_RX_MAX - link->rx_used, taken = *size < room ? *size : room;
+        if (taken) {
+            memcpy(link->rx + link->rx_used, *data, taken);
+            link->rx_used += taken;
+            link->rx_ns = now;
+            link->stats.bytes_received += taken;
+            *data += taken;
+            *size -= taken;
+        }
+        while (scan_once(link, now, response))
+            if (response->size)
+                return 1;
+        if (*size == 0 && !(late && link->rx_used))
+            return 0;
+        if (late)
+            give_up_partial(link);
+    }
+}

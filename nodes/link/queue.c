@@ -1,0 +1,55 @@
+// SPDX-License-Identifier: Apache-2.0
+// The byte ring behind link_queue: records may wrap around its end.
+#include "nodes/link/queue.h"
+
+#include "nodes/link/batch.h"
+
+void link_queue_init(struct link_queue *queue, uint8_t *memory, size_t size) {
+    *queue = (struct link_queue){.memory = memory, .size = size};
+}
+
+static void copy_in(struct link_queue *queue, uint64_t at, const uint8_t *from, size_t size) {
+    size_t start = at & (queue->size - 1);
+    size_t first = size < queue->size - start ? size : queue->size - start;
+    memcpy(queue->memory + start, from, first);
+    memcpy(queue->memory, from + first, size - first);
+}
+
+static void copy_out(const struct link_queue *queue, uint64_t at, uint8_t *to, size_t size) {
+    size_t start = at & (queue->size - 1);
+    size_t first = size < queue->size - start ? size : queue->size - start;
+    memcpy(to, queue->memory + start, first);
+    memcpy(to + first, queue->memory, size - first);
+}
+
+int link_queue_put(struct link_queue *queue, const uint8_t *batch, size_t size, uint64_t count) {
+    if (size > queue->size - link_queue_bytes(queue))
+        return 0;
+    copy_in(queue, queue->tail, batch, size);
+    queue->tail += size;
+    queue->commands += count;
+    if (queue->commands > queue->commands_max)
+        queue->commands_max = queue->commands;
+    if (link_queue_bytes(queue) > queue->bytes_max)
+        queue->bytes_max = link_queue_bytes(queue);
+    return 1;
+}
+
+uint64_t link_queue_peek(const struct link_queue *queue, uint64_t at, struct link_command *out) {
+    uint8_t header[BATCH_HEADER];
+    copy_out(queue, at, header, sizeof header);
+    memcpy(&out->min_clock, header, 8);
+    memcpy(&out->req_clock, header + 8, 8);
+    out->size = header[16];
+    return at + BATCH_HEADER + out->size;
+}
+
+void link_queue_payload(const struct link_queue *queue, uint64_t at, const struct link_command *command,
+                        uint8_t *out) {
+    copy_out(queue, at + BATCH_HEADER, out, command->size);
+}
+
+void link_queue_drop(struct link_queue *queue, uint64_t at, uint64_t count) {
+    queue->head = at;
+    queue->commands -= count;
+}

@@ -1,0 +1,46 @@
+// SPDX-License-Identifier: Apache-2.0
+// A bounded queue of commands in the format of batch.h, in memory that the owner hands in.
+#ifndef LINK_QUEUE_H
+#define LINK_QUEUE_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#include "wire/wire.h"
+
+// cffi: begin
+// Positions count bytes since the start and never wrap; SIZE is a power of two.
+struct link_queue {
+    uint8_t *memory;
+    uint64_t size, head, tail;
+    uint64_t commands;                // records inside now
+    uint64_t bytes_max, commands_max; // most that ever were inside
+};
+// cffi: end
+
+// One record at the front of a queue; PAYLOAD is read separately.
+struct link_command {
+    uint64_t min_clock, req_clock;
+    uint8_t size;
+};
+
+void link_queue_init(struct link_queue *queue, uint8_t *memory, size_t size);
+
+// Appends COUNT whole records of SIZE bytes in all; returns 0 and changes nothing when they do not fit.
+int link_queue_put(struct link_queue *queue, const uint8_t *batch, size_t size, uint64_t count);
+
+// Reads the record at position AT (head <= AT < tail) and returns the position behind it.
+uint64_t link_queue_peek(const struct link_queue *queue, uint64_t at, struct link_command *out);
+
+// Copies the payload of the record at position AT, of which COMMAND was peeked.
+void link_queue_payload(const struct link_queue *queue, uint64_t at, const struct link_command *command,
+                        uint8_t *out);
+
+// Drops the COUNT records in front of position AT.
+void link_queue_drop(struct link_queue *queue, uint64_t at, uint64_t count);
+
+static inline uint64_t link_queue_bytes(const struct link_queue *queue) {
+    return queue->tail - queue->head;
+}
+
+#endif

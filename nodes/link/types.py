@@ -1,0 +1,146 @@
+"""The values that pass between a link and its users."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol
+
+from nodes.errors import CanductorError
+
+
+class LinkError(CanductorError):
+    """A link or its transport cannot do what was asked; the sentence says why and what to do."""
+
+
+class TransportKind(IntEnum):
+    """How a transport's file descriptor carries data (``enum io_kind`` of io_thread.h)."""
+
+    CAN_STREAM = 0
+    """A byte stream of 16-byte ``struct can_frame``."""
+    CAN_PACKET = 1
+    """One ``struct can_frame`` per read and write: SocketCAN."""
+    BYTES = 2
+    """A serial line: the bytes of one node's blocks."""
+
+
+class LinkTransport(Protocol):
+    """What a link needs of a transport; the transports of ``nodes.transport`` are such."""
+
+    @property
+    def name(self) -> str:
+        """How messages to the user call it, for example ``can0`` or ``/dev/ttyACM0``."""
+
+    @property
+    def kind(self) -> int:
+        """One of TransportKind."""
+
+    def fileno(self) -> int:
+        """Return the file descriptor, open until close()."""
+
+    def close(self) -> None:
+        """Close the file descriptor."""
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """One response of a node: the checked content of a block."""
+
+    content: bytes
+    sent_ns: int
+    """Host time at which the block it acknowledges was sent; 0 when that was repeated, and so ambiguous."""
+    received_ns: int
+    """Host time at which it was read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A CAN frame that belongs to no link, for example an admin response."""
+
+    can_id: int
+    """With the flag bits of ``struct can_frame`` for extended, remote and error frames."""
+    data: bytes
+    received_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSettings:
+    """What a link has to know of its node."""
+
+    nodeid: int | None
+    """1..255 on CAN, None on a serial line."""
+    receive_window: int = 192
+    """Bytes the node can buffer, at least 64: RECEIVE_WINDOW of its dictionary."""
+    lost_after_s: float = 1.0
+    """Without an acknowledgement for so long, the link is lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStats:
+    """Counters of one link, since it was opened. Times in s; queue depths in commands and bytes."""
+
+    blocks_sent: int = 0
+    """Everything put on the wire, repeats included; bytes_sent has the sync bytes too."""
+    bytes_sent: int = 0
+    commands_sent: int = 0
+    commands_dropped: int = 0
+    """Queued commands thrown away by send_urgent."""
+    blocks_repeated: int = 0
+    bytes_repeated: int = 0
+    naks: int = 0
+    timeouts: int = 0
+    blocks_received: int = 0
+    bytes_received: int = 0
+    bytes_invalid: int = 0
+    """Received bytes that were part of no sound block."""
+    acks_duplicate: int = 0
+    acks_never_sent: int = 0
+    """Acknowledgements of blocks that were never sent: ignored."""
+    srtt_s: float = 0.0
+    """Smoothed round trip; 0 until one was measured."""
+    rttvar_s: float = 0.0
+    rto_s: float = 0.0
+    """Timeout in use."""
+    pending: int = 0
+    """Commands queued or not acknowledged."""
+    flying_bytes: int = 0
+    flying_blocks: int = 0
+    control_commands: int = 0
+    control_commands_max: int = 0
+    control_bytes: int = 0
+    control_bytes_max: int = 0
+    motion_commands: int = 0
+    motion_commands_max: int = 0
+    motion_bytes: int = 0
+    motion_bytes_max: int = 0
+    lead_count: int = 0
+    """Motion commands whose lead (time left until due, when acknowledged) is known."""
+    min_lead_s: float | None = None
+    """The smallest lead of all; negative: a command came too late. None: no lead is known."""
+    lead_histogram: tuple[int, ...] = ()
+    """Commands by lead: late, < 1 ms, < 2 ms, < 4 ms, …, and the last: 2^14 ms or more."""
+
+
+@dataclass(frozen=True, slots=True)
+class IOStats:
+    """Counters of one bus, since its thread was started."""
+
+    frames_sent: int
+    frames_received: int
+    frames_unclaimed: int
+    """Received frames that belong to no link."""
+    frames_dropped: int
+    """Of those: the oldest gave way because Python was too slow."""
+    frames_malformed: int
+    responses_dropped: int
+    """Responses that gave way because Python was too slow."""
+    responses_max: int
+    unclaimed_max: int
+    admin_max: int
+    bytes_sent: int
+    bytes_received: int
+    waits: int
+    """Times the kernel took no more and sending paused."""
+    wakeups: int
+
+
+FrameHandler = Callable[[Frame], None]

@@ -1,0 +1,125 @@
+"""One conversation of some sixty blocks, and every fault at every one of its blocks, in both directions."""
+
+import random
+from collections.abc import Callable, Iterable
+
+import pytest
+
+from tests.nodes.link.twin import NodeTwin, WindowObserver, answer, ask, store
+from tests.nodes.link.virtual import MS, TO_HOST, TO_NODE, CoreLink, Delivery, Fault, Line, no_fault
+
+COMMANDS = [store(i, 44) if i % 4 else ask(i) for i in range(74)]
+ASKED = [answer(i) for i in range(0, 74, 4)]
+Damage = Callable[[bytes], Iterable[Delivery]]
+
+
+def flip(at: int, bits: int = 0x41) -> Damage:
+    def damage(data: bytes) -> Iterable[Delivery]:
+        # Sync bytes in front of a repeat are not what is aimed at.
+        start = len(data) - len(data.lstrip(b"~"))
+        place = min(start + at, len(data) - 1) if at >= 0 else len(data) + at
+        return [(0, data[:place] + bytes([data[place] ^ bits]) + data[place + 1 :])]
+
+    return damage
+
+
+DAMAGES: dict[str, Damage] = {
+    "dropped": lambda data: [],
+    "twice": lambda data: [(0, data), (0, data)],
+    "twice, late": lambda data: [(0, data), (7 * MS, data)],
+    "delayed 3 ms": lambda data: [(3 * MS, data)],
+    "delayed beyond the timeout": lambda data: [(150 * MS, data)],
+    "length up": flip(0, 0x18),
+    "length 64": lambda data: [(0, b"\x40" + data.lstrip(b"~")[1:])],
+    "length out of range": flip(0, 0x80),
+    "sequence": flip(1, 0x03),
+    "sequence mark": flip(1, 0x40),
+    "first content byte": flip(2),
+    "last content byte": flip(-4),
+    "checksum high": flip(-3),
+    "checksum low": flip(-2),
+    "sync": flip(-1),
+    "first frame lost": lambda data: [(0, data[8:])],
+    "middle frame lost": lambda data: [(0, data[:8] + data[16:])],
+    "last frame lost": lambda data: [(0, data[: (len(data) - 1) // 8 * 8])],
+    "last byte lost": lambda data: [(0, data[:-1])],
+    "noise in front": lambda data: [(0, bytes(range(1, 40)) + data)],
+}
+
+
+def converse(fault: Fault, expected: int = 5) -> Line:
+    """Hold the whole conversation and check that everything was executed once, in order."""
+    line = Line(CoreLink(), NodeTwin(expected), fault, observer=WindowObserver())
+    for command in COMMANDS:
+        assert line.link.send(command) == 0
+    line.run()
+    assert not line.link.lost
+    assert line.node.executed == COMMANDS
+    asked = [content for content, _ in line.responses]
+    assert all(content in ASKED for content in asked)
+    assert line.node.overflows == 0
+    return line
+
+
+CLEAN = converse(no_fault)
+CLEAN_NS = CLEAN.now - 1000 * MS
+
+
+def test_the_clean_conversation_is_what_the_faults_assume() -> None:
+    assert 55 <= CLEAN.counts[TO_NODE] <= 70
+    assert [content for content, _ in CLEAN.responses] == ASKED
+    assert CLEAN.link.stats.blocks_repeated == CLEAN.link.stats.naks == CLEAN.link.stats.timeouts == 0
+    assert CLEAN.observer is not None
+    assert CLEAN.observer.most_bytes > 128
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("direction", [TO_NODE, TO_HOST])
+def test_one_fault_anywhere(direction: int, damage: str) -> None:
+    for index in range(CLEAN.counts[direction]):
+
+        def fault(way: int, at: int, data: bytes, index: int = index) -> Iterable[Delivery]:
+            return DAMAGES[damage](data) if (way, at) == (direction, index) else [(0, data)]
+
+        line = converse(fault)
+        # One first timeout of 100 ms, one delay of 150 ms, and a second timeout are the worst of it.
+        assert line.now - 1000 * MS <= CLEAN_NS + 420 * MS, f"index {index}"
+        if direction == TO_NODE:
+            assert [content for content, _ in line.responses] == ASKED, f"index {index}"
+
+
+@pytest.mark.parametrize("seed", range(120))
+def test_two_faults_anywhere(seed: int) -> None:
+    chance = random.Random(seed)
+    places = {
+        (way, chance.randrange(CLEAN.counts[way])): DAMAGES[chance.choice(list(DAMAGES))]
+        for way in (chance.randrange(2), chance.randrange(2))
+    }
+
+    def fault(way: int, at: int, data: bytes) -> Iterable[Delivery]:
+        return places[way, at](data) if (way, at) in places else [(0, data)]
+
+    line = converse(fault, expected=seed % 16)
+    assert line.now - 1000 * MS <= CLEAN_NS + 840 * MS
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_a_bad_line_all_the_time(seed: int) -> None:
+    chance = random.Random(seed)
+
+    def fault(way: int, at: int, data: bytes) -> Iterable[Delivery]:
+        return chance.choice(list(DAMAGES.values()))(data) if chance.random() < 0.15 else [(0, data)]
+
+    line = converse(fault, expected=seed % 16)
+    assert line.now - 1000 * MS <= 20_000 * MS
+
+
+@pytest.mark.parametrize("direction", [TO_NODE, TO_HOST])
+def test_repeats_do_not_cause_repeats(direction: int) -> None:
+    """A single delay beyond the timeout makes every block in flight arrive twice, and must end there."""
+
+    def fault(way: int, at: int, data: bytes) -> Iterable[Delivery]:
+        return [(300 * MS if (way, at) == (direction, 12) else 0, data)]
+
+    line = converse(fault)
+    assert 1 <= line.link.stats.blocks_repeated <= 12

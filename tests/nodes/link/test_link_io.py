@@ -1,0 +1,326 @@
+"""The I/O thread and its Python skin over socket pairs, with twin nodes at the far end."""
+
+import asyncio
+import struct
+from collections.abc import Coroutine
+
+import pytest
+
+from nodes.link import LinkError, LinkSettings, TransportKind
+from tests.nodes.link.peers import TIMEOUT_S, bench, open_files, pack_frame
+from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, block, store
+
+KINDS = list(TransportKind)
+CAN_KINDS = [TransportKind.CAN_STREAM, TransportKind.CAN_PACKET]
+
+
+def run(test: Coroutine[object, object, None]) -> None:
+    async def limited() -> None:
+        async with asyncio.timeout(2 * TIMEOUT_S):
+            await test
+
+    asyncio.run(limited())
+
+
+def node_id(kind: TransportKind) -> int:
+    return 0 if kind == TransportKind.BYTES else 4
+
+
+def record(command: bytes, min_clock: int = 0, req_clock: int = 0) -> bytes:
+    return struct.pack("=QQB", min_clock, req_clock, len(command)) + command
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("small_buffers", [False, True])
+def test_commands_arrive_in_order_and_answers_come_back(kind: TransportKind, small_buffers: bool) -> None:
+    async def test() -> None:
+        node = NodeTwin(expected=9)
+        with bench(kind, {node_id(kind): node}, small_buffers=small_buffers) as b:
+            link = b.open(node_id(kind))
+            commands = [store(i, i % 50) if i % 3 else ask(i) for i in range(400)]
+            for command in commands:
+                link.send(command)
+            await b.inbox.until(lambda: len(b.inbox.responses) == 134)
+            await link.drained()
+            assert link.pending() == 0
+            assert node.executed == commands
+            assert [r.content for r in b.inbox.responses] == [answer(i) for i in range(0, 400, 3)]
+            assert all(0 < r.sent_ns < r.received_ns for r in b.inbox.responses)
+            stats = link.stats()
+            assert stats.commands_sent == 400
+            assert stats.blocks_repeated == stats.bytes_invalid == 0
+            assert stats.srtt_s > 0
+            assert b.io.stats().bytes_sent >= stats.bytes_sent
+
+    run(test())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_batch_goes_as_motion_and_its_lead_is_measured(kind: TransportKind) -> None:
+    async def test() -> None:
+        node = NodeTwin()
+        with bench(kind, {node_id(kind): node}) as b:
+            link = b.open(node_id(kind))
+            now_ns = int(asyncio.get_running_loop().time() * 1e9)
+            link.set_clock(1e6, now_ns, 5_000_000)
+            due = 5_000_000 + 3_000_000  # in three seconds
+            commands = [store(i, 4) for i in range(2000)]
+            link.send_batch(b"".join(record(c, 0, due) for c in commands))
+            await link.drained()
+            assert node.executed == commands
+            stats = link.stats()
+            assert stats.lead_count == sum(stats.lead_histogram) == 2000
+            assert stats.min_lead_s is not None
+            assert 0 < stats.min_lead_s < 3.0
+            assert stats.motion_commands_max == 2000
+            assert stats.motion_commands == stats.motion_bytes == 0
+
+    run(test())
+
+
+@pytest.mark.parametrize("kind", CAN_KINDS)
+def test_four_links_share_a_bus(kind: TransportKind) -> None:
+    async def test() -> None:
+        nodes = {i: NodeTwin(expected=i & 15) for i in (1, 4, 5, 255)}
+        with bench(kind, nodes) as b:
+            links = {i: b.open(i) for i in nodes}
+            commands = {i: [store(i * 1000 + k, 30) for k in range(150)] for i in nodes}
+            for i, link in links.items():
+                link.send_batch(b"".join(record(c) for c in commands[i]))
+            await asyncio.gather(*(link.drained() for link in links.values()))
+            assert {i: node.executed for i, node in nodes.items()} == commands
+            # Equal among equals: nobody is served last.
+            half = b.peer.order[: len(b.peer.order) // 2]
+            assert min(half.count(i) for i in nodes) > len(half) / 8
+            assert b.io.stats().frames_sent == len(b.peer.frames)
+
+    run(test())
+
+
+def test_blocks_of_one_link_share_frames() -> None:
+    async def test() -> None:
+        node = NodeTwin()
+        with bench(TransportKind.CAN_STREAM, {4: node}) as b:
+            link = b.open(4)
+            link.send_batch(b"".join(record(store(i, 50)) for i in range(90)))
+            await link.drained()
+            full = [data for _, data in b.peer.frames if len(data) == 8]
+            assert len(full) / len(b.peer.frames) > 0.8
+
+    run(test())
+
+
+@pytest.mark.parametrize("kind", CAN_KINDS)
+def test_other_frames_go_to_python_and_come_from_it(kind: TransportKind) -> None:
+    async def test() -> None:
+        with bench(kind, {}) as b:
+            b.open(4)
+            b.io.send_frame(0x3F0, b"\x00")
+            async with asyncio.timeout(TIMEOUT_S):
+                await b.peer.frame_arrived.wait()
+            assert b.peer.frames == [(0x3F0, b"\x00")]
+            for can_id in (0x3F1, 0x107, 0x108, 0x80000109, 0x40000109, 0x305):
+                b.peer.send(pack_frame(can_id, b"12345678"))
+            await b.inbox.until(lambda: len(b.inbox.frames) == 6)
+            assert [f.can_id for f in b.inbox.frames] == [0x3F1, 0x107, 0x108, 0x80000109, 0x40000109, 0x305]
+            assert all(f.data == b"12345678" and f.received_ns > 0 for f in b.inbox.frames)
+            with pytest.raises(LinkError, match="a frame of 9 bytes"):
+                b.io.send_frame(0x3F0, bytes(9))
+
+    run(test())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_deaf_peer_stops_sending_without_loss_or_spinning(kind: TransportKind) -> None:
+    async def test() -> None:
+        node = NodeTwin()
+        with bench(kind, {node_id(kind): node}, small_buffers=True) as b:
+            link = b.open(node_id(kind))
+            link.send(ask(1))
+            await b.inbox.until(lambda: b.inbox.responses)
+            b.peer.deafen()
+            if kind != TransportKind.BYTES:  # enough to fill any buffer: admin frames know no window
+                with pytest.raises(LinkError, match="admin frames wait already"):
+                    while True:
+                        b.io.send_frame(0x3F0, bytes(8))
+                assert b.io.stats().waits > 0
+            commands = [store(i, 50) for i in range(30)]
+            for command in commands:
+                link.send(command)
+            before = b.io.stats().wakeups
+            with pytest.raises(TimeoutError):
+                async with asyncio.timeout(0.05):
+                    await link.drained()
+            assert b.io.stats().wakeups - before < 40
+            b.peer.listen()
+            await link.drained()
+            assert node.executed[1:] == commands
+            if kind != TransportKind.BYTES:
+                assert sum(can_id == 0x3F0 for can_id, _ in b.peer.frames) >= 256
+
+    run(test())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_silent_node_is_lost_once_and_the_others_go_on(kind: TransportKind) -> None:
+    async def test() -> None:
+        nodes = {} if kind == TransportKind.BYTES else {9: NodeTwin()}
+        with bench(kind, {0: NodeTwin(window=0), **nodes}) as b:
+            link = b.open(node_id(kind), lost_after_s=0.05)
+            link.send(ask(1))
+            with pytest.raises(LinkError, match="lost, no acknowledgement for 0.05 s"):
+                await link.drained()
+            await b.inbox.until(lambda: b.inbox.lost)
+            assert "does not answer at all" in b.inbox.lost[0]
+            with pytest.raises(LinkError, match="lost"):
+                link.send(ask(2))
+            if nodes:
+                other = b.open(9)
+                other.send(ask(3))
+                await b.inbox.until(lambda: b.inbox.responses)
+            link.close()
+            again = b.open(node_id(kind))
+            again.close()
+            again.close()
+            assert len(b.inbox.lost) == 1
+
+    run(test())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_peer_that_closes_is_told_once(kind: TransportKind) -> None:
+    async def test() -> None:
+        with bench(kind, {node_id(kind): NodeTwin()}) as b:
+            link = b.open(node_id(kind))
+            link.send(ask(1))
+            await b.inbox.until(lambda: b.inbox.responses)
+            b.peer.close()
+            await b.inbox.until(lambda: b.inbox.closed)
+            assert b.inbox.closed[0].startswith("pair: the connection ended (")
+            with pytest.raises(LinkError, match="the connection ended"):
+                link.send(ask(2))
+            with pytest.raises(LinkError, match="the connection ended"):
+                await link.drained()
+            with pytest.raises(LinkError):
+                b.open(77 if node_id(kind) else 0)
+            assert link.stats().commands_sent == 1
+            assert b.inbox.lost == []
+
+    run(test())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_close_during_traffic_joins_the_thread_and_leaks_nothing(kind: TransportKind) -> None:
+    async def test() -> None:
+        for _ in range(5):
+            with bench(kind, {node_id(kind): NodeTwin()}) as b:
+                link = b.open(node_id(kind))
+                link.send_batch(b"".join(record(store(i, 40)) for i in range(3000)))
+                link.send(ask(1))
+                await b.inbox.until(lambda: b.inbox.responses)
+                waiter = asyncio.ensure_future(link.drained())
+                await asyncio.sleep(0)
+                b.io.close()
+                b.io.close()
+                with pytest.raises(LinkError, match="closed by this program"):
+                    await waiter
+                with pytest.raises(LinkError, match="closed by this program"):
+                    link.send(ask(2))
+                with pytest.raises(LinkError, match="closed by this program"):
+                    b.io.send_frame(0x3F0, b"")
+                assert link.stats().commands_sent > 0
+                assert b.io.stats().bytes_sent > 0
+
+    run(test())
+    before = open_files()
+    run(test())
+    assert open_files() == before
+
+
+def test_a_callback_may_close_the_bus() -> None:
+    async def test() -> None:
+        with bench(TransportKind.BYTES, {0: NodeTwin()}) as b:
+            settings = LinkSettings(None)
+            link = b.io.open_link(settings, on_responses=lambda _: b.io.close(), on_lost=b.inbox.on_lost)
+            for i in range(20):
+                link.send(ask(i))
+            with pytest.raises(LinkError, match="closed by this program"):
+                await link.drained()
+
+    run(test())
+
+
+def test_urgent_drops_what_is_queued() -> None:
+    async def test() -> None:
+        node = NodeTwin()
+        with bench(TransportKind.CAN_STREAM, {4: node}) as b:
+            link = b.open(4)
+            link.send_batch(b"".join(record(store(i, 40)) for i in range(5000)))
+            link.send_urgent(STOP)
+            await link.drained()
+            assert node.executed[-1] == STOP
+            assert node.executed[:-1] == [store(i, 40) for i in range(len(node.executed) - 1)]
+            assert len(node.executed) - 1 + link.stats().commands_dropped == 5000
+
+    run(test())
+
+
+def test_full_queues_and_bad_arguments_are_refused_in_words() -> None:
+    async def test() -> None:
+        with bench(TransportKind.CAN_STREAM, {4: NodeTwin()}) as b:
+            link = b.open(4)
+            batch = record(store(1, 40)) * 10000
+            link.send_batch(batch)
+            with pytest.raises(LinkError, match="does not fit into the motion queue"):
+                link.send_batch(batch + batch)
+            with pytest.raises(LinkError, match="ends within a record"):
+                link.send_batch(batch[:-1][-70:])
+            with pytest.raises(LinkError, match="a command of 60 bytes"):
+                link.send(bytes(60))
+            with pytest.raises(LinkError, match="a command of 0 bytes"):
+                link.send_urgent(b"")
+            with pytest.raises(LinkError, match="control queue .* is full"):
+                while True:
+                    link.send(ask(1), min_clock=1)  # no clock is known: it waits
+            with pytest.raises(LinkError, match="cannot hold a block"):
+                link.set_receive_window(63)
+            for freq_hz in (0.0, -1.0, float("nan"), float("inf")):
+                with pytest.raises(LinkError, match="not a clock"):
+                    link.set_clock(freq_hz, 0, 0)
+            for settings in (
+                LinkSettings(None),
+                LinkSettings(0),
+                LinkSettings(256),
+                LinkSettings(4),
+                LinkSettings(5, receive_window=10),
+                LinkSettings(5, lost_after_s=0.0),
+            ):
+                with pytest.raises(LinkError, match="pair: node"):
+                    b.io.open_link(settings, on_responses=b.inbox.on_responses, on_lost=b.inbox.on_lost)
+
+    run(test())
+
+
+def test_when_python_is_slow_old_responses_give_way_and_motion_goes_on() -> None:
+    async def test() -> None:
+        node = NodeTwin()
+        with bench(TransportKind.BYTES, {0: node}) as b:
+            link = b.open(0)
+            link.send(store(1))
+            await link.drained()
+            b.peer.end.setblocking(True)
+            total = 9000
+            for i in range(total):  # the loop does not run meanwhile: Python is slow
+                b.peer.end.send(block(node.expected, answer(i)))
+            b.peer.end.setblocking(False)
+            link.send(store(2))
+            await link.drained()
+            await b.inbox.until(lambda: b.inbox.responses[-1].content == answer(total - 1))
+            stats = b.io.stats()
+            assert stats.responses_dropped > 0
+            assert stats.responses_max == 4096
+            assert stats.responses_dropped + len(b.inbox.responses) == total
+            kept = [answer(i) for i in range(total - len(b.inbox.responses), total)]
+            assert [r.content for r in b.inbox.responses] == kept
+
+    run(test())
