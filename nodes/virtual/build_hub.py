@@ -1,0 +1,14 @@
+"""Builds ``nodes.virtual._hub``: the virtual CAN bus."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent.parent))
+
+from nodes.native_build import builder
+
+ffibuilder = builder(
+    "nodes.virtual._hub",
+    headers=["nodes/virtual/frame_bits.h", "nodes/virtual/hub.h", "nodes/virtual/hub_loop.h"],
+    sources=["nodes/virtual/frame_bits.c", "nodes/virtual/hub.c", "nodes/virtual/hub_loop.c"],
+)

@@ -1,0 +1,15 @@
+// SPDX-License-Identifier: Apache-2.0
+// The true length of a CAN frame on the wire.
+#ifndef VIRTUAL_FRAME_BITS_H
+#define VIRTUAL_FRAME_BITS_H
+
+#include <stdint.h>
+
+// cffi: begin
+// Bit times that a data frame with an 11-bit ID and LENGTH (0..8) bytes of DATA keeps the bus busy: all
+// fields, the stuff bits that this very content needs, and the interframe space. 47 + 8 * LENGTH and up to 24
+// more.
+uint32_t can_frame_bits(uint32_t id, uint32_t length, const uint8_t *data);
+// cffi: end
+
+#endif

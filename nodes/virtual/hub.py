@@ -1,0 +1,288 @@
+"""A virtual CAN bus: firmware processes and hosts meet at a Unix socket, without root or a kernel module.
+
+Every client connects to the bus's socket and exchanges 16-byte ``struct can_frame`` records. The bus arbitrates
+by id, takes the true time of each frame at its bit rate, and delivers in one order to everybody; a client that
+does not read stops the bus instead of losing frames. The work is done in C (``hub.h``, ``hub_loop.h``) in a
+thread of its own that never needs the interpreter.
+"""
+
+import argparse
+import contextlib
+import errno
+import json
+import os
+import signal
+import socket
+import stat
+import sys
+import threading
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from nodes.errors import CanductorError
+from nodes.virtual._hub import ffi, lib
+
+STUCK_LIMIT_S = 2.0
+"""How long a client may stop the bus by not reading before it is disconnected."""
+
+BITRATE_MIN, BITRATE_MAX = 1_000, 1_000_000_000
+BACKLOG = 64
+SOCKET_PATH_MAX = 107
+"""Bytes; the kernel's ``sun_path`` less its closing zero."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClientStats:
+    """What one connected client did."""
+
+    place: int
+    """Number of its connection, 0..63; reused after it leaves."""
+    sent: int
+    """Frames it sent that went over the bus."""
+    received: int
+    """Frames of others that were queued for it."""
+    rejected: int
+    """Its records that were no data frame with an 11-bit id."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusStats:
+    """Counters of a bus since its start."""
+
+    frames: int
+    """Frames that went over the bus, lost ones included."""
+    bits: int
+    """Their true length, stuff bits and interframe space included."""
+    lost: int
+    """Frames taken away by the asked-for loss."""
+    busy_ns: int
+    """Time in which the bus was taken."""
+    rejected: int
+    """Records that were no data frame with an 11-bit id."""
+    expelled: int
+    """Clients disconnected because they had stopped the bus for too long."""
+    refused: int
+    """Connections beyond the 64 places."""
+    late_ns_max: int
+    """The latest the bus ever woke for the end of a frame."""
+    realtime: bool
+    """Whether the bus was granted real-time priority; without, more latency jitter is to be expected."""
+    clients: tuple[ClientStats, ...]
+    """Who is connected now."""
+
+
+class VirtualBus:
+    """A virtual CAN bus at the Unix socket PATH.
+
+    ``bitrate`` in bit/s, or None for frames that take no time. ``loss`` (0..1) is the share of frames that reach
+    nobody; which ones is decided by ``seed``. ``stuck_limit_s``: see STUCK_LIMIT_S. Use it as a context manager,
+    or call start() and close(); methods are for one thread.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        bitrate: int | None = 1_000_000,
+        loss: float = 0.0,
+        seed: int = 0,
+        stuck_limit_s: float = STUCK_LIMIT_S,
+    ) -> None:
+        """Check the arguments; raises CanductorError. Nothing happens before start()."""
+        self.path = Path(path)
+        self.bitrate = bitrate or None
+        if len(os.fsencode(self.path)) > SOCKET_PATH_MAX:
+            raise CanductorError(
+                f"virtual bus: the path {self.path} is longer than the {SOCKET_PATH_MAX} bytes a Unix socket can"
+                " have; choose a shorter one"
+            )
+        if self.bitrate is not None and not BITRATE_MIN <= self.bitrate <= BITRATE_MAX:
+            raise CanductorError(
+                f"virtual bus {self.path}: bit rate {bitrate} is not between {BITRATE_MIN} and {BITRATE_MAX} bit/s"
+                " (0 means no limit)"
+            )
+        if not 0 <= loss <= 1:
+            raise CanductorError(f"virtual bus {self.path}: loss {loss} is not a share between 0 and 1")
+        if not 0 < stuck_limit_s < 1e6:
+            raise CanductorError(f"virtual bus {self.path}: stuck limit {stuck_limit_s} s is not a positive time")
+        self._config = {
+            "bitrate": self.bitrate or 0,
+            "loss": loss,
+            "seed": seed % 2**64,
+            "stuck_limit_ns": int(stuck_limit_s * 1e9),
+        }
+        self._listener: socket.socket | None = None
+        self._inode = 0
+        self._loop = ffi.NULL
+        self._thread: threading.Thread | None = None
+        self._final: BusStats | None = None
+        self._error = 0
+
+    @property
+    def address(self) -> str:
+        """How a transport is told to connect to this bus."""
+        return f"virtual:{self.path}"
+
+    @property
+    def running(self) -> bool:
+        """Whether frames are being carried."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self) -> Self:
+        """Open the socket and begin to carry frames; raises CanductorError when the path cannot be had."""
+        if self._thread is not None or self._final is not None:
+            raise CanductorError(f"virtual bus {self.path}: started twice; make a new VirtualBus instead")
+        self._listener = _listen(self.path)
+        self._inode = self.path.stat().st_ino
+        self._loop = lib.hub_loop_new(self._listener.fileno(), ffi.new("struct hub_config *", self._config))
+        if self._loop == ffi.NULL:
+            reason = os.strerror(ffi.errno)
+            self._close_listener()
+            raise CanductorError(f"virtual bus {self.path}: cannot start: {reason}")
+        self._thread = threading.Thread(target=self._run, name=f"virtual bus {self.path}", daemon=True)
+        self._thread.start()
+        return self
+
+    def _run(self) -> None:
+        self._error = lib.hub_loop_run(self._loop)
+
+    @property
+    def stats(self) -> BusStats:
+        """The counters now, or after close() those of the end."""
+        if self._final is not None:
+            return self._final
+        if self._loop == ffi.NULL:
+            raise CanductorError(f"virtual bus {self.path}: not started, so it has no figures yet")
+        return _read_stats(self._loop)
+
+    def close(self) -> None:
+        """Disconnect everybody and remove the socket; doing it again is harmless.
+
+        Raises CanductorError when the bus had died before.
+        """
+        if self._thread is None:
+            return
+        lib.hub_loop_stop(self._loop)
+        self._thread.join()
+        self._thread = None
+        self._final = _read_stats(self._loop)
+        lib.hub_loop_free(self._loop)
+        self._loop = ffi.NULL
+        self._close_listener()
+        if self._error:
+            raise CanductorError(f"virtual bus {self.path}: stopped by itself: {os.strerror(self._error)}")
+
+    def _close_listener(self) -> None:
+        assert self._listener is not None
+        # Only our own socket: someone may have put another bus in its place.
+        with contextlib.suppress(FileNotFoundError):
+            if self.path.stat().st_ino == self._inode:
+                self.path.unlink()
+        self._listener.close()
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _read_stats(loop: object) -> BusStats:
+    report = ffi.new("struct hub_report *")
+    lib.hub_loop_report(loop, report)
+    counters = report.counters
+    return BusStats(
+        frames=counters.frames,
+        bits=counters.bits,
+        lost=counters.lost,
+        busy_ns=counters.busy_ns,
+        rejected=counters.rejected,
+        expelled=counters.expelled,
+        refused=counters.refused,
+        late_ns_max=report.late_ns_max,
+        realtime=report.realtime,
+        clients=tuple(
+            ClientStats(c.place, c.counters.sent, c.counters.received, c.counters.rejected)
+            for c in report.clients[0 : report.client_count]
+        ),
+    )
+
+
+def _listen(path: Path) -> socket.socket:
+    """Open a listening socket at PATH; a file left by a bus that died is replaced."""
+    _remove_stale(path)
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        listener.bind(os.fspath(path))
+        listener.listen(BACKLOG)
+        listener.setblocking(False)
+    except OSError as error:
+        listener.close()
+        if error.errno == errno.EADDRINUSE:
+            raise CanductorError(f"virtual bus {path}: another bus took this path just now; choose another") from error
+        raise CanductorError(
+            f"virtual bus {path}: cannot make the socket: {error.strerror}; the folder must exist and be writable"
+        ) from error
+    return listener
+
+
+def _remove_stale(path: Path) -> None:
+    try:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise CanductorError(f"virtual bus {path}: a file that is no socket is in the way; choose another path")
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            probe.setblocking(False)  # a bus whose backlog is full is in use too
+            probe.connect(os.fspath(path))
+    except ConnectionRefusedError:
+        path.unlink(missing_ok=True)
+    except FileNotFoundError:
+        pass
+    except BlockingIOError as error:
+        raise _in_use(path) from error
+    except OSError as error:
+        raise CanductorError(f"virtual bus {path}: cannot use this path: {error.strerror}") from error
+    else:
+        raise _in_use(path)
+
+
+def _in_use(path: Path) -> CanductorError:
+    return CanductorError(f"virtual bus {path}: a bus is already running there; stop it or choose another path")
+
+
+def _parse_arguments(arguments: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="python -m nodes.virtual.hub",
+        description="Carries a virtual CAN bus until SIGTERM or SIGINT. Prints one JSON line when it is ready and"
+        " one with its counters at the end.",
+    )
+    parser.add_argument("path", metavar="PATH", help="the Unix socket to which clients connect")
+    parser.add_argument("--bitrate", type=int, default=1_000_000, help="bit/s; 0: no limit (default 1000000)")
+    parser.add_argument("--loss", type=float, default=0.0, help="share of frames that reach nobody (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help="which frames are lost (default 0)")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str]) -> int:
+    """Run a bus as a process of its own; returns the exit status."""
+    options = _parse_arguments(arguments)
+    ending = {signal.SIGTERM, signal.SIGINT}
+    signal.pthread_sigmask(signal.SIG_BLOCK, ending)  # before the thread starts, which inherits it
+    try:
+        bus = VirtualBus(options.path, bitrate=options.bitrate, loss=options.loss, seed=options.seed).start()
+        print(json.dumps({"ready": True, "address": bus.address}), flush=True)
+        while bus.running and signal.sigtimedwait(ending, 0.5) is None:
+            pass
+        bus.close()
+    except CanductorError as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(json.dumps(asdict(bus.stats)), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,42 @@
+// SPDX-License-Identifier: Apache-2.0
+// Runs a virtual CAN bus (hub.h) on sockets: one thread, ppoll, precise to what the kernel's scheduler
+// allows.
+#ifndef VIRTUAL_HUB_LOOP_H
+#define VIRTUAL_HUB_LOOP_H
+
+#include "nodes/virtual/hub.h"
+
+// cffi: begin
+struct hub_loop;
+
+struct hub_client_report {
+    int32_t place; // of 0..HUB_CLIENTS-1
+    struct hub_client_counters counters;
+};
+
+struct hub_report {
+    struct hub_counters counters;
+    uint64_t late_ns_max; // the latest the thread ever woke for the end of a frame
+    bool realtime;        // whether the thread was granted real-time priority
+    int32_t client_count;
+    struct hub_client_report clients[64]; // HUB_CLIENTS
+};
+
+// Makes a bus whose clients connect to LISTEN_FD, a listening non-blocking stream socket that stays the
+// caller's. Returns NULL when there is no memory or no file descriptor (errno tells).
+struct hub_loop *hub_loop_new(int listen_fd, const struct hub_config *config);
+
+// Works until hub_loop_stop(); one thread. Returns 0, or the errno that ended it.
+int hub_loop_run(struct hub_loop *loop);
+
+// Makes hub_loop_run() return; from any thread.
+void hub_loop_stop(struct hub_loop *loop);
+
+// The figures up to now; from any thread.
+void hub_loop_report(struct hub_loop *loop, struct hub_report *report);
+
+// Closes the clients' connections and frees all. Not while hub_loop_run() is at work.
+void hub_loop_free(struct hub_loop *loop);
+// cffi: end
+
+#endif
