@@ -1,0 +1,86 @@
+"""The configured machine's devices: what each node is configured as, and what motion has to know of it."""
+
+from collections.abc import Iterable, Mapping
+
+from coordinator.machine.description import MachineDescription, StepperDescription
+from coordinator.motion.specs import NodeStreamSpec, StepperSpec
+from nodes.devices.stepper import Stepper
+from nodes.dictionary import Dictionary
+from nodes.node_config import NodeConfig
+
+DEFAULT_STEP_PULSE_S = 2e-6
+"""For drivers whose pulse is not configured on nodes that cannot step on both edges."""
+
+
+class MachineDevices:
+    """The steppers of a machine, shared by the real and the offline one.
+
+    Call ``build_config`` for every node with its dictionary first; the specs are known afterwards.
+    """
+
+    def __init__(self, description: MachineDescription) -> None:
+        self.description = description
+        self.steppers: dict[str, Stepper] = {s.name: _stepper(s) for s in description.steppers}
+
+    def build_config(self, node: str, dictionary: Dictionary) -> NodeConfig:
+        """Return what NODE is to be configured as; raises CanductorError when it cannot be that."""
+        config = NodeConfig(node, dictionary)
+        pins = dictionary.enumerations.get("pin")
+        numbers: Mapping[str, int] = pins.values if pins is not None else {}
+        for stepper in self.description.steppers:
+            if stepper.node == node:
+                stepper.step_pin.number(numbers)  # tells file and line when the node has no such pin
+                stepper.dir_pin.number(numbers)
+                self.steppers[stepper.name].configure(config)
+        return config
+
+    @property
+    def moving_nodes(self) -> list[str]:
+        """Names of the nodes that carry steppers, in the order of the description."""
+        moving = {stepper.node for stepper in self.description.steppers}
+        return [node.name for node in self.description.nodes if node.name in moving]
+
+    def stepper_specs(self) -> list[StepperSpec]:
+        """Return the steppers as step generation takes them; nodes count as in ``moving_nodes``."""
+        order = {name: index for index, name in enumerate(self.moving_nodes)}
+        return [self._spec(stepper, order[stepper.node]) for stepper in self.description.steppers]
+
+    def _spec(self, described: StepperDescription, node: int) -> StepperSpec:
+        stepper = self.steppers[described.name]
+        assert stepper.oid is not None
+        both_edges = stepper.steps_on_both_edges
+        return StepperSpec(
+            name=described.name,
+            node=node,
+            oid=stepper.oid,
+            weights=described.weights,
+            step_distance=described.step_distance,
+            invert_dir=described.dir_pin.invert,
+            step_pulse_s=0.0 if both_edges else described.step_pulse_s or DEFAULT_STEP_PULSE_S,
+        )
+
+
+def _stepper(described: StepperDescription) -> Stepper:
+    return Stepper(
+        described.name,
+        step_pin=described.step_pin.name,
+        dir_pin=described.dir_pin.name,
+        invert_step=described.step_pin.invert,
+        step_pulse_s=described.step_pulse_s or DEFAULT_STEP_PULSE_S,
+        both_edges=described.step_pulse_s is None,
+    )
+
+
+def stream_specs(nodes: Iterable[tuple[str, Dictionary, int]]) -> list[NodeStreamSpec]:
+    """Return how each node (name, dictionary, move_count) takes step commands."""
+    return [
+        NodeStreamSpec(
+            name=name,
+            clock_freq=dictionary.clock_freq_hz,
+            move_count=move_count,
+            queue_step_id=dictionary.command("queue_step").message_id,
+            set_next_step_dir_id=dictionary.command("set_next_step_dir").message_id,
+            reset_step_clock_id=dictionary.command("reset_step_clock").message_id,
+        )
+        for name, dictionary, move_count in nodes
+    ]

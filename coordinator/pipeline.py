@@ -1,0 +1,128 @@
+"""From a G-code job to every node's command batches: planner and step generation joined.
+
+The batch planner and the real-time streamer both drive this; it does no I/O beyond reading the job's program and
+keeps no clock. Not thread-safe: one thread at a time.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coordinator.gcode.events import End, Event, PositionSet
+from coordinator.gcode.interpreter import Job
+from coordinator.motion.planner import TRAPEZOID, Planner, Position
+from coordinator.motion.steps import StepGenerator
+
+BatchSink = Callable[[int, bytes], None]
+"""Takes a node's index and a piece of its stream (nodes/link/batch.h)."""
+
+BATCH_ROOM = 1 << 16
+
+
+@dataclass(slots=True)
+class PlanRecord:
+    """What was planned, kept for whoever checks it: trapezoids in order, and where positions were declared."""
+
+    start: Position
+    pieces: list[NDArray[np.void]] = field(default_factory=list)
+    declared: list[tuple[int, Position]] = field(default_factory=list)
+    """Before trapezoid number N the machine was declared to stand at a position."""
+    count: int = 0
+
+    def add(self, trapezoids: NDArray[np.void]) -> None:
+        """Keep a copy."""
+        self.pieces.append(trapezoids.copy())
+        self.count += len(trapezoids)
+
+    def epochs(self) -> list[tuple[Position, NDArray[np.void]]]:
+        """Return the stretches between declarations: where each begins, and its trapezoids."""
+        every = np.concatenate(self.pieces) if self.pieces else np.empty(0, TRAPEZOID)
+        cuts = [(0, self.start), *self.declared]
+        ends = [at for at, _ in cuts[1:]] + [len(every)]
+        return [(position, every[at:end]) for (at, position), end in zip(cuts, ends, strict=True)]
+
+
+class Pipeline:
+    """Moves of JOB, planned by its planner, turned by STEPS into batches that SINK takes."""
+
+    def __init__(
+        self, job: Job, steps: StepGenerator, sink: BatchSink, *, nodes: int, record: PlanRecord | None = None
+    ) -> None:
+        self.job = job
+        self.steps = steps
+        self._sink = sink
+        self._nodes = nodes
+        self._record = record
+        self._appended_until = 0.0
+        self.moves = 0
+        """Trapezoids handed to step generation."""
+
+    @property
+    def planner(self) -> Planner:
+        """The job's planner."""
+        return self.job.planner
+
+    @property
+    def appended_until(self) -> float:
+        """Print time up to which step generation has all moves, in s."""
+        return self._appended_until
+
+    def step(self) -> Event:
+        """Let the job work until it has something to tell, and act on what concerns motion.
+
+        After an event that ends in a standstill (PositionSet, Wait, End) all moves have become batches.
+        Raises GCodeError and StepError.
+        """
+        event = self.job.step()
+        if isinstance(event, PositionSet):
+            self.finish()
+            self.steps.set_axis_position(event.position)
+            if self._record is not None:
+                self._record.declared.append((self._record.count, event.position))
+        elif isinstance(event, End):
+            self.finish()
+        return event
+
+    def transfer(self) -> bool:
+        """Hand planned moves to step generation while it has room; return whether all were handed over."""
+        while (waiting := self.planner.take()).count:
+            view = waiting.array()
+            taken = self.steps.append(waiting.pointer, waiting.count)
+            if taken:
+                last = view[taken - 1]
+                end = last["print_time"] + last["accel_s"] + last["cruise_s"] + last["decel_s"]
+                self._appended_until = float(end)
+                self.moves += taken
+                if self._record is not None:
+                    self._record.add(view[:taken])
+                self.planner.release(taken)
+            if taken < waiting.count:
+                return False
+        self._appended_until = max(self._appended_until, self.planner.print_time_end_s)
+        return True
+
+    def generate(self, until: float, *, flush: bool = False) -> None:
+        """Make the commands of everything before print time UNTIL and pass them on."""
+        until = max(until, self.steps.generated_until)
+        while True:
+            done = self.steps.generate(until, flush=flush)
+            for node in range(self._nodes):
+                while batch := self.steps.take_batch(node, BATCH_ROOM):
+                    self._sink(node, batch)
+            if done:
+                return
+
+    def run_through(self) -> None:
+        """Turn everything that is planned into batches, however much; what may still grow is held back."""
+        while not self.transfer():
+            self.generate(self._appended_until)
+        self.generate(self._appended_until)
+
+    def finish(self) -> None:
+        """Plan all moves to a standstill and turn them into batches, to the last step."""
+        while not self.planner.flush():
+            self.run_through()
+        self.run_through()
+        self.generate(self._appended_until, flush=True)
