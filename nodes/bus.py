@@ -6,7 +6,8 @@ from typing import Final
 
 from nodes.assign import Assignment, IdAssignment, Uuid, number_nodes
 from nodes.errors import CanductorError
-from nodes.node import Node, NodeLost, OnClock, OnState
+from nodes.node import Node, OnClock, OnState
+from nodes.node_errors import NodeLost
 from nodes.seams import (
     BuildConfig,
     FrameLike,

@@ -13,6 +13,7 @@ from nodes.errors import CanductorError
 from nodes.load import NodeLoad, load_of
 from nodes.message_format import Message, Value
 from nodes.node_config import NodeConfig
+from nodes.node_errors import NodeError, NodeLost, NodeShutdown
 from nodes.node_states import NodeEvent, NodeState, following
 from nodes.seams import BuildConfig, Connector, LinkLike
 from nodes.vocabulary import check_vocabulary
@@ -26,18 +27,6 @@ RESET_SETTLE_S: Final = 0.3
 SHUTDOWN_GRACE_S: Final = 0.05
 """For a node that is seen to be shut down to say why."""
 CLOCK_TIMEOUT_S: Final = 5.0
-
-
-class NodeError(CanductorError):
-    """A node cannot be used, and why."""
-
-
-class NodeLost(NodeError):  # noqa: N818
-    """A node is gone: it does not answer, or it restarted by itself."""
-
-
-class NodeShutdown(NodeError):  # noqa: N818
-    """A node stopped itself; what it reported is part of the sentence."""
 
 
 OnState = Callable[["Node"], None]
@@ -162,7 +151,15 @@ class Node:
     # --------------------------------------------------------------------------------------------- starting
 
     async def start(self) -> None:
-        """Bring the node to READY from CONNECTING; raises CanductorError, after which ``close`` is due."""
+        """Bring the node to READY from CONNECTING; raises CanductorError, leaving it LOST or SHUTDOWN."""
+        try:
+            await self._start()
+        except CanductorError as error:
+            if self.failure is None:
+                self._fail(NodeEvent.LOST, error if isinstance(error, NodeError) else NodeError(str(error)))
+            raise
+
+    async def _start(self) -> None:
         for _ in range(MAX_STARTS):
             self._starting_over = True
             link = await self._connector.connect(self._talk.receive, self._link_lost(self._generation))

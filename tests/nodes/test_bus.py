@@ -11,7 +11,7 @@ from nodes.assign import AssignError
 from nodes.bus import CanBus, UartBus
 from nodes.dictionary_parts import DictionaryError
 from nodes.message_format import Message
-from nodes.node import NodeLost
+from nodes.node_errors import NodeLost
 from nodes.node_states import NodeState
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid

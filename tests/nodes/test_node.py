@@ -2,18 +2,22 @@
 
 import asyncio
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from nodes.assign import AssignError
 from nodes.bus import CanBus, UartBus
 from nodes.clock import HostTime
 from nodes.errors import CanductorError
-from nodes.node import Node, NodeError, NodeLost, NodeShutdown
+from nodes.node_errors import NodeError, NodeLost, NodeShutdown
 from nodes.node_states import NodeState
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
 from tests.nodes.twin_bus import TwinIO, TwinNode, source_of, without_commands
+
+if TYPE_CHECKING:
+    from nodes.node import Node
 
 # ---------------------------------------------------------------------------------------------------- start
 
@@ -224,6 +228,24 @@ def test_a_lost_link_ends_queries_and_the_node_can_come_back() -> None:
         assert machine.twin.nodeid == 4
         machine.io.links[0].on_lost("an old link's last words")
         assert machine.node.state is NodeState.READY
+
+    machine.run(machine.bus.start, check)
+
+
+def test_a_restart_that_fails_can_be_tried_again() -> None:
+    machine = Machine(TwinNode())
+
+    async def check() -> None:
+        machine.twin.alive = False
+        machine.node.lose("unplugged")
+        with pytest.raises(AssignError, match="not found on bus can0"):
+            await machine.node.restart()
+        assert str(machine.states[-1]) == str(NodeState.LOST)
+        assert "not found on bus can0" in str(machine.node.failure)
+        machine.twin.alive = True
+        machine.twin.reset()
+        await machine.node.restart()
+        assert str(machine.states[-1]) == str(NodeState.READY)
 
     machine.run(machine.bus.start, check)
 
