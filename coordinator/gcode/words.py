@@ -105,7 +105,7 @@ def parse(line: bytes) -> Command | None:
 
 def _without_comments(text: str) -> str:
     """Cut ``; ...`` and ``(...)`` out."""
-    kept = []
+    kept: list[str] = []
     at = 0
     while True:
         open_, semicolon = text.find("(", at), text.find(";", at)
