@@ -5,6 +5,7 @@
 
 static const double MIN_LENGTH = 1e-9;   // mm
 static const double POSITION_EPS = 1e-9; // mm by which sums of relative moves may miss a limit
+static const double MAX_EXTRUSION = 1e9; // mm; also keeps infinity and NaN out
 static const double MIN_SPEED = 1e-4;    // mm/s; keeps every duration finite
 // A move that extrudes no more than this length of path may hold is never refused: slicers round.
 static const double TINY_PATH = 0.1; // mm
@@ -104,6 +105,8 @@ static int describe(struct planner *p, struct planned_move *move, const double t
         delta[axis] = target[axis] - p->position[axis];
     if (check_range(p, delta, target))
         return -1;
+    if (!(fabs(delta[AXIS_E]) <= MAX_EXTRUSION))
+        return refuse(p, PLANNER_EXTRUDE_LONG, AXIS_E, delta[AXIS_E], 0, p->limits.max_extrude_only_distance);
     if (!(speed >= MIN_SPEED))
         return refuse(p, PLANNER_SPEED, 0, speed, MIN_SPEED, INFINITY);
 
