@@ -6,7 +6,8 @@ from typing import Final
 
 from nodes.assign import Assignment, IdAssignment, Uuid, number_nodes
 from nodes.errors import CanductorError
-from nodes.node import Node, NodeLost, OnClock, OnState
+from nodes.node import Node, OnClock, OnState
+from nodes.node_errors import NodeLost
 from nodes.seams import (
     BuildConfig,
     FrameLike,
@@ -34,7 +35,6 @@ class _Base:
         self.closed_because: str | None = None
         self._start_io = start_io
         self._io: LinkIOLike | None = None
-        self._lost_callbacks: dict[LinkLike, OnLost] = {}
 
     @property
     def io(self) -> LinkIOLike:
@@ -67,12 +67,6 @@ class _Base:
         if io is not None:
             io.close()
 
-    def open_link(self, settings: LinkSettings, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
-        """Open a link that also hears of the end of the whole bus."""
-        link = self.io.open_link(settings, on_responses=on_responses, on_lost=on_lost)
-        self._lost_callbacks[link] = on_lost
-        return _Tracked(link, self._lost_callbacks)
-
     def emergency_stop(self) -> None:
         """Stop every node that can be reached."""
         for node in self.nodes:
@@ -86,24 +80,8 @@ class _Base:
 
     def _io_closed(self, cause: str) -> None:
         self.closed_because = cause
-        for on_lost in tuple(self._lost_callbacks.values()):
-            on_lost(f"bus {self.name} closed: {cause}")
-
-
-class _Tracked:
-    """A link that is struck off its bus's list when it is closed."""
-
-    def __init__(self, link: LinkLike, callbacks: dict[LinkLike, OnLost]) -> None:
-        self._link, self._callbacks = link, callbacks
-        self.send = link.send
-        self.send_batch = link.send_batch
-        self.send_urgent = link.send_urgent
-        self.set_receive_window = link.set_receive_window
-        self.set_clock = link.set_clock
-
-    def close(self) -> None:
-        self._callbacks.pop(self._link, None)
-        self._link.close()
+        for node in self.nodes:
+            node.lose(cause)
 
 
 def _cause(error: BaseException) -> CanductorError | None:
@@ -146,7 +124,9 @@ class _UartConnector:
         self._bus = bus
 
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
-        return self._bus.open_link(LinkSettings(None, lost_after_s=LOST_AFTER_S), on_responses, on_lost)
+        return self._bus.io.open_link(
+            LinkSettings(None, lost_after_s=LOST_AFTER_S), on_responses=on_responses, on_lost=on_lost
+        )
 
     def forget(self) -> None:
         pass
@@ -237,7 +217,7 @@ class _CanConnector:
         if self.assignment is None:
             self.assignment = await self._bus.assign([self._uuid])
         settings = LinkSettings(self._bus.nodeid(self._uuid), lost_after_s=LOST_AFTER_S)
-        return self._bus.open_link(settings, on_responses, on_lost)
+        return self._bus.io.open_link(settings, on_responses=on_responses, on_lost=on_lost)
 
     def forget(self) -> None:
         self.assignment = None
@@ -245,7 +225,12 @@ class _CanConnector:
     def why_silent(self) -> CanductorError | None:
         if self.assignment is None:
             return None
-        return self.assignment.not_found(self._uuid, self._bus.name)
+        if self._uuid in self.assignment.unheard:
+            return self.assignment.not_found(self._uuid, self._bus.name)
+        return NodeLost(
+            f"node {self._uuid} on bus {self._bus.name} took id {self._bus.nodeid(self._uuid)} but does not "
+            "answer on it; check the bus for errors and for another host"
+        )
 
 
 def _ns(loop_time_s: float) -> int:

@@ -1,6 +1,7 @@
 """One node through its life: identified, configured, kept in time, and left in a known state."""
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from typing import Final
 
@@ -12,6 +13,7 @@ from nodes.errors import CanductorError
 from nodes.load import NodeLoad, load_of
 from nodes.message_format import Message, Value
 from nodes.node_config import NodeConfig
+from nodes.node_errors import NodeError, NodeLost, NodeShutdown
 from nodes.node_states import NodeEvent, NodeState, following
 from nodes.seams import BuildConfig, Connector, LinkLike
 from nodes.vocabulary import check_vocabulary
@@ -22,19 +24,9 @@ MAX_STARTS: Final = 3
 CONFIG_RESET_TRIES: Final = 4
 RESET_SETTLE_S: Final = 0.3
 """For the reset command to arrive, repeated if need be, and the node to come up again."""
+SHUTDOWN_GRACE_S: Final = 0.05
+"""For a node that is seen to be shut down to say why."""
 CLOCK_TIMEOUT_S: Final = 5.0
-
-
-class NodeError(CanductorError):
-    """A node cannot be used, and why."""
-
-
-class NodeLost(NodeError):  # noqa: N818
-    """A node is gone: it does not answer, or it restarted by itself."""
-
-
-class NodeShutdown(NodeError):  # noqa: N818
-    """A node stopped itself; what it reported is part of the sentence."""
 
 
 OnState = Callable[["Node"], None]
@@ -142,7 +134,13 @@ class Node:
     def emergency_stop(self) -> None:
         """Stop the node ahead of everything queued for it; without effect on one that cannot be reached."""
         if self._talk.connected and "emergency_stop" in self.dictionary.commands:
-            self._talk.link.send_urgent(self.dictionary.encode("emergency_stop"))
+            # The link may know already what the loop has yet to hear: that the node is gone.
+            with contextlib.suppress(CanductorError):
+                self._talk.link.send_urgent(self.dictionary.encode("emergency_stop"))
+
+    def lose(self, cause: str) -> None:
+        """Take note that the node can no longer be reached."""
+        self._fail(NodeEvent.LOST, NodeLost(f"lost node {self.name}: {cause}"))
 
     def _check_usable(self) -> None:
         if self.failure is not None:
@@ -153,7 +151,15 @@ class Node:
     # --------------------------------------------------------------------------------------------- starting
 
     async def start(self) -> None:
-        """Bring the node to READY from CONNECTING; raises CanductorError, after which ``close`` is due."""
+        """Bring the node to READY from CONNECTING; raises CanductorError, leaving it LOST or SHUTDOWN."""
+        try:
+            await self._start()
+        except CanductorError as error:
+            if self.failure is None:
+                self._fail(NodeEvent.LOST, error if isinstance(error, NodeError) else NodeError(str(error)))
+            raise
+
+    async def _start(self) -> None:
         for _ in range(MAX_STARTS):
             self._starting_over = True
             link = await self._connector.connect(self._talk.receive, self._link_lost(self._generation))
@@ -257,8 +263,18 @@ class Node:
         if not found.integer("is_config") or found.integer("crc") != wanted.crc:
             raise NodeError(f"node {self.name} did not take its configuration; restart it and try again")
 
-    async def _get_config(self) -> Message:
-        return (await self._talk.ask("get_config", "config", survives_shutdown=True)).message
+    async def _get_config(self, tries: int = QUERY_TRIES) -> Message:
+        answer = await self._talk.ask("get_config", "config", tries=tries, survives_shutdown=True)
+        return answer.message
+
+    async def _judge(self, found: Message) -> None:
+        """Notice what the node said only once, when that message got lost."""
+        if not found.integer("is_config"):
+            self.lose("it restarted by itself; check its power supply")
+        elif found.integer("is_shutdown"):
+            await asyncio.sleep(SHUTDOWN_GRACE_S)
+            reason = "the message with the reason got lost"
+            self._fail(NodeEvent.SHUTDOWN, NodeShutdown(f"node {self.name} shut down: {reason}"))
 
     async def _reset(self) -> None:
         if "reset" not in self.dictionary.commands:
@@ -286,19 +302,27 @@ class Node:
         self._clock = ClockEstimator(self.dictionary.clock_freq_hz)
         self._clock_ready.clear()
         self._clock_task = asyncio.get_running_loop().create_task(self._keep_clock(self._clock))
+        self._clock_task.add_done_callback(self._clock_ended)
+
+    def _clock_ended(self, task: asyncio.Task[None]) -> None:
+        """Bring a bug in keeping the clock to light, and stop using the node: its time is not known."""
+        bug = None if task.cancelled() else task.exception()
+        if bug is not None:
+            self.lose("its clock is no longer kept; this is a bug, please report it")
+            task.get_loop().call_exception_handler({"message": "keeping a clock failed", "exception": bug})
 
     async def _keep_clock(self, clock: ClockEstimator) -> None:
         """Ask for the clock for as long as the node can be talked to."""
         while True:
             try:
-                answer = await self._ask_clock(clock)
+                self._sampled(clock, await self._ask_clock(clock))
+                if self.state is NodeState.READY:
+                    await self._judge(await self._get_config(tries=1))
             except QueryTimeout:
                 pass  # the link decides when a silent node is lost
             except CanductorError as error:
-                self._fail(NodeEvent.LOST, NodeLost(f"lost node {self.name}: {error}"))
+                self.lose(str(error))
                 return
-            else:
-                self._sampled(clock, answer)
             await asyncio.sleep(clock.next_sample_ns(0) * 1e-9)
 
     def _sampled(self, clock: ClockEstimator, answer: Answer) -> None:
@@ -335,13 +359,11 @@ class Node:
 
     # ------------------------------------------------------------------------------------------- what comes
 
-    def _enter(self, event: NodeEvent) -> bool:
+    def _enter(self, event: NodeEvent) -> None:
         after = following(self.state, event)
-        if after is None:
-            return False
-        self.state = after
-        self._on_state(self)
-        return True
+        if after is not None:
+            self.state = after
+            self._on_state(self)
 
     def _fail(self, event: NodeEvent, failure: NodeError) -> None:
         if following(self.state, event) is None:
@@ -354,7 +376,7 @@ class Node:
     def _link_lost(self, generation: int) -> Callable[[str], None]:
         def lost(cause: str) -> None:
             if generation == self._generation:
-                self._fail(NodeEvent.LOST, NodeLost(f"lost node {self.name}: {cause}"))
+                self.lose(cause)
 
         return lost
 
@@ -371,10 +393,7 @@ class Node:
 
     def _starting_came(self, _: Message) -> None:
         if not self._starting_over:
-            self._fail(
-                NodeEvent.LOST,
-                NodeLost(f"lost node {self.name}: it restarted by itself; check its power supply"),
-            )
+            self.lose("it restarted by itself; check its power supply")
 
 
 _SHUTDOWN_MEANS: Final = (NodeState.CONFIGURING, NodeState.READY)

@@ -5,7 +5,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from nodes.dictionary import Dictionary
 from nodes.node_config import NodeConfig
@@ -49,10 +49,13 @@ class LinkLike(Protocol):
     """The reliable way to one node. Callbacks run on the control loop."""
 
     def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0) -> None: ...  # noqa: D102
-    def send_batch(self, buffer: bytes) -> None: ...  # noqa: D102
+    def send_batch(self, buffer: bytes, /) -> None: ...  # noqa: D102
     def send_urgent(self, content: bytes) -> None: ...  # noqa: D102
-    def set_receive_window(self, n: int) -> None: ...  # noqa: D102
+    def set_receive_window(self, size: int, /) -> None: ...  # noqa: D102
     def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> None: ...  # noqa: D102
+    def pending(self) -> int: ...  # noqa: D102
+    async def drained(self) -> None: ...  # noqa: D102
+    def stats(self) -> Any: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
 
 

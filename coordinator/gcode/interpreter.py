@@ -22,7 +22,7 @@ from coordinator.gcode.events import (
 )
 from coordinator.gcode.program import Program
 from coordinator.gcode.words import Command, WordError, number, parse, quoted
-from coordinator.motion.planner import AXIS_LETTERS, WORD_LETTERS, Fault, FeedStatus, Planner
+from coordinator.motion.planner import AXIS_LETTERS, WORD_LETTERS, FeedStatus, Planner
 
 MAX_NOTICES = 100
 """Different notices a job gives; a file of garbage must not flood the screen."""
@@ -68,7 +68,10 @@ class Job:
         return self.planner.lines + 1
 
     def step(self) -> Event:
-        """Work until there is something to tell; at most one piece of the program (64 KiB)."""
+        """Work until there is something to tell; at most one piece of the program (64 KiB).
+
+        Waits for input only where the program's source does (pipes, standard input).
+        """
         while not self._events:
             if isinstance(self._over, GCodeError):
                 raise self._over

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterable, Iterator
-from io import RawIOBase
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
@@ -64,9 +64,9 @@ class Program:
         """Open the file PATH, or standard input for ``-``. Raises CanductorError when that fails."""
         if str(path) == "-":
             # Unbuffered: what a person or a program typed is acted on at once, not when a block is full.
-            return cls(sys.stdin.buffer.raw, "standard input")
+            return cls(FileIO(sys.stdin.fileno(), closefd=False), "standard input")
         try:
-            source: RawIOBase = Path(path).open("rb", buffering=0)  # noqa: SIM115: close() closes it
+            source = FileIO(path)
             size = source.seek(0, 2) if source.seekable() else None
             if size is not None:
                 source.seek(0)

@@ -12,7 +12,7 @@ _NAME = re.compile(r"[A-Za-z_]\w*(?=[ \t;]|$)", re.ASCII)
 _BARE_WORD = re.compile(r"[XYZEFxyzef][+-]?\.?\d", re.ASCII)
 _LINE_NUMBER = re.compile(rb"[Nn]\d+[ \t]*")
 _CHECKSUM = re.compile(rb"\*[ \t]*(\S*)[ \t]*$")
-_WORD = re.compile(r"\s*([A-Za-z])([+-]?(?:\d+\.?\d*|\.\d+))?\s*", re.ASCII)
+_WORD = re.compile(r"\s*([A-Za-z])([+-]?(?:\d+\.?\d*|\.\d+)|(?=\s|$))\s*", re.ASCII)
 _PARAMETER = re.compile(r"\s*([A-Za-z_]\w*)=(\"[^\"]*\"|\S*)\s*", re.ASCII)
 _QUOTED_MAX = 40
 _LINE_MAX = 4096
@@ -42,7 +42,7 @@ class Command:
             letter = match[1].upper()
             if letter in words:
                 raise WordError(f"{self.name} has {letter} twice; leave one")
-            words[letter] = match[2] or ""
+            words[letter] = match[2]
             at = match.end()
         return words
 
@@ -105,7 +105,7 @@ def parse(line: bytes) -> Command | None:
 
 def _without_comments(text: str) -> str:
     """Cut ``; ...`` and ``(...)`` out."""
-    kept = []
+    kept: list[str] = []
     at = 0
     while True:
         open_, semicolon = text.find("(", at), text.find(";", at)

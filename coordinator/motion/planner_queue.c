@@ -5,11 +5,15 @@
 
 static const double MIN_LENGTH = 1e-9;   // mm
 static const double POSITION_EPS = 1e-9; // mm by which sums of relative moves may miss a limit
+static const double MAX_EXTRUSION = 1e9; // mm; also keeps infinity and NaN out
 static const double MIN_SPEED = 1e-4;    // mm/s; keeps every duration finite
 // A move that extrudes no more than this length of path may hold is never refused: slicers round.
 static const double TINY_PATH = 0.1; // mm
 // Flanks of the smooth profile are equal but for rounding; less than this is neither rise nor fall.
 static const double FLAT = 1e-9;
+// Rounding bends straight runs by less than this; no corner limit, even 0, may stop them.
+static const double STRAIGHT_COS2 = 1e-16; // turn of 2e-8 rad
+static const double EVEN_FLOW = 1e-9;      // mm of filament per mm of path
 enum { PLAN_AFTER_MIN = 32 };
 
 static inline struct planned_move *move_at(struct planner *p, uint64_t index) {
@@ -101,6 +105,8 @@ static int describe(struct planner *p, struct planned_move *move, const double t
         delta[axis] = target[axis] - p->position[axis];
     if (check_range(p, delta, target))
         return -1;
+    if (!(fabs(delta[AXIS_E]) <= MAX_EXTRUSION))
+        return refuse(p, PLANNER_EXTRUDE_LONG, AXIS_E, delta[AXIS_E], 0, p->limits.max_extrude_only_distance);
     if (!(speed >= MIN_SPEED))
         return refuse(p, PLANNER_SPEED, 0, speed, MIN_SPEED, INFINITY);
 
@@ -137,17 +143,21 @@ static double junction_v2(const struct planned_move *a, const struct planned_mov
         return 0;
     double v2 = min_of(a->cruise_v2, b->cruise_v2);
     double jump = fabs(a->ratio[AXIS_E] - b->ratio[AXIS_E]);
-    if (jump > 0) {
+    if (jump > EVEN_FLOW) {
         double speed = corner_velocity / jump;
         v2 = min_of(v2, speed * speed);
     }
-    // cos²(θ/2) of the inner angle, from the difference of the directions: precise where they are nearly
-    // equal.
-    double x = a->ratio[0] - b->ratio[0], y = a->ratio[1] - b->ratio[1], z = a->ratio[2] - b->ratio[2];
-    double cos2 = 0.25 * (x * x + y * y + z * z);
-    if (cos2 <= 0)
+    // cos² and sin² of θ/2, half the inner angle, from the difference and the sum of the directions: each is
+    // precise where the other one's complement would not be.
+    double cos2 = 0, sin2 = 0;
+    for (int axis = 0; axis < 3; axis++) {
+        double difference = a->ratio[axis] - b->ratio[axis], sum = a->ratio[axis] + b->ratio[axis];
+        cos2 += 0.25 * difference * difference;
+        sin2 += 0.25 * sum * sum;
+    }
+    if (cos2 <= STRAIGHT_COS2)
         return v2;
-    double sine = sqrt(max_of(0, 1 - cos2));
+    double sine = sqrt(sin2);
     double arc = sine * (1 + sine) / cos2; // = sin/(1−sin)
     v2 = min_of(v2, min_of(a->corner_v2, b->corner_v2) * arc);
     double half_tangent = 0.5 * sine / sqrt(cos2);
@@ -326,6 +336,8 @@ static void hand_out_unsettled(struct planner *p, uint64_t stop) {
     for (uint64_t i = p->head + 1; i < p->tail; i++)
         bound_start(move_at(p, i), move_at(p, i - 1));
     p->settled_v2 = p->settled_smooth_v2 = p->hill_scanned = p->head;
+    // Only where both profiles meet may a new hill begin, that is, may a lower top bound what comes.
+    p->falling = p->falling && !exceeds(p->speed_v2, move->smooth_start_v2);
     p->hill_closed = p->falling;
     p->fresh = 1; // the pass is due
 }

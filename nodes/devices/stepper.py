@@ -2,8 +2,9 @@
 
 from typing import Final
 
-from nodes.node import Node, NodeError
+from nodes.node import Node
 from nodes.node_config import NodeConfig
+from nodes.node_errors import NodeError
 
 BOTH_EDGE_CONSTANTS: Final = ("STEPPER_BOTH_EDGE", "STEPPER_STEP_BOTH_EDGE")
 COMMANDS: Final = (

@@ -11,7 +11,7 @@ from nodes.assign import AssignError
 from nodes.bus import CanBus, UartBus
 from nodes.dictionary_parts import DictionaryError
 from nodes.message_format import Message
-from nodes.node import NodeLost
+from nodes.node_errors import NodeLost
 from nodes.node_states import NodeState
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
@@ -50,6 +50,16 @@ def test_a_node_with_an_old_id_and_no_answer_to_queries_is_found_by_identify() -
         assert (machine.twin.nodeid, machine.node.state) == (4, NodeState.READY)
 
     machine.run(machine.bus.start, check)
+
+
+def test_a_node_that_takes_its_id_but_does_not_answer_on_it_is_not_called_missing() -> None:
+    class Mute(TwinNode):
+        def execute(self, content: bytes, now_s: float) -> list[bytes]:
+            return []
+
+    machine = Machine(Mute())
+    with pytest.raises(NodeLost, match="node 010203040501 on bus can0 took id 4 but does not answer on it"):
+        machine.run(machine.bus.start)
 
 
 def test_a_silent_uart_is_explained() -> None:

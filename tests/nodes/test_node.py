@@ -1,20 +1,23 @@
 """The life of nodes on a bus: starting, being configured anew, shutting down, getting lost, restarting."""
 
 import asyncio
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from nodes.assign import AssignError
 from nodes.bus import CanBus, UartBus
 from nodes.clock import HostTime
-from nodes.conversation import QueryTimeout
-from nodes.load import load_of
-from nodes.message_format import Message, MessageError
-from nodes.node import Node, NodeError, NodeLost, NodeShutdown
+from nodes.errors import CanductorError
+from nodes.node_errors import NodeError, NodeLost, NodeShutdown
 from nodes.node_states import NodeState
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
 from tests.nodes.twin_bus import TwinIO, TwinNode, source_of, without_commands
+
+if TYPE_CHECKING:
+    from nodes.node import Node
 
 # ---------------------------------------------------------------------------------------------------- start
 
@@ -229,6 +232,24 @@ def test_a_lost_link_ends_queries_and_the_node_can_come_back() -> None:
     machine.run(machine.bus.start, check)
 
 
+def test_a_restart_that_fails_can_be_tried_again() -> None:
+    machine = Machine(TwinNode())
+
+    async def check() -> None:
+        machine.twin.alive = False
+        machine.node.lose("unplugged")
+        with pytest.raises(AssignError, match="not found on bus can0"):
+            await machine.node.restart()
+        assert str(machine.states[-1]) == str(NodeState.LOST)
+        assert "not found on bus can0" in str(machine.node.failure)
+        machine.twin.alive = True
+        machine.twin.reset()
+        await machine.node.restart()
+        assert str(machine.states[-1]) == str(NodeState.READY)
+
+    machine.run(machine.bus.start, check)
+
+
 def test_a_node_that_restarts_by_itself_is_lost_for_that_reason() -> None:
     machine = Machine(TwinNode())
 
@@ -240,6 +261,32 @@ def test_a_node_that_restarts_by_itself_is_lost_for_that_reason() -> None:
     machine.run(machine.bus.start, check)
 
 
+@pytest.mark.parametrize(
+    ("happens", "state", "sentence"),
+    [
+        (
+            lambda twin: twin.shutdown(0.0, 1),
+            NodeState.SHUTDOWN,
+            "shut down: the message with the reason got lost",
+        ),
+        (lambda twin: twin.reset(), NodeState.LOST, "it restarted by itself"),
+    ],
+)
+def test_what_a_node_said_only_once_is_noticed_when_that_was_lost(
+    happens: Callable[[TwinNode], object], state: NodeState, sentence: str
+) -> None:
+    machine = Machine(TwinNode())
+
+    async def check() -> None:
+        happens(machine.twin)
+        before_s = asyncio.get_running_loop().time()
+        await machine.changed_to(state)
+        assert asyncio.get_running_loop().time() - before_s < 1.1
+        assert sentence in str(machine.node.failure)
+
+    machine.run(machine.bus.start, check)
+
+
 def test_a_bus_that_closes_takes_its_nodes_along() -> None:
     machine = Machine(TwinNode())
 
@@ -247,12 +294,52 @@ def test_a_bus_that_closes_takes_its_nodes_along() -> None:
         assert machine.io.on_closed is not None
         machine.io.on_closed("the adapter was unplugged")
         assert machine.node.state is NodeState.LOST
-        with pytest.raises(NodeLost, match="bus can0 closed: the adapter was unplugged"):
+        with pytest.raises(NodeLost, match="lost node mainboard: the adapter was unplugged"):
             machine.node.send("get_clock")
         with pytest.raises(NodeLost, match="bus can0 cannot be used: the adapter was unplugged"):
             await machine.node.restart()
 
     machine.run(machine.bus.start, check)
+
+
+@pytest.mark.parametrize("method", ["send", "send_urgent", "set_clock"])
+def test_a_link_that_refuses_before_its_loss_is_known_does_no_harm(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine = Machine(TwinNode())
+
+    def refuse(*_: object, **__: object) -> None:
+        raise CanductorError("can0 node 4: no answer for 1 s")
+
+    async def check() -> None:
+        monkeypatch.setattr(machine.io.links[0], method, refuse)
+        machine.node.emergency_stop()
+        if method != "send_urgent":
+            await machine.changed_to(NodeState.LOST)
+            assert str(machine.node.failure) == "lost node mainboard: can0 node 4: no answer for 1 s"
+
+    machine.run(machine.bus.start, check)
+
+
+def test_a_bug_in_a_listener_to_the_clock_is_not_silent() -> None:
+    machine = Machine(TwinNode())
+    told: list[object] = []
+    broken: list[bool] = []
+
+    def listener(*_: object) -> None:
+        if broken:
+            raise ZeroDivisionError
+
+    machine.node._on_clock = listener
+
+    async def check() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: told.append(context["exception"]))
+        broken.append(True)
+        await machine.changed_to(NodeState.LOST)
+        assert "this is a bug" in str(machine.node.failure)
+
+    machine.run(machine.bus.start, check)
+    assert [type(bug) for bug in told] == [ZeroDivisionError]
 
 
 def test_emergency_stop_reaches_the_node() -> None:
@@ -263,84 +350,6 @@ def test_emergency_stop_reaches_the_node() -> None:
         await machine.changed_to(NodeState.SHUTDOWN)
         assert machine.twin.shut_down
         assert str(machine.node.failure) == "node mainboard shut down: Emergency stop"
-
-    machine.run(machine.bus.start, check)
-
-
-# ------------------------------------------------------------------------------------- configuring, talking
-
-
-def test_queries_match_their_oid() -> None:
-    machine = Machine(TwinNode())
-
-    async def check() -> None:
-        names = ("stepper_get_position", "stepper_position")
-        answers = await asyncio.gather(*(machine.node.query(*names, oid=oid) for oid in (3, 1, 2)))
-        assert [answer.integer("pos") for answer in answers] == [-300, -100, -200]
-
-    machine.run(machine.bus.start, check)
-
-
-def test_a_query_without_an_answer_and_one_that_is_not_there() -> None:
-    machine = Machine(TwinNode())
-
-    async def check() -> None:
-        machine.twin.alive = False
-        with pytest.raises(QueryTimeout, match=r"mainboard did not answer debug_ping within 0.5 s"):
-            await machine.node.query("debug_ping", "pong", data=b"x", tries=2)
-        with pytest.raises(MessageError, match=r"node mainboard: .*no command 'fly'"):
-            await machine.node.query("fly", "flown")
-        with pytest.raises(MessageError, match="no response 'flown'"):
-            await machine.node.query("debug_ping", "flown", data=b"")
-
-    machine.run(machine.bus.start, check)
-
-
-def test_listeners_stats_and_garbage() -> None:
-    machine = Machine(TwinNode())
-    heard: list[str] = []
-
-    async def check() -> None:
-        end = machine.node.on("stepper_position", 1, lambda message: heard.append(str(message)))
-        machine.node.on("stepper_position", None, lambda message: heard.append("any " + str(message)))
-        say, response = machine.io.links[0].say, machine.twin.response
-        say(response("stepper_position", oid=1, pos=5))
-        say(response("stepper_position", oid=2, pos=6))
-        say(response("stats", count=100, sum=50_000, sumsq=100_000))
-        say(b"\x9f\x9f\x9f")
-        await asyncio.sleep(0.01)
-        end()
-        say(response("stepper_position", oid=1, pos=7))
-        await asyncio.sleep(0.01)
-        assert machine.node.undecodable == 1
-        assert machine.node.load is not None
-        assert machine.node.load.awake == pytest.approx(0.01)
-
-    machine.run(machine.bus.start, check)
-    assert heard == [
-        "stepper_position oid=1 pos=5",
-        "any stepper_position oid=1 pos=5",
-        "any stepper_position oid=2 pos=6",
-        "any stepper_position oid=1 pos=7",
-    ]
-
-
-def test_load_from_stats() -> None:
-    # 4 rounds of 100, 100, 300, 300 ticks at 1 MHz: mean 200 µs, deviation 100 µs.
-    stats = Message("stats", {"count": 4, "sum": 800, "sumsq": 200_000})
-    load = load_of(stats, 1_000_000, 1)
-    assert (load.task_s, load.task_spread_s) == pytest.approx((200e-6, 100e-6))
-    assert load_of(Message("stats", {"count": 0, "sum": 0, "sumsq": 0}), 1, 1).awake == 0
-
-
-def test_commands_carry_their_clocks_to_the_link() -> None:
-    machine = Machine(TwinNode())
-
-    async def check() -> None:
-        machine.node.send("queue_step", min_clock=5, req_clock=9, oid=0, interval=1, count=1, add=0)
-        content, min_clock, req_clock = machine.io.links[0].sent[-1]
-        assert (min_clock, req_clock) == (5, 9)
-        assert machine.node.dictionary.decode_commands(content) is not None
 
     machine.run(machine.bus.start, check)
 

@@ -214,6 +214,16 @@ class TwinLink:
     def send_urgent(self, content: bytes) -> None:
         self.send(content)
 
+    def pending(self) -> int:
+        return len(self._to_node)
+
+    async def drained(self) -> None:
+        while self._to_node:  # noqa: ASYNC110  virtual time
+            await asyncio.sleep(DELAY_S)
+
+    def stats(self) -> dict[str, int]:
+        return {"pending": len(self._to_node)}
+
     def set_receive_window(self, n: int) -> None:
         self.receive_window = n
 
