@@ -23,6 +23,7 @@ ACCEL = 7000.0
 CORNER_V = 8.0
 WORD = re.compile(r"([XYZEF])(-?[\d.]+)")
 Row = list[float]
+Rows = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 Position = tuple[float, float, float, float]
 
 
@@ -38,11 +39,11 @@ def machine(freq: int = 168_000_000, *, corexy: bool = False, microsteps: int = 
     return StepGenerator(steppers, [node])
 
 
-def trapezoid(t: float, start: Position, end: Position, v: float, v0: float, v1: float) -> Row:
-    """One move from START to END whose speeds are lowered until it fits."""
+def trapezoid(t: float, start: Position, end: Position, v: float, joint: float) -> Row:
+    """Plan one move from START to END; its speeds are lowered until it fits."""
     delta = [b - a for a, b in zip(start, end, strict=True)]
     length = math.hypot(*delta[:3]) or abs(delta[3])
-    v0, v1 = min(v0, v), min(v1, v)
+    v0, v1 = min(joint, v), min(CORNER_V, v)
     v1 = min(v1, math.sqrt(v0 * v0 + 2 * ACCEL * length))
     v0 = min(v0, math.sqrt(v1 * v1 + 2 * ACCEL * length))
     top = min(v, math.sqrt(ACCEL * length + (v0 * v0 + v1 * v1) / 2))
@@ -73,20 +74,22 @@ def file_moves(path: Path) -> Iterator[tuple[Position, Position, float]]:
             yield before, after, speed / 60  # type: ignore[misc]
 
 
-def plan(moves: Iterable[tuple[Position, Position, float]]) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
+def plan(
+    moves: Iterable[tuple[Position, Position, float]],
+) -> Rows:
     rows: list[Row] = []
     t, joint = 0.3, 0.0
     for start, end, speed in moves:
         z_only = start[:2] == end[:2]
         v = min(speed, 15.0 if z_only else 400.0)
-        row = trapezoid(t, start, end, v, joint, CORNER_V)
+        row = trapezoid(t, start, end, v, joint)
         rows.append(row)
         joint = row[5] - ACCEL * row[3]
         t += sum(row[1:4])
     return np.array(rows)
 
 
-def run(name: str, gen: StepGenerator, rows: "np.ndarray[tuple[int, int], np.dtype[np.float64]]") -> None:
+def run(name: str, gen: StepGenerator, rows: Rows) -> None:
     at, nbytes, cpu = 0, 0, 0.0
     end = float(rows[-1, :4].sum())
     while True:
@@ -105,14 +108,14 @@ def run(name: str, gen: StepGenerator, rows: "np.ndarray[tuple[int, int], np.dty
     node = stats.nodes[0]
     worst = max(s.worst_error_s for s in stats.steppers) * 1e6
     print(
-        f"{name:28} {steps:10} steps {steps / cpu / 1e6:7.1f} M/s {steps / max(queued, 1):8.1f} steps/queue_step "
-        f"{queued:7} queue_steps {node.framed_bytes:8} bytes {node.framed_bytes / max(steps, 1):.3f} bytes/step "
-        f"worst {worst:.1f} us, {cpu:.3f} s, {node.max_slots} slots"
+        f"{name:28} {steps:9} steps {steps / cpu / 1e6:6.1f} M/s {steps / queued:7.1f} per queue_step "
+        f"{queued:7} queue_steps {node.framed_bytes:8} bytes {node.framed_bytes / steps:.3f} per step "
+        f"worst {worst:.1f} us, {cpu:.3f} s"
     )
 
 
-def single(v: float, length: float, moves: int, accel_share: float) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
-    """MOVES back and forth along X: ACCEL_SHARE of the way in ramps."""
+def single(v: float, length: float, moves: int, accel_share: float) -> Rows:
+    """Plan MOVES back and forth along X, ACCEL_SHARE of the way in ramps."""
     rows, t = [], 0.3
     accel = v * v / (length * accel_share) if accel_share else 0.0
     for i in range(moves):
@@ -131,7 +134,9 @@ def main() -> None:
         run(f"ramps of 25 mm, {mhz} MHz", machine(freq), single(400, 50, 400, 1))
         run(f"ramps of 2 mm, {mhz} MHz", machine(freq), single(120, 4, 5000, 1))
     for microsteps in (16, 64, 256):
-        run(f"ramps of 2 mm, {microsteps} microsteps", machine(microsteps=microsteps), single(120, 4, 2500, 1))
+        run(
+            f"ramps of 2 mm, {microsteps} microsteps", machine(microsteps=microsteps), single(120, 4, 2500, 1)
+        )
     for file in sys.argv[1:]:
         rows = plan(file_moves(Path(file)))
         run(Path(file).name, machine(), rows)
