@@ -2,7 +2,7 @@
 
     python bench/steps.py [FILE.gcode]
 
-The file's moves are planned here with fixed junction speeds: no look-ahead, but realistic lengths and turns.
+The file's moves are planned here with a plain look-ahead, so that this measures step generation alone.
 """
 
 import math
@@ -23,6 +23,7 @@ ACCEL = 7000.0
 CORNER_V = 8.0
 WORD = re.compile(r"([XYZEF])(-?[\d.]+)")
 Row = list[float]
+Rows = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 Position = tuple[float, float, float, float]
 
 
@@ -38,17 +39,32 @@ def machine(freq: int = 168_000_000, *, corexy: bool = False, microsteps: int = 
     return StepGenerator(steppers, [node])
 
 
-def trapezoid(t: float, start: Position, end: Position, v: float, v0: float, v1: float) -> Row:
-    """One move from START to END whose speeds are lowered until it fits."""
+def direction(start: Position, end: Position) -> tuple[float, list[float]]:
     delta = [b - a for a, b in zip(start, end, strict=True)]
     length = math.hypot(*delta[:3]) or abs(delta[3])
-    v0, v1 = min(v0, v), min(v1, v)
+    return length, [d / length for d in delta]
+
+
+def trapezoid(t: float, start: Position, end: Position, v: float, joints: tuple[float, float]) -> Row:
+    """Plan one move from START to END; its speeds are lowered until it fits."""
+    length, ratio = direction(start, end)
+    v0, v1 = joints
     v1 = min(v1, math.sqrt(v0 * v0 + 2 * ACCEL * length))
-    v0 = min(v0, math.sqrt(v1 * v1 + 2 * ACCEL * length))
-    top = min(v, math.sqrt(ACCEL * length + (v0 * v0 + v1 * v1) / 2))
+    top = max(v0, v1, min(v, math.sqrt(ACCEL * length + (v0 * v0 + v1 * v1) / 2)))
     ramps = (2 * top * top - v0 * v0 - v1 * v1) / (2 * ACCEL)
     times = [(top - v0) / ACCEL, max(length - ramps, 0) / top, (top - v1) / ACCEL]
-    return [t, *times, v0, top, ACCEL, *start, *(d / length for d in delta)]
+    return [t, *times, v0, top, ACCEL, *start, *ratio]
+
+
+def corner_speed(before: list[float], after: list[float]) -> float:
+    """Return the speed of an arc through the corner (spec 04); E alone stops."""
+    cosine = -sum(a * b for a, b in zip(before[:3], after[:3], strict=True))
+    sine_half = math.sqrt(max(0.5 * (1 - cosine), 0))
+    if not any(before[:3]) or not any(after[:3]):
+        return 0.0
+    if sine_half > 0.999999:
+        return 1e6
+    return CORNER_V * math.sqrt((math.sqrt(2) - 1) * sine_half / (1 - sine_half))
 
 
 def file_moves(path: Path) -> Iterator[tuple[Position, Position, float]]:
@@ -73,20 +89,28 @@ def file_moves(path: Path) -> Iterator[tuple[Position, Position, float]]:
             yield before, after, speed / 60  # type: ignore[misc]
 
 
-def plan(moves: Iterable[tuple[Position, Position, float]]) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
+def plan(moves: Iterable[tuple[Position, Position, float]]) -> Rows:
+    """Plan the whole file at once: corners, then one pass back and one forth."""
+    chain = [
+        (start, end, min(speed, 15.0 if start[:2] == end[:2] else 400.0), *direction(start, end))
+        for start, end, speed in moves
+    ]
+    joints = [0.0] * (len(chain) + 1)
+    for i in range(len(chain) - 1, 0, -1):
+        before, after = chain[i - 1], chain[i]
+        reach = math.sqrt(joints[i + 1] ** 2 + 2 * ACCEL * after[3])
+        joints[i] = min(corner_speed(before[4], after[4]), before[2], after[2], reach)
     rows: list[Row] = []
     t, joint = 0.3, 0.0
-    for start, end, speed in moves:
-        z_only = start[:2] == end[:2]
-        v = min(speed, 15.0 if z_only else 400.0)
-        row = trapezoid(t, start, end, v, joint, CORNER_V)
+    for i, (start, end, speed, _, _) in enumerate(chain):
+        row = trapezoid(t, start, end, speed, (joint, joints[i + 1]))
         rows.append(row)
-        joint = row[5] - ACCEL * row[3]
+        joint = max(row[5] - ACCEL * row[3], 0.0)
         t += sum(row[1:4])
     return np.array(rows)
 
 
-def run(name: str, gen: StepGenerator, rows: "np.ndarray[tuple[int, int], np.dtype[np.float64]]") -> None:
+def run(name: str, gen: StepGenerator, rows: Rows) -> None:
     at, nbytes, cpu = 0, 0, 0.0
     end = float(rows[-1, :4].sum())
     while True:
@@ -105,15 +129,16 @@ def run(name: str, gen: StepGenerator, rows: "np.ndarray[tuple[int, int], np.dty
     node = stats.nodes[0]
     worst = max(s.worst_error_s for s in stats.steppers) * 1e6
     print(
-        f"{name:28} {steps:10} steps {steps / cpu / 1e6:7.1f} M/s {steps / max(queued, 1):8.1f} steps/queue_step "
-        f"{queued:7} queue_steps {node.framed_bytes:8} bytes {node.framed_bytes / max(steps, 1):.3f} bytes/step "
-        f"worst {worst:.1f} us, {cpu:.3f} s, {node.max_slots} slots"
+        f"{name:28} {steps:9} steps {steps / cpu / 1e6:6.1f} M/s {steps / queued:7.1f} per queue_step "
+        f"{queued:7} queue_steps {node.framed_bytes:8} bytes {node.framed_bytes / steps:.3f} per step "
+        f"worst {worst:.1f} us, {cpu:.3f} s"
     )
 
 
-def single(v: float, length: float, moves: int, accel_share: float) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
-    """MOVES back and forth along X: ACCEL_SHARE of the way in ramps."""
-    rows, t = [], 0.3
+def single(v: float, length: float, moves: int, accel_share: float) -> Rows:
+    """Plan MOVES back and forth along X, ACCEL_SHARE of the way in ramps."""
+    rows: list[Row] = []
+    t = 0.3
     accel = v * v / (length * accel_share) if accel_share else 0.0
     for i in range(moves):
         ramp = v / accel if accel else 0.0
@@ -131,7 +156,9 @@ def main() -> None:
         run(f"ramps of 25 mm, {mhz} MHz", machine(freq), single(400, 50, 400, 1))
         run(f"ramps of 2 mm, {mhz} MHz", machine(freq), single(120, 4, 5000, 1))
     for microsteps in (16, 64, 256):
-        run(f"ramps of 2 mm, {microsteps} microsteps", machine(microsteps=microsteps), single(120, 4, 2500, 1))
+        run(
+            f"ramps of 2 mm, {microsteps} microsteps", machine(microsteps=microsteps), single(120, 4, 2500, 1)
+        )
     for file in sys.argv[1:]:
         rows = plan(file_moves(Path(file)))
         run(Path(file).name, machine(), rows)

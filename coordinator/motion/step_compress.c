@@ -8,7 +8,9 @@
 
 #include <string.h>
 
-enum { ADD_MAX = 32767, TRIALS_MAX = 40, HOLES_MAX = 3 };
+enum { ADD_MAX = 32767, TRIALS_MAX = 40 };
+// Of the adds that fit, the share not worth searching: it buys few steps.
+static const double NOT_WORTH = 0.1;
 
 // Two steps at a time, as the baseline vector units of x86-64 and AArch64 have it.
 typedef double pair __attribute__((vector_size(16)));
@@ -84,37 +86,38 @@ struct bound {
     double whole, exact, slope; // interval >= or <= whole; exact before rounding; d exact / d add
 };
 
-static void raise(struct bound *low, const struct problem *p, double add, double k, double want) {
-    const double bent = p->clock + 0.5 * add * k * (k - 1);
-    if (k * low->whole + bent < want) {
-        low->exact = (want - bent) / k;
-        low->whole = ceil(low->exact);
-        low->whole += k * low->whole + bent < want; // the quotient may have been rounded down to a whole
-        low->slope = -0.5 * (k - 1);
-    }
-    if (low->whole + add * (k - 1) < p->shortest) {
-        low->whole = low->exact = p->shortest - add * (k - 1);
-        low->slope = -(k - 1);
-    }
+// Step K at WANT or later, BENT ticks of its clock coming from the last clock and the add.
+static inline void raise(struct bound *low, double bent, double k, double want) {
+    if (k * low->whole + bent >= want)
+        return;
+    low->exact = (want - bent) / k;
+    low->whole = (double)(int64_t)low->exact; // at most one below
+    low->whole += k * low->whole + bent < want;
+    low->slope = -0.5 * (k - 1);
 }
 
-static void lower(struct bound *high, const struct problem *p, double add, double k, double limit) {
-    const double bent = p->clock + 0.5 * add * k * (k - 1);
+static inline void lower(struct bound *high, double bent, double k, double limit) {
     if (k * high->whole + bent <= limit)
         return;
     high->exact = (limit - bent) / k;
-    high->whole = floor(high->exact);
+    high->whole = (double)(int64_t)high->exact; // at most one above
     high->whole -= k * high->whole + bent > limit;
     high->slope = -0.5 * (k - 1);
 }
 
-enum { BLOCK = 8 };
+// With an add below 0 the interval of step K is the shortest so far.
+static inline void keep_pulse(struct bound *low, double add, double k, double shortest) {
+    if (low->whole + add * (k - 1) >= shortest)
+        return;
+    low->whole = low->exact = shortest - add * (k - 1);
+    low->slope = -(k - 1);
+}
+
+enum { BLOCK = 4 };
 
 // Whether the bounds stay as they are through the BLOCK steps behind step I.
-static bool unchanged(const struct problem *p, size_t i, double add, double low, double high) {
+static inline bool unchanged(const struct problem *p, size_t i, double add, double low, double high) {
     const double k0 = (double)(int32_t)i, half = 0.5 * add;
-    if (low + add * (k0 + BLOCK - 1) < p->shortest)
-        return false;
     const pair clock = {p->clock, p->clock}, lows = {low, low}, highs = {high, high}, halves = {half, half};
     pair k = {k0 + 1, k0 + 2};
     mask bad = {0, 0};
@@ -123,31 +126,28 @@ static bool unchanged(const struct problem *p, size_t i, double add, double low,
         bad |= (k * lows + bent < load(p->low + i + j)) | (k * highs + bent > load(p->high + i + j));
         k += 2;
     }
-    return !(bad[0] | bad[1]);
+    return !(bad[0] | bad[1]) && low + add * (k0 + BLOCK - 1) >= p->shortest;
 }
 
 static struct reach reach(const struct problem *p, double add) {
     struct bound low = {p->shortest, p->shortest, 0}, high = {4294967295.0, 4294967295.0, 0};
-    struct bound kept_low = low, kept_high = high;
     size_t i = 0;
     while (i < p->count) {
-        if (i + BLOCK <= p->count && unchanged(p, i, add, low.whole, high.whole)) {
+        if (i >= BLOCK && i + BLOCK <= p->count && unchanged(p, i, add, low.whole, high.whole)) {
             i += BLOCK;
             continue;
         }
         const size_t end = i + BLOCK < p->count ? i + BLOCK : p->count;
         for (; i < end; i++) {
-            const double k = (double)(int32_t)(i + 1);
-            kept_low = low, kept_high = high;
-            raise(&low, p, add, k, p->low[i]);
-            lower(&high, p, add, k, p->high[i]);
+            const double k = (double)(int32_t)(i + 1), bent = p->clock + 0.5 * add * k * (k - 1);
+            const double low_before = low.whole, high_before = high.whole;
+            raise(&low, bent, k, p->low[i]);
+            lower(&high, bent, k, p->high[i]);
+            if (add < 0)
+                keep_pulse(&low, add, k, p->shortest);
             if (low.whole > high.whole)
-                return (struct reach){i,
-                                      add,
-                                      kept_low.whole,
-                                      kept_high.whole,
-                                      low.exact - high.exact,
-                                      low.slope - high.slope};
+                return (struct reach){
+                    i, add, low_before, high_before, low.exact - high.exact, low.slope - high.slope};
         }
     }
     return (struct reach){i, add, low.whole, high.whole, 0, 0};
@@ -178,10 +178,15 @@ static struct reach longest(const struct problem *p, double guess) {
         cut(&r, &first, &last);
         if (first > last)
             break;
-        if (from_left && from_right)
-            add = floor(0.5 * (first + last));
-        else
-            add = from_left ? first : last;
+        // About how wide the adds are that keep so many steps in the band: aim at the middle of them.
+        const double n = (double)(int32_t)best.count + 1, width = (p->high[0] - p->low[0]) / (n * n);
+        if (!(from_left && from_right)) {
+            add = from_left ? fmin(last, floor(first + width)) : fmax(first, ceil(last - width));
+            continue;
+        }
+        if (last - first < NOT_WORTH * width)
+            break;
+        add = floor(0.5 * (first + last));
     }
     return best;
 }
@@ -288,7 +293,8 @@ int step_compress(struct step_gen *gen, struct stepper *s, size_t final, double 
     const double closest = make_bands(s, final, next);
     const double rate = s->clock->ticks_per_s;
     if (closest < s->closest_ticks - 0.5)
-        return step_fail(gen, STEP_TOO_FAST, s, clock_print_time(s->clock, s->ticks[0], s->base), closest / rate);
+        return step_fail(gen, STEP_TOO_FAST, s, clock_print_time(s->clock, s->ticks[0], s->base),
+                         closest / rate);
     if (rate > s->stats.max_step_rate * closest)
         s->stats.max_step_rate = rate / closest;
     int status = STEP_OK;

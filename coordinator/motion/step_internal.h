@@ -10,10 +10,10 @@
 
 enum {
     SEGMENT_COUNT_MAX = 65535,
-    PREFIX_MAX = 10,      // id and oid as VLQ
-    RESET_GAP = 1 << 30,  // ticks; longer rests are bridged by reset_step_clock, far from the 2^31 of the wire
-    BUFFER_PAD = 16,      // the loops over steps work in blocks and may write behind the end
-    STEP_STALLED = 1000,  // internal status: no room for a segment now
+    PREFIX_MAX = 10,     // id and oid as VLQ
+    RESET_GAP = 1 << 30, // ticks; longer rests are bridged by reset_step_clock, far from the 2^31 of the wire
+    BUFFER_PAD = 16,     // the loops over steps work in blocks and may write behind the end
+    STEP_STALLED = 1000, // internal status: no room for a segment now
     COMMANDS_PER_SEGMENT = 3,
 };
 

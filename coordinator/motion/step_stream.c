@@ -109,8 +109,7 @@ static void emit_segment(struct node *node, struct stepper *s) {
         const int64_t value = (g->flags & SEGMENT_DIR_VALUE) != 0;
         emit_for(node, s, 0, &s->set_dir, &value, 1);
     }
-    const uint64_t min_clock =
-        take_slot(node, node->last_req, positive(g->first), positive(g->finish));
+    const uint64_t min_clock = take_slot(node, node->last_req, positive(g->first), positive(g->finish));
     const int64_t values[] = {g->interval, g->count, g->add};
     emit_for(node, s, min_clock, &s->queue_step, values, 3);
     s->segment_head = (s->segment_head + 1) % STEP_SEGMENTS;
@@ -206,8 +205,8 @@ size_t step_take_batch(struct step_gen *gen, int index, uint8_t *out, size_t roo
 
 int step_add_timed(struct step_gen *gen, int index, uint64_t req_clock, uint64_t finish_clock,
                    const uint8_t *payload, size_t size) {
-    if (index < 0 || index >= gen->node_count || !size || size > STEP_PAYLOAD_MAX ||
-        req_clock > INT64_MAX || finish_clock > INT64_MAX)
+    if (index < 0 || index >= gen->node_count || !size || size > STEP_PAYLOAD_MAX || req_clock > INT64_MAX ||
+        finish_clock > INT64_MAX)
         return STEP_BAD_CONFIG;
     struct node *node = &gen->nodes[index];
     if (node->timed_count == STEP_TIMED)

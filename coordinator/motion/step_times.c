@@ -30,8 +30,8 @@ static void split(const struct trapezoid *m, struct phase phase[3]) {
     const double cruise_way = m->cruise_v * m->cruise_s;
     const double end_v = fmax(m->cruise_v - m->accel * m->decel_s, 0);
     phase[0] = (struct phase){m->print_time, m->accel_s, 0, accel_way, m->start_v, m->accel, false};
-    phase[1] = (struct phase){
-        m->print_time + m->accel_s, m->cruise_s, accel_way, cruise_way, m->cruise_v, 0, false};
+    phase[1] =
+        (struct phase){m->print_time + m->accel_s, m->cruise_s, accel_way, cruise_way, m->cruise_v, 0, false};
     phase[2] = (struct phase){m->print_time + m->accel_s + m->cruise_s,
                               m->decel_s,
                               accel_way + cruise_way,
@@ -141,7 +141,8 @@ static int put(struct step_gen *gen, struct stepper *s, const struct phase *p, i
         if (empty)
             step_rebase(s, (int64_t)floor(clock_relative(s->clock, p->time, 0)));
         s->direction = direction;
-        const int64_t room = (int64_t)(STEP_BUFFER - s->count), batch = count - done < room ? count - done : room;
+        const int64_t room = (int64_t)(STEP_BUFFER - s->count),
+                      batch = count - done < room ? count - done : room;
         fill(p, s->clock, s->base, at, dx, (size_t)batch, s->ticks + s->count);
         s->count += (size_t)batch;
         if (empty)
@@ -178,11 +179,13 @@ static int play(struct step_gen *gen, struct stepper *s, const struct trapezoid 
     int last = 2;
     while (last > 0 && !(phase[last].way > 0))
         last--;
-    for (int i = 0; i <= last && phase[i].time < until; i++) {
+    for (int i = 0; i <= last; i++) {
         const struct phase *p = &phase[i];
+        const double p_end = p->time + p->seconds;
+        if (p->time >= until && !is_over(p_end, until))
+            break;
         if (!(p->way > 0))
             continue;
-        const double p_end = p->time + p->seconds;
         int64_t to = target;
         if (!is_over(p_end, until))
             to = reached(begin + ratio * way_at(p, until), direction, target);
@@ -192,7 +195,8 @@ static int play(struct step_gen *gen, struct stepper *s, const struct trapezoid 
         if (count <= 0)
             continue;
         const double boundary = (double)s->position + 0.5 * direction;
-        const int status = put(gen, s, p, direction, (boundary - begin) / ratio - p->from, 1 / fabs(ratio), count);
+        const int status =
+            put(gen, s, p, direction, (boundary - begin) / ratio - p->from, 1 / fabs(ratio), count);
         if (status)
             return status;
     }
@@ -211,7 +215,7 @@ static int check_begin(struct step_gen *gen, const struct stepper *s, const stru
 int step_times_advance(struct step_gen *gen, struct stepper *s, double until) {
     for (; s->move < gen->moves_to; s->move++) {
         const struct trapezoid *m = &gen->moves[s->move % STEP_TRAPEZOIDS];
-        if (m->print_time >= until)
+        if (m->print_time >= until && !is_over(move_end(m), until))
             break;
         int status = STEP_OK;
         if (s->begun != s->move + 1) {

@@ -4,11 +4,12 @@
 
 #include <string.h>
 
-static const double SLICE_S = 0.25;      // steppers of a node advance together by so much
-static const double GROW_S = 0.5;        // how long a segment may wait for more while more is to come
-static const double PIVOT_S = 600;       // after which a clock is measured from a newer time
-static const double LONGEST_S = 1e9;     // any time or duration
-static const double FASTEST_HZ = 1e10;   // any clock
+static const double SLICE_S = 0.25;       // steppers of a node advance together by so much
+static const double GROW_S = 0.5;         // how long a segment may wait for more while more is to come
+static const double PIVOT_S = 600;        // after which a clock is measured from a newer time
+static const double ROUNDING_MM_S = 1e-6; // of speeds
+static const double LONGEST_S = 1e9;      // any time or duration
+static const double FASTEST_HZ = 1e10;    // any clock
 
 // ------------------------------------------------------------------------------------------------ memory
 
@@ -22,7 +23,8 @@ static bool is_legal(const struct step_config *c) {
     for (int i = 0; ok && i < AXES; i++)
         ok = fabs(c->start[i]) < LONGEST_S;
     for (int i = 0; ok && i < c->node_count; i++)
-        ok = in_range(c->nodes[i].clock_freq, 0, FASTEST_HZ) && c->max_error_s * c->nodes[i].clock_freq >= 1 &&
+        ok = in_range(c->nodes[i].clock_freq, 0, FASTEST_HZ) &&
+             c->max_error_s * c->nodes[i].clock_freq >= 1 &&
              in_range(c->nodes[i].move_count, 0, STEP_MOVE_COUNT_MAX);
     for (int i = 0; ok && i < c->stepper_count; i++) {
         const struct step_stepper_config *s = &c->steppers[i];
@@ -143,29 +145,40 @@ int step_fail(struct step_gen *gen, enum step_status status, const struct steppe
 
 // ----------------------------------------------------------------------------------------------- moves in
 
-static bool move_is_legal(const struct trapezoid *m) {
-    const double *durations[] = {&m->accel_s, &m->cruise_s, &m->decel_s};
-    bool ok = fabs(m->print_time) < LONGEST_S;
+static bool is_between(double value, double low) {
+    return value >= low && value < LONGEST_S; // false for NaN
+}
+
+// Speeds and durations that planning's rounding left a little below 0 count as 0.
+static double *clip(double *value, double tolerance) {
+    if (*value < 0 && *value >= -tolerance)
+        *value = 0;
+    return value;
+}
+
+static bool move_is_legal(struct trapezoid *m) {
+    bool ok = fabs(m->print_time) < LONGEST_S && is_between(m->accel, 0);
+    double *durations[] = {&m->accel_s, &m->cruise_s, &m->decel_s};
     for (int i = 0; i < 3; i++)
-        ok = ok && *durations[i] >= 0 && *durations[i] < LONGEST_S;
+        ok = ok && is_between(*clip(durations[i], ROUNDING_S), 0);
     for (int i = 0; i < AXES; i++)
         ok = ok && fabs(m->start[i]) < LONGEST_S && fabs(m->ratio[i]) < LONGEST_S;
-    return ok && m->start_v >= 0 && m->start_v < LONGEST_S && m->cruise_v >= 0 && m->cruise_v < LONGEST_S &&
-           m->accel >= 0 && m->accel < LONGEST_S &&
-           m->cruise_v - m->accel * m->decel_s >= -1e-6 * (1 + m->cruise_v);
+    return ok && is_between(*clip(&m->start_v, ROUNDING_MM_S), 0) &&
+           is_between(*clip(&m->cruise_v, ROUNDING_MM_S), 0) &&
+           m->cruise_v - m->accel * m->decel_s >= -ROUNDING_MM_S * (1 + m->cruise_v);
 }
 
 int step_append(struct step_gen *gen, const struct trapezoid *moves, int n) {
     int taken = 0;
     for (; taken < n && gen->moves_to - gen->moves_from < STEP_TRAPEZOIDS; taken++) {
-        const struct trapezoid *m = &moves[taken];
-        if (!move_is_legal(m))
-            return -step_fail(gen, STEP_BAD_MOVE, NULL, m->print_time, taken);
+        struct trapezoid m = moves[taken];
+        if (!move_is_legal(&m))
+            return -step_fail(gen, STEP_BAD_MOVE, NULL, m.print_time, taken);
         const double earliest = fmax(gen->moves_end, gen->slice);
-        if (m->print_time < earliest - ROUNDING_S)
-            return -step_fail(gen, STEP_BAD_ORDER, NULL, m->print_time, earliest);
-        gen->moves[gen->moves_to++ % STEP_TRAPEZOIDS] = *m;
-        gen->moves_end = move_end(m);
+        if (m.print_time < earliest - ROUNDING_S)
+            return -step_fail(gen, STEP_BAD_ORDER, NULL, m.print_time, earliest);
+        gen->moves[gen->moves_to++ % STEP_TRAPEZOIDS] = m;
+        gen->moves_end = move_end(&m);
     }
     return taken;
 }

@@ -31,7 +31,7 @@ enum {
     STEP_SEGMENTS = 8192,   // segments of one stepper that wait to be merged
     STEP_TIMED = 1024,      // other timed commands of one node that wait to be merged
     STEP_OUT_BYTES = 1 << 18,
-    STEP_PAYLOAD_MAX = 59,  // one command must fit into a block
+    STEP_PAYLOAD_MAX = 59, // one command must fit into a block
     STEP_MOVE_COUNT_MAX = 65535,
     STEP_SNAP = 65536,
     STEP_SLACK_TICKS = 2, // room for rounding that steps need beyond what the pulses need

@@ -73,7 +73,8 @@ def resting_step(spec: StepperSpec, start: Position, position: Position) -> int:
     This is the rule the generator follows: half a step rounds up, and 1/65536 of a step decides no tie.
     """
     begin, end = (_mix(spec, at) / spec.step_distance for at in (start, position))
-    return math.floor(round((end - begin) * lib.STEP_SNAP) / lib.STEP_SNAP + 0.5)
+    snap = int(lib.STEP_SNAP)
+    return math.floor(round((end - begin) * snap) / snap + 0.5)
 
 
 def _mix(spec: StepperSpec, position: Position) -> float:
@@ -224,7 +225,7 @@ class StepGenerator:
             raise StepError(f"node {name}: {ticks_per_s} ticks/s is no possible clock")
 
     def _error(self) -> StepError:
-        e = ffi.new("struct step_error *")
+        e: Any = ffi.new("struct step_error *")
         lib.step_last_error(self._gen, e)
         who = self._steppers[e.stepper].name if e.stepper >= 0 else "the plan"
         return StepError(f"{who} at print time {e.print_time:.6f} s: {_REASONS[e.status].format(e.value)}")
@@ -271,7 +272,7 @@ def _config(
     for c, n in zip(c_nodes, nodes, strict=False):
         c.clock_freq, c.move_count, c.queue_step_id = n.clock_freq, n.move_count, n.queue_step_id
         c.set_next_step_dir_id, c.reset_step_clock_id = n.set_next_step_dir_id, n.reset_step_clock_id
-    struct = ffi.new("struct step_config *")
+    struct: Any = ffi.new("struct step_config *")
     struct.stepper_count, struct.node_count = len(steppers), len(nodes)
     struct.steppers, struct.nodes = c_steppers, c_nodes
     struct.max_error_s, struct.start = max_error_s, start

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 
 Position = tuple[float, float, float, float]
 LONG = np.longdouble
+Longs = np.ndarray[tuple[int], np.dtype[np.longdouble]]
 SNAP = 65536
 SLACK_TICKS = 2
 BISECTIONS = 90
@@ -35,14 +35,15 @@ class Move:
         head = [self.print_time, *self.seconds, self.start_v, self.cruise_v, self.accel]
         return [*head, *self.start, *self.ratio]
 
-    def way(self, t: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
+    def way(self, t: Longs) -> Longs:
         """Return s after T seconds, straight from the definition of a trapezoid."""
         ta, tc, td = (LONG(s) for s in self.seconds)
         v0, v, a = LONG(self.start_v), LONG(self.cruise_v), LONG(self.accel)
         t1 = np.clip(t, 0, ta)
         t2 = np.clip(t - ta, 0, tc)
         t3 = np.clip(t - ta - tc, 0, td)
-        return v0 * t1 + a * t1 * t1 / 2 + v * t2 + v * t3 - a * t3 * t3 / 2
+        way: Longs = v0 * t1 + a * t1 * t1 / 2 + v * t2 + v * t3 - a * t3 * t3 / 2
+        return way
 
     @property
     def total_s(self) -> float:
@@ -50,12 +51,14 @@ class Move:
 
     @property
     def end(self) -> Position:
-        way = float(self.way(np.array([self.total_s], LONG))[0])
+        way = float(self.way(np.full(1, LONG(self.total_s)))[0])
         x, y, z, e = (p + r * way for p, r in zip(self.start, self.ratio, strict=True))
         return x, y, z, e
 
 
-def make_move(t: float, start: Position, end: Position, speeds: tuple[float, float, float], accel: float) -> Move:
+def make_move(
+    t: float, start: Position, end: Position, speeds: tuple[float, float, float], accel: float
+) -> Move:
     """Return a move with start, cruise and end speed, lowered until they fit the length."""
     delta = [b - a for a, b in zip(start, end, strict=True)]
     length = math.sqrt(sum(d * d for d in delta[:3])) or abs(delta[3])
@@ -86,7 +89,9 @@ def _position(u: float) -> int:
     return math.floor(round(u * SNAP) / SNAP + 0.5)
 
 
-def step_times(spec: StepperSpec, freq: float, moves: Sequence[Move], start: Position, max_error_s: float) -> list[Step]:
+def step_times(
+    spec: StepperSpec, freq: float, moves: Sequence[Move], start: Position, max_error_s: float
+) -> list[Step]:
     """Return every step STEPPER has to do, with its band."""
     origin = _mix(spec, start) / spec.step_distance
     closest = (max(math.ceil(2 * spec.step_pulse_s * freq), 1) + SLACK_TICKS) / freq
@@ -104,7 +109,7 @@ def step_times(spec: StepperSpec, freq: float, moves: Sequence[Move], start: Pos
         low = np.zeros(len(wanted), LONG)
         high = np.full(len(wanted), LONG(move.total_s))
         for _ in range(BISECTIONS):
-            middle = (low + high) / 2
+            middle: Longs = (low + high) / LONG(2)
             before = move.way(middle) < wanted
             low, high = np.where(before, middle, low), np.where(before, high, middle)
         for t in high:
@@ -246,7 +251,8 @@ class Node:
 
     def check_slots(self) -> int:
         """Receive everything as early as its min_clock allows; return the most slots ever in use."""
-        now, most, held = 0, 0, []
+        held: list[int] = []
+        now, most = 0, 0
         for record in self.records:
             now = max(now, record.min_clock)
             if record.name == "queue_step":
@@ -282,15 +288,20 @@ def fewest_segments(bands: Sequence[tuple[int, int]], clock: int) -> int:
                 following.add((i + 1, first))
                 if i + 1 < len(bands):
                     for second in range(bands[i + 1][0], bands[i + 1][1] + 1):
-                        _follow(bands, i + 1, first, second - first, second - 2 * first + at, following)
+                        _follow(bands, (i + 1, first), second - first, second - 2 * first + at, following)
         reachable = following - seen
         seen |= reachable
     return segments
 
 
 def _follow(
-    bands: Sequence[tuple[int, int]], i: int, clock: int, interval: int, add: int, found: set[tuple[int, int]]
+    bands: Sequence[tuple[int, int]],
+    at: tuple[int, int],
+    interval: int,
+    add: int,
+    found: set[tuple[int, int]],
 ) -> None:
+    i, clock = at
     if not -32768 <= add <= 32767:
         return
     while i < len(bands) and interval > 0:
