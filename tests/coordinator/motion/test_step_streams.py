@@ -166,6 +166,7 @@ def test_the_ring_says_when_it_is_full() -> None:
     taken = run.gen.append(rows(moves), 5000)
     assert 0 < taken < 5000
     assert run.gen.append(rows(moves[taken:]), 5000 - taken) == 0
+    assert StepGenerator([], [node_spec()]).append(rows(moves[:3]), 7) == 3, "no further than the buffer"
     while not run.gen.generate(float(taken)):
         run.collect()
     assert run.gen.append(rows(moves[taken:]), 5000 - taken) == 5000 - taken
