@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.gcode.events import End, Event, PositionSet
 from coordinator.gcode.interpreter import Job
 from coordinator.motion.planner import TRAPEZOID, Planner, Position
 from coordinator.motion.steps import StepGenerator
@@ -69,21 +68,11 @@ class Pipeline:
         """Print time up to which step generation has all moves, in s."""
         return self._appended_until
 
-    def step(self) -> Event:
-        """Let the job work until it has something to tell, and act on what concerns motion.
-
-        After an event that ends in a standstill (PositionSet, Wait, End) all moves have become batches.
-        Raises GCodeError and StepError.
-        """
-        event = self.job.step()
-        if isinstance(event, PositionSet):
-            self.finish()
-            self.steps.set_axis_position(event.position)
-            if self._record is not None:
-                self._record.declared.append((self._record.count, event.position))
-        elif isinstance(event, End):
-            self.finish()
-        return event
+    def declare(self, position: Position) -> None:
+        """Take note that the machine stands at POSITION from now on (PositionSet); all moves are generated."""
+        self.steps.set_axis_position(position)
+        if self._record is not None:
+            self._record.declared.append((self._record.count, position))
 
     def transfer(self) -> bool:
         """Hand planned moves to step generation while it has room; return whether all were handed over."""

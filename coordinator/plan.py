@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from coordinator.commands import PlanOptions
-from coordinator.gcode.events import Emergency, End, Full, Notice, Progress, Reply, Wait
+from coordinator.gcode.events import Emergency, End, Full, Notice, PositionSet, Progress
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.machine.description import MachineDescription, load_machine
@@ -176,10 +176,13 @@ def _run(pipeline: Pipeline, display: ProgressDisplay) -> tuple[list[str], End]:
     notices: list[str] = []
     began = time.monotonic()
     while True:
-        event = pipeline.step()
+        event = pipeline.job.step()
         match event:
             case Full():
                 pipeline.run_through()
+            case PositionSet():
+                pipeline.finish()
+                pipeline.declare(event.position)
             case Progress():
                 display.update(
                     Shown(
@@ -197,9 +200,10 @@ def _run(pipeline: Pipeline, display: ProgressDisplay) -> tuple[list[str], End]:
                     "remove it to plan what follows"
                 )
             case End():
+                pipeline.finish()
                 return notices, event
-            case Wait() | Reply() | _:
-                pass
+            case _:
+                pass  # waiting costs a plan nothing, and replies are for who asked
 
 
 def _report(

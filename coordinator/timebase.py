@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from nodes.clock import HostTime, Ticks
 from nodes.errors import CanductorError
 
 STEER_HORIZON_S = 1.0
@@ -26,11 +27,11 @@ JUMP_LIMIT_S = 0.005
 class EstimatedClock(Protocol):
     """A node's clock as far as the host knows it."""
 
-    def ticks_at(self, host_ns: int) -> float:
+    def ticks_at(self, at_ns: HostTime, /) -> Ticks:
         """Return the node's 64-bit ticks at a moment of host time."""
         ...
 
-    def ns_at(self, ticks: float) -> int:
+    def ns_at(self, ticks: Ticks, /) -> HostTime:
         """Return the host time at which the node's clock stands at TICKS."""
         ...
 
@@ -89,13 +90,13 @@ class TimeBase:
         self._primary = primary
         self._clock_freq = clock_freq
 
-    def print_time_at(self, host_ns: int) -> float:
+    def print_time_at(self, host_ns: HostTime) -> float:
         """Return the print time at a moment of host time, in s."""
         return self._primary.ticks_at(host_ns) / self._clock_freq
 
-    def host_ns_at(self, print_time: float) -> int:
+    def host_ns_at(self, print_time: float) -> HostTime:
         """Return the host time of a print time."""
-        return self._primary.ns_at(print_time * self._clock_freq)
+        return self._primary.ns_at(Ticks(round(print_time * self._clock_freq)))
 
     def primary_map(self, print_time: float) -> ClockMap:
         """Return the primary node's own map, which never bends."""

@@ -4,10 +4,10 @@
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 from nodes.dictionary import Dictionary
+from nodes.link import LinkSettings as LinkSettings
 from nodes.node_config import NodeConfig
 
 
@@ -29,15 +29,6 @@ class FrameLike(Protocol):
     def can_id(self) -> int: ...  # noqa: D102
     @property
     def data(self) -> bytes: ...  # noqa: D102
-
-
-@dataclass(frozen=True, slots=True)
-class LinkSettings:
-    """How to reach a node: its id on a CAN bus, or None on a UART."""
-
-    nodeid: int | None
-    receive_window: int = 192
-    lost_after_s: float = 1.0
 
 
 OnResponses = Callable[[Sequence[ResponseLike]], None]

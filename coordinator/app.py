@@ -1,0 +1,217 @@
+"""The connected machine, assembled in one place: transports, buses, nodes, devices, and what happens on failure."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from coordinator.machine.description import (
+    CanConnection,
+    MachineDescription,
+    NodeDescription,
+    UartConnection,
+)
+from coordinator.machine_devices import MachineDevices, stream_specs
+from coordinator.motion.specs import NodeStreamSpec
+from coordinator.timebase import ClockMap, TimeBase
+from nodes.assign import Uuid
+from nodes.bus import CanBus, UartBus
+from nodes.clock import HostTime
+from nodes.dictionary import Dictionary
+from nodes.errors import CanductorError
+from nodes.link import Link, LinkIO
+from nodes.node import Node
+from nodes.node_config import NodeConfig
+from nodes.node_states import NodeState
+from nodes.seams import IoFactory, LinkIOLike, OnFrame, OnLost
+from nodes.transport import ByteTransport, CanTransport, open_can, open_uart
+
+
+class MachineStopped(CanductorError):  # noqa: N818
+    """The machine was stopped for safety; the sentence tells the cause."""
+
+
+CONFIRM_STOP_S = 0.5
+"""How long the nodes have to confirm an emergency stop before the host gives up on them."""
+
+
+def host_now() -> HostTime:
+    """Return the host time: CLOCK_MONOTONIC, as the links stamp their messages."""
+    return HostTime(time.monotonic_ns())
+
+
+@dataclass(frozen=True, slots=True)
+class _OpenBus:
+    bus: CanBus | UartBus
+    transport: CanTransport | ByteTransport
+
+
+class Machine:
+    """All nodes of DESCRIPTION as one machine; lives on one asyncio loop.
+
+    ``start``, then ``close`` whatever happened. When any node is lost or shuts down, all others are stopped at
+    once and ``stopped`` tells why.
+    """
+
+    def __init__(self, description: MachineDescription) -> None:
+        self.description = description
+        self.devices = MachineDevices(description)
+        self.nodes: dict[str, Node] = {}
+        self.stopped: MachineStopped | None = None
+        self._open: list[_OpenBus] = []
+        self._failed = asyncio.Event()
+        self._stopped_at_s = 0.0
+        self._all_down = asyncio.Event()
+        self._confirmed_s: dict[str, float] = {}
+        self._ready = False
+
+    # ------------------------------------------------------------------------------------------ life
+
+    async def start(self) -> None:
+        """Open every bus and bring every node to READY; raises CanductorError with all closed."""
+        try:
+            self._open_buses()
+            async with asyncio.TaskGroup() as group:
+                for opened in self._open:
+                    group.create_task(opened.bus.start())
+        except BaseException as error:
+            await self.close()
+            if isinstance(error, BaseExceptionGroup):
+                raise _first_cause(error) from None
+            raise
+        self._ready = True
+
+    async def close(self) -> None:
+        """Leave the nodes as they are and release everything."""
+        self._ready = False
+        for opened in self._open:
+            await opened.bus.close()
+            opened.transport.close()
+        self._open.clear()
+
+    def stop(self, cause: str) -> None:
+        """Stop every node that can be reached, ahead of everything queued; the first CAUSE is kept."""
+        if self.stopped is not None:
+            return
+        self.stopped = MachineStopped(cause)
+        self._stopped_at_s = time.monotonic()
+        for node in self.nodes.values():
+            node.emergency_stop()
+        self._failed.set()
+
+    async def wait_stopped(self) -> MachineStopped:
+        """Wait until the machine is stopped; return why."""
+        await self._failed.wait()
+        assert self.stopped is not None
+        return self.stopped
+
+    async def confirm_stop(self) -> dict[str, float]:
+        """Wait until every node that can be reached has reported its shutdown, but not longer than a moment.
+
+        Returns for each that did how long after ``stop`` that was, in s.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(CONFIRM_STOP_S):
+                await self._all_down.wait()
+        return dict(self._confirmed_s)
+
+    # ------------------------------------------------------------------------------------------ parts
+
+    @property
+    def primary(self) -> Node:
+        """The node whose clock is print time."""
+        return self.nodes[self.description.nodes[0].name]
+
+    @property
+    def moving(self) -> list[Node]:
+        """The nodes that carry steppers, in the order in which motion counts them."""
+        return [self.nodes[name] for name in self.devices.moving_nodes]
+
+    def time_base(self) -> TimeBase:
+        """Return print time as the primary node's clock gives it."""
+        return TimeBase(self.primary.clock, self.primary.dictionary.clock_freq_hz)
+
+    def stream_specs(self) -> list[NodeStreamSpec]:
+        """Return how the moving nodes take step commands."""
+        return stream_specs((node.name, node.dictionary, node.move_count) for node in self.moving)
+
+    def clock_map(self, time_base: TimeBase, node: Node, print_time: float) -> ClockMap:
+        """Return the map from print time to NODE's ticks, beginning at PRINT_TIME."""
+        if node is self.primary:
+            return time_base.primary_map(print_time)
+        return time_base.secondary_map(node.clock, node.dictionary.clock_freq_hz, print_time)
+
+    async def stepper_positions(self) -> dict[str, int]:
+        """Ask every node how many steps its steppers stand from where they began."""
+        node_of = {stepper.name: stepper.node for stepper in self.description.steppers}
+        return {
+            name: await stepper.position(self.nodes[node_of[name]])
+            for name, stepper in self.devices.steppers.items()
+        }
+
+    # ------------------------------------------------------------------------------------------ assembly
+
+    def _open_buses(self) -> None:
+        can: dict[str, CanBus] = {}
+        for node in self.description.nodes:
+            connection = node.connection
+            if isinstance(connection, UartConnection):
+                self._add_uart(node, connection)
+                continue
+            if connection.interface not in can:
+                can[connection.interface] = self._open_can(connection)
+            self.nodes[node.name] = can[connection.interface].add_node(
+                node.name,
+                Uuid.parse(connection.uuid),
+                self._build_config(node),
+                on_state=self._node_changed,
+            )
+
+    def _open_can(self, connection: CanConnection) -> CanBus:
+        transport = open_can(connection.interface)
+        bus = CanBus(transport.name, _io_factory(transport))
+        self._open.append(_OpenBus(bus, transport))
+        return bus
+
+    def _add_uart(self, node: NodeDescription, connection: UartConnection) -> None:
+        transport = open_uart(connection.path, connection.baud)
+        bus = UartBus(transport.name, _io_factory(transport))
+        self._open.append(_OpenBus(bus, transport))
+        self.nodes[node.name] = bus.add_node(
+            node.name, self._build_config(node), on_state=self._node_changed
+        )
+
+    def _build_config(self, node: NodeDescription) -> Callable[[Dictionary], NodeConfig]:
+        return lambda dictionary: self.devices.build_config(node.name, dictionary)
+
+    def _node_changed(self, node: Node) -> None:
+        if not self._ready or node.state not in (NodeState.LOST, NodeState.SHUTDOWN):
+            return
+        self.stop(f"{node.failure}; all other nodes were stopped")
+        if node.state is NodeState.SHUTDOWN:
+            self._confirmed_s[node.name] = time.monotonic() - self._stopped_at_s
+        if all(other.state in (NodeState.LOST, NodeState.SHUTDOWN) for other in self.nodes.values()):
+            self._all_down.set()
+
+
+def _io_factory(transport: CanTransport | ByteTransport) -> IoFactory:
+    def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike:
+        return LinkIO(transport, asyncio.get_running_loop(), on_frame=on_frame, on_closed=on_closed)
+
+    return start
+
+
+def _first_cause(group: BaseExceptionGroup[BaseException]) -> BaseException:
+    for error in group.exceptions:
+        if not isinstance(error, BaseExceptionGroup):
+            return error
+        return _first_cause(error)
+    return group
+
+
+def link_of(node: Node) -> Link:
+    """Return the node's link with its counters."""
+    link = node.link
+    assert isinstance(link, Link)
+    return link

@@ -1,0 +1,251 @@
+"""Real time: feeds a job's motion to the nodes, early enough and not too early.
+
+The control loop wakes every CYCLE_S. What costs time (the job's g-code, planning, step generation) runs in one
+worker thread without the interpreter lock; the loop only hands finished batches to the links.
+"""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+from coordinator.app import Machine, host_now, link_of
+from coordinator.gcode.events import Emergency, End, Event, Full, Idle, Notice, PositionSet, Progress, Reply, Wait
+from coordinator.gcode.interpreter import Job
+from coordinator.motion.planner import Planner
+from coordinator.motion.steps import StepGenerator
+from coordinator.pipeline import Pipeline, PlanRecord
+from coordinator.timebase import ClockMap
+
+CYCLE_S: Final = 0.05
+PLAN_AHEAD_S: Final = 3.0
+"""Moves are planned so far ahead of now; beyond, the g-code waits."""
+SEND_AHEAD_S: Final = 1.2
+"""Step commands are made so far ahead of now; the clocks of the nodes are predicted over this long."""
+START_LEAD_S: Final = 0.6
+"""From standstill, the first move begins so far ahead of now."""
+RUN_DRY_S: Final = 0.8
+"""When what is planned ends so soon and no more comes, it is planned to a standstill."""
+SETTLE_S: Final = 0.05
+
+Told = Reply | Notice
+
+
+@dataclass(frozen=True, slots=True)
+class JobState:
+    """How far a job is."""
+
+    done_bytes: int
+    size_bytes: int | None
+    print_time_s: float
+    """Seconds of the job executed."""
+    moves: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Cycle:
+    """What one visit to the worker brought."""
+
+    batches: list[tuple[int, bytes]]
+    told: list[Told]
+    event: Event | None
+    """What the job waits for; None: it has more."""
+
+
+class Streamer:
+    """Runs one JOB on MACHINE, whose nodes are READY. ON_TOLD gets replies and notices, ON_STATE progress."""
+
+    def __init__(
+        self,
+        machine: Machine,
+        job: Job,
+        *,
+        record: PlanRecord | None = None,
+        on_told: Callable[[Told], None],
+        on_state: Callable[[JobState], None],
+    ) -> None:
+        self._machine = machine
+        self._job = job
+        self._on_told = on_told
+        self._on_state = on_state
+        self._nodes = machine.moving
+        self._time_base = machine.time_base()
+        self._batches: list[tuple[int, bytes]] = []
+        self.steps = StepGenerator(machine.devices.stepper_specs(), machine.stream_specs())
+        self.pipeline = Pipeline(
+            job, self.steps, lambda n, b: self._batches.append((n, b)), nodes=len(self._nodes), record=record
+        )
+        self.maps: list[ClockMap] = []
+        """Per moving node: print time to ticks, as the steps were timed."""
+        self.began_s = 0.0
+        """Print time at which the job began."""
+        self.ended_s = 0.0
+        self._done = Progress(0, 0, None)
+
+    @property
+    def _planner(self) -> Planner:
+        return self._job.planner
+
+    def print_time_now(self) -> float:
+        """Return the present print time."""
+        return self._time_base.print_time_at(host_now())
+
+    async def run(self) -> None:
+        """Run the job to its end: until the last step is executed.
+
+        Raises MachineStopped when the machine stops meanwhile, CanductorError when the job or a link fails;
+        the machine is stopped then.
+        """
+        self._begin()
+        work = asyncio.ensure_future(self._stream())
+        watch = asyncio.ensure_future(self._machine.wait_stopped())
+        try:
+            await asyncio.wait((work, watch), return_when=asyncio.FIRST_COMPLETED)
+            if watch.done():
+                raise watch.result()
+            work.result()
+        finally:
+            for task in (work, watch):
+                task.cancel()
+            await asyncio.gather(work, watch, return_exceptions=True)
+
+    # ------------------------------------------------------------------------------------------- streaming
+
+    def _begin(self) -> None:
+        self.began_s = self.print_time_now() + START_LEAD_S
+        self._planner.begin_at(self.began_s)
+        for index, node in enumerate(self._nodes):
+            clock_map = self._machine.clock_map(self._time_base, node, self.print_time_now())
+            piece = clock_map.last
+            self.steps.set_clock_base(index, piece.print_time, round(piece.ticks), piece.ticks_per_s)
+            self.maps.append(clock_map)
+
+    async def _stream(self) -> None:
+        loop = asyncio.get_running_loop()
+        with ThreadPoolExecutor(1, thread_name_prefix="motion") as worker:
+            event: Event | None = None
+            while not isinstance(event, End):
+                cycle = await loop.run_in_executor(worker, self._work, event)
+                event = cycle.event
+                self._hand_over(cycle)
+                if isinstance(event, Emergency):
+                    self._machine.stop(f"{self._job.program.name}:{event.line}: M112 stopped the machine")
+                    return
+                if event is not None:
+                    await asyncio.sleep(CYCLE_S)
+            self.ended_s = event.print_time_s
+            await self._settle(worker)
+
+    def _hand_over(self, cycle: _Cycle) -> None:
+        for node, batch in cycle.batches:
+            link_of(self._nodes[node]).send_batch(batch)
+        for told in cycle.told:
+            self._on_told(told)
+        self._report()
+
+    def _report(self) -> None:
+        now = self.print_time_now()
+        self._on_state(
+            JobState(
+                self._done.done_bytes,
+                self._done.size_bytes,
+                max(0.0, min(now, self.pipeline.appended_until) - self.began_s),
+                self.pipeline.moves,
+            )
+        )
+
+    async def _settle(self, worker: ThreadPoolExecutor) -> None:
+        """Bring what is left to the nodes and wait until the last step is executed."""
+        loop = asyncio.get_running_loop()
+        while self.print_time_now() < self.ended_s + SETTLE_S:
+            self._hand_over(await loop.run_in_executor(worker, self._rest))
+            await asyncio.sleep(CYCLE_S)
+        for node in self._nodes:
+            await link_of(node).drained()
+
+    # ---------------------------------------------------------------------------- in the worker's thread
+
+    def _work(self, waiting_for: Event | None) -> _Cycle:
+        """Let the job go on as far as it should by now, and make the commands that are due."""
+        now = self.print_time_now()
+        told: list[Told] = []
+        event = waiting_for
+        if not self._still_waiting(waiting_for, now):
+            self._planner.plan_until_s = now + PLAN_AHEAD_S
+            self._begin_anew(now)
+            event = self._advance(told)
+        if isinstance(event, Idle) or self._runs_dry(now):
+            self._planner.flush()
+        self._generate(now)
+        return self._cycle(told, event)
+
+    def _rest(self) -> _Cycle:
+        self._generate(self.print_time_now())
+        return self._cycle([], None)
+
+    def _cycle(self, told: Sequence[Told], event: Event | None) -> _Cycle:
+        batches, self._batches = self._batches, []
+        return _Cycle(batches, list(told), event)
+
+    def _still_waiting(self, event: Event | None, now: float) -> bool:
+        if isinstance(event, Wait):
+            return now < event.print_time_s
+        if isinstance(event, PositionSet):
+            return not self._declared(event)
+        return False
+
+    def _declared(self, event: PositionSet) -> bool:
+        """Declare the position once every move before it is generated; return whether it was."""
+        if not self._all_generated():
+            return False
+        self.pipeline.declare(event.position)
+        return True
+
+    def _all_generated(self) -> bool:
+        return (
+            self._planner.at_standstill
+            and self.pipeline.transfer()
+            and self.steps.generated_until >= self.pipeline.appended_until
+        )
+
+    def _advance(self, told: list[Told]) -> Event | None:
+        """Step the job until it has to wait for something, or a few hundred lines are done."""
+        for _ in range(200):
+            event = self._job.step()
+            if isinstance(event, Reply | Notice):
+                told.append(event)
+            elif isinstance(event, Progress):
+                self._done = event
+            elif isinstance(event, PositionSet) and self._declared(event):
+                continue
+            else:
+                return event
+        return None
+
+    def _begin_anew(self, now: float) -> None:
+        """After a standstill the next move needs time to reach the nodes."""
+        if self._planner.at_standstill and self._planner.print_time_end_s < now + START_LEAD_S:
+            self._planner.begin_at(now + START_LEAD_S)
+
+    def _runs_dry(self, now: float) -> bool:
+        return self._planner.print_time_end_s < now + RUN_DRY_S and not self._planner.at_standstill
+
+    def _generate(self, now: float) -> None:
+        """Make the commands up to SEND_AHEAD_S from now, with every node's clock steered first."""
+        while True:
+            complete = self.pipeline.transfer()
+            self._steer()
+            standing = complete and self._planner.at_standstill
+            end = self.pipeline.appended_until
+            until = min(end, now + SEND_AHEAD_S)
+            self.pipeline.generate(until, flush=standing and until >= end)
+            if complete or until < end:
+                return
+
+    def _steer(self) -> None:
+        border = self.steps.generated_until
+        for index, (node, clock_map) in enumerate(zip(self._nodes, self.maps, strict=True)):
+            if node is not self._machine.primary and border > clock_map.last.print_time:
+                piece = self._time_base.steer(node.name, clock_map, node.clock, border)
+                self.steps.set_clock(index, piece.ticks_per_s)
