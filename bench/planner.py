@@ -50,7 +50,8 @@ def main() -> None:
     if not paths:
         print("no G-code files beside the project: name some")
     for path in paths:
-        moves = sum(line[:3] in {b"G1 ", b"G0 "} for line in path.read_bytes().splitlines())
+        with path.open("rb") as lines:
+            moves = sum(line[:3] in {b"G1 ", b"G0 "} for line in lines)
         runs = [run(path) for _ in range(ROUNDS)]
         cpu_s = statistics.median(cost for cost, _ in runs)
         planner = runs[0][1]

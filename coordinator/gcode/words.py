@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache, reduce
 from operator import xor
 
 _CODE = re.compile(r"([GMTgmt])(\d{1,9})(\.\d{1,9})?(?![\d_.])", re.ASCII)
@@ -78,6 +78,7 @@ def number(what: str, words: Mapping[str, str], key: str) -> float:
     return value
 
 
+@lru_cache(maxsize=256)  # slicers repeat few different lines, thousands of times
 def parse(line: bytes) -> Command | None:
     """Read LINE; None when there is nothing to do. Raises WordError."""
     if len(line) > _LINE_MAX:

@@ -41,6 +41,7 @@ Position = tuple[float, float, float, float]
 
 AXIS_LETTERS = "XYZE"
 WORD_LETTERS = "XYZEF"
+_STATUS = tuple(FeedStatus)
 DEFAULT_SPEED_MM_S = 25.0
 """Speed of moves before the first F word."""
 RING_TRAPEZOIDS = int(lib.PLANNER_RING)
@@ -91,7 +92,7 @@ class Planner:
         self._offset[0] = start
         with ffi.from_buffer(data) as text:
             status = lib.gcode_feed(self._state, self._core, text, end, self._offset, final)
-        return Feed(FeedStatus(status), self._offset[0], self._state.lines + 1)
+        return Feed(_STATUS[status], self._offset[0], self._state.lines + 1)
 
     def line_done(self) -> None:
         """Count a line that the caller consumed."""
