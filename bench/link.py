@@ -1,4 +1,4 @@
-"""Link figures: six-byte commands per second, and the round trip of a query, from Python, to an acking process."""
+"""Link figures, against an acking process: six-byte commands per second, and a query's round trip."""
 
 import asyncio
 import json
@@ -27,14 +27,18 @@ RECORD = struct.pack("=QQB", 0, 0, 6) + bytes([1, 2, 3, 4, 5, 6])
 
 @dataclass
 class FdTransport:
+    """A transport that is a bare file descriptor."""
+
     name: str
     kind: TransportKind
     fd: int
 
     def fileno(self) -> int:
+        """Return it."""
         return self.fd
 
     def close(self) -> None:
+        """Close it."""
         os.close(self.fd)
 
 

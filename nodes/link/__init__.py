@@ -1,6 +1,7 @@
 """Links: reliable, ordered command streams to nodes, and the I/O thread of the bus they share."""
 
-from nodes.link.bus_io import Link, LinkIO
+from nodes.link.bus_io import LinkIO
+from nodes.link.link import Link
 from nodes.link.types import (
     Frame,
     IOStats,

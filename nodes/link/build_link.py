@@ -13,6 +13,6 @@ ffibuilder = builder(
     sources=[
         *(f"firmware/wire/{name}.c" for name in ("vlq", "message", "block")),
         *(f"nodes/link/{name}.c" for name in ("queue", "link", "link_receive")),
-        *(f"nodes/link/{name}.c" for name in ("io_schedule", "io_transfer", "io_thread")),
+        *(f"nodes/link/{name}.c" for name in ("io_schedule", "io_transfer", "io_thread", "io_links")),
     ],
 )

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The inside of an I/O thread, shared by io_thread.c (thread and interface), io_transfer.c (bytes and frames)
-// and io_schedule.c (whose turn it is); not for others. Every function here wants the mutex held.
+// The inside of an I/O thread, shared by io_thread.c (thread, events), io_links.c (what is asked of links),
+// io_transfer.c (bytes and frames) and io_schedule.c (whose turn it is); not for others. Every function here
+// wants the mutex held.
 #ifndef LINK_IO_BUS_H
 #define LINK_IO_BUS_H
 
@@ -63,6 +64,10 @@ void io_write_all(struct io_bus *bus, uint64_t now);
 void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, size_t size, uint64_t now);
 void io_end(struct io_bus *bus, int cause);
 void io_notify(struct io_bus *bus);
+
+// io_thread.c: notes what Python has to hear of; sends from the caller's thread what was queued.
+void io_note_states(struct io_bus *bus);
+void io_send_now(struct io_bus *bus);
 
 // io_schedule.c: the link that shall send its next block now, or NULL; and that it did.
 struct io_link *io_next_link(const struct io_bus *bus, uint64_t now);

@@ -17,16 +17,17 @@
 
 #define NS_PER_S 1000000000ULL
 
+enum { KERNEL_FRAMES = 16 };
+
 static uint64_t monotonic_ns(void) {
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
     return (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
 }
 
-// -----------------------------------------------------------------------------------------------------
-// thread
+// -------------------------------------------------------------------------------------------------- thread
 
-static void note_states(struct io_bus *bus) {
+void io_note_states(struct io_bus *bus) {
     for (size_t i = 0; i < bus->link_count; i++) {
         struct io_link *node = bus->links[i];
         if (node->link.state == LINK_LOST && !node->lost_told) {
@@ -93,7 +94,7 @@ static void *run(void *argument) {
             io_read_all(bus, now);
         handle_timers(bus, now);
         io_write_all(bus, now);
-        note_states(bus);
+        io_note_states(bus);
         seen = sleep_unlocked(bus, now);
     }
     pthread_mutex_unlock(&bus->mutex);
@@ -108,7 +109,7 @@ static void wake(struct io_bus *bus) {
 
 // The caller sends what it queued by itself, which saves a query the thread's wake-up on its way out; the
 // thread is woken only when it has to wait for something that it does not yet know of.
-static void send_now(struct io_bus *bus) {
+void io_send_now(struct io_bus *bus) {
     if (!bus->sleeping)
         return; // the thread is at work, or on its way to it, and will find what was queued
     uint64_t now = monotonic_ns();
@@ -117,8 +118,7 @@ static void send_now(struct io_bus *bus) {
         wake(bus);
 }
 
-// ----------------------------------------------------------------------------------------------- start and
-// end
+// ------------------------------------------------------------------------------------------- start and end
 
 static int make_ring(struct io_ring *ring, size_t size) {
     ring->events = calloc(size, sizeof *ring->events);
@@ -139,11 +139,12 @@ static void forget(struct io_bus *bus) {
     free(bus);
 }
 
-// What sits in the kernel cannot be overtaken by something more urgent. A small send buffer bounds it (the
-// kernel accounts some 768 bytes for a frame or a short run of them, and doubles the figure it is given) and
-// makes a full SocketCAN queue show as "not writable" instead of ENOBUFS. No socket: nothing to bound.
+// What sits in the kernel cannot be overtaken by something more urgent. A small send buffer bounds it, and
+// makes a full SocketCAN queue show as "not writable" instead of as ENOBUFS. The kernel accounts some 768
+// bytes for a frame (or for a short run of them on a stream) and doubles the figure it is given. No socket:
+// no such buffer.
 static void bound_kernel_queue(int fd) {
-    int bytes = 8 * 768 / 2 * 2;
+    int bytes = KERNEL_FRAMES * 768 / 2;
     setsockopt(fd, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes);
 }
 
@@ -180,8 +181,7 @@ int io_notice_fd(struct io_bus *bus) {
     return bus->notice_fd;
 }
 
-// ------------------------------------------------------------------------------------------------------
-// taking
+// -------------------------------------------------------------------------------------------------- taking
 
 static size_t take_ring(struct io_ring *ring, struct io_event *out, size_t room) {
     size_t taken = 0;
@@ -226,181 +226,4 @@ size_t io_take(struct io_bus *bus, struct io_event *out, size_t room) {
         bus->noticed = 0;
     pthread_mutex_unlock(&bus->mutex);
     return taken;
-}
-
-// -------------------------------------------------------------------------------------------------------
-// links
-
-static enum io_status add_link(struct io_bus *bus, unsigned nodeid, const struct link_settings *settings,
-                               uint32_t *number) {
-    int taken = bus->kind == IO_BYTES ? bus->link_count > 0 : bus->by_nodeid[nodeid] != NULL;
-    if (taken || bus->link_count == IO_LINKS_MAX)
-        return IO_TAKEN;
-    struct io_link *node = calloc(1, sizeof *node);
-    if (!node)
-        return IO_NO_MEMORY;
-    link_init(&node->link, settings, node->control_memory, IO_CONTROL_BYTES, node->motion_memory,
-              IO_MOTION_BYTES);
-    node->nodeid = (uint8_t)nodeid;
-    node->number = *number = ++bus->last_number;
-    bus->links[bus->link_count++] = node;
-    if (bus->kind != IO_BYTES)
-        bus->by_nodeid[nodeid] = node;
-    return IO_OK;
-}
-
-enum io_status io_open_link(struct io_bus *bus, unsigned nodeid, const struct link_settings *settings,
-                            uint32_t *number) {
-    if (nodeid > 255 || (bus->kind == IO_BYTES) != (nodeid == 0) || !settings->lost_after_ns ||
-        settings->receive_window < LINK_WINDOW_MIN)
-        return IO_INVALID;
-    pthread_mutex_lock(&bus->mutex);
-    enum io_status status = bus->ended ? IO_CLOSED : add_link(bus, nodeid, settings, number);
-    pthread_mutex_unlock(&bus->mutex);
-    return status;
-}
-
-static size_t index_of(const struct io_bus *bus, uint32_t number) {
-    size_t at = 0;
-    while (at < bus->link_count && bus->links[at]->number != number)
-        at++;
-    return at;
-}
-
-void io_close_link(struct io_bus *bus, uint32_t number) {
-    pthread_mutex_lock(&bus->mutex);
-    size_t at = index_of(bus, number);
-    if (at < bus->link_count) {
-        struct io_link *node = bus->links[at];
-        bus->by_nodeid[node->nodeid] = NULL;
-        bus->link_count--;
-        memmove(bus->links + at, bus->links + at + 1, (bus->link_count - at) * sizeof *bus->links);
-        free(node);
-    }
-    pthread_mutex_unlock(&bus->mutex);
-}
-
-// Locks the bus and finds the link; NULL (and *status): it cannot be used.
-static struct io_link *enter(struct io_bus *bus, uint32_t number, enum io_status *status) {
-    pthread_mutex_lock(&bus->mutex);
-    size_t at = index_of(bus, number);
-    *status = bus->ended ? IO_CLOSED : at == bus->link_count ? IO_GONE : IO_OK;
-    return *status == IO_OK ? bus->links[at] : NULL;
-}
-
-static enum io_status leave(struct io_bus *bus, enum io_status status) {
-    if (status == IO_OK)
-        send_now(bus);
-    pthread_mutex_unlock(&bus->mutex);
-    return status;
-}
-
-static enum io_status from_link(enum link_status status) {
-    static const enum io_status same[] = {
-        [LINK_OK] = IO_OK, [LINK_FULL] = IO_FULL, [LINK_INVALID] = IO_INVALID, [LINK_GONE] = IO_GONE};
-    return same[status];
-}
-
-enum io_status io_send(struct io_bus *bus, uint32_t number, const uint8_t *content, size_t size,
-                       uint64_t min_clock, uint64_t req_clock) {
-    enum io_status status;
-    struct io_link *node = enter(bus, number, &status);
-    if (node)
-        status = from_link(link_send(&node->link, content, size, min_clock, req_clock));
-    return leave(bus, status);
-}
-
-enum io_status io_send_batch(struct io_bus *bus, uint32_t number, const uint8_t *batch, size_t size) {
-    enum io_status status;
-    struct io_link *node = enter(bus, number, &status);
-    if (node)
-        status = from_link(link_send_batch(&node->link, batch, size));
-    return leave(bus, status);
-}
-
-enum io_status io_send_urgent(struct io_bus *bus, uint32_t number, const uint8_t *content, size_t size) {
-    enum io_status status;
-    struct io_link *node = enter(bus, number, &status);
-    if (node)
-        status = from_link(link_send_urgent(&node->link, content, size));
-    return leave(bus, status);
-}
-
-enum io_status io_set_receive_window(struct io_bus *bus, uint32_t number, uint64_t size) {
-    enum io_status status;
-    struct io_link *node = enter(bus, number, &status);
-    if (node)
-        status = from_link(link_set_receive_window(&node->link, size));
-    return leave(bus, status);
-}
-
-enum io_status io_set_clock(struct io_bus *bus, uint32_t number, double freq_hz, uint64_t at_ns,
-                            uint64_t at_ticks) {
-    enum io_status status;
-    struct io_link *node = enter(bus, number, &status);
-    if (node)
-        status = from_link(link_set_clock(&node->link, freq_hz, at_ns, at_ticks));
-    return leave(bus, status);
-}
-
-enum io_status io_watch_drained(struct io_bus *bus, uint32_t number) {
-    enum io_status status;
-    struct io_link *node = enter(bus, number, &status);
-    if (node) {
-        node->watch_drained = 1;
-        note_states(bus);
-    }
-    return leave(bus, status);
-}
-
-enum io_status io_send_frame(struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size) {
-    if (size > CAN_MAX_DLEN || bus->kind == IO_BYTES)
-        return IO_INVALID;
-    pthread_mutex_lock(&bus->mutex);
-    if (bus->ended || bus->admin_count == IO_ADMIN_MAX)
-        return leave(bus, bus->ended ? IO_CLOSED : IO_FULL);
-    struct can_frame *frame = &bus->admin[(bus->admin_first + bus->admin_count++) % IO_ADMIN_MAX];
-    *frame = (struct can_frame){.can_id = can_id, .can_dlc = (uint8_t)size};
-    memcpy(frame->data, data, size);
-    if (bus->admin_count > bus->stats.admin_max)
-        bus->stats.admin_max = bus->admin_count;
-    return leave(bus, IO_OK);
-}
-
-// ----------------------------------------------------------------------------------------------------
-// counters
-
-enum io_status io_get_link_stats(struct io_bus *bus, uint32_t number, struct io_link_stats *out) {
-    enum io_status status;
-    struct io_link *node = enter(bus, number, &status);
-    if (!node) {
-        size_t at = index_of(bus, number);
-        node = at < bus->link_count ? bus->links[at] : NULL; // the counters of an ended bus stay readable
-    }
-    if (node) {
-        const struct link *link = &node->link;
-        const struct link_queue *control = &link->control, *motion = &link->motion;
-        *out = (struct io_link_stats){
-            .pending = link_pending(link),
-            .control_commands = control->commands,
-            .control_bytes = link_queue_bytes(control),
-            .control_commands_max = control->commands_max,
-            .control_bytes_max = control->bytes_max,
-            .motion_commands = motion->commands,
-            .motion_bytes = link_queue_bytes(motion),
-            .motion_commands_max = motion->commands_max,
-            .motion_bytes_max = motion->bytes_max,
-            .flying_bytes = link->flying_bytes,
-            .flying_blocks = link->next - link->first,
-        };
-        link_get_stats(link, &out->link);
-    }
-    pthread_mutex_unlock(&bus->mutex);
-    return node ? IO_OK : status;
-}
-
-void io_get_stats(struct io_bus *bus, struct io_stats *out) {
-    pthread_mutex_lock(&bus->mutex);
-    *out = bus->stats;
-    pthread_mutex_unlock(&bus->mutex);
 }

@@ -12,7 +12,7 @@
 
 enum { FRAME = sizeof(struct can_frame), DATA_MAX = 8, DATA_ID = 0x100, FROM_NODE = 1 };
 
-// ------------------------------------------------------------------------------------------------- for
+// ----------------------------------------------------------------------------------------------------- for
 // Python
 
 void io_notify(struct io_bus *bus) {
@@ -43,8 +43,7 @@ void io_end(struct io_bus *bus, int cause) {
     io_notify(bus);
 }
 
-// ----------------------------------------------------------------------------------------------------
-// reading
+// ------------------------------------------------------------------------------------------------- reading
 
 void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, size_t size, uint64_t now) {
     struct link_response response;
@@ -116,8 +115,7 @@ void io_read_all(struct io_bus *bus, uint64_t now) {
     }
 }
 
-// ----------------------------------------------------------------------------------------------------
-// writing
+// ------------------------------------------------------------------------------------------------- writing
 
 static void put_frame(struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size) {
     struct can_frame frame = {.can_id = can_id, .can_dlc = (uint8_t)size};

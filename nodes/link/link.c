@@ -17,7 +17,7 @@
 #define RTO_FIRST_NS (100 * NS_PER_MS) // until a round trip was measured
 #define FIRST_SEQUENCE 16              // room below for the adoption of the node's
 
-// ---------------------------------------------------------------------------------------------------- set-up
+// -------------------------------------------------------------------------------------------------- set-up
 
 void link_init(struct link *link, const struct link_settings *settings, uint8_t *control, size_t control_size,
                uint8_t *motion, size_t motion_size) {
@@ -55,7 +55,7 @@ uint64_t link_clock_to_ns(const struct link *link, uint64_t ticks) {
     return away_ns < (double)link->clock_at_ns ? link->clock_at_ns - (uint64_t)away_ns : 0;
 }
 
-// -------------------------------------------------------------------------------------------------- queueing
+// ------------------------------------------------------------------------------------------------ queueing
 
 enum link_status link_send(struct link *link, const uint8_t *content, size_t size, uint64_t min_clock,
                            uint64_t req_clock) {
@@ -97,7 +97,7 @@ uint64_t link_pending(const struct link *link) {
     return link->control.commands + link->motion.commands + link->flying_commands;
 }
 
-// --------------------------------------------------------------------------------------------------- packing
+// ------------------------------------------------------------------------------------------------- packing
 
 // The records at the front of a queue that may go now and fit together.
 struct front {
@@ -194,8 +194,7 @@ static void take(struct link_queue *queue, const struct front *front, struct lin
     }
 }
 
-// -----------------------------------------------------------------------------------------------
-// transmission
+// -------------------------------------------------------------------------------------------- transmission
 
 static int fits(const struct link *link, size_t bytes) {
     return link->flying_bytes == 0 || link->flying_bytes + bytes <= link->settings.receive_window;
@@ -283,7 +282,7 @@ uint64_t link_next_due(const struct link *link, uint64_t now) {
     return may_go(link, &plan, now) ? plan.due_ns : LINK_NEVER;
 }
 
-// ------------------------------------------------------------------------------------------------------ time
+// ---------------------------------------------------------------------------------------------------- time
 
 uint64_t link_rto(const struct link *link) {
     const struct link_stats *stats = &link->stats;
@@ -317,7 +316,8 @@ static uint64_t repeat_deadline(const struct link *link) {
 }
 
 static uint64_t lost_deadline(const struct link *link) {
-    return link->first < link->next ? link->progress_ns + link->settings.lost_after_ns : LINK_NEVER;
+    int waiting = link->first < link->next || link->probe_answered;
+    return waiting ? link->progress_ns + link->settings.lost_after_ns : LINK_NEVER;
 }
 
 void link_handle_timer(struct link *link, uint64_t now) {

@@ -22,7 +22,7 @@ enum {
     LINK_WINDOW_MIN = 64,   // smallest receive window: one whole block
     LINK_WIRE_MAX = 128,    // most bytes link_next_block writes: sync bytes and one block
     LINK_RX_MAX = 256,      // received bytes that wait for the rest of their block
-    LINK_LEAD_BUCKETS = 16, // late, < 1 ms, < 2 ms, < 4 ms, … >= 2^14 ms
+    LINK_LEAD_BUCKETS = 16, // late, < 1 ms, < 2 ms, < 4 ms, … >= 2^13 ms
 };
 
 enum link_status {
@@ -110,7 +110,7 @@ struct link_response {
 void link_init(struct link *link, const struct link_settings *settings, uint8_t *control, size_t control_size,
                uint8_t *motion, size_t motion_size);
 
-// ------------------------------------------------------------------------------------------------- commands
+// ------------------------------------------------------------------------------------------------ commands
 
 // Queues one encoded command. Control commands go in order, before motion, as soon as the window allows, but
 // not before min_clock (0: at once).

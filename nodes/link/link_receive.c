@@ -9,8 +9,7 @@
 // up.
 #define GAP_NS (25 * NS_PER_MS)
 
-// --------------------------------------------------------------------------------------------
-// acknowledgement
+// ----------------------------------------------------------------------------------------- acknowledgement
 
 static void note_lead(struct link *link, uint64_t req_clock, uint64_t now) {
     int64_t lead_ns = (int64_t)(link_clock_to_ns(link, req_clock) - now);
@@ -74,8 +73,7 @@ static void handle_nak(struct link *link, uint64_t now) {
     link_rewind(link, now, LEAD_SYNC);
 }
 
-// ---------------------------------------------------------------------------------------------- first
-// contact
+// ------------------------------------------------------------------------------------------- first contact
 
 static void adopt(struct link *link, uint64_t sequence) {
     link->first = link->cursor = link->next = sequence;
@@ -103,8 +101,7 @@ static void handle_probe_answer(struct link *link, unsigned answer, uint64_t now
     }
 }
 
-// -----------------------------------------------------------------------------------------------------
-// blocks
+// -------------------------------------------------------------------------------------------------- blocks
 
 static void handle_sequence(struct link *link, unsigned answer, int empty, uint64_t now) {
     if (link->state == LINK_LOST)

@@ -117,7 +117,7 @@ class LinkStats:
     min_lead_s: float | None = None
     """The smallest lead of all; negative: a command came too late. None: no lead is known."""
     lead_histogram: tuple[int, ...] = ()
-    """Commands by lead: late, < 1 ms, < 2 ms, < 4 ms, …, and the last: 2^14 ms or more."""
+    """Commands by lead: late, < 1 ms, < 2 ms, < 4 ms, …, and the last: 2^13 ms or more."""
 
 
 @dataclass(frozen=True, slots=True)

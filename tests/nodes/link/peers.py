@@ -2,11 +2,11 @@
 
 import asyncio
 import contextlib
-import os
 import socket
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from nodes.link import Frame, Link, LinkIO, LinkSettings, Response, TransportKind
 from tests.nodes.link.twin import NodeTwin
@@ -114,8 +114,7 @@ class Inbox:
         self.closed: list[str] = []
         self._changed = asyncio.Event()
 
-    def on_responses(self, responses: "list[Response] | tuple[Response, ...] | object") -> None:
-        assert isinstance(responses, list)
+    def on_responses(self, responses: Sequence[Response]) -> None:
         self.responses += responses
         self._changed.set()
 
@@ -173,4 +172,4 @@ def bench(kind: TransportKind, nodes: dict[int, NodeTwin], *, small_buffers: boo
 
 def open_files() -> int:
     """How many file descriptors this process has open."""
-    return len(os.listdir("/proc/self/fd"))
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())

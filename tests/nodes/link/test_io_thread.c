@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/*.c
+// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/io_*.c nodes/link/queue.c
 // The thread of a bus between several calling threads and a node that answers as fast as it can. Also built
 // by hand with -fsanitize=thread: what the mutex guards, it guards.
 #include "tests/check.h"

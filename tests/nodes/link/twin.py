@@ -108,7 +108,10 @@ class NodeTwin:
         bad = not 5 <= length <= 64 or (len(self.buffer) > 1 and self.buffer[1] >> 4 != 1)
         if not bad and len(self.buffer) < length:
             return False
-        if bad or self.buffer[length - 3 : length] != crc16(self.buffer[: length - 3]).to_bytes(2, "big") + b"~":
+        if (
+            bad
+            or self.buffer[length - 3 : length] != crc16(self.buffer[: length - 3]).to_bytes(2, "big") + b"~"
+        ):
             self.errors += 1
             self.hunting = True
             answers.append(block(self.expected))

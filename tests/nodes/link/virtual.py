@@ -28,10 +28,12 @@ class CoreLink:
     """The C struct with Python's manners."""
 
     def __init__(self, window: int = 192, lost_after_ns: int = 1000 * MS) -> None:
-        settings = ffi.new("struct link_settings *", {"receive_window": window, "lost_after_ns": lost_after_ns})
+        settings = ffi.new(
+            "struct link_settings *", {"receive_window": window, "lost_after_ns": lost_after_ns}
+        )
         self._memory = ffi.new("uint8_t[]", QUEUE), ffi.new("uint8_t[]", MOTION_QUEUE)
         self._out = ffi.new("uint8_t[]", lib.LINK_WIRE_MAX)
-        self._response = ffi.new("struct link_response *")
+        self._response: Any = ffi.new("struct link_response *")
         self.c: Any = ffi.new("struct link *")
         lib.link_init(self.c, settings, self._memory[0], QUEUE, self._memory[1], MOTION_QUEUE)
 

@@ -1,0 +1,181 @@
+// SPDX-License-Identifier: Apache-2.0
+// What Python asks of the links of a bus: open, close, send, read counters.
+#include <stdlib.h>
+#include <string.h>
+
+#include "nodes/link/io_bus.h"
+
+// --------------------------------------------------------------------------------------------------- links
+
+static enum io_status add_link(struct io_bus *bus, unsigned nodeid, const struct link_settings *settings,
+                               uint32_t *number) {
+    int taken = bus->kind == IO_BYTES ? bus->link_count > 0 : bus->by_nodeid[nodeid] != NULL;
+    if (taken || bus->link_count == IO_LINKS_MAX)
+        return IO_TAKEN;
+    struct io_link *node = calloc(1, sizeof *node);
+    if (!node)
+        return IO_NO_MEMORY;
+    link_init(&node->link, settings, node->control_memory, IO_CONTROL_BYTES, node->motion_memory,
+              IO_MOTION_BYTES);
+    node->nodeid = (uint8_t)nodeid;
+    node->number = *number = ++bus->last_number;
+    bus->links[bus->link_count++] = node;
+    if (bus->kind != IO_BYTES)
+        bus->by_nodeid[nodeid] = node;
+    return IO_OK;
+}
+
+enum io_status io_open_link(struct io_bus *bus, unsigned nodeid, const struct link_settings *settings,
+                            uint32_t *number) {
+    if (nodeid > 255 || (bus->kind == IO_BYTES) != (nodeid == 0) || !settings->lost_after_ns ||
+        settings->receive_window < LINK_WINDOW_MIN)
+        return IO_INVALID;
+    pthread_mutex_lock(&bus->mutex);
+    enum io_status status = bus->ended ? IO_CLOSED : add_link(bus, nodeid, settings, number);
+    pthread_mutex_unlock(&bus->mutex);
+    return status;
+}
+
+static size_t index_of(const struct io_bus *bus, uint32_t number) {
+    size_t at = 0;
+    while (at < bus->link_count && bus->links[at]->number != number)
+        at++;
+    return at;
+}
+
+void io_close_link(struct io_bus *bus, uint32_t number) {
+    pthread_mutex_lock(&bus->mutex);
+    size_t at = index_of(bus, number);
+    if (at < bus->link_count) {
+        struct io_link *node = bus->links[at];
+        bus->by_nodeid[node->nodeid] = NULL;
+        bus->link_count--;
+        memmove(bus->links + at, bus->links + at + 1, (bus->link_count - at) * sizeof *bus->links);
+        free(node);
+    }
+    pthread_mutex_unlock(&bus->mutex);
+}
+
+// Locks the bus and finds the link; NULL (and *status): it cannot be used.
+static struct io_link *enter(struct io_bus *bus, uint32_t number, enum io_status *status) {
+    pthread_mutex_lock(&bus->mutex);
+    size_t at = index_of(bus, number);
+    *status = bus->ended ? IO_CLOSED : at == bus->link_count ? IO_GONE : IO_OK;
+    return *status == IO_OK ? bus->links[at] : NULL;
+}
+
+static enum io_status leave(struct io_bus *bus, enum io_status status) {
+    if (status == IO_OK)
+        io_send_now(bus);
+    pthread_mutex_unlock(&bus->mutex);
+    return status;
+}
+
+static enum io_status from_link(enum link_status status) {
+    static const enum io_status same[] = {
+        [LINK_OK] = IO_OK, [LINK_FULL] = IO_FULL, [LINK_INVALID] = IO_INVALID, [LINK_GONE] = IO_GONE};
+    return same[status];
+}
+
+enum io_status io_send(struct io_bus *bus, uint32_t number, const uint8_t *content, size_t size,
+                       uint64_t min_clock, uint64_t req_clock) {
+    enum io_status status;
+    struct io_link *node = enter(bus, number, &status);
+    if (node)
+        status = from_link(link_send(&node->link, content, size, min_clock, req_clock));
+    return leave(bus, status);
+}
+
+enum io_status io_send_batch(struct io_bus *bus, uint32_t number, const uint8_t *batch, size_t size) {
+    enum io_status status;
+    struct io_link *node = enter(bus, number, &status);
+    if (node)
+        status = from_link(link_send_batch(&node->link, batch, size));
+    return leave(bus, status);
+}
+
+enum io_status io_send_urgent(struct io_bus *bus, uint32_t number, const uint8_t *content, size_t size) {
+    enum io_status status;
+    struct io_link *node = enter(bus, number, &status);
+    if (node)
+        status = from_link(link_send_urgent(&node->link, content, size));
+    return leave(bus, status);
+}
+
+enum io_status io_set_receive_window(struct io_bus *bus, uint32_t number, uint64_t size) {
+    enum io_status status;
+    struct io_link *node = enter(bus, number, &status);
+    if (node)
+        status = from_link(link_set_receive_window(&node->link, size));
+    return leave(bus, status);
+}
+
+enum io_status io_set_clock(struct io_bus *bus, uint32_t number, double freq_hz, uint64_t at_ns,
+                            uint64_t at_ticks) {
+    enum io_status status;
+    struct io_link *node = enter(bus, number, &status);
+    if (node)
+        status = from_link(link_set_clock(&node->link, freq_hz, at_ns, at_ticks));
+    return leave(bus, status);
+}
+
+enum io_status io_watch_drained(struct io_bus *bus, uint32_t number) {
+    enum io_status status;
+    struct io_link *node = enter(bus, number, &status);
+    if (node) {
+        node->watch_drained = 1;
+        io_note_states(bus);
+    }
+    return leave(bus, status);
+}
+
+enum io_status io_send_frame(struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size) {
+    if (size > CAN_MAX_DLEN || bus->kind == IO_BYTES)
+        return IO_INVALID;
+    pthread_mutex_lock(&bus->mutex);
+    if (bus->ended || bus->admin_count == IO_ADMIN_MAX)
+        return leave(bus, bus->ended ? IO_CLOSED : IO_FULL);
+    struct can_frame *frame = &bus->admin[(bus->admin_first + bus->admin_count++) % IO_ADMIN_MAX];
+    *frame = (struct can_frame){.can_id = can_id, .can_dlc = (uint8_t)size};
+    memcpy(frame->data, data, size);
+    if (bus->admin_count > bus->stats.admin_max)
+        bus->stats.admin_max = bus->admin_count;
+    return leave(bus, IO_OK);
+}
+
+// ------------------------------------------------------------------------------------------------ counters
+
+enum io_status io_get_link_stats(struct io_bus *bus, uint32_t number, struct io_link_stats *out) {
+    enum io_status status;
+    struct io_link *node = enter(bus, number, &status);
+    if (!node) {
+        size_t at = index_of(bus, number);
+        node = at < bus->link_count ? bus->links[at] : NULL; // the counters of an ended bus stay readable
+    }
+    if (node) {
+        const struct link *link = &node->link;
+        const struct link_queue *control = &link->control, *motion = &link->motion;
+        *out = (struct io_link_stats){
+            .pending = link_pending(link),
+            .control_commands = control->commands,
+            .control_bytes = link_queue_bytes(control),
+            .control_commands_max = control->commands_max,
+            .control_bytes_max = control->bytes_max,
+            .motion_commands = motion->commands,
+            .motion_bytes = link_queue_bytes(motion),
+            .motion_commands_max = motion->commands_max,
+            .motion_bytes_max = motion->bytes_max,
+            .flying_bytes = link->flying_bytes,
+            .flying_blocks = link->next - link->first,
+        };
+        link_get_stats(link, &out->link);
+    }
+    pthread_mutex_unlock(&bus->mutex);
+    return node ? IO_OK : status;
+}
+
+void io_get_stats(struct io_bus *bus, struct io_stats *out) {
+    pthread_mutex_lock(&bus->mutex);
+    *out = bus->stats;
+    pthread_mutex_unlock(&bus->mutex);
+}

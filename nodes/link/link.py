@@ -1,0 +1,208 @@
+"""One node's link, as Python uses it."""
+
+import asyncio
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from nodes.link._link import ffi, lib
+from nodes.link.handle import BusHandle
+from nodes.link.types import LinkError, LinkSettings, LinkStats, Response
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
+
+_S_PER_NS = 1e-9
+
+ResponsesHandler = Callable[[Sequence[Response]], None]
+TextHandler = Callable[[str], None]
+
+
+class Link:
+    """One node's link: commands in, in order and reliably; responses out. Made by LinkIO.open_link()."""
+
+    def __init__(
+        self,
+        bus: BusHandle,
+        number: int,
+        settings: LinkSettings,
+        *,
+        on_responses: ResponsesHandler,
+        on_lost: TextHandler,
+        on_close: Callable[[int], object],
+    ) -> None:
+        self._on_close = on_close
+        self._bus = bus
+        self._number = number
+        self._settings = settings
+        self._on_responses = on_responses
+        self._on_lost = on_lost
+        self._name = bus.name if settings.nodeid is None else f"{bus.name} node {settings.nodeid}"
+        self._failed: str | None = None
+        self._drained: asyncio.Future[None] | None = None
+        self._final = LinkStats()
+        self._closed = False
+
+    @property
+    def name(self) -> str:
+        """How messages to the user call it: transport and node id."""
+        return self._name
+
+    def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0) -> None:
+        """Queue one encoded control command: in order, before motion, not before MIN_CLOCK (node ticks).
+
+        Raises LinkError when the queue is full, the command is too long, or the link is closed or lost.
+        """
+        data = ffi.from_buffer(content)
+        status = lib.io_send(self._live(), self._number, data, len(content), min_clock, req_clock)
+        self._check_command(status, len(content))
+
+    def send_batch(self, batch: "Buffer") -> None:
+        """Queue the motion commands of a batch (format: batch.h), all or none; raises LinkError as send()."""
+        with memoryview(batch) as view:
+            size = view.nbytes
+            status = lib.io_send_batch(self._live(), self._number, ffi.from_buffer(view), size)
+        if status == lib.IO_FULL:
+            free = lib.IO_MOTION_BYTES - self.stats().motion_bytes
+            raise LinkError(
+                f"{self._name}: a batch of {size} bytes does not fit into the motion queue "
+                f"({free} of {lib.IO_MOTION_BYTES} free); send less ahead, or wait for drained()"
+            )
+        if status == lib.IO_INVALID:
+            raise LinkError(
+                f"{self._name}: a batch of {size} bytes ends within a record, or has a bad command"
+            )
+        self._check(status)
+
+    def send_urgent(self, content: bytes) -> None:
+        """Drop everything that is queued and unsent and send CONTENT next; raises LinkError as send()."""
+        status = lib.io_send_urgent(self._live(), self._number, ffi.from_buffer(content), len(content))
+        self._check_command(status, len(content))
+
+    def set_receive_window(self, size: int) -> None:
+        """Bound the unacknowledged bytes to SIZE, at least 64; LinkError below."""
+        if size < lib.LINK_WINDOW_MIN:
+            raise LinkError(f"{self._name}: a receive window of {size} bytes cannot hold a block (64)")
+        self._check(lib.io_set_receive_window(self._live(), self._number, size))
+
+    def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> None:
+        """Tell the node's clock: it reads AT_TICKS (64 bits) at host time AT_NS and runs at FREQ_HZ (> 0)."""
+        if not (math.isfinite(freq_hz) and freq_hz > 0 and at_ns >= 0 and at_ticks >= 0):
+            raise LinkError(
+                f"{self._name}: not a clock: {freq_hz} Hz at {at_ns} ns, {at_ticks} ticks; estimate it again"
+            )
+        self._check(lib.io_set_clock(self._live(), self._number, freq_hz, at_ns, at_ticks))
+
+    def pending(self) -> int:
+        """Return how many commands are not yet acknowledged, queued ones included."""
+        return self.stats().pending
+
+    async def drained(self) -> None:
+        """Wait until nothing is pending; raises LinkError when the link is lost or closed meanwhile."""
+        if self._drained is None:
+            self._check(lib.io_watch_drained(self._live(), self._number))
+            self._drained = asyncio.get_running_loop().create_future()
+        await asyncio.shield(self._drained)
+
+    def stats(self) -> LinkStats:
+        """Return the counters so far; after close(), the last ones."""
+        if not self._closed:
+            raw = ffi.new("struct io_link_stats *")
+            if lib.io_get_link_stats(self._bus.live(), self._number, raw) == lib.IO_OK:
+                self._final = _convert(raw)
+        return self._final
+
+    def close(self) -> None:
+        """Forget the link; what is queued is dropped. Further calls do nothing."""
+        if self._closed:
+            return
+        self.stats()
+        self._fail(f"{self._name}: the link was closed by this program")
+        self._closed = True
+        lib.io_close_link(self._bus.live(), self._number)
+        self._on_close(self._number)
+
+    # ------------------------------------------------------------------------- called by LinkIO
+
+    def handle_responses(self, responses: Sequence[Response]) -> None:
+        """Pass on what arrived."""
+        self._on_responses(responses)
+
+    def handle_drained(self) -> None:
+        """Wake those who wait in drained()."""
+        if self._drained:
+            if not self._drained.done():
+                self._drained.set_result(None)
+            self._drained = None
+
+    def handle_lost(self, cause: int) -> None:
+        """Tell the user, once, that the node does not acknowledge any more."""
+        heard = "answers, but accepts nothing" if cause == lib.LINK_CAUSE_STUCK else "does not answer at all"
+        silence_s = self._settings.lost_after_s
+        text = (
+            f"{self._name}: lost, no acknowledgement for {silence_s:g} s, the node {heard}; "
+            "check its power, cable and termination, and whether its firmware runs"
+        )
+        self._fail(text)
+        self._on_lost(text)
+
+    def handle_ended(self, text: str) -> None:
+        """Note that the transport is gone; LinkIO's on_closed tells the user."""
+        self._fail(text)
+
+    # ----------------------------------------------------------------------------------- inside
+
+    def _live(self) -> Any:
+        if self._failed:
+            raise LinkError(self._failed)
+        return self._bus.live()
+
+    def _fail(self, text: str) -> None:
+        self._failed = self._failed or text
+        if self._drained:
+            if not self._drained.done():
+                self._drained.set_exception(LinkError(text))
+                self._drained.exception()  # nobody has to be waiting
+            self._drained = None
+
+    def _check(self, status: int) -> None:
+        if status == lib.IO_GONE:
+            raise LinkError(f"{self._name}: the link is lost; open it again when the node is back")
+        self._bus.check(status, self._name)
+
+    def _check_command(self, status: int, size: int) -> None:
+        if status == lib.IO_FULL:
+            raise LinkError(
+                f"{self._name}: the control queue ({lib.IO_CONTROL_BYTES} bytes) is full; "
+                "wait until drained() before sending more"
+            )
+        if status == lib.IO_INVALID:
+            raise LinkError(
+                f"{self._name}: a command of {size} bytes; a block holds 1..{lib.WIRE_CONTENT_MAX} bytes"
+            )
+        self._check(status)
+
+
+_COUNTERS = (
+    *("blocks_sent", "bytes_sent", "commands_sent", "commands_dropped", "blocks_repeated", "bytes_repeated"),
+    *("naks", "timeouts", "blocks_received", "bytes_received", "bytes_invalid", "acks_duplicate"),
+    *("acks_never_sent", "lead_count"),
+)
+_DEPTHS = (
+    *("pending", "flying_bytes", "flying_blocks"),
+    *("control_commands", "control_commands_max", "control_bytes", "control_bytes_max"),
+    *("motion_commands", "motion_commands_max", "motion_bytes", "motion_bytes_max"),
+)
+
+
+def _convert(raw: Any) -> LinkStats:
+    link = raw.link
+    return LinkStats(
+        **{name: getattr(link, name) for name in _COUNTERS},
+        **{name: getattr(raw, name) for name in _DEPTHS},
+        srtt_s=link.srtt_ns * _S_PER_NS,
+        rttvar_s=link.rttvar_ns * _S_PER_NS,
+        rto_s=link.rto_ns * _S_PER_NS,
+        min_lead_s=link.lead_min_ns * _S_PER_NS if link.lead_count else None,
+        lead_histogram=tuple(link.lead_histogram),
+    )
