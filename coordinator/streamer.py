@@ -10,8 +10,20 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final
 
-from coordinator.app import Machine, host_now, link_of
-from coordinator.gcode.events import Emergency, End, Event, Full, Idle, Notice, PositionSet, Progress, Reply, Wait
+from coordinator.app import Machine, MachineStopped, host_now, link_of
+from coordinator.gcode.errors import GCodeError
+from coordinator.gcode.events import (
+    Emergency,
+    End,
+    Event,
+    Full,
+    Idle,
+    Notice,
+    PositionSet,
+    Progress,
+    Reply,
+    Wait,
+)
 from coordinator.gcode.interpreter import Job
 from coordinator.motion.planner import Planner
 from coordinator.motion.steps import StepGenerator
@@ -27,7 +39,11 @@ START_LEAD_S: Final = 0.6
 """From standstill, the first move begins so far ahead of now."""
 RUN_DRY_S: Final = 0.8
 """When what is planned ends so soon and no more comes, it is planned to a standstill."""
+REST_BORDER_S: Final = 0.3
+"""At rest everything up to so far ahead of now counts as generated; below START_LEAD_S."""
 SETTLE_S: Final = 0.05
+"""After the last step is due, before it is believed to be done."""
+CAUSE_WAIT_S: Final = 0.1
 
 Told = Reply | Notice
 
@@ -82,6 +98,7 @@ class Streamer:
         """Print time at which the job began."""
         self.ended_s = 0.0
         self._done = Progress(0, 0, None)
+        self._failure: GCodeError | None = None
 
     @property
     def _planner(self) -> Planner:
@@ -102,6 +119,8 @@ class Streamer:
         watch = asyncio.ensure_future(self._machine.wait_stopped())
         try:
             await asyncio.wait((work, watch), return_when=asyncio.FIRST_COMPLETED)
+            if not watch.done() and work.exception() is not None:
+                await self._stop_after(work.exception(), watch)
             if watch.done():
                 raise watch.result()
             work.result()
@@ -109,6 +128,15 @@ class Streamer:
             for task in (work, watch):
                 task.cancel()
             await asyncio.gather(work, watch, return_exceptions=True)
+
+    async def _stop_after(self, error: BaseException | None, watch: asyncio.Future[MachineStopped]) -> None:
+        """Stop the machine after ERROR of the stream, unless it is that of a program and all stands still."""
+        if isinstance(error, GCodeError):
+            return
+        # The link may have failed a moment before its node is known to be lost: that is the better cause.
+        await asyncio.wait((watch,), timeout=CAUSE_WAIT_S)
+        self._machine.stop(f"{error}; all nodes were stopped")
+        await watch
 
     # ------------------------------------------------------------------------------------------- streaming
 
@@ -134,8 +162,10 @@ class Streamer:
                     return
                 if event is not None:
                     await asyncio.sleep(CYCLE_S)
-            self.ended_s = event.print_time_s
+            self.ended_s = self._planner.print_time_end_s
             await self._settle(worker)
+        if self._failure is not None:
+            raise self._failure
 
     def _hand_over(self, cycle: _Cycle) -> None:
         for node, batch in cycle.batches:
@@ -171,14 +201,23 @@ class Streamer:
         now = self.print_time_now()
         told: list[Told] = []
         event = waiting_for
-        if not self._still_waiting(waiting_for, now):
+        if self._failure is None and not self._still_waiting(waiting_for, now):
             self._planner.plan_until_s = now + PLAN_AHEAD_S
             self._begin_anew(now)
-            event = self._advance(told)
+            try:
+                event = self._advance(told)
+            except GCodeError as error:
+                # What came before the bad line is carried out, to a standstill.
+                self._failure = error
+        if self._failure is not None:
+            event = self._end_early()
         if isinstance(event, Idle) or self._runs_dry(now):
             self._planner.flush()
         self._generate(now)
         return self._cycle(told, event)
+
+    def _end_early(self) -> Event:
+        return End(self._job.line, self._planner.print_time_end_s) if self._planner.flush() else Full()
 
     def _rest(self) -> _Cycle:
         self._generate(self.print_time_now())
@@ -239,7 +278,9 @@ class Streamer:
             standing = complete and self._planner.at_standstill
             end = self.pipeline.appended_until
             until = min(end, now + SEND_AHEAD_S)
-            self.pipeline.generate(until, flush=standing and until >= end)
+            flush = standing and until >= end
+            # At rest the border moves on with time, so that the clocks are steered at all times.
+            self.pipeline.generate(max(until, now + REST_BORDER_S) if flush else until, flush=flush)
             if complete or until < end:
                 return
 

@@ -4,6 +4,7 @@
 event           what the driver does before it calls ``step`` again
 ==============  ==========================================================================================
 Progress        nothing
+Idle            waits for input; plans what there is to a standstill before the machine runs dry
 Full            takes and releases trapezoids (a streamer: waits until there is room, or raises plan_until_s)
 Wait            takes all trapezoids; in real time, waits until PRINT_TIME_S has been executed
 PositionSet     takes all trapezoids, then tells step generation where the machine stands
@@ -24,6 +25,11 @@ class Progress:
     done_bytes: int
     size_bytes: int | None
     """None where the length is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Idle:
+    """The program's source has nothing at present, but has not ended: someone is typing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,4 +89,4 @@ class End:
     print_time_s: float
 
 
-Event = Progress | Full | Wait | PositionSet | Reply | Notice | Emergency | End
+Event = Progress | Idle | Full | Wait | PositionSet | Reply | Notice | Emergency | End

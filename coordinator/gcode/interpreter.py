@@ -14,6 +14,7 @@ from coordinator.gcode.events import (
     End,
     Event,
     Full,
+    Idle,
     Notice,
     PositionSet,
     Progress,
@@ -99,8 +100,9 @@ class Job:
             self._end()
         else:
             program.check_line_length(self.line)
-            program.refill()
-            self._events.append(Progress(self.planner.lines, program.done_bytes, program.size_bytes))
+            more = program.refill()
+            progress = Progress(self.planner.lines, program.done_bytes, program.size_bytes)
+            self._events.append(progress if more else Idle())
 
     def _end(self) -> None:
         if not self.planner.flush():

@@ -1,5 +1,7 @@
 """The text of a G-code program, read in bounded pieces: memory does not grow with its length."""
 
+import os
+import select
 import sys
 from collections.abc import Iterable, Iterator
 from io import FileIO
@@ -20,7 +22,7 @@ class ByteSource(Protocol):
     """What a program is read from: an open binary file, a pipe, standard input."""
 
     def read(self, size: int, /) -> bytes | None:
-        """Return at most SIZE bytes; none at the end."""
+        """Return at most SIZE bytes; none at the end; None when nothing has come yet."""
 
     def close(self) -> None:
         """Release it."""
@@ -40,6 +42,21 @@ class _Pieces:
 
     def close(self) -> None:
         """Nothing to release."""
+
+
+class _Typed:
+    """Standard input as it comes: a read never waits, and leaves the terminal's settings alone."""
+
+    def __init__(self, fd: int) -> None:
+        self._fd = fd
+        self._poll = select.poll()
+        self._poll.register(fd, select.POLLIN)
+
+    def read(self, size: int, /) -> bytes | None:
+        return os.read(self._fd, size) if self._poll.poll(0) else None
+
+    def close(self) -> None:
+        """Leave standard input to others."""
 
 
 class Program:
@@ -76,6 +93,11 @@ class Program:
         return cls(source, str(path), size_bytes=size)
 
     @classmethod
+    def typed(cls) -> Self:
+        """Read standard input as it comes, without ever waiting for it."""
+        return cls(_Typed(sys.stdin.fileno()), "standard input")
+
+    @classmethod
     def from_lines(cls, lines: Iterable[str | bytes], name: str = "program") -> Self:
         """Read from LINES, with or without line feeds."""
         return cls(_Pieces(lines), name)
@@ -85,8 +107,8 @@ class Program:
         """Bytes consumed."""
         return self._read_bytes - (len(self.data) - self.start)
 
-    def refill(self) -> None:
-        """Drop what was consumed and read one piece more, waiting for it if need be.
+    def refill(self) -> bool:
+        """Drop what was consumed and read one piece more; False when the source has nothing yet.
 
         Raises CanductorError when reading fails or a line is longer than MAX_LINE_BYTES.
         """
@@ -96,7 +118,7 @@ class Program:
             reason = (error.strerror or str(error)).lower()
             raise CanductorError(f"reading {self.name} failed: {reason}; copy the file again") from error
         if piece is None:
-            raise CanductorError(f"reading {self.name} failed: it is non-blocking; give a file or a pipe")
+            return False
         if self._read_bytes == 0 and piece.startswith(_BYTE_ORDER_MARK):
             self._read_bytes = len(_BYTE_ORDER_MARK)
             piece = piece[len(_BYTE_ORDER_MARK) :]
@@ -106,6 +128,7 @@ class Program:
         self._read_bytes += len(piece)
         self.data = self.data[self.start :] + piece
         self.start = 0
+        return True
 
     def line_end(self) -> int:
         """Return where the line at ``start`` ends, line feed excluded."""
