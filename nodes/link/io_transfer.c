@@ -12,8 +12,7 @@
 
 enum { FRAME = sizeof(struct can_frame), DATA_MAX = 8, DATA_ID = 0x100, FROM_NODE = 1 };
 
-// ----------------------------------------------------------------------------------------------------- for
-// Python
+// -------------------------------------------------------------------------------------------- for Python
 
 void io_notify(struct io_bus *bus) {
     uint64_t one = 1;
@@ -98,7 +97,8 @@ static void receive_bytes(struct io_bus *bus, size_t size, uint64_t now) {
 
 void io_read_all(struct io_bus *bus, uint64_t now) {
     // Bounded, so that a flood cannot keep the thread from sending; what is left wakes it again at once.
-    for (int rounds = 0; rounds < 64 && !bus->ended; rounds++) {
+    // Enough for all that waits after a stall of the host, lest an acknowledgement in there count as late.
+    for (int rounds = 0; rounds < 1024 && !bus->ended; rounds++) {
         size_t room = bus->kind == IO_CAN_PACKET ? FRAME : sizeof bus->in - bus->in_used;
         ssize_t size = read(bus->fd, bus->in + bus->in_used, room);
         if (size > 0) {

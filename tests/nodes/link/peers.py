@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import os
 import socket
 import struct
 from collections.abc import Callable, Iterator, Sequence
@@ -32,6 +33,21 @@ class SocketTransport:
 
     def close(self) -> None:
         self.socket.close()
+
+
+@dataclass
+class FdTransport:
+    """A transport that is a bare file descriptor."""
+
+    name: str
+    kind: TransportKind
+    fd: int
+
+    def fileno(self) -> int:
+        return self.fd
+
+    def close(self) -> None:
+        os.close(self.fd)
 
 
 class Peer:

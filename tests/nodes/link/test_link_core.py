@@ -106,9 +106,10 @@ def test_an_acknowledgement_of_what_was_never_sent_is_ignored_and_counted() -> N
     line.link.send(store(1, 50))
     line.pump()
     expected = line.node.expected
-    line.link.receive(block(expected + 5), line.now)
-    assert line.link.pending() == 1
-    assert line.link.stats.acks_never_sent == 1
+    for ahead in range(2, 16):
+        line.link.receive(block(expected + ahead), line.now)
+        assert line.link.pending() == 1
+        assert line.link.stats.acks_never_sent == ahead - 1
     line.run()
     assert line.node.executed == [store(1, 50)]
 
@@ -144,6 +145,21 @@ def test_a_nak_repeats_at_once_and_the_round_trip_is_not_measured_by_repeats() -
     assert line.link.stats.naks >= 1
     assert line.link.stats.srtt_ns == srtt_ns
     assert line.now - start_ns < 6 * MS
+
+
+def test_a_repeated_block_gives_no_round_trip() -> None:
+    """Whether the answer belongs to the block or to its repeat cannot be known (Karn)."""
+    line = connected()
+    late = line.counts[TO_NODE]
+    line.fault = lambda way, index, data: [(21 * MS if (way, index) == (TO_NODE, late) else 0, data)]
+    line.link.send(store(1))
+    line.run()
+    assert line.link.stats.timeouts == 1
+    assert line.link.stats.srtt_ns == 2 * MS
+    assert line.link.stats.rto_ns == 40 * MS  # and the doubled timeout stays until there is one
+    line.link.send(store(2))
+    line.run()
+    assert line.link.stats.rto_ns == 20 * MS
 
 
 def test_responses_tell_when_their_question_was_sent_unless_it_was_repeated() -> None:

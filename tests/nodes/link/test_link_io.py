@@ -1,13 +1,16 @@
 """The I/O thread and its Python skin over socket pairs, with twin nodes at the far end."""
 
 import asyncio
+import os
+import pty
 import struct
+import tty
 from collections.abc import Callable, Coroutine
 
 import pytest
 
-from nodes.link import LinkError, LinkSettings, TransportKind
-from tests.nodes.link.peers import TIMEOUT_S, bench, open_files, pack_frame
+from nodes.link import LinkError, LinkIO, LinkSettings, TransportKind
+from tests.nodes.link.peers import TIMEOUT_S, FdTransport, Inbox, bench, open_files, pack_frame
 from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, block, store
 
 KINDS = list(TransportKind)
@@ -210,6 +213,36 @@ def test_a_peer_that_closes_is_told_once(kind: TransportKind) -> None:
                 b.open(77 if node_id(kind) else 0)
             assert link.stats().commands_sent == 1
             assert b.inbox.lost == []
+
+    run(test())
+
+
+def test_a_pseudo_terminal_carries_a_link_and_its_end_is_told() -> None:
+    async def test() -> None:
+        ours, theirs = pty.openpty()
+        tty.setraw(theirs)
+        os.set_blocking(theirs, False)
+        node, inbox, loop = NodeTwin(3), Inbox(), asyncio.get_running_loop()
+
+        def serve() -> None:
+            for block_ in node.receive(os.read(theirs, 4096)):
+                os.write(theirs, block_)
+
+        loop.add_reader(theirs, serve)
+        transport = FdTransport("tty", TransportKind.BYTES, ours)
+        io = LinkIO(transport, loop, on_closed=inbox.on_closed)
+        link = io.open_link(LinkSettings(None), on_responses=inbox.on_responses, on_lost=inbox.on_lost)
+        for i in range(200):
+            link.send(ask(i))
+        await link.drained()
+        await inbox.until(lambda: len(inbox.responses) == 200)
+        assert link.stats().bytes_invalid == 0
+        loop.remove_reader(theirs)
+        os.close(theirs)
+        await inbox.until(lambda: inbox.closed)
+        assert "tty: the connection ended (Input/output error)" in inbox.closed[0]
+        io.close()
+        transport.close()
 
     run(test())
 

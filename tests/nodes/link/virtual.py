@@ -103,6 +103,8 @@ class Line:
     node: NodeTwin
     fault: Fault = no_fault
     delay_ns: int = MS
+    block_ns: int = 0
+    """What each block occupies the line for."""
     now: int = 1_000 * MS
     observer: WindowObserver | None = None
     responses: list[tuple[bytes, int]] = field(default_factory=list)
@@ -119,7 +121,7 @@ class Line:
         for delay_ns, faulty in self.fault(direction, index, data):
             self._order += 1
             at_ns = max(self.now + self.delay_ns + delay_ns, self._free_ns[direction])
-            self._free_ns[direction] = at_ns
+            self._free_ns[direction] = at_ns + self.block_ns
             heapq.heappush(self._events, (at_ns, self._order, direction, faulty))
 
     def pump(self) -> None:
