@@ -1,1 +1,55 @@
-"""Ways to reach nodes: SocketCAN, the virtual bus, any python-can backend, UART."""
+"""Ways to a bus or a board: each is a file descriptor the link's C thread takes over (see ``base``)."""
+
+from pathlib import Path
+
+from nodes.errors import CanductorError
+from nodes.transport.base import (
+    ByteTransport,
+    CanTransport,
+    Transport,
+    TransportBusyError,
+    TransportClosedError,
+    TransportKind,
+)
+from nodes.transport.frame import CanFrame
+from nodes.transport.python_can_bridge import PythonCanBridge
+from nodes.transport.socketcan import SocketCanTransport
+from nodes.transport.uart import BAUD_DEFAULT, UartTransport
+from nodes.transport.virtual import VirtualTransport
+
+__all__ = [
+    "ByteTransport",
+    "CanFrame",
+    "CanTransport",
+    "Transport",
+    "TransportBusyError",
+    "TransportClosedError",
+    "TransportKind",
+    "open_can",
+    "open_uart",
+]
+
+
+def open_can(spec: str, *, bitrate: int | None = None) -> CanTransport:
+    """Open the CAN bus that SPEC names; raises CanductorError.
+
+    ``can0``: the SocketCAN interface; ``virtual:PATH``: the project's virtual bus; ``INTERFACE:CHANNEL``: a
+    backend of python-can. BITRATE in bit/s: backends of python-can are set to it; the others are as they are
+    and are only believed to have it.
+    """
+    interface, colon, channel = spec.partition(":")
+    if not interface or (colon and not channel):
+        raise CanductorError(
+            f"CAN bus '{spec}': not a bus; write an interface (can0), virtual:PATH, or INTERFACE:CHANNEL of"
+            " python-can"
+        )
+    if not colon:
+        return SocketCanTransport(interface, bitrate=bitrate)
+    if interface == "virtual":
+        return VirtualTransport(channel, bitrate=bitrate)
+    return PythonCanBridge.open(interface, channel, bitrate=bitrate)
+
+
+def open_uart(path: str | Path, baud: int = BAUD_DEFAULT) -> ByteTransport:
+    """Open the serial device at PATH at BAUD bit/s; raises CanductorError."""
+    return UartTransport(path, baud)

@@ -1,9 +1,9 @@
 """A virtual CAN bus: firmware processes and hosts meet at a Unix socket, without root or a kernel module.
 
-Every client connects to the bus's socket and exchanges 16-byte ``struct can_frame`` records. The bus arbitrates
-by id, takes the true time of each frame at its bit rate, and delivers in one order to everybody; a client that
-does not read stops the bus instead of losing frames. The work is done in C (``hub.h``, ``hub_loop.h``) in a
-thread of its own that never needs the interpreter.
+Every client connects to the bus's socket and exchanges 16-byte ``struct can_frame`` records. The bus
+arbitrates by id, takes the true time of each frame at its bit rate, and delivers in one order to everybody; a
+client that does not read stops the bus instead of losing frames. The work is done in C (``hub.h``,
+``hub_loop.h``) in a thread of its own that never needs the interpreter.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import threading
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from nodes.errors import CanductorError
 from nodes.virtual._hub import ffi, lib
@@ -76,9 +76,9 @@ class BusStats:
 class VirtualBus:
     """A virtual CAN bus at the Unix socket PATH.
 
-    ``bitrate`` in bit/s, or None for frames that take no time. ``loss`` (0..1) is the share of frames that reach
-    nobody; which ones is decided by ``seed``. ``stuck_limit_s``: see STUCK_LIMIT_S. Use it as a context manager,
-    or call start() and close(); methods are for one thread.
+    ``bitrate`` in bit/s, or None for frames that take no time. ``loss`` (0..1) is the share of frames that
+    reach nobody; which ones is decided by ``seed``. ``stuck_limit_s``: see STUCK_LIMIT_S. Use it as a context
+    manager, or call start() and close(); methods are for one thread.
     """
 
     def __init__(
@@ -95,18 +95,20 @@ class VirtualBus:
         self.bitrate = bitrate or None
         if len(os.fsencode(self.path)) > SOCKET_PATH_MAX:
             raise CanductorError(
-                f"virtual bus: the path {self.path} is longer than the {SOCKET_PATH_MAX} bytes a Unix socket can"
-                " have; choose a shorter one"
+                f"virtual bus: the path {self.path} is longer than the {SOCKET_PATH_MAX} bytes of a Unix"
+                " socket's; choose a shorter one"
             )
         if self.bitrate is not None and not BITRATE_MIN <= self.bitrate <= BITRATE_MAX:
             raise CanductorError(
-                f"virtual bus {self.path}: bit rate {bitrate} is not between {BITRATE_MIN} and {BITRATE_MAX} bit/s"
-                " (0 means no limit)"
+                f"virtual bus {self.path}: bit rate {bitrate} is not between {BITRATE_MIN} and"
+                f" {BITRATE_MAX} bit/s (0 means no limit)"
             )
         if not 0 <= loss <= 1:
             raise CanductorError(f"virtual bus {self.path}: loss {loss} is not a share between 0 and 1")
         if not 0 < stuck_limit_s < 1e6:
-            raise CanductorError(f"virtual bus {self.path}: stuck limit {stuck_limit_s} s is not a positive time")
+            raise CanductorError(
+                f"virtual bus {self.path}: stuck limit {stuck_limit_s} s is not a positive time"
+            )
         self._config = {
             "bitrate": self.bitrate or 0,
             "loss": loss,
@@ -192,7 +194,7 @@ class VirtualBus:
 
 
 def _read_stats(loop: object) -> BusStats:
-    report = ffi.new("struct hub_report *")
+    report: Any = ffi.new("struct hub_report *")
     lib.hub_loop_report(loop, report)
     counters = report.counters
     return BusStats(
@@ -223,9 +225,12 @@ def _listen(path: Path) -> socket.socket:
     except OSError as error:
         listener.close()
         if error.errno == errno.EADDRINUSE:
-            raise CanductorError(f"virtual bus {path}: another bus took this path just now; choose another") from error
+            raise CanductorError(
+                f"virtual bus {path}: another bus took this path just now; choose another"
+            ) from error
         raise CanductorError(
-            f"virtual bus {path}: cannot make the socket: {error.strerror}; the folder must exist and be writable"
+            f"virtual bus {path}: cannot make the socket: {error.strerror}; the folder must exist and be"
+            " writable"
         ) from error
     return listener
 
@@ -233,7 +238,9 @@ def _listen(path: Path) -> socket.socket:
 def _remove_stale(path: Path) -> None:
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise CanductorError(f"virtual bus {path}: a file that is no socket is in the way; choose another path")
+            raise CanductorError(
+                f"virtual bus {path}: a file that is no socket is in the way; choose another path"
+            )
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
             probe.setblocking(False)  # a bus whose backlog is full is in use too
             probe.connect(os.fspath(path))
@@ -250,20 +257,29 @@ def _remove_stale(path: Path) -> None:
 
 
 def _in_use(path: Path) -> CanductorError:
-    return CanductorError(f"virtual bus {path}: a bus is already running there; stop it or choose another path")
+    return CanductorError(
+        f"virtual bus {path}: a bus is already running there; stop it or choose another path"
+    )
 
 
 def _parse_arguments(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m nodes.virtual.hub",
-        description="Carries a virtual CAN bus until SIGTERM or SIGINT. Prints one JSON line when it is ready and"
-        " one with its counters at the end.",
+        description="Carries a virtual CAN bus until SIGTERM or SIGINT. Prints one JSON line when it is"
+        " ready and one with its counters at the end.",
     )
     parser.add_argument("path", metavar="PATH", help="the Unix socket to which clients connect")
     parser.add_argument("--bitrate", type=int, default=1_000_000, help="bit/s; 0: no limit (default 1000000)")
-    parser.add_argument("--loss", type=float, default=0.0, help="share of frames that reach nobody (default 0)")
+    parser.add_argument(
+        "--loss", type=float, default=0.0, help="share of frames that reach nobody (default 0)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="which frames are lost (default 0)")
     return parser.parse_args(arguments)
+
+
+def _print_json(value: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(value) + "\n")
+    sys.stdout.flush()
 
 
 def main(arguments: list[str]) -> int:
@@ -273,14 +289,14 @@ def main(arguments: list[str]) -> int:
     signal.pthread_sigmask(signal.SIG_BLOCK, ending)  # before the thread starts, which inherits it
     try:
         bus = VirtualBus(options.path, bitrate=options.bitrate, loss=options.loss, seed=options.seed).start()
-        print(json.dumps({"ready": True, "address": bus.address}), flush=True)
+        _print_json({"ready": True, "address": bus.address})
         while bus.running and signal.sigtimedwait(ending, 0.5) is None:
             pass
         bus.close()
     except CanductorError as error:
-        print(error, file=sys.stderr)
+        sys.stderr.write(f"{error}\n")
         return 1
-    print(json.dumps(asdict(bus.stats)), flush=True)
+    _print_json(asdict(bus.stats))
     return 0
 
 

@@ -1,0 +1,238 @@
+"""Starts and ends the processes of virtual hardware: firmware nodes, and the bus as a process of its own.
+
+They print one JSON line when they are ready and, on SIGTERM, one with their counters. They die with this
+process, however it ends: the kernel sends them SIGKILL (PR_SET_PDEATHSIG, set by util-linux's ``setpriv``
+between fork and exec, where Python code would not be safe). The kernel watches the *thread* that forked, so
+all are started from one thread that lives as long as the interpreter. They are in a session of their own:
+Ctrl-C at the terminal reaches only this process, which ends them in order.
+"""
+
+import contextlib
+import json
+import os
+import select
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+from nodes.errors import CanductorError
+
+BIN_DIR = Path(__file__).parent / "bin"
+READY_TIMEOUT_S = 10.0
+STOP_TIMEOUT_S = 5.0
+LINE_MAX = 65_536
+"""Bytes a line of a child may have."""
+_STDERR_TAIL = 500
+"""Bytes of a child's last words that go into an error message."""
+
+Flavour = Literal["mainboard", "toolhead", "uart"]
+
+_starter = ThreadPoolExecutor(max_workers=1, thread_name_prefix="process starter")
+
+
+class ChildProcess:
+    """A process that announces itself and reports at its end, both as a JSON line. NAME is for messages.
+
+    The constructor only starts it, so that several can come up at the same time; wait_ready() completes that.
+    Methods are for one thread. As a context manager it is stopped, or killed when an exception leaves the
+    block.
+    """
+
+    def __init__(self, name: str, command: Sequence[str | Path]) -> None:
+        """Start COMMAND; raises CanductorError when that is impossible."""
+        self.name = name
+        self.ready: dict[str, Any] | None = None
+        """What the process said when it was ready."""
+        self._statistics: dict[str, Any] | None = None
+        self._received = b""
+        setpriv = shutil.which("setpriv")
+        if setpriv is None:
+            raise CanductorError(
+                f"{name}: cannot be started without 'setpriv'; install the package util-linux"
+            )
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (a pipe nobody reads would stop the process)
+        self._process: subprocess.Popen[bytes] = _starter.submit(
+            subprocess.Popen,
+            [setpriv, "--pdeathsig", "KILL", "--", *(str(word) for word in command)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._stderr,
+            start_new_session=True,
+        ).result()
+
+    @property
+    def pid(self) -> int:
+        """The process's id."""
+        return self._process.pid
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self._process.poll() is None
+
+    def wait_ready(self, timeout_s: float = READY_TIMEOUT_S) -> dict[str, Any]:
+        """Return what the process says when it is ready; else kill it and raise CanductorError."""
+        if self.ready is None:
+            line = self._read_line(timeout_s)
+            if line is None or line.get("ready") is not True:
+                raise self._failure("did not become ready", timeout_s)
+            self.ready = line
+        return self.ready
+
+    def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> dict[str, Any]:
+        """Ask the process to end and return its counters; doing it again returns them again.
+
+        Raises CanductorError when it had died before, does not end in time (it is killed), or ends with an
+        error.
+        """
+        if self._statistics is not None:
+            return self._statistics
+        if self.running:
+            self._process.terminate()
+        deadline_s = time.monotonic() + timeout_s
+        line = self._read_line(timeout_s)
+        if line is not None and line.get("ready") is True:  # it was stopped before anybody waited for it
+            line = self._read_line(deadline_s - time.monotonic())
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(max(0.0, deadline_s - time.monotonic()))
+        if line is None or self._process.returncode != 0:
+            raise self._failure("did not end in order", timeout_s)
+        self._close()
+        self._statistics = line
+        return line
+
+    def kill(self) -> None:
+        """End the process at once, without counters; harmless when it has ended."""
+        self._process.kill()
+        self._process.wait()
+        self._close()
+
+    def _close(self) -> None:
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        self._stderr.close()
+
+    def _read_line(self, timeout_s: float) -> dict[str, Any] | None:
+        """Return the process's next JSON line; None when none comes, or something else."""
+        deadline_s = time.monotonic() + timeout_s
+        assert self._process.stdout is not None
+        if self._process.stdout.closed:
+            return None
+        fd = self._process.stdout.fileno()
+        poller = select.poll()
+        poller.register(fd, select.POLLIN)
+        while b"\n" not in self._received:
+            if not poller.poll(max(0.0, deadline_s - time.monotonic()) * 1000):
+                return None
+            data = os.read(fd, 4096)
+            self._received += data
+            if not data or len(self._received) > LINE_MAX:
+                return None
+        line, _, self._received = self._received.partition(b"\n")
+        try:
+            value = json.loads(line)
+        except ValueError:
+            return None
+        return value if isinstance(value, dict) else None
+
+    def _failure(self, what: str, timeout_s: float) -> CanductorError:
+        """Say why, and make sure that the process has ended."""
+        if self._process.stdout is not None and self._process.stdout.closed:
+            return CanductorError(f"{self.name} {what}: it had been killed before")
+        # Its output may end a moment before the process itself does.
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(0.1)
+        status = self._process.poll()
+        if status is None:
+            reason = f"no answer in {timeout_s:g} s; it was killed"
+        elif status < 0:
+            reason = f"ended by signal {-status}"
+        else:
+            reason = f"ended with status {status}"
+        self._process.kill()
+        self._process.wait()
+        self._stderr.seek(max(0, self._stderr.seek(0, os.SEEK_END) - _STDERR_TAIL))
+        words = " ".join(self._stderr.read().decode(errors="replace").split())
+        self._close()
+        return CanductorError(f"{self.name} {what}: {reason}" + (f": {words}" if words else ""))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            self.kill()
+        elif not self._stderr.closed:
+            self.stop()
+
+
+class NodeProcess(ChildProcess):
+    """A virtual node: the project's firmware as a process.
+
+    FLAVOUR is the board it plays. Exactly one of ``can`` (a virtual bus's socket), ``socketcan`` (an
+    interface) and ``uart`` (where to put the link to the node's pseudo-terminal) says how it is reached; the
+    last two parts of the clock are its rate error in ppm and its value at the start. ``jitter_us`` and
+    ``slice_us``: see the firmware.
+    """
+
+    def __init__(
+        self,
+        flavour: Flavour,
+        *,
+        uuid: str,
+        can: Path | None = None,
+        socketcan: str | None = None,
+        uart: Path | None = None,
+        rate_ppm: float = 0.0,
+        start_clock: int | None = None,
+        jitter_us: int | None = None,
+        slice_us: int | None = None,
+        seed: int | None = None,
+        edge_log: Path | None = None,
+        name: str | None = None,
+        bin_dir: Path = BIN_DIR,
+    ) -> None:
+        """Start the node; raises CanductorError. Options left at None are the firmware's own choice."""
+        name = name or f"virtual node {flavour}"
+        links = {"--can": can, "--socketcan": socketcan, "--uart": uart}
+        if sum(link is not None for link in links.values()) != 1:
+            raise CanductorError(f"{name}: needs exactly one of can, socketcan and uart to be reached")
+        executable = bin_dir / f"canductor-node-{flavour}"
+        if not executable.is_file():
+            raise CanductorError(
+                f"{name}: its firmware {executable} is not there; build it with 'make setup'"
+            )
+        options = links | {
+            "--uuid": uuid,
+            "--rate-ppm": rate_ppm,
+            "--start-clock": start_clock,
+            "--jitter-us": jitter_us,
+            "--slice-us": slice_us,
+            "--seed": seed,
+            "--edge-log": edge_log,
+        }
+        command: list[str | Path] = [executable]
+        for option, value in options.items():
+            if value is not None:
+                command += [option, str(value)]
+        super().__init__(name, command)
+
+
+class BusProcess(ChildProcess):
+    """The virtual bus as a process of its own; stop() returns its BusStats as a dictionary."""
+
+    def __init__(
+        self, path: str | Path, *, bitrate: int | None = 1_000_000, loss: float = 0.0, seed: int = 0
+    ) -> None:
+        """Start the bus; the arguments are those of VirtualBus."""
+        options = ["--bitrate", str(bitrate or 0), "--loss", str(loss), "--seed", str(seed)]
+        super().__init__(f"virtual bus {path}", [sys.executable, "-m", "nodes.virtual.hub", path, *options])
