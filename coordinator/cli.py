@@ -124,8 +124,8 @@ def _stdout_is_gone() -> bool:
         poll = select.poll()
         poll.register(sys.stdout.fileno(), select.POLLOUT)
         return any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0))
-    except (OSError, ValueError):
-        return True
+    except (OSError, ValueError):  # not a file: nobody can close its other end
+        return False
 
 
 def _drop_stdout() -> None:

@@ -20,7 +20,7 @@ SAVED_PREFIX = "#*#"
 SAVED_HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
 _SAVED_HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>\s*")
 _COMMENT = re.compile(r"(?:^|\s)[#;].*")
-_SECTION = re.compile(r"\[([^\[\]]*)\]")
+_SECTION = re.compile(r"\[(include .*|[^\[\]]*)\]")  # wildcards of a path may hold brackets
 _SEPARATOR = re.compile(r"[:=]")
 _MAX_NAME_CHARS = 200
 
@@ -174,7 +174,7 @@ class _Parser:
 
 
 def _section_name(text: str, place: Place) -> str:
-    match = _SECTION.fullmatch(text)
+    match = _SECTION.fullmatch(text.replace("\t", " "))
     name = " ".join(match[1].split()) if match else ""
     if match is None or not name or len(name) > _MAX_NAME_CHARS:
         raise ConfigError(place, f"{shown(text)} is not a section header; write [name] or [name instance]")
