@@ -9,7 +9,7 @@ from pathlib import Path
 from coordinator.machine.problem import ConfigError, Place, shown_path
 
 MAX_FILES = 200
-MAX_BYTES = 8_000_000
+MAX_BYTES = 2_000_000
 MAX_DEPTH = 16
 MAX_DIRECTORY_ENTRIES = 20_000
 _WILDCARDS = "*?["

@@ -227,6 +227,8 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--help"]) == 0
     text = capsys.readouterr().out
     assert all(word in text for word in ("demo", "run", "plan", "--version"))
+    assert cli.main([]) == 2
+    assert capsys.readouterr() == (text, "")
 
 
 LONG_REPORT = """

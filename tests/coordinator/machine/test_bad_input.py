@@ -64,15 +64,15 @@ CASES = {
     "missing pin": (
         changed("dir_pin: PA1\n", ""),
         (
-            "printer.cfg:12: [stepper_x] lacks option 'dir_pin', a pin as in PA3 or toolhead:PA3, with !"
-            " before it: the driver's direction input; ! when high means negative"
+            "printer.cfg:12: [stepper_x] lacks option 'dir_pin', a pin as in PA3 or toolhead:PA3, may"
+            " begin with !: the driver's direction input; ! when high means negative"
         ),
     ),
     "missing option": (
         changed("rotation_distance: 8\n", ""),
         (
-            "printer.cfg:26: [stepper_z] lacks option 'rotation_distance', a number in mm, above 0 and at"
-            " most 10000: way of the axis for one turn of the motor, or of the last gear"
+            "printer.cfg:26: [stepper_z] lacks option 'rotation_distance', a number in mm, above 0"
+            " and at most 10000: way of the axis for one turn of the motor, or of the last gear"
         ),
     ),
     "pin used twice": (
@@ -92,8 +92,8 @@ CASES = {
     "pin used by the heater": (
         PRINTER_CFG + "heater_pin: toolhead:PA0\n",
         (
-            "printer.cfg:40: 'heater_pin' of [extruder]: pin toolhead:PA0 is already used for 'step_pin'"
-            " of [extruder] (printer.cfg:34)"
+            "printer.cfg:40: 'heater_pin' of [extruder]: pin toolhead:PA0 is already used for"
+            " 'step_pin' of [extruder] (printer.cfg:34)"
         ),
     ),
     "pin of an unknown node": (
@@ -107,15 +107,15 @@ CASES = {
     "step and direction on two nodes": (
         changed("toolhead:PA1", "PB1"),
         (
-            "printer.cfg:35: option 'dir_pin' of [extruder] is 'PB1', on node 'mcu', but step_pin is on"
-            " 'toolhead'; both must be on one node"
+            "printer.cfg:35: option 'dir_pin' of [extruder] is 'PB1', on node 'mcu', but step_pin is"
+            " on 'toolhead'; both must be on one node"
         ),
     ),
     "pin misspelt": (
         changed("step_pin: PA0", "step_pin: !!PA0"),
         (
             "printer.cfg:13: option 'step_pin' of [stepper_x] is '!!PA0', must be a pin as in PA3 or"
-            " toolhead:PA3, with ! before it"
+            " toolhead:PA3, may begin with !"
         ),
     ),
     "pull-up on an output": (
@@ -125,15 +125,15 @@ CASES = {
     "wrong uuid": (
         changed("11aa22bb33cc", "11aa22bb33"),
         (
-            "printer.cfg:2: option 'canbus_uuid' of [mcu] is '11aa22bb33', must be 12 hex digits such as"
-            " 11aa22bb33cc"
+            "printer.cfg:2: option 'canbus_uuid' of [mcu] is '11aa22bb33', must be 12 hex digits such"
+            " as 11aa22bb33cc"
         ),
     ),
     "uuid of two nodes": (
         changed("serial: /dev/ttyACM0", "canbus_uuid: 11AA22BB33CC"),
         (
-            "printer.cfg:5: nodes 'mcu' (printer.cfg:2) and 'toolhead' are both '11aa22bb33cc'; each node"
-            " needs its own"
+            "printer.cfg:5: nodes 'mcu' (printer.cfg:2) and 'toolhead' are both '11aa22bb33cc'; each"
+            " node needs its own"
         ),
     ),
     "node without connection": (
@@ -151,15 +151,15 @@ CASES = {
     "reset line on a bus": (
         changed("11aa22bb33cc\n", "11aa22bb33cc\nrestart_method: arduino\n"),
         (
-            "printer.cfg:3: option 'restart_method' of [mcu] is 'arduino', but a node on CAN restarts by"
-            " command only; remove it"
+            "printer.cfg:3: option 'restart_method' of [mcu] is 'arduino', but a node on CAN restarts"
+            " by command only; remove it"
         ),
     ),
     "bad bus": (
         changed("11aa22bb33cc\n", "11aa22bb33cc\ncanbus_interface: can 0\n"),
         (
-            "printer.cfg:3: option 'canbus_interface' of [mcu] is 'can 0', must be an interface such as"
-            " can0, virtual:PATH or INTERFACE:CHANNEL"
+            "printer.cfg:3: option 'canbus_interface' of [mcu] is 'can 0', must be an interface such"
+            " as can0, virtual:PATH or INTERFACE:CHANNEL"
         ),
     ),
     "primary named twice": (
@@ -169,8 +169,8 @@ CASES = {
     "below a bound": (
         changed("max_velocity: 300", "max_velocity: 0"),
         (
-            "printer.cfg:9: option 'max_velocity' of [printer] is '0', must be a number in mm/s, above 0"
-            " and at most 100000"
+            "printer.cfg:9: option 'max_velocity' of [printer] is '0', must be a number in mm/s,"
+            " above 0 and at most 100000"
         ),
     ),
     "above a bound": (
@@ -183,22 +183,22 @@ CASES = {
     "not a number": (
         changed("max_accel: 5000", "max_accel: fast"),
         (
-            "printer.cfg:10: option 'max_accel' of [printer] is 'fast', must be a number in mm/s², above"
-            " 0 and at most 10000000"
+            "printer.cfg:10: option 'max_accel' of [printer] is 'fast', must be a number in mm/s²,"
+            " above 0 and at most 10000000"
         ),
     ),
     "not finite": (
         changed("max_accel: 5000", "max_accel: nan"),
         (
-            "printer.cfg:10: option 'max_accel' of [printer] is 'nan', must be a number in mm/s², above 0"
-            " and at most 10000000"
+            "printer.cfg:10: option 'max_accel' of [printer] is 'nan', must be a number in mm/s²,"
+            " above 0 and at most 10000000"
         ),
     ),
     "odd full steps": (
         changed("microsteps: 16", "microsteps: 16\nfull_steps_per_rotation: 202"),
         (
-            "printer.cfg:16: option 'full_steps_per_rotation' of [stepper_x] is '202', must be a multiple"
-            " of 4, at least 4 and at most 10000"
+            "printer.cfg:16: option 'full_steps_per_rotation' of [stepper_x] is '202', must be a"
+            " multiple of 4, at least 4 and at most 10000"
         ),
     ),
     "gear ratio": (
@@ -210,13 +210,13 @@ CASES = {
     ),
     "unknown kinematics": (
         changed("corexy", "corexyz"),
-        "printer.cfg:8: option 'kinematics' of [printer] is 'corexyz', must be cartesian or corexy",
+        ("printer.cfg:8: option 'kinematics' of [printer] is 'corexyz', must be cartesian or corexy"),
     ),
     "later kinematics": (
         changed("corexy", "delta"),
         (
-            "printer.cfg:8: option 'kinematics' of [printer] is 'delta', recognised but not built yet;"
-            " use cartesian or corexy"
+            "printer.cfg:8: option 'kinematics' of [printer] is 'delta', recognised but not built"
+            " yet; use cartesian or corexy"
         ),
     ),
     "empty range": (
@@ -240,8 +240,8 @@ CASES = {
     "homing away from the endstop": (
         changed("position_max: 200", "position_max: 200\nposition_endstop: 0\nhoming_positive_dir: yes"),
         (
-            "printer.cfg:19: option 'homing_positive_dir' of [stepper_x] is 'yes', but position_endstop"
-            " is 0 mm, the other end of the axis"
+            "printer.cfg:19: option 'homing_positive_dir' of [stepper_x] is 'yes', but"
+            " position_endstop is 0 mm, the other end of the axis"
         ),
     ),
     "endstop without position": (
@@ -261,8 +261,8 @@ CASES = {
     "two ways to limit zig-zag": (
         changed("max_accel: 5000\n", "max_accel: 5000\nmax_accel_to_decel: 1\nminimum_cruise_ratio: 0.5\n"),
         (
-            "printer.cfg:11: option 'max_accel_to_decel' of [printer] has no effect beside the others;"
-            " remove it"
+            "printer.cfg:11: option 'max_accel_to_decel' of [printer] has no effect beside the"
+            " others; remove it"
         ),
     ),
     "further steppers with a gap": (
@@ -280,8 +280,8 @@ CASES = {
     "alias of an unknown node": (
         PRINTER_CFG + "[board_pins]\nmcu: toolhed\naliases: A=PA7\n",
         (
-            "printer.cfg:41: option 'mcu' of [board_pins] is 'toolhed', there is no node 'toolhed'; did"
-            " you mean toolhead?"
+            "printer.cfg:41: option 'mcu' of [board_pins] is 'toolhed', there is no node 'toolhed';"
+            " did you mean toolhead?"
         ),
     ),
     "alias without pin": (
@@ -299,8 +299,8 @@ CASES = {
     "shared pin misspelt": (
         PRINTER_CFG + "[duplicate_pin_override]\npins: PA1, P A2\n",
         (
-            "printer.cfg:41: option 'pins' of [duplicate_pin_override] is 'PA1, P A2', 'P A2' must be a"
-            " pin as in PA3 or toolhead:PA3, with ! or ^ or ~ before it"
+            "printer.cfg:41: option 'pins' of [duplicate_pin_override] is 'PA1, P A2', 'P A2' must be"
+            " a pin as in PA3 or toolhead:PA3, may begin with ! or ^ or ~"
         ),
     ),
     "shared enable pin with other marks": (

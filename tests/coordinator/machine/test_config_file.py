@@ -157,7 +157,7 @@ def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
     path = tmp_path / "printer.cfg"
     with path.open("wb") as file:
         file.truncate(1 << 40)  # a hole: takes no room
-    with pytest.raises(ConfigError, match=r"larger than 8 MB in all$"):
+    with pytest.raises(ConfigError, match=r"larger than 2 MB in all$"):
         parse_config(str(path))
 
 
