@@ -28,7 +28,7 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 
 # rich_markup_mode=None: plain help, and rich is not imported before something is to be drawn.
-app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None)
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
 # Where the library keeps this class has changed between its versions; that BadParameter is one has not.
 _CommandLineError: type[Exception] = next(
     c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException"
@@ -54,9 +54,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str], as_json: bool) -> int:
     try:
-        job = typer.main.get_command(app).main(words, prog_name="canductor", standalone_mode=False)
+        job = typer.main.get_command(app).main(
+            words or ["--help"], prog_name="canductor", standalone_mode=False
+        )
         if not callable(job):  # --help and --version have done their work
-            return int(job or EXIT_OK)
+            return EXIT_OK if words else EXIT_USAGE
         return _show(job(), as_json)
     except CanductorError as error:
         return _fail(str(error), EXIT_FAILED, as_json)
@@ -124,8 +126,8 @@ def _stdout_is_gone() -> bool:
         poll = select.poll()
         poll.register(sys.stdout.fileno(), select.POLLOUT)
         return any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0))
-    except (OSError, ValueError):
-        return True
+    except (OSError, ValueError):  # not a file: nobody can close its other end
+        return False
 
 
 def _drop_stdout() -> None:

@@ -20,7 +20,7 @@ SAVED_PREFIX = "#*#"
 SAVED_HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
 _SAVED_HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>\s*")
 _COMMENT = re.compile(r"(?:^|\s)[#;].*")
-_SECTION = re.compile(r"\[([^\[\]]*)\]")
+_SECTION = re.compile(r"\[(include .*|[^\[\]]*)\]")  # wildcards of a path may hold brackets
 _SEPARATOR = re.compile(r"[:=]")
 _MAX_NAME_CHARS = 200
 
@@ -80,9 +80,9 @@ def parse_config(path: str) -> ConfigFile:
     lines = config_text.read_lines(path, place, budget)
     header = _saved_header(lines)
     config.user_lines = lines[:header]
-    _Parser(config.sections, config.notes, budget).parse(path, enumerate(config.user_lines, 1))
+    _Parser(config, config.sections, budget).parse(path, enumerate(config.user_lines, 1))
     saved_lines = _saved_lines(path, lines, header)
-    _Parser(config.saved, config.notes, None).parse(path, saved_lines)
+    _Parser(config, config.saved, None).parse(path, saved_lines)
     for saved in config.saved.values():
         section = config.sections.setdefault(saved.name, RawSection(saved.name, saved.place))
         section.options.update(saved.options)
@@ -111,50 +111,57 @@ def _saved_lines(path: str, lines: list[str], header: int) -> list[tuple[int, st
 
 
 class _Parser:
-    """Turns numbered lines into sections; follows includes as they come."""
+    """Turns one file's numbered lines into sections; follows includes as they come."""
 
-    def __init__(self, sections: dict[str, RawSection], notes: list[str], budget: ReadBudget | None) -> None:
-        self._sections = sections
-        self._notes = notes
+    def __init__(
+        self, config: ConfigFile, sections: dict[str, RawSection], budget: ReadBudget | None
+    ) -> None:
+        self._config = config
+        self._sections = sections  # may have been begun by another file
         self._budget = budget  # none: includes are refused
+        self._section: RawSection | None = None
+        self._here: dict[str, RawOption] = {}  # under the last header, where a repeat is a mistake
+        self._option: RawOption | None = None
+        self._option_indent = 0
+        self._value: list[str] = []
 
     def parse(self, path: str, lines: Iterable[tuple[int, str]]) -> None:
-        """Read one file's lines; the sections may have been begun by another file."""
-        section: RawSection | None = None
-        here: dict[str, RawOption] = {}  # options under the last header, where a repeat is a mistake
-        option: RawOption | None = None
-        value: list[str] = []
-        option_indent = 0
+        """Read all lines of a file; raises ConfigError."""
         for number, line in lines:
             text = _COMMENT.sub("", line, count=1).rstrip()
+            indent = len(text) - len(text.lstrip())
             if not text:
                 # A blank line may stand inside a value, a comment leaves no trace in it.
-                if option is not None and not line.strip():
-                    value.append("")
-                continue
-            indent = len(text) - len(text.lstrip())
-            text = text.strip()
-            if option is not None and indent > option_indent:
-                value.append(text)
-                continue
-            if option is not None:
-                option.value = "\n".join(value).strip()
-                option = None
-            place = Place(path, number)
-            if text.startswith("["):
-                name = _section_name(text, place)
-                if name.partition(" ")[0] == "include":
-                    self._include(name.partition(" ")[2], place)
-                    section = None
-                else:
-                    section = self._sections.setdefault(name, RawSection(name, place))
-                    here = {}
-                continue
-            option, first = _option(text, place)
-            value, option_indent = [first], indent
-            _add(section, here, option)
-        if option is not None:
-            option.value = "\n".join(value).strip()
+                if not line.strip():
+                    self._value.append("")
+            elif self._option is not None and indent > self._option_indent:
+                self._value.append(text.strip())
+            else:
+                self._end_option()
+                self._begin(text.strip(), indent, Place(path, number))
+        self._end_option()
+
+    def _begin(self, text: str, indent: int, place: Place) -> None:
+        """Take a line that is not a value's continuation."""
+        if not text.startswith("["):
+            self._option, first = _option(text, place)
+            self._value, self._option_indent = [first], indent
+            _add(self._section, self._here, self._option)
+            return
+        name = _section_name(text, place)
+        kind, _, pattern = name.partition(" ")
+        self._here = {}
+        if kind == "include":
+            self._section = None
+            self._include(pattern, place)
+        else:
+            self._section = self._sections.setdefault(name, RawSection(name, place))
+
+    def _end_option(self) -> None:
+        if self._option is not None:
+            self._option.value = "\n".join(self._value).strip()
+        self._option = None
+        self._value = []
 
     def _include(self, pattern: str, place: Place) -> None:
         if self._budget is None:
@@ -166,15 +173,14 @@ class _Parser:
             lines = config_text.read_lines(path, place, self._budget)
             header = _saved_header(lines)
             if header < len(lines):
-                self._notes.append(
-                    f"{Place(path, header + 1)}: the SAVE_CONFIG block of an included file is not read"
-                )
-            self.parse(path, enumerate(lines[:header], 1))
+                where = Place(path, header + 1)
+                self._config.notes.append(f"{where}: the SAVE_CONFIG block of an included file is not read")
+            _Parser(self._config, self._sections, self._budget).parse(path, enumerate(lines[:header], 1))
             self._budget.open_files.pop()
 
 
 def _section_name(text: str, place: Place) -> str:
-    match = _SECTION.fullmatch(text)
+    match = _SECTION.fullmatch(text.replace("\t", " "))
     name = " ".join(match[1].split()) if match else ""
     if match is None or not name or len(name) > _MAX_NAME_CHARS:
         raise ConfigError(place, f"{shown(text)} is not a section header; write [name] or [name instance]")

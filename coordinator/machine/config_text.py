@@ -6,10 +6,10 @@ import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from coordinator.machine.problem import ConfigError, Place, shown
+from coordinator.machine.problem import ConfigError, Place, shown_path
 
 MAX_FILES = 200
-MAX_BYTES = 8_000_000
+MAX_BYTES = 2_000_000
 MAX_DEPTH = 16
 MAX_DIRECTORY_ENTRIES = 20_000
 _WILDCARDS = "*?["
@@ -51,12 +51,12 @@ def _read_bytes(path: str, place: Place, budget: ReadBudget) -> bytes:
     try:
         # Looked at before it is opened: opening a FIFO or a device may block or act.
         if not stat.S_ISREG(Path(path).stat().st_mode):
-            raise ConfigError(place, f"{shown(path)} is not a regular file")
+            raise ConfigError(place, f"{shown_path(path)} is not a regular file")
         with Path(path).open("rb") as file:
             data = file.read(budget.bytes + 1)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a valid path"
-        raise ConfigError(place, f"cannot read {shown(path)}: {reason}") from None
+        raise ConfigError(place, f"cannot read {shown_path(path)}: {reason}") from None
     budget.bytes -= len(data)
     if budget.bytes < 0:
         raise ConfigError(place, f"the configuration is larger than {MAX_BYTES // 1_000_000} MB in all")
@@ -72,7 +72,7 @@ def enter_file(path: str, place: Place, budget: ReadBudget) -> None:
     else:
         identity = (status.st_dev, status.st_ino)
         if identity in budget.open_files:
-            raise ConfigError(place, f"{shown(path)} includes itself")
+            raise ConfigError(place, f"{shown_path(path)} includes itself")
     if len(budget.open_files) >= MAX_DEPTH:
         raise ConfigError(place, f"files are included more than {MAX_DEPTH} deep")
     budget.open_files.append(identity)

@@ -82,7 +82,7 @@ class PinOption(Option[PinName]):
     def rule(self) -> str:
         """Return the values allowed."""
         marks = ("!" if self.invertible else "") + ("^~" if self.pullable else "")
-        return "a pin as in PA3 or toolhead:PA3" + (f", with {' or '.join(marks)} before it" if marks else "")
+        return "a pin as in PA3 or toolhead:PA3" + (f", may begin with {' or '.join(marks)}" if marks else "")
 
 
 _ANY_PIN = PinOption(name="pin", help="any pin", pullable=True)

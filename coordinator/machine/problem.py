@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from nodes.errors import CanductorError
 
 _SHOWN_CHARS = 60
+_SHOWN_PATH_CHARS = 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +38,12 @@ def shown(text: str) -> str:
     if len(line) > _SHOWN_CHARS:
         line = line[: _SHOWN_CHARS - 1] + "…"
     return "'" + "".join(c if c.isprintable() else "?" for c in line) + "'"
+
+
+def shown_path(path: str) -> str:
+    """Quote a path; of a long one the end is what tells."""
+    line = "".join(c if c.isprintable() else "?" for c in path)
+    return f"'{line}'" if len(line) <= _SHOWN_PATH_CHARS else f"'…{line[-_SHOWN_PATH_CHARS:]}'"
 
 
 def nearest(word: str, valid: Iterable[str], *, pattern: str = "{}") -> str:

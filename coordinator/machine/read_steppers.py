@@ -124,7 +124,7 @@ RAIL = SectionSpec(
     later=LATER_STEPPER_OPTIONS,
 )
 EXTRA_STEPPER = SectionSpec(
-    help="A further stepper of an axis: stepper_z1, stepper_z2, …; an endstop of its own may follow",
+    help="A further stepper of an axis: stepper_z1, stepper_z2, …; its endstop waits for homing",
     options=(*MOTOR, ENDSTOP_PIN),
 )
 

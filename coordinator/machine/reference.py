@@ -1,0 +1,60 @@
+"""The tables of docs/configuration.md, made from the options themselves.
+
+``python -m coordinator.machine.reference`` prints them all.
+"""
+
+import sys
+
+from coordinator.machine import read_extruder, read_nodes, read_printer, read_steppers
+from coordinator.machine.options import Option, SectionSpec
+from coordinator.machine.well_known import LATER_SECTIONS
+
+SECTIONS: dict[str, SectionSpec] = {
+    "[mcu], [mcu NAME]": read_nodes.MCU,
+    "[printer]": read_printer.PRINTER,
+    "[stepper_x], [stepper_y], [stepper_z]": read_steppers.RAIL,
+    "[stepper_x1], [stepper_z1], [stepper_z2] …": read_steppers.EXTRA_STEPPER,
+    "[extruder]": read_extruder.EXTRUDER,
+    "[board_pins], [board_pins NAME]": read_nodes.BOARD_PINS,
+    "[duplicate_pin_override]": read_nodes.DUPLICATE_PIN_OVERRIDE,
+}
+
+
+def section_table(title: str) -> str:
+    """Return one section's heading, purpose and options in Markdown."""
+    spec = SECTIONS[title]
+    lines = [
+        f"### `{title}`",
+        "",
+        f"{spec.help}.",
+        "",
+        "| option | value | default | what it is |",
+        "|---|---|---|---|",
+    ]
+    lines += [_row(option) for option in spec.options]
+    if spec.later:
+        names = ", ".join(f"`{name}`" for name in spec.later)
+        lines += ["", f"Recognised, not yet acting: {names}."]
+    return "\n".join(lines) + "\n"
+
+
+def later_sections() -> str:
+    """Return the first words of all sections that do not act yet."""
+    return ", ".join(f"`{name}`" for name in sorted(LATER_SECTIONS)) + ".\n"
+
+
+def _row(option: Option[object]) -> str:
+    default = option.default
+    if isinstance(default, tuple):
+        default = ", ".join(default)
+    text = "" if default is None else f"{default:g}" if isinstance(default, float) else str(default)
+    return f"| `{option.name}` | {option.rule()} | {text} | {option.help} |"
+
+
+def main() -> None:
+    """Print all tables."""
+    sys.stdout.write("\n".join(section_table(title) for title in SECTIONS) + "\n" + later_sections())
+
+
+if __name__ == "__main__":
+    main()

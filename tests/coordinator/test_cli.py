@@ -1,0 +1,268 @@
+"""The command line: words become options, every end is one sentence, with --json one object."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from coordinator import cli
+from coordinator.commands import DEMO_MACHINE, DemoOptions, PlanOptions, RunOptions
+from nodes.errors import CanductorError
+
+
+@dataclass
+class PlainReport:
+    ok: bool = True
+    figures: Mapping[str, object] = field(default_factory=dict)
+
+    def to_json(self) -> Mapping[str, object]:
+        return self.figures
+
+    def to_text(self) -> str:
+        return f"figures: {self.figures}"
+
+
+class Runners:
+    """Takes the place of the parts the command line starts; keeps what it was asked for."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.asked: list[object] = []
+        self.answer: Callable[[], PlainReport] = PlainReport
+        for module, function in (("demo", "run_demo"), ("run", "run_machine"), ("plan", "plan_file")):
+            stand_in = ModuleType(f"coordinator.{module}")
+            setattr(stand_in, function, self._run)
+            monkeypatch.setitem(sys.modules, f"coordinator.{module}", stand_in)
+
+    def _run(self, options: object) -> PlainReport:
+        self.asked.append(options)
+        return self.answer()
+
+
+@pytest.fixture
+def runners(monkeypatch: pytest.MonkeyPatch) -> Runners:
+    return Runners(monkeypatch)
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Work in a folder with a configuration, a g-code file and a dictionary."""
+    for name in ("my.cfg", "part.gcode", "dict.json"):
+        (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_demo_options(runners: Runners, files: Path) -> None:
+    words = (
+        "demo --machine my.cfg --gcode part.gcode --json --no-web --loss 1% --seed 7 --rate-ppm toolhead=200"
+        " --rate-ppm zboard=-3.5 --start-clock zboard=4294967295 --keep out"
+    )
+    assert cli.main(words.split()) == 0
+    assert runners.asked == [
+        DemoOptions(
+            machine=Path("my.cfg"),
+            gcode=Path("part.gcode"),
+            json=True,
+            web=False,
+            loss=0.01,
+            seed=7,
+            rate_ppm={"toolhead": 200.0, "zboard": -3.5},
+            start_clock={"zboard": 2**32 - 1},
+            keep=Path("out"),
+        )
+    ]
+
+
+def test_demo_defaults(runners: Runners) -> None:
+    assert cli.main(["demo"]) == 0
+    assert runners.asked == [DemoOptions()]
+    assert DemoOptions().machine == DEMO_MACHINE
+    assert DEMO_MACHINE.is_file()
+
+
+def test_run_and_plan_options(runners: Runners, files: Path) -> None:
+    assert cli.main(["run", "my.cfg"]) == 0
+    assert cli.main(["run", "my.cfg", "--gcode", "part.gcode", "--json"]) == 0
+    assert cli.main(["plan", "my.cfg", "part.gcode"]) == 0
+    assert (
+        cli.main(["plan", "my.cfg", "part.gcode", "-o", "out", "--json", "--dictionary", "mcu=dict.json"])
+        == 0
+    )
+    assert runners.asked == [
+        RunOptions(config=Path("my.cfg")),
+        RunOptions(config=Path("my.cfg"), gcode=Path("part.gcode"), json=True),
+        PlanOptions(config=Path("my.cfg"), gcode=Path("part.gcode")),
+        PlanOptions(
+            config=Path("my.cfg"),
+            gcode=Path("part.gcode"),
+            output=Path("out"),
+            json=True,
+            dictionaries={"mcu": Path("dict.json")},
+        ),
+    ]
+
+
+def test_a_report_is_shown_and_decides_the_status(
+    runners: Runners, files: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runners.answer = lambda: PlainReport(ok=True, figures={"steps": 5})
+    assert cli.main(["plan", "my.cfg", "part.gcode"]) == 0
+    assert capsys.readouterr() == ("figures: {'steps': 5}\n", "")
+    runners.answer = lambda: PlainReport(ok=False, figures={"steps": 5})
+    assert cli.main(["plan", "my.cfg", "part.gcode", "--json"]) == 1
+    assert capsys.readouterr() == ('{"ok": false, "steps": 5}\n', "")
+
+
+def raising(error: BaseException) -> Callable[[], PlainReport]:
+    def fail() -> PlainReport:
+        raise error
+
+    return fail
+
+
+FAILURES: list[tuple[BaseException, int, str]] = [
+    (CanductorError("node 'mcu' is silent; check its power"), 1, "node 'mcu' is silent; check its power"),
+    (KeyboardInterrupt(), 130, "stopped by Ctrl-C"),
+]
+
+
+@pytest.mark.parametrize("failure", FAILURES)
+def test_failures_end_in_one_sentence(
+    runners: Runners,
+    files: Path,
+    capsys: pytest.CaptureFixture[str],
+    failure: tuple[BaseException, int, str],
+) -> None:
+    error, status, sentence = failure
+    runners.answer = raising(error)
+    assert cli.main(["run", "my.cfg"]) == status
+    assert capsys.readouterr() == ("", f"canductor: {sentence}\n")
+    assert cli.main(["run", "my.cfg", "--json"]) == status
+    out, err = capsys.readouterr()
+    assert err == f"canductor: {sentence}\n"
+    assert json.loads(out.splitlines()[-1]) == {"ok": False, "error": sentence}
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("by\nzero"), BrokenPipeError("a node's socket")])
+def test_a_bug_leaves_its_traceback_in_a_file(
+    runners: Runners,
+    files: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(files))
+    runners.answer = raising(error)
+    assert cli.main(["run", "my.cfg", "--json"]) == 70
+    out, err = capsys.readouterr()
+    match = re.fullmatch(r"canductor: internal error: (\w+): (.*); please report it with (.*)\n", err)
+    assert match
+    assert match[1] == type(error).__name__
+    assert match[2] == " ".join(str(error).split())
+    log = Path(match[3]).read_text()
+    assert Path(match[3]).parent == files
+    assert "Traceback" in log
+    assert "Traceback" not in out + err
+    assert json.loads(out) == {"ok": False, "error": err.removeprefix("canductor: ").rstrip("\n")}
+
+
+USAGE = {
+    "plam": "No such command 'plam'",
+    "plan": "Missing argument 'config'",
+    "demo --sed 1": "No such option: --sed",
+    "demo --seed x": "Invalid value for '--seed'",
+    "demo --loss 60%": "--loss is '60%', must be a share from 0 to 0.5, or a percentage such as 1%",
+    "demo --loss nan": "--loss is 'nan', must be a share from 0 to 0.5, or a percentage such as 1%",
+    "demo --loss much": "--loss is 'much', must be a share from 0 to 0.5, or a percentage such as 1%",
+    "demo --rate-ppm 5": "--rate-ppm takes NAME=VALUE, not '5'",
+    "demo --rate-ppm a=b": "--rate-ppm for 'a' is 'b', must be a number in ppm, from -10000 to 10000",
+    "demo --rate-ppm a=nan": "--rate-ppm for 'a' is 'nan', must be a number in ppm, from -10000 to 10000",
+    "demo --rate-ppm a=1 --rate-ppm a=2": "--rate-ppm is given twice for 'a'",
+    "demo --start-clock a=-1": "--start-clock for 'a' is '-1', must be a whole number of ticks",
+    "demo --start-clock a=18446744073709551616": "must be a whole number of ticks, from 0 to 2^64 - 1",
+}
+
+
+@pytest.mark.parametrize("words", USAGE)
+def test_a_mistaken_command_line(runners: Runners, capsys: pytest.CaptureFixture[str], words: str) -> None:
+    assert cli.main(words.split()) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("canductor: ")
+    assert err.endswith(" (see 'canductor --help')\n")
+    assert err.count("\n") == 1
+    assert USAGE[words] in err
+    assert runners.asked == []
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("run no.cfg", "there is no file 'no.cfg'"),
+        ("run .", "'.' is a folder, not a file"),
+        ("plan my.cfg no.gcode", "there is no file 'no.gcode'"),
+        ("plan my.cfg part.gcode --dictionary mcu=no.json", "there is no file 'no.json'"),
+        ("demo --gcode no.gcode", "there is no file 'no.gcode'"),
+        ("demo --machine no", "there is no machine 'no': neither a file nor an example; examples are demo"),
+    ],
+)
+def test_files_that_are_not_there(
+    runners: Runners, files: Path, capsys: pytest.CaptureFixture[str], words: str, sentence: str
+) -> None:
+    assert cli.main(words.split()) == 1
+    assert capsys.readouterr().err.startswith(f"canductor: {sentence}")
+    assert runners.asked == []
+
+
+def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["--version"]) == 0
+    assert re.fullmatch(r"canductor \d+\.\d+\.\d+\n", capsys.readouterr().out)
+    assert cli.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("demo", "run", "plan", "--version"))
+    assert cli.main([]) == 2
+    assert capsys.readouterr() == (text, "")
+
+
+LONG_REPORT = """
+import sys, types
+from coordinator import cli
+
+class Report:
+    ok = True
+    def to_text(self):
+        return "line\\n" * 100_000
+
+sys.modules["coordinator.run"] = types.ModuleType("coordinator.run")
+sys.modules["coordinator.run"].run_machine = lambda options: Report()
+sys.exit(cli.main(["run", __file__]))
+"""
+
+
+def test_a_closed_reader_is_no_error(tmp_path: Path) -> None:
+    script = tmp_path / "long_report.py"
+    script.write_text(LONG_REPORT)
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, script], stdout=writer, stderr=subprocess.PIPE, timeout=60, check=False
+    )
+    os.close(writer)
+    assert done.stderr == b""
+    assert done.returncode == cli.EXIT_BROKEN_PIPE
+
+
+def test_starting_imports_nothing_slow() -> None:
+    script = "import sys, coordinator.cli; print(*sys.modules)"
+    out = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
+    ).stdout
+    slow = {"numpy", "can", "serial", "rich", "asyncio", "importlib.metadata", "coordinator.machine.options"}
+    assert not slow & set(out.split())
