@@ -13,6 +13,7 @@ from nodes.errors import CanductorError
 EXAMPLES = Path(__file__).parent.parent / "config"
 """The example machines."""
 DEMO_MACHINE = EXAMPLES / "demo" / "machine.cfg"
+DEMO_GCODE = EXAMPLES / "demo" / "part.gcode"
 
 
 class Report(Protocol):

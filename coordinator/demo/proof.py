@@ -24,7 +24,7 @@ Clocks = NDArray[np.uint64]
 class NodeTruth(Protocol):
     """What a node's log tells: its clock at any moment, in truth."""
 
-    def ticks_to_monotonic_ns(self, ticks: Clocks) -> Floats:
+    def ticks_to_monotonic_ns(self, clock: Clocks, /) -> NDArray[np.int64]:
         """Return the host's CLOCK_MONOTONIC at these node clocks."""
         ...
 
@@ -39,6 +39,8 @@ class StepperProof:
     steps_executed: int
     position_expected: int
     position_executed: int
+    position_counted: int
+    """What the node itself counted."""
     wrong_directions: int
     worst_band_error_s: float
     """Furthest that a step's clock lay from the plan, by the clocks the host believed in."""
@@ -56,6 +58,7 @@ class StepperProof:
         return (
             self.steps_executed == self.steps_expected
             and self.position_error_steps == 0
+            and self.position_counted == self.position_expected
             and self.wrong_directions == 0
             and self.worst_band_error_s <= EDGE_TOLERANCE_S
         )
@@ -70,7 +73,7 @@ class PrimaryClock:
         self._true_ticks_per_s = true_ticks_per_s
         self._clock_freq = clock_freq
 
-    def print_time(self, monotonic_ns: Floats) -> Floats:
+    def print_time(self, monotonic_ns: NDArray[np.int64]) -> Floats:
         """Return the print time at these moments of the host's clock."""
         elapsed_s = (monotonic_ns - self._monotonic_ns) * 1e-9
         return (self._ticks + elapsed_s * self._true_ticks_per_s) / self._clock_freq
@@ -114,11 +117,15 @@ def prove_stepper(
     expected: Iterable[ExpectedSteps],
     executed: Iterable[tuple[Clocks, NDArray[np.int8]]],
     *,
+    counted: int,
     clock_map: ClockMap,
     truth: NodeTruth,
     primary: PrimaryClock,
 ) -> StepperProof:
-    """Pair EXPECTED with EXECUTED steps (clock, direction) and measure every difference."""
+    """Pair EXPECTED with EXECUTED steps (clock, direction) and measure every difference.
+
+    COUNTED is where the node itself says that the stepper stands.
+    """
     log = _Buffered(executed)
     steps_expected = steps_executed = position_expected = position_executed = wrong = 0
     worst_band = worst_true = 0.0
@@ -144,6 +151,7 @@ def prove_stepper(
         steps_executed=steps_executed + more,
         position_expected=position_expected,
         position_executed=position_executed + total,
+        position_counted=counted,
         wrong_directions=wrong,
         worst_band_error_s=worst_band,
         worst_error_s=worst_true,

@@ -17,8 +17,7 @@
 #define DECL_RESPONSE(name, format) @@response(name, format)@@
 #define DECL_CONSTANT(name, value) @@constant(name, value)@@
 #define DECL_CONSTANT_STR(name, text) @@constant_str(name, text)@@
-#define DECL_ENUMERATION_RANGE(enumeration, name, value, count)                                              \
-    @@enumeration(enumeration, name, value, count)@@
+#define DECL_ENUMERATION_RANGE(of, name, value, count) @@enumeration(of, name, value, count)@@
 #define DECL_STATIC_STRING(name, text) @@string(name, text)@@
 #define DECL_TASK(function) @@task(function)@@
 #define DECL_INIT(function) @@init(function)@@
@@ -33,7 +32,7 @@
 #define DECL_CONSTANT(name, value) struct node
 #define DECL_CONSTANT_STR(name, text) struct node
 // COUNT names beginning with NAME ("PA0", "PA1", ...) stand for VALUE and the numbers after it.
-#define DECL_ENUMERATION_RANGE(enumeration, name, value, count) struct node
+#define DECL_ENUMERATION_RANGE(of, name, value, count) struct node
 // A text that travels as a number; string_NAME is the number. The same pair may be declared in several files.
 #define DECL_STATIC_STRING(name, text) extern const uint16_t string_##name
 // void FUNCTION(struct node *) runs, with interrupts on, some time after WAKE(node, FUNCTION).
@@ -47,6 +46,6 @@
 #endif
 
 #define DECL_COMMAND(function, format) DECL_COMMAND_FLAGS(function, 0, format)
-#define DECL_ENUMERATION(enumeration, name, value) DECL_ENUMERATION_RANGE(enumeration, name, value, 1)
+#define DECL_ENUMERATION(of, name, value) DECL_ENUMERATION_RANGE(of, name, value, 1)
 
 #endif

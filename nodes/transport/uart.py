@@ -3,6 +3,7 @@
 import contextlib
 import os
 import select
+import termios
 import time
 from pathlib import Path
 
@@ -39,8 +40,9 @@ class UartTransport:
         try:
             port.baudrate = baud
             port.open()
+            _let_empty_differ_from_ended(port.fd)
             port.reset_input_buffer()
-        except (OSError, ValueError, OverflowError) as error:  # SerialException is an OSError
+        except (OSError, ValueError, OverflowError, termios.error) as error:  # SerialException is an OSError
             port.close()
             raise _cannot_open(path, baud, error) from error
         # USB adapters else hold received bytes back for up to 16 ms; what cannot do it needs it not.
@@ -101,6 +103,14 @@ class UartTransport:
         return TransportClosedError(
             f"UART {self.name}: the device is gone; was it unplugged, or its process stopped?"
         )
+
+
+def _let_empty_differ_from_ended(fd: int) -> None:
+    """With VMIN 0, as pyserial leaves it, a read of nothing looks like the end; with 1 it says EAGAIN."""
+    attributes = termios.tcgetattr(fd)
+    characters = attributes[6]
+    characters[termios.VMIN], characters[termios.VTIME] = 1, 0
+    termios.tcsetattr(fd, termios.TCSANOW, attributes)
 
 
 def _cannot_open(path: str | Path, baud: int, error: Exception) -> CanductorError:

@@ -1,0 +1,123 @@
+"""What the demo found, as figures and as text."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from coordinator.demo.proof import ClockProof, StepperProof
+
+
+@dataclass(frozen=True, slots=True)
+class NodeReport:
+    """One node's part in it. ``dispatch_late_s``: how late the host's kernel ran its timers at worst."""
+
+    name: str
+    bytes_sent: int
+    retransmitted_bytes: int
+    min_lead_s: float | None
+    round_trip_s: float
+    clock_error_bound_s: float
+    dispatch_late_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class DemoReport:
+    """The demo's outcome; ``ok`` only when every step was proved."""
+
+    moves: int
+    print_time_s: float
+    queue_steps: int
+    steppers: tuple[StepperProof, ...]
+    clocks: tuple[ClockProof, ...]
+    stray_edges: int
+    """Level changes of pins that are no stepper's."""
+    nodes: tuple[NodeReport, ...]
+    frames: int
+    frames_lost: int
+    notices: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every stepper did exactly what was planned, and nothing else moved."""
+        return all(stepper.holds for stepper in self.steppers) and self.stray_edges == 0
+
+    def to_json(self) -> Mapping[str, object]:
+        """Return the figures by name."""
+        leads = [node.min_lead_s for node in self.nodes if node.min_lead_s is not None]
+        return {
+            "nodes": [node.name for node in self.nodes],
+            "moves": self.moves,
+            "print_time_s": round(self.print_time_s, 3),
+            "steps": sum(s.steps_executed for s in self.steppers),
+            "steps_planned": sum(s.steps_expected for s in self.steppers),
+            "queue_steps": self.queue_steps,
+            "bytes_to_nodes": sum(node.bytes_sent for node in self.nodes),
+            "position_error_steps": sum(s.position_error_steps for s in self.steppers),
+            "worst_step_error_us": _us(max((s.worst_error_s for s in self.steppers), default=0.0)),
+            "worst_band_error_us": _us(max((s.worst_band_error_s for s in self.steppers), default=0.0)),
+            "clock_rms_us": {clock.node: _us(clock.rms_s) for clock in self.clocks},
+            "clock_worst_us": {clock.node: _us(clock.worst_s) for clock in self.clocks},
+            "retransmitted_bytes": sum(node.retransmitted_bytes for node in self.nodes),
+            "min_lead_ms": round(min(leads) * 1e3, 1) if leads else None,
+            "frames": self.frames,
+            "frames_lost": self.frames_lost,
+            "stray_edges": self.stray_edges,
+            "steppers": {
+                s.stepper: {
+                    "node": s.node,
+                    "steps": s.steps_executed,
+                    "steps_planned": s.steps_expected,
+                    "position": s.position_executed,
+                    "position_planned": s.position_expected,
+                    "position_counted": s.position_counted,
+                    "wrong_directions": s.wrong_directions,
+                    "worst_step_error_us": _us(s.worst_error_s),
+                    "worst_band_error_us": _us(s.worst_band_error_s),
+                }
+                for s in self.steppers
+            },
+            "dispatch_late_us": {node.name: _us(node.dispatch_late_s) for node in self.nodes},
+            "round_trip_us": {node.name: _us(node.round_trip_s) for node in self.nodes},
+        }
+
+    def to_text(self) -> str:
+        """Return the proof for a reader."""
+        lines = [*self.notices, ""]
+        lines += [
+            f"{s.stepper} on {s.node}: {s.steps_executed:,} of {s.steps_expected:,} steps, stands at "
+            f"{s.position_executed:,} (plan {s.position_expected:,}, node's counter {s.position_counted:,}), "
+            f"timed within {_us(s.worst_band_error_s)} µs of the plan, {_us(s.worst_error_s)} µs in truth"
+            for s in self.steppers
+        ]
+        lines += [
+            f"clock of {c.node}: {_us(c.rms_s)} µs rms from print time, {_us(c.worst_s)} µs at worst"
+            for c in self.clocks
+        ]
+        lines += [_node_line(node) for node in self.nodes]
+        lines.append(
+            f"{self.moves:,} moves in {self.print_time_s:.1f} s, {self.queue_steps:,} queue_step commands; "
+            f"{self.frames:,} CAN frames, {self.frames_lost:,} of them lost on purpose"
+        )
+        lines.append(
+            "PROVED: every stepper stands where the plan says; no step early, late or lost"
+            if self.ok
+            else f"FAILED: {self._failures()}; please report this with the output above"
+        )
+        return "\n".join(lines)
+
+    def _failures(self) -> str:
+        failed = [s.stepper for s in self.steppers if not s.holds]
+        if failed:
+            return f"{', '.join(failed)} did not do what was planned"
+        return f"{self.stray_edges} changes of pins that are no stepper's"
+
+
+def _node_line(node: NodeReport) -> str:
+    lead = "no motion" if node.min_lead_s is None else f"lead at least {node.min_lead_s * 1e3:.0f} ms"
+    return (
+        f"node {node.name}: {node.bytes_sent:,} bytes sent, {node.retransmitted_bytes:,} of them again, "
+        f"{lead}, round trip {_us(node.round_trip_s)} µs"
+    )
+
+
+def _us(seconds: float) -> float:
+    return round(seconds * 1e6, 2)

@@ -1,0 +1,191 @@
+"""``canductor demo``: prints on virtual nodes in real time, then proves every step against the plan."""
+
+import asyncio
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coordinator.app import Machine
+from coordinator.commands import DEMO_GCODE, DemoOptions
+from coordinator.demo.expected import ExpectedSteps, expected_steps
+from coordinator.demo.proof import ClockProof, PrimaryClock, StepperProof, prove_clock, prove_stepper
+from coordinator.demo.report import DemoReport, NodeReport
+from coordinator.demo.stage import Stage
+from coordinator.gcode.program import Program
+from coordinator.machine.description import MachineDescription, StepperDescription, load_machine
+from coordinator.pipeline import PlanRecord
+from coordinator.progress import ProgressDisplay
+from coordinator.session import Outcome, run_job
+from coordinator.streamer import Told
+from nodes.virtual.edge_log import EdgeLog
+from nodes.virtual.firmware import firmware_dictionary
+
+
+def run_demo(options: DemoOptions) -> DemoReport:
+    """Run the demo; raises CanductorError when it cannot be brought to its end."""
+    description = load_machine(str(options.machine))
+    record = PlanRecord((0.0, 0.0, 0.0, 0.0))
+    told: list[str] = []
+    both_edges: dict[str, bool] = {}
+
+    def ready(machine: Machine) -> None:
+        both_edges.update({name: s.steps_on_both_edges for name, s in machine.devices.steppers.items()})
+
+    with ExitStack() as stack:
+        folder = stack.enter_context(_folder(options.keep))
+        program = stack.enter_context(Program.open(options.gcode or DEMO_GCODE))
+        stage = stack.enter_context(Stage(description, options, folder))
+        display = stack.enter_context(ProgressDisplay(f"printing {program.name}", quiet=options.json))
+        outcome = asyncio.run(
+            run_job(
+                stage.description,
+                program,
+                display,
+                record=record,
+                on_told=lambda event: told.append(_text(event)),
+                on_ready=ready,
+            )
+        )
+        figures = stage.stop_nodes()
+        prover = _Prover(description, stage.edge_log, outcome, record, both_edges)
+        return _report(prover, stage, figures, outcome, told, description)
+
+
+@contextmanager
+def _folder(keep: Path | None) -> Iterator[Path]:
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
+        yield keep
+        return
+    with tempfile.TemporaryDirectory(prefix="canductor-demo-") as folder:
+        yield Path(folder)
+
+
+def _text(told: Told) -> str:
+    return told.text
+
+
+class _Prover:
+    """Compares what the nodes' pins did with the plan."""
+
+    def __init__(
+        self,
+        description: MachineDescription,
+        edge_log: Callable[[str], EdgeLog],
+        outcome: Outcome,
+        record: PlanRecord,
+        both_edges: Mapping[str, bool],
+    ) -> None:
+        self._description = description
+        self._outcome = outcome
+        self._record = record
+        self._both_edges = both_edges
+        self._logs = {node.name: edge_log(node.name) for node in description.nodes}
+        self._pins = firmware_dictionary("canductor-node-mainboard").enumerations["pin"].values
+        primary = self._logs[description.nodes[0].name]
+        self._primary = PrimaryClock(
+            monotonic_ns=primary.start_monotonic_ns,
+            ticks=primary.start_clock,
+            true_ticks_per_s=primary.ticks_per_second,
+            clock_freq=primary.clock_freq,
+        )
+
+    def steppers(self) -> list[StepperProof]:
+        """Prove every stepper."""
+        return [self._stepper(stepper) for stepper in self._description.steppers]
+
+    def clocks(self) -> list[ClockProof]:
+        """Measure the clocks of the secondary nodes that step."""
+        primary = self._description.nodes[0].name
+        return [
+            prove_clock(name, clock_map, self._logs[name], self._primary, self._outcome.span)
+            for name, clock_map in self._outcome.maps.items()
+            if name != primary
+        ]
+
+    def stray_edges(self) -> int:
+        """Count level changes of pins that no stepper of the node owns."""
+        return sum(self._stray(node.name, log) for node, log in self._with_logs())
+
+    def _with_logs(self) -> Iterator[tuple[Any, EdgeLog]]:
+        for node in self._description.nodes:
+            yield node, self._logs[node.name]
+
+    def _stray(self, node: str, log: EdgeLog) -> int:
+        owned = [
+            self._pins[pin.name]
+            for stepper in self._description.steppers
+            if stepper.node == node
+            for pin in (stepper.step_pin, stepper.dir_pin)
+        ]
+        counted = sum(len(clock) for clock, _, _ in log.edges(*owned))
+        return log.record_count - counted
+
+    def _stepper(self, stepper: StepperDescription) -> StepperProof:
+        log = self._logs[stepper.node]
+        return prove_stepper(
+            stepper.name,
+            stepper.node,
+            self._expected(stepper),
+            self._executed(stepper, log),
+            counted=self._signed(stepper) * self._outcome.positions[stepper.name],
+            clock_map=self._outcome.maps[stepper.node],
+            truth=log,
+            primary=self._primary,
+        )
+
+    def _expected(self, stepper: StepperDescription) -> Iterator[ExpectedSteps]:
+        for position, moves in self._record.epochs():
+            origin = float(np.dot(stepper.weights, position))
+            yield from expected_steps(moves, stepper.weights, stepper.step_distance, origin)
+
+    def _executed(self, stepper: StepperDescription, log: EdgeLog) -> Iterator[tuple[Any, Any]]:
+        sign = np.int8(self._signed(stepper))
+        for clock, direction in log.steps(
+            self._pins[stepper.step_pin.name],
+            self._pins[stepper.dir_pin.name],
+            self._both_edges[stepper.name],
+            step_idle_level=int(stepper.step_pin.invert),
+        ):
+            yield clock, direction * sign
+
+    @staticmethod
+    def _signed(stepper: StepperDescription) -> int:
+        return -1 if stepper.dir_pin.invert else 1
+
+
+def _report(
+    prover: _Prover,
+    stage: Stage,
+    figures: Mapping[str, Mapping[str, Any]],
+    outcome: Outcome,
+    told: list[str],
+    description: MachineDescription,
+) -> DemoReport:
+    return DemoReport(
+        moves=outcome.moves,
+        print_time_s=outcome.print_time_s,
+        queue_steps=outcome.queue_steps,
+        steppers=tuple(prover.steppers()),
+        clocks=tuple(prover.clocks()),
+        stray_edges=prover.stray_edges(),
+        nodes=tuple(
+            NodeReport(
+                name=node.name,
+                bytes_sent=node.link.bytes_sent,
+                retransmitted_bytes=node.link.bytes_repeated,
+                min_lead_s=node.link.min_lead_s,
+                round_trip_s=node.link.srtt_s,
+                clock_error_bound_s=node.clock_error_s,
+                dispatch_late_s=float(figures[node.name].get("timer_late_us_max", 0.0)) * 1e-6,
+            )
+            for node in outcome.nodes
+        ),
+        frames=sum(stats.frames for stats in stage.bus_stats()),
+        frames_lost=sum(stats.lost for stats in stage.bus_stats()),
+        notices=(*map(str, description.not_yet_acting), *description.notes, *told),
+    )

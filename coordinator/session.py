@@ -1,0 +1,146 @@
+"""One job on one machine: connect, run, ask the nodes where they stand; shared by ``run`` and ``demo``."""
+
+import asyncio
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from coordinator.app import Machine, link_of
+from coordinator.gcode.interpreter import Job
+from coordinator.gcode.program import Program
+from coordinator.machine.description import MachineDescription
+from coordinator.motion.planner import Planner
+from coordinator.pipeline import PlanRecord
+from coordinator.progress import NodeFigures, Progress, ProgressDisplay
+from coordinator.streamer import JobState, Streamer, Told
+from coordinator.timebase import ClockMap
+from nodes.errors import CanductorError
+from nodes.link import LinkStats
+
+
+@dataclass(frozen=True, slots=True)
+class NodeOutcome:
+    """A node after a job."""
+
+    name: str
+    link: LinkStats
+    clock_error_s: float
+    """What the clock estimator promises."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a job was, told by the host and by the nodes' own counters."""
+
+    moves: int
+    print_time_s: float
+    span: tuple[float, float]
+    """Print times of begin and end."""
+    steps: int
+    queue_steps: int
+    positions: dict[str, int]
+    """By stepper: steps from where it began, as its node counts them."""
+    issued: dict[str, int]
+    """By stepper: steps that the host's commands add up to."""
+    maps: dict[str, ClockMap]
+    """By moving node: print time to ticks."""
+    nodes: tuple[NodeOutcome, ...]
+
+
+def homed_positions(description: MachineDescription) -> dict[str, float]:
+    """Return where each axis stands after G28, mm."""
+    return {rail.axis.upper(): rail.homing.position_endstop or 0.0 for rail in description.rails}
+
+
+async def run_job(
+    description: MachineDescription,
+    program: Program,
+    display: ProgressDisplay,
+    *,
+    record: PlanRecord | None = None,
+    on_told: Callable[[Told], None],
+    on_ready: Callable[[Machine], None] | None = None,
+) -> Outcome:
+    """Connect to the machine, run PROGRAM on it and return what became of it.
+
+    Raises CanductorError. Whatever ends the job before its end (a failure, Ctrl-C, SIGTERM) stops all nodes.
+    """
+    task = asyncio.current_task()
+    assert task is not None
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+    machine = Machine(description)
+    await machine.start()
+    if on_ready is not None:
+        on_ready(machine)
+    try:
+        return await _print(machine, program, display, record, on_told)
+    except asyncio.CancelledError:
+        machine.stop("stopped by the user")
+        raise
+    finally:
+        if machine.stopped is not None:
+            await machine.confirm_stop()
+        await machine.close()
+
+
+async def _print(
+    machine: Machine,
+    program: Program,
+    display: ProgressDisplay,
+    record: PlanRecord | None,
+    on_told: Callable[[Told], None],
+) -> Outcome:
+    began = time.monotonic()
+
+    def show(state: JobState) -> None:
+        display.update(
+            Progress(
+                done=state.done_bytes,
+                total=state.size_bytes or 0,
+                print_time_s=state.print_time_s,
+                wall_time_s=time.monotonic() - began,
+                nodes=tuple(_figures(machine, name) for name in machine.nodes),
+            )
+        )
+
+    job = Job(program, Planner(machine.description.limits), homed_positions(machine.description))
+    streamer = Streamer(machine, job, record=record, on_told=on_told, on_state=show)
+    await streamer.run()
+    return await _outcome(machine, streamer)
+
+
+async def _outcome(machine: Machine, streamer: Streamer) -> Outcome:
+    stats = streamer.steps.stats()
+    return Outcome(
+        moves=streamer.pipeline.moves,
+        print_time_s=streamer.ended_s - streamer.began_s,
+        span=(streamer.began_s, streamer.ended_s),
+        steps=sum(s.steps for s in stats.steppers),
+        queue_steps=sum(s.queue_steps for s in stats.steppers),
+        positions=await machine.stepper_positions(),
+        issued={s.name: s.issued for s in stats.steppers},
+        maps={node.name: m for node, m in zip(machine.moving, streamer.maps, strict=True)},
+        nodes=tuple(
+            NodeOutcome(node.name, link_of(node).stats(), node.clock.estimate().error_s)
+            for node in machine.nodes.values()
+        ),
+    )
+
+
+def _figures(machine: Machine, name: str) -> NodeFigures:
+    node = machine.nodes[name]
+    try:
+        stats = link_of(node).stats()
+    except CanductorError:
+        return NodeFigures(name=name)
+    return NodeFigures(
+        name=name,
+        round_trip_ms=stats.srtt_s * 1e3,
+        retransmitted_bytes=stats.bytes_repeated,
+        queue_depth=stats.motion_commands,
+        lead_ms=None if stats.min_lead_s is None else stats.min_lead_s * 1e3,
+        clock_error_us=node.clock.estimate().error_s * 1e6,
+    )
+
+
