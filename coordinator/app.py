@@ -178,9 +178,7 @@ class Machine:
         transport = open_uart(connection.path, connection.baud)
         bus = UartBus(transport.name, _io_factory(transport))
         self._open.append(_OpenBus(bus, transport))
-        self.nodes[node.name] = bus.add_node(
-            node.name, self._build_config(node), on_state=self._node_changed
-        )
+        self.nodes[node.name] = bus.add_node(node.name, self._build_config(node), on_state=self._node_changed)
 
     def _build_config(self, node: NodeDescription) -> Callable[[Dictionary], NodeConfig]:
         return lambda dictionary: self.devices.build_config(node.name, dictionary)

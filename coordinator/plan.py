@@ -135,7 +135,9 @@ def _dictionaries(description: MachineDescription, options: PlanOptions) -> dict
     names = [node.name for node in description.nodes]
     for name in options.dictionaries:
         if name not in names:
-            raise CanductorError(f"--dictionary {name}: the machine has no such node; it has {', '.join(names)}")
+            raise CanductorError(
+                f"--dictionary {name}: the machine has no such node; it has {', '.join(names)}"
+            )
     return {
         name: _read_dictionary(options.dictionaries[name])
         if name in options.dictionaries

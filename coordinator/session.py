@@ -142,5 +142,3 @@ def _figures(machine: Machine, name: str) -> NodeFigures:
         lead_ms=None if stats.min_lead_s is None else stats.min_lead_s * 1e3,
         clock_error_us=node.clock.estimate().error_s * 1e6,
     )
-
-

@@ -59,9 +59,7 @@ class Stage:
             for path in dict.fromkeys(self._bus_path(n) for n in self._described.nodes):
                 if path is not None:
                     self._buses[path] = stack.enter_context(
-                        VirtualBus(
-                            path, bitrate=BITRATE, loss=self._options.loss, seed=self._options.seed
-                        )
+                        VirtualBus(path, bitrate=BITRATE, loss=self._options.loss, seed=self._options.seed)
                     )
             for index, node in enumerate(self._described.nodes):
                 self.processes[node.name] = stack.enter_context(self._start(index, node))

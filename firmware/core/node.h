@@ -85,10 +85,8 @@ struct response {
 // The most parameters a command or response may have.
 enum { MESSAGE_ARGS_MAX = 12 };
 
-#define ARG(number)                                                                                          \
-    { .value = (uint32_t)(number), .data = NULL }
-#define ARG_BYTES(bytes, length)                                                                             \
-    { .value = (uint32_t)(length), .data = (bytes) }
+#define ARG(number) {.value = (uint32_t)(number), .data = NULL}
+#define ARG_BYTES(bytes, length) {.value = (uint32_t)(length), .data = (bytes)}
 // Sends the response NAME with one ARG or ARG_BYTES per parameter.
 #define RESPOND(node, name, ...)                                                                             \
     node_respond(node, &response_##name, (const struct wire_arg[]){__VA_ARGS__},                             \

@@ -119,8 +119,7 @@ DECL_COMMAND_FLAGS(command_get_canbus_id, COMMAND_IN_SHUTDOWN, "get_canbus_id");
 void command_get_canbus_id(struct node *node, const struct wire_arg *args) {
     (void)args;
     static const struct can_stream none; // a board built for CAN may run on a UART
-    const struct can_stream *can =
-        node->config.transport == &can_stream_transport ? state_of(node) : &none;
+    const struct can_stream *can = node->config.transport == &can_stream_transport ? state_of(node) : &none;
     RESPOND(node, canbus_id, ARG_BYTES(can->uuid, CAN_UUID_SIZE), ARG(can->nodeid));
 }
 

@@ -54,8 +54,9 @@ void command_config_endstop(struct node *node, const struct wire_arg *args) {
         node_shutdown(node, string_not_a_pin);
 }
 
-DECL_COMMAND(command_endstop_home, "endstop_home oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u"
-                                   " pin_value=%c trsync_oid=%c trigger_reason=%c");
+DECL_COMMAND(command_endstop_home,
+             "endstop_home oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u"
+             " pin_value=%c trsync_oid=%c trigger_reason=%c");
 void command_endstop_home(struct node *node, const struct wire_arg *args) {
     struct endstop *e = oid_lookup(node, (uint8_t)args[0].value, &endstop_type);
     if (!e)

@@ -158,8 +158,7 @@ static void start(struct node *node, struct stepper *s) {
         sched_add_timer(node, &s->timer);
 }
 
-DECL_COMMAND_FLAGS(command_queue_step, COMMAND_FREQUENT,
-                   "queue_step oid=%c interval=%u count=%hu add=%hi");
+DECL_COMMAND_FLAGS(command_queue_step, COMMAND_FREQUENT, "queue_step oid=%c interval=%u count=%hu add=%hi");
 void command_queue_step(struct node *node, const struct wire_arg *args) {
     struct stepper *s = lookup(node, args[0].value);
     if (!s)

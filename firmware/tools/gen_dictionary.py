@@ -63,9 +63,7 @@ class Declarations:
     constants: dict[str, int | str] = field(default_factory=dict)
     enumerations: dict[str, dict[str, int | list[int]]] = field(default_factory=dict)
     strings: dict[str, str] = field(default_factory=dict)  # symbol -> text
-    functions: dict[str, list[str]] = field(
-        default_factory=lambda: {"task": [], "init": [], "shutdown": []}
-    )
+    functions: dict[str, list[str]] = field(default_factory=lambda: {"task": [], "init": [], "shutdown": []})
 
     def add(self, kind: str, arguments: list[str]) -> None:
         """Take one marker."""
@@ -174,7 +172,10 @@ def assign_ids(found: Declarations) -> dict[str, int]:
         if names.count(name) > 1:
             fail(f"{name!r} is declared with two formats")
     free = iter([*range(2, 96), *range(-32, 0), *range(96, 4096)])
-    return {message: FIXED_IDS[name] if name in FIXED_IDS else next(free) for message, name in zip(messages, names)}
+    return {
+        message: FIXED_IDS[name] if name in FIXED_IDS else next(free)
+        for message, name in zip(messages, names)
+    }
 
 
 def string_ids(found: Declarations) -> dict[str, int]:
@@ -250,7 +251,9 @@ def c_source(found: Declarations, ids: dict[str, int], blob: bytes, version: str
         entry = f"{{{ids[message]}, {count}, types_of_response_{symbol}}}"
         lines += [array, f"const struct response response_{symbol} = {entry};"]
     numbers = string_ids(found)
-    lines += [f"const uint16_t string_{symbol} = {numbers[string]};" for symbol, string in found.strings.items()]
+    lines += [
+        f"const uint16_t string_{symbol} = {numbers[string]};" for symbol, string in found.strings.items()
+    ]
     tasks = found.functions["task"]
     if len(tasks) > 32:
         fail("more than 32 tasks; the set of woken tasks is one 32-bit word")

@@ -32,7 +32,9 @@ def base() -> TimeBase:
 def test_print_time_is_the_primary_at_nominal_frequency() -> None:
     time_base = base()
     assert time_base.print_time_at(HostTime(0)) == pytest.approx(1e9 / PRIMARY_FREQ)
-    assert time_base.host_ns_at(time_base.print_time_at(HostTime(123_456_789))) == pytest.approx(123_456_789, abs=10)
+    assert time_base.host_ns_at(time_base.print_time_at(HostTime(123_456_789))) == pytest.approx(
+        123_456_789, abs=10
+    )
 
 
 def test_secondary_map_follows_a_clock_that_was_seen_wrong_without_a_jump() -> None:

@@ -16,12 +16,14 @@ int64_t monotonic_ns(void) {
 }
 
 uint64_t clock_at(const struct linux_board *board, int64_t ns) {
-    __extension__ unsigned __int128 product = (unsigned __int128)(uint64_t)(ns - board->start_ns) * board->rate_mHz;
+    __extension__ unsigned __int128 product =
+        (unsigned __int128)(uint64_t)(ns - board->start_ns) * board->rate_mHz;
     return board->options.start_clock + (uint64_t)(product / NS_MHZ);
 }
 
 int64_t ns_at(const struct linux_board *board, uint64_t clock) {
-    __extension__ unsigned __int128 product = (unsigned __int128)(clock - board->options.start_clock) * NS_MHZ;
+    __extension__ unsigned __int128 product =
+        (unsigned __int128)(clock - board->options.start_clock) * NS_MHZ;
     // Rounded up: at this time the clock has reached CLOCK.
     return board->start_ns + (int64_t)((product + board->rate_mHz - 1) / board->rate_mHz);
 }

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // The board `linux`: a process is a node. For machines without hardware, and for the tests.
 //
-// Time. The board's clock runs at an adjustable true rate against CLOCK_MONOTONIC. A process is dispatched late
-// by its kernel; so that this does not look like late steps, the clock stands at a timer's own wake-up while
-// that timer runs: an infinitely fast chip. Commands and tasks see the real clock, so a command that comes too
-// late is late. How late the kernel dispatched timers is measured and reported.
+// Time. The board's clock runs at an adjustable true rate against CLOCK_MONOTONIC. A process is dispatched
+// late by its kernel; so that this does not look like late steps, the clock stands at a timer's own wake-up
+// while that timer runs: an infinitely fast chip. Commands and tasks see the real clock, so a command that
+// comes too late is late. How late the kernel dispatched timers is measured and reported.
 #ifndef BOARDS_LINUX_BOARD_H
 #define BOARDS_LINUX_BOARD_H
 

@@ -75,7 +75,8 @@ static struct timespec pause_of(const struct linux_board *board, int64_t now_ns)
     return (struct timespec){.tv_sec = wait_ns / S_NS, .tv_nsec = wait_ns % S_NS};
 }
 
-// ---------------------------------------------------------------------------------------------------- main loop
+// ---------------------------------------------------------------------------------------------------- main
+// loop
 
 static uint64_t next_random(struct linux_board *board) { // xorshift64*
     board->random ^= board->random >> 12;
@@ -132,8 +133,8 @@ static void print_statistics(const struct linux_board *board) {
            ", \"blocks\": %" PRIu32 ", \"blocks_damaged\": %" PRIu32 ", \"blocks_out_of_order\": %" PRIu32
            ", \"bytes_dropped\": %" PRIu32 ", \"responses_dropped\": %" PRIu32 ", \"is_shutdown\": %s}\n",
            board->edges, board->timers, mean, (double)board->late_ticks_max * us, board->bytes_in,
-           board->bytes_out, board->frames_in, board->frames_out, board->frames_bad, link->blocks, link->losses,
-           link->out_of_order, link->receive_dropped, link->transmit_dropped,
+           board->bytes_out, board->frames_in, board->frames_out, board->frames_bad, link->blocks,
+           link->losses, link->out_of_order, link->receive_dropped, link->transmit_dropped,
            board->node.is_shutdown ? "true" : "false");
 }
 
@@ -162,7 +163,8 @@ int main(int argc, char **argv) {
     if (wires_open(board))
         return EXIT_FAILURE;
     if (edge_log_open(board)) {
-        fprintf(stderr, "canductor-node: cannot write the log %s; name another file\n", board->options.edge_log);
+        fprintf(stderr, "canductor-node: cannot write the log %s; name another file\n",
+                board->options.edge_log);
         return EXIT_FAILURE;
     }
     start_node(board);

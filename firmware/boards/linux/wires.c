@@ -86,7 +86,8 @@ void wires_close(struct linux_board *board) {
         close(board->slave_fd);
 }
 
-// ---------------------------------------------------------------------------------------------------- reading
+// ----------------------------------------------------------------------------------------------------
+// reading
 
 static void receive_frame(struct linux_board *board, const uint8_t *record) {
     struct can_frame frame;
@@ -123,7 +124,8 @@ void wires_read(struct linux_board *board) {
     }
 }
 
-// ---------------------------------------------------------------------------------------------------- writing
+// ----------------------------------------------------------------------------------------------------
+// writing
 
 static size_t room(const struct linux_board *board) {
     return sizeof(board->out) - (board->out_to - board->out_from);
@@ -183,7 +185,8 @@ void board_can_filter(struct node *node, const uint32_t *ids, uint8_t count) {
     struct linux_board *board = board_of(node);
     struct can_filter filters[3];
     for (uint8_t i = 0; i < count; i++)
-        filters[i] = (struct can_filter){.can_id = ids[i], .can_mask = CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG};
+        filters[i] =
+            (struct can_filter){.can_id = ids[i], .can_mask = CAN_SFF_MASK | CAN_EFF_FLAG | CAN_RTR_FLAG};
     if (board->options.socketcan)
         setsockopt(board->fd, SOL_CAN_RAW, CAN_RAW_FILTER, filters, count * (socklen_t)sizeof(*filters));
 }
