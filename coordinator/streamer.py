@@ -1,14 +1,14 @@
 """Real time: feeds a job's motion to the nodes, early enough and not too early.
 
-The control loop wakes every CYCLE_S. What costs time (the job's g-code, planning, step generation) runs in one
-worker thread without the interpreter lock; the loop only hands finished batches to the links.
+The control loop wakes every CYCLE_S. What costs time (the job's g-code, planning, step generation) runs in
+one worker thread without the interpreter lock; the loop only hands finished batches to the links.
 """
 
 import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from coordinator.app import Machine, MachineStopped, host_now, link_of
 from coordinator.gcode.errors import GCodeError
@@ -28,7 +28,9 @@ from coordinator.gcode.interpreter import Job
 from coordinator.motion.planner import Planner
 from coordinator.motion.steps import StepGenerator
 from coordinator.pipeline import Pipeline, PlanRecord
-from coordinator.timebase import ClockMap
+
+if TYPE_CHECKING:
+    from coordinator.timebase import ClockMap
 
 CYCLE_S: Final = 0.05
 PLAN_AHEAD_S: Final = 3.0

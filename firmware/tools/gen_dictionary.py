@@ -2,10 +2,10 @@
 
 Usage: gen_dictionary.py -o OUT.c [--json OUT.json] [-D NAME=VALUE]... [--cc CC] SOURCE.c...
 
-Each source goes through ``CC -E -DCANDUCTOR_COLLECT``, where a declaration becomes ``@@kind(arguments)@@``. The
-result is one C file that defines what the declarations promise. It needs no file that lists commands, and only
-Python's standard library. A contradiction (one id symbol for two texts, two commands of one name, ...) ends the
-build with one sentence.
+Each source goes through ``CC -E -DCANDUCTOR_COLLECT``, where a declaration becomes ``@@kind(arguments)@@``.
+The result is one C file that defines what the declarations promise. It needs no file that lists commands, and
+only Python's standard library. A contradiction (one id symbol for two texts, two commands of one name, ...)
+ends the build with one sentence.
 """
 
 import argparse
@@ -124,9 +124,9 @@ def split_arguments(inside: str) -> list[str]:
     """Split at commas that stand neither in a string nor in parentheses."""
     arguments, depth, start = [], 0, 0
     for match in re.finditer(STRING.pattern + r"|[(),]", inside):
-        token = match.group()
-        depth += (token == "(") - (token == ")")
-        if token == "," and depth == 0:
+        mark = match.group()
+        depth += (mark == "(") - (mark == ")")
+        if mark == "," and depth == 0:
             arguments.append(inside[start : match.start()].strip())
             start = match.end()
     return [*arguments, inside[start:].strip()]
@@ -164,7 +164,7 @@ def parameter_types(message: str) -> list[str]:
 
 
 def assign_ids(found: Declarations) -> dict[str, int]:
-    """Give each format its id: the fixed ones, then frequent commands first; ids up to 95 and -32 take one byte."""
+    """Give each format its id: fixed ones, then frequent commands; -32 to 95 take one byte."""
     frequent = [message for message, (_, flags) in found.commands.items() if flags & FREQUENT]
     messages = list(dict.fromkeys([*frequent, *found.commands, *found.responses.values()]))
     names = [name_of(message) for message in messages]
@@ -174,12 +174,12 @@ def assign_ids(found: Declarations) -> dict[str, int]:
     free = iter([*range(2, 96), *range(-32, 0), *range(96, 4096)])
     return {
         message: FIXED_IDS[name] if name in FIXED_IDS else next(free)
-        for message, name in zip(messages, names)
+        for message, name in zip(messages, names, strict=True)
     }
 
 
 def string_ids(found: Declarations) -> dict[str, int]:
-    """Number the static strings from 2 on, sorted so that the build does not depend on the order of sources."""
+    """Give each static string a number from 2 on; sorted, so that the order of sources does not matter."""
     return {string: i for i, string in enumerate(sorted(set(found.strings.values())), start=2)}
 
 
@@ -240,7 +240,7 @@ def command_lines(found: Declarations, ids: dict[str, int]) -> list[str]:
 def c_source(found: Declarations, ids: dict[str, int], blob: bytes, version: str) -> str:
     """Return the generated C file."""
     lines = [
-        f"// Made by firmware/tools/gen_dictionary.py from the declarations of firmware {version}; do not edit.",
+        f"// Made by firmware/tools/gen_dictionary.py from the sources of firmware {version}; do not edit.",
         '#include "core/tables.h"',
         *command_lines(found, ids),
     ]
@@ -269,7 +269,8 @@ def c_source(found: Declarations, ids: dict[str, int], blob: bytes, version: str
             *rows,
             "};",
             "const struct tables node_tables = {commands, FIRST_ID, COMMAND_COUNT, inits, tasks, shutdowns,",
-            f"    {counts['init']}, {counts['task']}, {counts['shutdown']}, dictionary, sizeof(dictionary)}};",
+            f"    {counts['init']}, {counts['task']}, {counts['shutdown']},",
+            "    dictionary, sizeof(dictionary)};",
             "",
         ]
     )
