@@ -201,6 +201,7 @@ struct node {
 
     struct timer *timers;  // sorted, earliest first
     struct timer *running; // popped for its run; NULL when it was removed or added meanwhile
+    uint32_t standstill;   // runs in a row that a timer wanted to repeat at the same clock
     uint32_t tasks_woken;  // one bit each
 
     struct link link;

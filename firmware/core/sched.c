@@ -42,8 +42,12 @@ void sched_del_timer(struct node *node, struct timer *timer) {
     board_irq_restore(node, irq);
 }
 
+// A timer with an interval of nothing would stop the world: so many runs at one clock are an error.
+enum { STANDSTILL_MAX = 1000 };
+
 void sched_dispatch(struct node *node) {
     struct timer *timer = node->timers;
+    uint32_t due = timer->wake_clock;
     node->timers = timer->next;
     node->running = timer;
     enum timer_result result = timer->run(node, timer);
@@ -51,8 +55,9 @@ void sched_dispatch(struct node *node) {
     node->running = NULL;
     if (!again)
         return;
+    node->standstill = timer->wake_clock == due ? node->standstill + 1 : 0;
     uint32_t latest = timer->wake_clock + node->config.timer_slack_ticks;
-    if (clock_before(latest, board_clock(node))) {
+    if (clock_before(latest, board_clock(node)) || node->standstill > STANDSTILL_MAX) {
         node_shutdown(node, string_timer_in_past);
         return;
     }

@@ -79,7 +79,8 @@ static enum timer_result unstep_run(struct node *node, struct timer *timer) {
     timer->run = step_run;
     if (!next_step(node, s))
         return TIMER_DONE;
-    // A pause is as long as a pulse at least; a step delayed by that does not delay the ones behind it.
+    // A pause is as long as a pulse at least; a step delayed by that does not delay the ones behind it. One
+    // that is due even before the step just made is left in the past: the rate is more than pulses allow.
     uint32_t earliest = timer->wake_clock + s->pulse_ticks;
     uint32_t step_clock = s->step_clock;
     bool in_past = clock_before(step_clock, timer->wake_clock - s->pulse_ticks);
@@ -187,7 +188,7 @@ void command_queue_step(struct node *node, const struct wire_arg *args) {
 DECL_COMMAND_FLAGS(command_set_next_step_dir, COMMAND_FREQUENT, "set_next_step_dir oid=%c dir=%c");
 void command_set_next_step_dir(struct node *node, const struct wire_arg *args) {
     struct stepper *s = lookup(node, args[0].value);
-    if (s && !s->needs_reset)
+    if (s)
         s->next_dir = args[1].value != 0;
 }
 
