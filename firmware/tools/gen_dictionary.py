@@ -142,6 +142,8 @@ def collect(sources: Iterable[str], cc: str, defines: list[str]) -> Declarations
             fail(f"{source} does not preprocess: {run.stderr.strip()}")
         for kind, inside in MARKER.findall(run.stdout):
             found.add(kind, split_arguments(inside))
+    if not found.commands:
+        fail(f"no command is declared in {', '.join(sources)}; the markers of core/declare.h do not come through")
     return found
 
 
