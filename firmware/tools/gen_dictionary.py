@@ -143,7 +143,7 @@ def collect(sources: Iterable[str], cc: str, defines: list[str]) -> Declarations
         for kind, inside in MARKER.findall(run.stdout):
             found.add(kind, split_arguments(inside))
     if not found.commands:
-        fail(f"no command is declared in {', '.join(sources)}; the markers of core/declare.h do not come through")
+        fail("no source declares a command; the markers of core/declare.h do not come through")
     return found
 
 
