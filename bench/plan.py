@@ -29,9 +29,8 @@ def main() -> None:
     paths = [Path(argument) for argument in sys.argv[1:]]
     configs = [path for path in paths if path.suffix == ".cfg"] or [ROOT / "config/demo/machine.cfg"]
     programs = [path for path in paths if path.suffix != ".cfg"] or [ROOT / "config/demo/part.gcode"]
-    print(
-        f"{'program':12} {'machine':24} {'CPU s':>6} {'MB':>5} {'steps':>11} {'queue_steps':>11} {'bytes':>10}"
-    )
+    head = ("program", "machine", "CPU s", "MB", "steps", "queue_steps", "bytes")
+    print("{:12} {:24} {:>6} {:>5} {:>11} {:>11} {:>10}".format(*head))
     for program, config in product(programs, configs):
         runs = [plan(config, program) for _ in range(RUNS)]
         cpu_s = statistics.median(run["cpu_s"] for run in runs)
