@@ -31,7 +31,8 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/clang-format --dry-run --Werror $(C_SOURCES)
-	@for c in $(filter %.c,$(filter firmware/% nodes/% coordinator/%,$(C_SOURCES))); do \
+	# A board needs its build's constants: firmware/Makefile compiles those, with the same warnings as errors.
+	@for c in $(filter-out firmware/boards/%,$(filter %.c,$(filter firmware/% nodes/% coordinator/%,$(C_SOURCES)))); do \
 	  gcc $(C_WARNINGS) -fsyntax-only $$c || exit 1; done
 	$(BIN)/pytest tests/test_import_floors.py
 
