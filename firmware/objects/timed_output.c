@@ -1,94 +1,76 @@
 // SPDX-License-Identifier: Apache-2.0
-// Queue and safety net of timed outputs.
+// Timed outputs: see timed_output.h.
 #include "objects/timed_output.h"
 
 #include "boards/board.h"
 
-// Finds what happens next; false when nothing does.
-static bool plan(struct timed_output *out) {
-    bool any = out->queue.first || out->has_deadline;
-    if (any)
-        out->timer.wake_clock = out->queue.first ? out->queue.first->output.clock : out->deadline;
-    if (out->has_between && (!any || clock_before(out->between_clock, out->timer.wake_clock))) {
-        out->timer.wake_clock = out->between_clock;
-        any = true;
+struct value_move {
+    struct move link;
+    uint32_t clock, value;
+};
+_Static_assert(sizeof(struct value_move) <= NODE_MOVE_SIZE, "a value fits into a slot");
+
+// Drives VALUE from CLOCK on and begins its period of grace.
+static void drive(struct node *node, struct timed_output *output, uint32_t clock, uint32_t value) {
+    output->apply(node, output, clock, value);
+    output->has_end = output->max_duration && value != output->default_value;
+    output->end_clock = clock + output->max_duration;
+}
+
+// Sets the timer to what comes next. Returns 0 when nothing does, or after a shutdown.
+static int plan(struct node *node, struct timed_output *output) {
+    const struct value_move *next = (const struct value_move *)output->queue.first;
+    if (!next) {
+        output->timer.waketime = output->end_clock;
+        return output->has_end;
     }
-    return any;
+    if (output->has_end && clock_before(output->end_clock, next->clock)) {
+        node_shutdown(node, output->exceeded);
+        return 0;
+    }
+    output->timer.waketime = next->clock;
+    return 1;
 }
 
-static void apply(struct node *node, struct timed_output *out, uint32_t value, uint32_t clock) {
-    out->has_between = false;
-    bool is_default = out->kind->apply(node, out, value, clock);
-    out->has_deadline = out->max_duration && !is_default;
-    out->deadline = clock + out->max_duration;
-}
-
-// Tells whether CLOCK comes too late to renew the present value.
-static bool exceeds(const struct timed_output *out, uint32_t clock) {
-    return out->has_deadline && clock_before(out->deadline, clock);
-}
-
-static enum timer_result run(struct node *node, struct timer *timer) {
-    struct timed_output *out = (struct timed_output *)(void *)timer;
-    uint32_t now = timer->wake_clock;
-    const struct move *first = out->queue.first;
-    if (first && first->output.clock == now) {
-        struct move *move = move_pop(&out->queue);
-        apply(node, out, move->output.value, now);
-        move_free(node, move);
-        if (out->queue.first && exceeds(out, out->queue.first->output.clock)) {
-            node_shutdown(node, *out->kind->exceeds);
-            return TIMER_DONE;
-        }
-    } else if (out->has_between && out->between_clock == now) {
-        out->kind->between(node, out, now);
-    } else {
-        node_shutdown(node, *out->kind->missed);
+static enum timer_result event(struct node *node, struct timer *timer) {
+    struct timed_output *output = (struct timed_output *)timer;
+    struct value_move *move = (struct value_move *)move_queue_pop(&output->queue);
+    if (!move) {
+        node_shutdown(node, output->missed);
         return TIMER_DONE;
     }
-    return plan(out) ? TIMER_RESCHEDULE : TIMER_DONE;
+    drive(node, output, move->clock, move->value);
+    move_free(node, move);
+    return plan(node, output) ? TIMER_AGAIN : TIMER_DONE;
 }
 
-// Puts the timer where the changed queue wants it.
-static void replan(struct node *node, struct timed_output *out) {
-    sched_del_timer(node, &out->timer);
-    if (plan(out))
-        sched_add_timer(node, &out->timer);
+void timed_output_init(struct timed_output *output) {
+    output->timer.function = event;
 }
 
-void timed_output_setup(struct timed_output *out, const struct timed_output_kind *kind,
-                        uint32_t max_duration) {
-    out->kind = kind;
-    out->timer.run = run;
-    out->max_duration = max_duration;
-}
-
-void timed_output_queue(struct node *node, struct timed_output *out, uint32_t clock, uint32_t value) {
-    struct move *move = move_alloc(node);
+void timed_output_queue(struct node *node, struct timed_output *output, uint32_t clock, uint32_t value) {
+    struct value_move *move = move_alloc(node);
     if (!move)
         return;
-    move->output.clock = clock;
-    move->output.value = value;
-    uint32_t irq = board_irq_save(node);
-    bool first = !out->queue.first;
-    bool late = first && exceeds(out, clock);
-    move_push(&out->queue, move);
-    if (first && !late)
-        replan(node, out);
-    board_irq_restore(node, irq);
-    if (late)
-        node_shutdown(node, *out->kind->exceeds);
+    move->clock = clock;
+    move->value = value;
+    if (!move_queue_push(&output->queue, &move->link))
+        return; // judged when its turn comes
+    sched_delete_timer(node, &output->timer);
+    if (plan(node, output))
+        sched_add_timer(node, &output->timer);
 }
 
-void timed_output_set(struct node *node, struct timed_output *out, uint32_t value) {
-    uint32_t irq = board_irq_save(node);
-    apply(node, out, value, board_clock(node));
-    replan(node, out);
-    board_irq_restore(node, irq);
+void timed_output_update(struct node *node, struct timed_output *output, uint32_t value) {
+    sched_delete_timer(node, &output->timer);
+    drive(node, output, board_clock(node), value);
+    if (plan(node, output))
+        sched_add_timer(node, &output->timer);
 }
 
-void timed_output_stop(struct node *node, struct timed_output *out) {
-    sched_del_timer(node, &out->timer);
-    move_clear(node, &out->queue);
-    out->has_between = out->has_deadline = false;
+void timed_output_stop(struct node *node, struct timed_output *output) {
+    sched_delete_timer(node, &output->timer);
+    move_queue_clear(node, &output->queue);
+    output->has_end = 0;
+    output->apply(node, output, board_clock(node), output->default_value);
 }

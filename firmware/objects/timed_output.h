@@ -1,39 +1,31 @@
 // SPDX-License-Identifier: Apache-2.0
-// What digital and PWM outputs share: a queue of values with clocks, and the safety net max_duration.
-//
-// A value other than the default must be followed by another within max_duration ticks (0: no such limit);
-// when it is not, the node shuts down, and the shutdown hook of the object sets the default.
+// What all timed outputs share: a queue of values with their clocks, and the safety net max_duration: a value
+// other than the default must be renewed within so many ticks, or the node shuts down.
 #ifndef OBJECTS_TIMED_OUTPUT_H
 #define OBJECTS_TIMED_OUTPUT_H
 
 #include "core/node.h"
 
-struct timed_output;
-
-struct timed_output_kind {
-    // Sets VALUE at CLOCK; returns true when it is the default, which needs no renewal. Any context.
-    bool (*apply)(struct node *node, struct timed_output *output, uint32_t value, uint32_t clock);
-    // Optional: makes the level change that is due at CLOCK between two queued values (software PWM) ...
-    void (*between)(struct node *node, struct timed_output *output, uint32_t clock);
-    const uint16_t *missed, *exceeds; // what a shutdown says
-};
-
+// First member of the object. APPLY drives the pin from CLOCK (now, but for the interrupt's delay) on;
+// it runs in interrupt context.
 struct timed_output {
-    struct timer timer; // first: the timer leads back to the object
-    const struct timed_output_kind *kind;
+    struct timer timer;
     struct move_queue queue;
-    uint32_t max_duration, deadline;
-    uint32_t between_clock; // ... which the object announces here
-    bool has_deadline, has_between;
+    void (*apply)(struct node *node, struct timed_output *output, uint32_t clock, uint32_t value);
+    uint32_t max_duration; // 0: no limit
+    uint32_t default_value;
+    uint32_t end_clock;        // when has_end: the value must be renewed by then
+    uint16_t missed, exceeded; // texts of the two shutdowns
+    uint8_t has_end;
 };
 
-void timed_output_setup(struct timed_output *output, const struct timed_output_kind *kind,
-                        uint32_t max_duration);
-// Queues VALUE for CLOCK.
+// Call after the members above are set (timer and queue zero).
+void timed_output_init(struct timed_output *output);
+// Queues VALUE for CLOCK. Interrupts must be off.
 void timed_output_queue(struct node *node, struct timed_output *output, uint32_t clock, uint32_t value);
-// Sets VALUE now; the queue is empty.
-void timed_output_set(struct node *node, struct timed_output *output, uint32_t value);
-// For shutdown hooks: gives up the queue.
+// Sets VALUE now; the queue must be empty. Interrupts must be off.
+void timed_output_update(struct node *node, struct timed_output *output, uint32_t value);
+// Forgets the queue and applies the default value. For shutdown hooks.
 void timed_output_stop(struct node *node, struct timed_output *output);
 
 #endif
