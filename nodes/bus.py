@@ -18,6 +18,7 @@ from nodes.seams import (
     OnLost,
     OnResponses,
 )
+from nodes.wire_time import can_wire_ns
 
 LOST_AFTER_S: Final = 1.0
 
@@ -128,6 +129,9 @@ class _UartConnector:
             LinkSettings(None, lost_after_s=LOST_AFTER_S), on_responses=on_responses, on_lost=on_lost
         )
 
+    def wire_ns(self, content_bytes: int, bitrate: int) -> int:  # noqa: ARG002
+        return 0  # a device file does not tell whether a baud rate is real, or a USB or pseudo-terminal's
+
     def forget(self) -> None:
         pass
 
@@ -218,6 +222,9 @@ class _CanConnector:
             self.assignment = await self._bus.assign([self._uuid])
         settings = LinkSettings(self._bus.nodeid(self._uuid), lost_after_s=LOST_AFTER_S)
         return self._bus.io.open_link(settings, on_responses=on_responses, on_lost=on_lost)
+
+    def wire_ns(self, content_bytes: int, bitrate: int) -> int:
+        return can_wire_ns(content_bytes, bitrate) if bitrate > 0 else 0
 
     def forget(self) -> None:
         self.assignment = None

@@ -25,9 +25,9 @@ Ticks = NewType("Ticks", int)
 
 BURST_SAMPLES: Final = 16
 BURST_INTERVAL_NS: Final = 25_000_000
-SETTLE_SAMPLES: Final = 32
-SETTLE_INTERVAL_NS: Final = 100_000_000
-"""After the burst, up to SETTLE_SAMPLES: the rate is known to some ppm two seconds after the start."""
+SETTLE_SAMPLES: Final = 48
+SETTLE_INTERVAL_NS: Final = 50_000_000
+"""After the burst, up to SETTLE_SAMPLES: two seconds after the start the rate is known to some 10 ppm."""
 SAMPLE_INTERVAL_NS: Final = 984_300_000
 """Not a divisor or multiple of a second: periodic work on a node must not meet every sample."""
 MAX_SAMPLES: Final = 160
@@ -98,8 +98,8 @@ class ClockEstimator:
 
     @property
     def ready(self) -> bool:
-        """Whether there are samples enough to plan with."""
-        return self.accepted >= BURST_SAMPLES
+        """Whether there are samples enough to plan with: what is planned looks two seconds ahead."""
+        return self.accepted >= SETTLE_SAMPLES
 
     @property
     def round_trip_s(self) -> float:

@@ -30,11 +30,15 @@ class Answer:
     message: Message
     sent_ns: int
     received_ns: int
+    asked_bytes: int
+    """Content of the question's block, and of the answer's."""
+    answered_bytes: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Waiter:
     name: str
+    asked_bytes: int
     matching: Mapping[str, Value]
     answered: asyncio.Future[Answer]
     survives_shutdown: bool
@@ -130,7 +134,7 @@ class Conversation:
         if len(self._waiters) >= MAX_WAITERS:
             raise QueryTimeout(f"node {self.name}: {MAX_WAITERS} queries are unanswered; {name} was not sent")
         answered: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
-        waiter = _Waiter(response, matching, answered, survives_shutdown)
+        waiter = _Waiter(response, len(content), matching, answered, survives_shutdown)
         self._waiters.append(waiter)
         try:
             for _ in range(tries):
@@ -168,7 +172,8 @@ class Conversation:
     def _deliver(self, message: Message, response: ResponseLike) -> None:
         for waiter in self._waiters:
             if waiter.wants(message) and not waiter.answered.done():
-                waiter.answered.set_result(Answer(message, response.sent_ns, response.received_ns))
+                times = response.sent_ns, response.received_ns
+                waiter.answered.set_result(Answer(message, *times, waiter.asked_bytes, len(response.content)))
                 break
         oid = message.params.get("oid")
         for key in dict.fromkeys(((message.name, oid), (message.name, None))):

@@ -17,6 +17,7 @@ from nodes.node_errors import NodeError, NodeLost, NodeShutdown
 from nodes.node_states import NodeEvent, NodeState, following
 from nodes.seams import BuildConfig, Connector, LinkLike
 from nodes.vocabulary import check_vocabulary
+from nodes.wire_time import narrow
 
 IDENTIFY_PIECE: Final = 40
 MAX_STARTS: Final = 3
@@ -339,9 +340,15 @@ class Node:
             return await self._talk.ask("get_clock", "clock", tries=1, survives_shutdown=True)
         return await self._talk.ask("get_uptime", "uptime", tries=1, survives_shutdown=True)
 
-    @staticmethod
-    def _take_sample(clock: ClockEstimator, answer: Answer) -> bool:
-        message, sent_ns, received_ns = answer.message, answer.sent_ns, answer.received_ns
+    def _take_sample(self, clock: ClockEstimator, answer: Answer) -> bool:
+        message = answer.message
+        bitrate = self.dictionary.int_constant("CANBUS_FREQUENCY", 0)
+        sent_ns, received_ns = narrow(
+            answer.sent_ns,
+            answer.received_ns,
+            self._connector.wire_ns(answer.asked_bytes, bitrate),
+            self._connector.wire_ns(answer.answered_bytes, bitrate),
+        )
         if message.name == "clock":
             return clock.add(sent_ns, received_ns, message.integer("clock"))
         return clock.begin(sent_ns, received_ns, message.integer("high"), message.integer("clock"))
