@@ -13,15 +13,17 @@
 #define COMMAND_FREQUENT 2    // gets one of the one-byte ids
 
 #ifdef CANDUCTOR_COLLECT
-#define DECL_COMMAND_FLAGS(function, flags, format) @ @command(function, flags, format) @ @
-#define DECL_RESPONSE(name, format) @ @response(name, format) @ @
-#define DECL_CONSTANT(name, value) @ @constant(name, value) @ @
-#define DECL_CONSTANT_STR(name, text) @ @constant_str(name, text) @ @
-#define DECL_ENUMERATION_RANGE(of, name, value, count) @ @enumeration(of, name, value, count) @ @
-#define DECL_STATIC_STRING(name, text) @ @string(name, text) @ @
-#define DECL_TASK(function) @ @task(function) @ @
-#define DECL_INIT(function) @ @init(function) @ @
-#define DECL_SHUTDOWN_HOOK(function) @ @shutdown(function) @ @
+// clang-format off: it would take the markers apart
+#define DECL_COMMAND_FLAGS(function, flags, format) @@command(function, flags, format)@@
+#define DECL_RESPONSE(name, format) @@response(name, format)@@
+#define DECL_CONSTANT(name, value) @@constant(name, value)@@
+#define DECL_CONSTANT_STR(name, text) @@constant_str(name, text)@@
+#define DECL_ENUMERATION_RANGE(of, name, value, count) @@enumeration(of, name, value, count)@@
+#define DECL_STATIC_STRING(name, text) @@string(name, text)@@
+#define DECL_TASK(function) @@task(function)@@
+#define DECL_INIT(function) @@init(function)@@
+#define DECL_SHUTDOWN_HOOK(function) @@shutdown(function)@@
+// clang-format on
 #else
 // void FUNCTION(struct node *, const struct wire_arg *) obeys the command FORMAT; one argument per parameter.
 #define DECL_COMMAND_FLAGS(function, flags, format)                                                          \
