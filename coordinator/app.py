@@ -81,6 +81,11 @@ class Machine:
                 raise _first_cause(error) from None
             raise
         self._ready = True
+        for node in self.nodes.values():
+            self._node_changed(node)  # one may have failed while others still started
+        if self.stopped is not None:
+            await self.close()
+            raise self.stopped
 
     async def close(self) -> None:
         """Leave the nodes as they are and release everything."""

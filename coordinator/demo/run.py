@@ -1,6 +1,5 @@
 """``canductor demo``: prints on virtual nodes in real time, then proves every step against the plan."""
 
-import asyncio
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -19,7 +18,7 @@ from coordinator.gcode.program import Program
 from coordinator.machine.description import MachineDescription, StepperDescription, load_machine
 from coordinator.pipeline import PlanRecord
 from coordinator.progress import ProgressDisplay
-from coordinator.session import Outcome, run_job
+from coordinator.session import Outcome, run_job, run_to_end
 from coordinator.streamer import Told
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import firmware_dictionary
@@ -40,11 +39,11 @@ def run_demo(options: DemoOptions) -> DemoReport:
         program = stack.enter_context(Program.open(options.gcode or DEMO_GCODE))
         stage = stack.enter_context(Stage(description, options, folder))
         display = stack.enter_context(ProgressDisplay(f"printing {program.name}", quiet=options.json))
-        outcome = asyncio.run(
+        outcome = run_to_end(
             run_job(
                 stage.description,
                 program,
-                display,
+                display.update,
                 record=record,
                 on_told=lambda event: told.append(_text(event)),
                 on_ready=ready,
