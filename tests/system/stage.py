@@ -5,11 +5,12 @@ import json
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Self
 
 from nodes.virtual.processes import BusProcess, ChildProcess, NodeProcess
 
@@ -17,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 DEMO_CFG = (ROOT / "config" / "demo" / "machine.cfg").read_text(encoding="utf-8")
 CANDUCTOR = (sys.executable, "-m", "coordinator.cli")
 MCU_UUID, TOOLHEAD_UUID = "90a4ae022dfc", "5e1ec7ab1e02"
-END_S = 60.0
+END_S = 30.0
 """No command of these tests may take longer; on a busy machine they take a fifth of it."""
 
 SQUARE = """\
@@ -30,7 +31,7 @@ G1 X20 Y20 F9000
 G1 X40 Y20 E1 F3000
 G1 X40 Y40 E2
 G1 X20 Y40 E3
-G1 X20 Y20 E4
+G1 X20 Y30 E4
 G1 Z0.6 F600
 """
 """Every stepper of the demo machine moves, both ways where it can; two seconds."""
@@ -64,6 +65,42 @@ class Ended:
         return lines[0].removeprefix("canductor: ")
 
 
+class _Output:
+    """What a process writes to PIPE, line by line, read by a thread of its own."""
+
+    def __init__(self, pipe: IO[str]) -> None:
+        self._lines: list[str] = []
+        self._ended = False
+        self._news = threading.Condition()
+        self._reader = threading.Thread(target=self._read, args=(pipe,), daemon=True)
+        self._reader.start()
+
+    def _read(self, pipe: IO[str]) -> None:
+        with pipe:
+            for line in pipe:
+                with self._news:
+                    self._lines.append(line)
+                    self._news.notify_all()
+        with self._news:
+            self._ended = True
+            self._news.notify_all()
+
+    def wait_for(self, words: str, count: int = 1) -> None:
+        """Wait until COUNT lines had WORDS in them."""
+
+        def found() -> bool:
+            return sum(words in line for line in self._lines) >= count
+
+        with self._news:
+            self._news.wait_for(lambda: self._ended or found(), END_S)
+            assert found(), f"{words!r} was not said, but {self._lines}"
+
+    def all(self) -> str:
+        self._reader.join(END_S)
+        assert self._ended
+        return "".join(self._lines)
+
+
 class Command:
     """A ``canductor`` command while it runs; its standard input is a pipe."""
 
@@ -76,46 +113,35 @@ class Command:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            bufsize=1,
         )
+        assert self.process.stdin
+        assert self.process.stdout
+        assert self.process.stderr
+        self._stdin = self.process.stdin
+        self.stdout, self.stderr = _Output(self.process.stdout), _Output(self.process.stderr)
 
     def type(self, *lines: str) -> None:
-        assert self.process.stdin is not None
-        self.process.stdin.write("".join(line + "\n" for line in lines))
-        self.process.stdin.flush()
-
-    def read_until(self, words: str) -> str:
-        """Return the next line of its output with WORDS in it."""
-        assert self.process.stdout is not None
-        seen = []
-        for line in self.process.stdout:
-            seen.append(line)
-            if words in line:
-                return line
-        raise AssertionError(f"{words!r} was never said, but {seen} {self.process.communicate()}")
+        """Write LINES to its standard input."""
+        self._stdin.write("".join(line + "\n" for line in lines))
+        self._stdin.flush()
 
     def signal(self, number: signal.Signals) -> None:
         self.process.send_signal(number)
 
     def end(self) -> Ended:
         """Close its input and wait for it."""
-        try:
-            stdout, stderr = self.process.communicate(timeout=END_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            raise
-        return Ended(self.process.returncode, stdout, stderr, time.monotonic() - self._began_s)
+        self._stdin.close()
+        status = self.process.wait(END_S)
+        return Ended(status, self.stdout.all(), self.stderr.all(), time.monotonic() - self._began_s)
 
-    def __enter__(self) -> "Command":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
-            if pipe is not None and not pipe.closed:
-                pipe.close()
+        self.process.kill()
+        self.process.wait()
+        if not self._stdin.closed:
+            self._stdin.close()
 
 
 def canductor(*words: str | Path) -> Ended:

@@ -13,7 +13,8 @@ def test_a_file_is_printed_and_every_node_counts_what_it_was_sent(machine: Hardw
     assert ended.status == 0, ended
     report = ended.json
     assert report["ok"] is True
-    assert report["steppers"]["stepper_x"] == {"steps_moved": 6400, "steps_sent": 6400}
+    assert report["steppers"]["stepper_x"] == {"steps_moved": 8000, "steps_sent": 8000}
+    assert report["steppers"]["stepper_y"] == {"steps_moved": -1600, "steps_sent": -1600}
     assert report["steppers"]["stepper_z"] == {"steps_moved": 240, "steps_sent": 240}
     assert all(node["min_lead_ms"] > 0 for node in report["nodes"].values())
     assert not any(node["is_shutdown"] for node in machine.stop())
