@@ -99,7 +99,9 @@ def run_machine(options: RunOptions) -> RunReport:
         )
         _announce(description)
         show = stack.enter_context(_progress(options, program))
-        outcome = run_to_end(run_job(description, program, show, on_told=lambda told: _say(told.text)))
+        outcome = run_to_end(
+            lambda: run_job(description, program, show, on_told=lambda told: _say(told.text))
+        )
         return RunReport(program.name, outcome)
 
 

@@ -46,7 +46,7 @@ class Outcome:
     steps: int
     queue_steps: int
     positions: dict[str, int]
-    """By stepper: steps from where it began, as its node counts them."""
+    """By stepper: steps that the job moved it by, as its node counts them."""
     issued: dict[str, int]
     """By stepper: steps that the host's commands add up to."""
     maps: dict[str, ClockMap]
@@ -59,25 +59,33 @@ def homed_positions(description: MachineDescription) -> dict[str, float]:
     return {rail.axis.upper(): rail.homing.position_endstop or 0.0 for rail in description.rails}
 
 
-def run_to_end(job: Coroutine[Any, Any, T]) -> T:
+def run_to_end(job: Callable[[], Coroutine[Any, Any, T]]) -> T:
     """Run JOB in a loop of its own; Ctrl-C and SIGTERM cancel it and are raised when it has ended.
 
-    Raises KeyboardInterrupt after Ctrl-C, Terminated after SIGTERM.
+    Raises KeyboardInterrupt after Ctrl-C, Terminated after SIGTERM. Both are held back while the loop is made
+    and taken down: an exception in there would leave it half done.
     """
+    held_back = {signal.SIGINT, signal.SIGTERM}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
+    handler = signal.getsignal(signal.SIGTERM)
 
     async def interruptible() -> T:
         task = asyncio.current_task()
         assert task is not None
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
-        return await job
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        try:
+            return await job()
+        finally:
+            signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
 
-    before = signal.getsignal(signal.SIGTERM)
     try:
         return asyncio.run(interruptible())
     except asyncio.CancelledError:
         raise Terminated from None
     finally:
-        signal.signal(signal.SIGTERM, before)  # the loop leaves the kernel's default behind
+        signal.signal(signal.SIGTERM, handler)  # the loop leaves the kernel's default behind
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 async def run_job(

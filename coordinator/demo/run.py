@@ -40,7 +40,7 @@ def run_demo(options: DemoOptions) -> DemoReport:
         stage = stack.enter_context(Stage(description, options, folder))
         display = stack.enter_context(ProgressDisplay(f"printing {program.name}", quiet=options.json))
         outcome = run_to_end(
-            run_job(
+            lambda: run_job(
                 stage.description,
                 program,
                 display.update,
@@ -131,7 +131,7 @@ class _Prover:
             stepper.node,
             self._expected(stepper),
             self._executed(stepper, log),
-            counted=self._signed(stepper) * self._outcome.positions[stepper.name],
+            counted=self._outcome.positions[stepper.name],
             clock_map=self._outcome.maps[stepper.node],
             truth=log,
             primary=self._primary,
@@ -143,7 +143,7 @@ class _Prover:
             yield from expected_steps(moves, stepper.weights, stepper.step_distance, origin)
 
     def _executed(self, stepper: StepperDescription, log: EdgeLog) -> Iterator[tuple[Any, Any]]:
-        sign = np.int8(self._signed(stepper))
+        sign = np.int8(-1 if stepper.dir_pin.invert else 1)
         for clock, direction in log.steps(
             self._pins[stepper.step_pin.name],
             self._pins[stepper.dir_pin.name],
@@ -151,10 +151,6 @@ class _Prover:
             step_idle_level=int(stepper.step_pin.invert),
         ):
             yield clock, direction * sign
-
-    @staticmethod
-    def _signed(stepper: StepperDescription) -> int:
-        return -1 if stepper.dir_pin.invert else 1
 
 
 def _report(

@@ -85,14 +85,14 @@ class _Output:
             self._ended = True
             self._news.notify_all()
 
-    def wait_for(self, words: str, count: int = 1) -> None:
-        """Wait until COUNT lines had WORDS in them."""
+    def wait_for(self, words: str, limit_s: float = END_S) -> None:
+        """Wait until a line had WORDS in it."""
 
         def found() -> bool:
-            return sum(words in line for line in self._lines) >= count
+            return any(words in line for line in self._lines)
 
         with self._news:
-            self._news.wait_for(lambda: self._ended or found(), END_S)
+            self._news.wait_for(lambda: self._ended or found(), limit_s)
             assert found(), f"{words!r} was not said, but {self._lines}"
 
     def all(self) -> str:

@@ -20,6 +20,21 @@ def printing(machine: Hardware, *words: str) -> Command:
     return command
 
 
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)], ids=["Ctrl-C", "SIGTERM"]
+)
+def test_a_start_ended_by_the_user_ends_at_once(
+    machine: Hardware, number: signal.Signals, status: int
+) -> None:
+    machine.nodes["mcu"].kill()  # so that the start cannot come to its end before the signal
+    with Command("run", machine.config) as command:
+        command.stdout.wait_for("not yet acting")
+        command.signal(number)
+        ended = command.end()
+    assert ended.sentence(status).startswith("stopped by")
+    assert ended.took_s < OVERALL_LIMIT_S
+
+
 def check_others_stopped(ended: Ended, machine: Hardware, others: set[str]) -> None:
     """The others reported their shutdown in time, and are shut down."""
     delays = {name: int(ms) for name, ms in re.findall(r"(\w+) after (\d+) ms", ended.sentence())}
