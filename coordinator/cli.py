@@ -73,10 +73,13 @@ def _run(words: list[str], as_json: bool) -> int:
         return _fail(str(error), EXIT_FAILED, as_json)
     except _CommandLineError as error:
         return _fail(_usage_sentence(error), EXIT_USAGE, as_json)
-    except Terminated:
-        return _fail("stopped by SIGTERM", EXIT_TERMINATED, as_json)
-    except (KeyboardInterrupt, typer.Abort):
-        return _fail("stopped by Ctrl-C", EXIT_INTERRUPTED, as_json)
+    except (KeyboardInterrupt, typer.Abort) as error:
+        terminated = isinstance(error, Terminated)
+        return _fail(
+            "stopped by SIGTERM" if terminated else "stopped by Ctrl-C",
+            EXIT_TERMINATED if terminated else EXIT_INTERRUPTED,
+            as_json,
+        )
     except BrokenPipeError:
         raise
     except Exception:  # noqa: BLE001 (the last line of defence: whatever comes here is a bug, and is told so)

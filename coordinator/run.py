@@ -1,4 +1,4 @@
-"""``canductor run``: brings up the machine of a configuration and prints a file, or what comes on standard input."""
+"""``canductor run``: brings up a configured machine and prints a file, or what comes on standard input."""
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -49,10 +49,8 @@ class RunReport:
     def to_text(self) -> str:
         """Return the same for a reader."""
         outcome = self.outcome
-        lines = [
-            f"{self.gcode}: {outcome.moves:,} moves in {outcome.print_time_s:.1f} s, {outcome.steps:,} steps "
-            f"in {outcome.queue_steps:,} queue_step commands"
-        ]
+        moved = f"{outcome.moves:,} moves in {outcome.print_time_s:.1f} s, {outcome.steps:,} steps"
+        lines = [f"{self.gcode}: {moved} in {outcome.queue_steps:,} queue_step commands"]
         lines += [
             f"  {name}: moved by {steps:+,} steps, as its node counts them"
             for name, steps in outcome.positions.items()

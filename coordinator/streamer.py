@@ -1,14 +1,14 @@
 """Real time: feeds a job's motion to the nodes, early enough and not too early.
 
-The control loop wakes every CYCLE_S. What costs time (the job's g-code, planning, step generation) runs in one
-worker thread without the interpreter lock; the loop only hands finished batches to the links.
+The control loop wakes every CYCLE_S. What costs time (the job's g-code, planning, step generation) runs in
+one worker thread without the interpreter lock; the loop only hands finished batches to the links.
 """
 
 import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from coordinator.app import Machine, MachineStopped, host_now, link_of
 from coordinator.gcode.errors import GCodeError
@@ -27,7 +27,9 @@ from coordinator.gcode.interpreter import Job
 from coordinator.motion.planner import Planner
 from coordinator.motion.steps import StepGenerator
 from coordinator.pipeline import Pipeline, PlanRecord
-from coordinator.timebase import ClockMap
+
+if TYPE_CHECKING:
+    from coordinator.timebase import ClockMap
 
 CYCLE_S: Final = 0.05
 PLAN_AHEAD_S: Final = 3.0
@@ -93,7 +95,7 @@ class Streamer:
             job, self.steps, lambda n, b: self._batches.append((n, b)), nodes=len(self._nodes), record=record
         )
         self.maps: list[ClockMap] = []
-        """Per moving node: print time to ticks, as the steps were timed; all of it when recorded, else its end."""
+        """Per moving node: print time to ticks, as the steps were timed; without a record only its end."""
         self.began_s = 0.0
         """Print time at which the job began."""
         self.ended_s = 0.0

@@ -51,7 +51,8 @@ def run_demo(options: DemoOptions) -> DemoReport:
         )
         figures = stage.stop_nodes()
         prover = _Prover(description, stage.edge_log, outcome, record, both_edges)
-        return _report(prover, stage, figures, outcome, told, description)
+        notices = (*map(str, description.not_yet_acting), *description.notes, *told)
+        return _report(prover, stage, figures, outcome, notices)
 
 
 @contextmanager
@@ -158,8 +159,7 @@ def _report(
     stage: Stage,
     figures: Mapping[str, Mapping[str, Any]],
     outcome: Outcome,
-    told: list[str],
-    description: MachineDescription,
+    notices: tuple[str, ...],
 ) -> DemoReport:
     return DemoReport(
         moves=outcome.moves,
@@ -182,5 +182,5 @@ def _report(
         ),
         frames=sum(stats.frames for stats in stage.bus_stats()),
         frames_lost=sum(stats.lost for stats in stage.bus_stats()),
-        notices=(*map(str, description.not_yet_acting), *description.notes, *told),
+        notices=notices,
     )

@@ -1,4 +1,4 @@
-"""Virtual hardware and the ``canductor`` executable, as a user has them: everything here is a real process."""
+"""Virtual hardware and the ``canductor`` command, as a user has them: everything is a real process."""
 
 import dataclasses
 import json

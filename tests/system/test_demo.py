@@ -63,11 +63,11 @@ STEP_MM = 0.01
 class Exact:
     """A node whose clock is the host's, in µs."""
 
-    def ticks_to_monotonic_ns(self, clock: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+    def ticks_to_monotonic_ns(self, clock: np.ndarray) -> np.ndarray:
         return clock.astype(np.int64) * 1000
 
 
-def there_and_back() -> np.ndarray:  # type: ignore[type-arg]
+def there_and_back() -> np.ndarray:
     """Return two trapezoids: 2 mm along X in 0.3 s, and back."""
     moves = np.zeros(2, TRAPEZOID)
     for move, begin, start, way in zip(moves, (1.0, 1.3), (0.0, 2.0), (1.0, -1.0), strict=True):

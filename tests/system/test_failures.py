@@ -1,4 +1,4 @@
-"""What is lost in the middle of a print, and what ends it: a clean stop, one sentence, nothing left behind."""
+"""What is lost in the middle of a print, and who ends it: a clean stop, one sentence."""
 
 import re
 import signal

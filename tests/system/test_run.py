@@ -1,7 +1,5 @@
 """``canductor run`` on nodes that outlive it: files, typed commands, one job after the other."""
 
-import re
-
 import pytest
 
 from tests.system.stage import SQUARE, Command, Ended, Hardware, canductor, write_config, write_gcode
@@ -74,7 +72,7 @@ def test_typed_commands_are_answered_as_they_come(machine: Hardware) -> None:
 
 
 def test_a_pause_in_typing_lets_the_machine_stand_and_start_again(machine: Hardware) -> None:
-    """Time passes by dwells: the program's own (G4), and one in which nothing is typed for 4 s."""
+    """The clocks are followed meanwhile, or the next steps were late."""
     with Command("run", machine.config, "--json") as command:
         command.type("G28", "G1 X10 F6000", "M400", "M114")
         command.stdout.wait_for("X:10.00")
@@ -91,7 +89,7 @@ def test_a_pause_in_typing_lets_the_machine_stand_and_start_again(machine: Hardw
 
 
 def test_one_long_move_is_sent_piece_by_piece(machine: Hardware) -> None:
-    """Half a minute of motion, of which no more than the next moments wait in the host."""
+    """All of half a minute's motion is read at once, but not all is at the nodes when the user ends it."""
     with Command("run", machine.config) as command:
         command.type("G28", "G1 X30 F60")
         command.stdout.wait_for("already home")
@@ -102,4 +100,4 @@ def test_one_long_move_is_sent_piece_by_piece(machine: Hardware) -> None:
     ended.sentence(143)
     counters = machine.stop("mcu")[0]
     assert counters["is_shutdown"]
-    assert re.search("Traceback", ended.stdout) is None
+    assert counters["edges"] < 1000  # of 4800 per motor: those still queued were dropped
