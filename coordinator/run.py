@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from coordinator.commands import RunOptions
 from coordinator.gcode.program import Program
+from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, load_machine
 from coordinator.progress import Progress, ProgressDisplay
-from coordinator.session import NodeOutcome, Outcome, run_job, run_to_end
+from coordinator.session import NodeOutcome, Outcome, run_job
 
 
 @dataclass(frozen=True, slots=True)

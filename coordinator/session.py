@@ -1,14 +1,10 @@
 """One job on one machine: connect, run, ask the nodes where they stand; shared by ``run`` and ``demo``."""
 
-import asyncio
-import signal
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
 
 from coordinator.app import Machine, MachineStopped, link_of
-from coordinator.commands import Terminated
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
@@ -21,7 +17,6 @@ from coordinator.timebase import ClockMap
 from nodes.errors import CanductorError
 from nodes.link import LinkStats
 
-T = TypeVar("T")
 OnProgress = Callable[[Progress], None]
 
 
@@ -57,35 +52,6 @@ class Outcome:
 def homed_positions(description: MachineDescription) -> dict[str, float]:
     """Return where each axis stands after G28, mm."""
     return {rail.axis.upper(): rail.homing.position_endstop or 0.0 for rail in description.rails}
-
-
-def run_to_end(job: Callable[[], Coroutine[Any, Any, T]]) -> T:
-    """Run JOB in a loop of its own; Ctrl-C and SIGTERM cancel it and are raised when it has ended.
-
-    Raises KeyboardInterrupt after Ctrl-C, Terminated after SIGTERM. Both are held back while the loop is made
-    and taken down: an exception in there would leave it half done.
-    """
-    held_back = {signal.SIGINT, signal.SIGTERM}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
-    handler = signal.getsignal(signal.SIGTERM)
-
-    async def interruptible() -> T:
-        task = asyncio.current_task()
-        assert task is not None
-        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        try:
-            return await job()
-        finally:
-            signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
-
-    try:
-        return asyncio.run(interruptible())
-    except asyncio.CancelledError:
-        raise Terminated from None
-    finally:
-        signal.signal(signal.SIGTERM, handler)  # the loop leaves the kernel's default behind
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 async def run_job(

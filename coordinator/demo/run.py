@@ -15,10 +15,11 @@ from coordinator.demo.proof import ClockProof, PrimaryClock, StepperProof, prove
 from coordinator.demo.report import DemoReport, NodeReport
 from coordinator.demo.stage import Stage
 from coordinator.gcode.program import Program
+from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, StepperDescription, load_machine
 from coordinator.pipeline import PlanRecord
 from coordinator.progress import ProgressDisplay
-from coordinator.session import Outcome, run_job, run_to_end
+from coordinator.session import Outcome, run_job
 from coordinator.streamer import Told
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import firmware_dictionary
