@@ -6,7 +6,7 @@ C_SOURCES := $(shell git ls-files '*.c' '*.h' 2>/dev/null || find firmware nodes
 NATIVE_INPUTS := $(C_SOURCES) $(wildcard firmware/Makefile firmware/tools/*.py) setup.py pyproject.toml \
 	$(shell find nodes coordinator -name 'build_*.py')
 
-C_WARNINGS := -D_GNU_SOURCE -std=gnu11 -Wall -Wextra -Wconversion -Werror -I. -Ifirmware
+C_WARNINGS := -std=gnu11 -Wall -Wextra -Wconversion -Werror -I. -Ifirmware
 
 .PHONY: demo test check pytest ctest bench clean setup format
 .DEFAULT_GOAL := test
@@ -31,7 +31,8 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/clang-format --dry-run --Werror $(C_SOURCES)
-	@for c in $(filter %.c,$(filter firmware/% nodes/% coordinator/%,$(C_SOURCES))); do \
+	# A board needs its build's constants: firmware/Makefile compiles those, with the same warnings as errors.
+	@for c in $(filter-out firmware/boards/%,$(filter %.c,$(filter firmware/% nodes/% coordinator/%,$(C_SOURCES)))); do \
 	  gcc $(C_WARNINGS) -fsyntax-only $$c || exit 1; done
 	$(BIN)/pytest tests/test_import_floors.py
 

@@ -4,6 +4,7 @@ A cffi module is found by its build script: any ``build_*.py`` in a package that
 """
 
 import subprocess
+import sys
 from pathlib import Path
 
 from setuptools import setup
@@ -20,7 +21,8 @@ class BuildNative(build_ext):
         super().run()
         inplace = self.inplace or self.editable_mode
         bin_dir = (ROOT if inplace else Path(self.build_lib).absolute()) / "nodes" / "virtual" / "bin"
-        subprocess.run(["make", "-C", str(ROOT / "firmware"), "linux", f"BIN_DIR={bin_dir}"], check=True)
+        options = [f"BIN_DIR={bin_dir}", f"PYTHON={sys.executable}"]
+        subprocess.run(["make", "-C", str(ROOT / "firmware"), "linux", *options], check=True)
 
 
 setup(

@@ -1,4 +1,4 @@
-"""The connected machine, assembled in one place: transports, buses, nodes, devices; what failures do."""
+"""The connected machine, assembled in one place; and what happens to it when a part fails."""
 
 import asyncio
 import contextlib
@@ -50,8 +50,8 @@ class _OpenBus:
 class Machine:
     """All nodes of DESCRIPTION as one machine; lives on one asyncio loop.
 
-    ``start``, then ``close`` whatever happened. When any node is lost or shuts down, all others are stopped
-    at once and ``stopped`` tells why.
+    ``start``, then ``close`` whatever happened. When any node is lost or shuts down, all others are
+    stopped at once and ``stopped`` tells why.
     """
 
     def __init__(self, description: MachineDescription) -> None:

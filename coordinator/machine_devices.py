@@ -8,9 +8,6 @@ from nodes.devices.stepper import Stepper
 from nodes.dictionary import Dictionary
 from nodes.node_config import NodeConfig
 
-DEFAULT_STEP_PULSE_S = 2e-6
-"""For drivers whose pulse is not configured on nodes that cannot step on both edges."""
-
 
 class MachineDevices:
     """The steppers of a machine, shared by the real and the offline one.
@@ -48,7 +45,6 @@ class MachineDevices:
     def _spec(self, described: StepperDescription, node: int) -> StepperSpec:
         stepper = self.steppers[described.name]
         assert stepper.oid is not None
-        both_edges = stepper.steps_on_both_edges
         return StepperSpec(
             name=described.name,
             node=node,
@@ -56,7 +52,7 @@ class MachineDevices:
             weights=described.weights,
             step_distance=described.step_distance,
             invert_dir=described.dir_pin.invert,
-            step_pulse_s=0.0 if both_edges else described.step_pulse_s or DEFAULT_STEP_PULSE_S,
+            step_pulse_s=described.step_pulse_s,
         )
 
 
@@ -66,8 +62,7 @@ def _stepper(described: StepperDescription) -> Stepper:
         step_pin=described.step_pin.name,
         dir_pin=described.dir_pin.name,
         invert_step=described.step_pin.invert,
-        step_pulse_s=described.step_pulse_s or DEFAULT_STEP_PULSE_S,
-        both_edges=described.step_pulse_s is None,
+        step_pulse_s=described.step_pulse_s,
     )
 
 

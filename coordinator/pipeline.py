@@ -1,7 +1,7 @@
 """From a G-code job to every node's command batches: planner and step generation joined.
 
-The batch planner and the real-time streamer both drive this; it does no I/O beyond reading the job's program and
-keeps no clock. Not thread-safe: one thread at a time.
+The batch planner and the real-time streamer both drive this; it does no I/O beyond reading the job's
+program and keeps no clock. Not thread-safe: one thread at a time.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ BATCH_ROOM = 1 << 16
 
 @dataclass(slots=True)
 class PlanRecord:
-    """What was planned, kept for whoever checks it: trapezoids in order, and where positions were declared."""
+    """What was planned, for whoever checks it: trapezoids in order, and where positions were declared."""
 
     start: Position
     pieces: list[NDArray[np.void]] = field(default_factory=list)
@@ -69,7 +69,7 @@ class Pipeline:
         return self._appended_until
 
     def declare(self, position: Position) -> None:
-        """Take note that the machine stands at POSITION from now on (PositionSet); all moves are generated."""
+        """Take note that the machine stands at POSITION now (PositionSet); all moves are generated."""
         self.steps.set_axis_position(position)
         if self._record is not None:
             self._record.declared.append((self._record.count, position))

@@ -1,4 +1,4 @@
-"""``canductor plan``: plans a program for a machine without its hardware and tells what it would ask of it."""
+"""``canductor plan``: plans a program for a machine without its hardware, and tells what it would ask."""
 
 import resource
 import time
@@ -82,8 +82,10 @@ class PlanReport:
         lines = [
             *self.not_yet_acting,
             *self.notices,
-            f"{self.gcode}: {self.moves:,} moves in {_duration(self.print_time_s)}, {self.steps:,} steps "
-            f"in {self.queue_steps:,} queue_step commands, {self.bytes_to_nodes:,} bytes to the nodes",
+            (
+                f"{self.gcode}: {self.moves:,} moves in {_duration(self.print_time_s)}, {self.steps:,} steps "
+                f"in {self.queue_steps:,} queue_step commands, {self.bytes_to_nodes:,} bytes to the nodes"
+            ),
         ]
         lines += [
             f"  {s.name} on {s.node}: {s.steps:,} steps, {s.queue_steps:,} queue_steps, "
@@ -123,7 +125,7 @@ def plan_file(options: PlanOptions) -> PlanReport:
         pipeline = Pipeline(job, steps, lambda n, b: _keep(files, n, b), nodes=len(moving))
         display = stack.enter_context(ProgressDisplay(f"planning {program.name}", quiet=options.json))
         notices, end = _run(pipeline, display)
-    return _report(description, program, pipeline, moving, notices, end)
+    return _report(description, pipeline, notices, end)
 
 
 def homed_positions(description: MachineDescription) -> dict[str, float]:
@@ -208,19 +210,12 @@ def _run(pipeline: Pipeline, display: ProgressDisplay) -> tuple[list[str], End]:
                 pass  # waiting costs a plan nothing, and replies are for who asked
 
 
-def _report(
-    description: MachineDescription,
-    program: Program,
-    pipeline: Pipeline,
-    moving: list[str],
-    notices: list[str],
-    end: End,
-) -> PlanReport:
+def _report(description: MachineDescription, pipeline: Pipeline, notices: list[str], end: End) -> PlanReport:
     stats: StepStats = pipeline.steps.stats()
     node_of = {stepper.name: stepper.node for stepper in description.steppers}
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return PlanReport(
-        gcode=program.name,
+        gcode=pipeline.job.program.name,
         moves=pipeline.moves,
         print_time_s=end.print_time_s,
         steps=sum(s.steps for s in stats.steppers),
@@ -234,11 +229,7 @@ def _report(
             )
             for s in stats.steppers
         ),
-        nodes=tuple(
-            NodeReport(n.name, n.commands, n.framed_bytes, n.max_slots)
-            for n in stats.nodes
-            if n.name in moving
-        ),
+        nodes=tuple(NodeReport(n.name, n.commands, n.framed_bytes, n.max_slots) for n in stats.nodes),
         notices=tuple(notices),
         not_yet_acting=tuple(str(entry) for entry in description.not_yet_acting),
     )

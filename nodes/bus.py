@@ -6,6 +6,7 @@ from typing import Final
 
 from nodes.assign import Assignment, IdAssignment, Uuid, number_nodes
 from nodes.errors import CanductorError
+from nodes.link import LinkSettings
 from nodes.node import Node, OnClock, OnState
 from nodes.node_errors import NodeLost
 from nodes.seams import (
@@ -14,7 +15,6 @@ from nodes.seams import (
     IoFactory,
     LinkIOLike,
     LinkLike,
-    LinkSettings,
     OnLost,
     OnResponses,
 )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from nodes.dictionary import Dictionary
-from nodes.link import LinkSettings as LinkSettings
+from nodes.link import LinkSettings
 from nodes.node_config import NodeConfig
 
 

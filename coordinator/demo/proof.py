@@ -75,9 +75,9 @@ class PrimaryClock:
 
     def print_time(self, monotonic_ns: NDArray[np.int64]) -> Floats:
         """Return the print time at these moments of the host's clock."""
-        elapsed_s = (monotonic_ns - self._monotonic_ns).astype(np.float64) * 1e-9
-        seconds: Floats = (self._ticks + elapsed_s * self._true_ticks_per_s) / self._clock_freq
-        return seconds
+        elapsed_s = (monotonic_ns - self._monotonic_ns) * 1e-9
+        ticks = self._ticks + elapsed_s * self._true_ticks_per_s
+        return np.asarray(ticks / self._clock_freq, np.float64)
 
 
 class _Buffered:

@@ -1,7 +1,7 @@
 """``canductor demo``: prints on virtual nodes in real time, then proves every step against the plan."""
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ def run_demo(options: DemoOptions) -> DemoReport:
         )
         figures = stage.stop_nodes()
         prover = _Prover(description, stage.edge_log, outcome, record, both_edges)
-        notices = (*map(str, description.not_yet_acting), *description.notes, *told)
+        notices = [*map(str, description.not_yet_acting), *description.notes, *told]
         return _report(prover, stage, figures, outcome, notices)
 
 
@@ -160,7 +160,7 @@ def _report(
     stage: Stage,
     figures: Mapping[str, Mapping[str, Any]],
     outcome: Outcome,
-    notices: tuple[str, ...],
+    notices: Sequence[str],
 ) -> DemoReport:
     return DemoReport(
         moves=outcome.moves,
@@ -183,5 +183,5 @@ def _report(
         ),
         frames=sum(stats.frames for stats in stage.bus_stats()),
         frames_lost=sum(stats.lost for stats in stage.bus_stats()),
-        notices=notices,
+        notices=tuple(notices),
     )

@@ -58,8 +58,8 @@ class StepperDescription:
     microsteps: int
     gear_ratio: float
     """Turns of the motor per turn of the output."""
-    step_pulse_s: float | None
-    """Shortest high time of the step pin; None: both edges step where the node can, else 2 µs."""
+    step_pulse_s: float
+    """Shortest high time of the step pin; 0: the driver steps on both edges."""
     place: Place
 
     @property

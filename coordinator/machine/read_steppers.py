@@ -43,7 +43,8 @@ FULL_STEPS = IntOption(
 GEAR_RATIO = GearRatioOption(name="gear_ratio", help="gears between motor and axis", default=1.0)
 STEP_PULSE = FloatOption(
     name="step_pulse_duration",
-    help="shortest high time of the step pin; by default both edges step where the node can, else 2 µs",
+    help="shortest high time of the step pin; 0 for a driver that is set to step on both edges",
+    default=2e-6,
     unit="s",
     minimum=0,
     maximum=0.001,
@@ -167,7 +168,7 @@ def read_stepper(reader: SectionReader, weights: Weights, pins: PinRegistry) -> 
         full_steps_per_rotation=full_steps,
         microsteps=microsteps,
         gear_ratio=gear_ratio,
-        step_pulse_s=reader.find(STEP_PULSE),
+        step_pulse_s=reader.get(STEP_PULSE),
         place=reader.place,
     )
 

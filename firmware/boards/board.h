@@ -1,67 +1,43 @@
 // SPDX-License-Identifier: Apache-2.0
-// What a board provides to the chip-free firmware: these functions, resolved when linking, and nothing else.
-// A board calls in through core/node.h and net/*.h. docs/firmware.md lists the steps of a port.
+// What a board gives the core. Link-time functions: a build has one board, which finds its own state around
+// the struct node (usually struct node is the first member of the board's struct).
 #ifndef BOARDS_BOARD_H
 #define BOARDS_BOARD_H
 
-#include <stdbool.h>
-#include <stdint.h>
+#include "core/node.h"
 
-struct node;
-
-// ----------------------------------------------------------------------------------------------------- time
-
-// The free-running 32-bit clock.
+// The free-running clock, config.clock_freq ticks per second. May be read in every context.
 uint32_t board_clock(struct node *node);
-// A clock for the load figure only: the same one, but where board_clock() stands still while a task runs.
-uint32_t board_busy_clock(struct node *node);
 
-// ----------------------------------------------------------------------------------------------- interrupts
-
-// Disables interrupts; the result goes to board_irq_restore. Pairs nest.
+// Masks the interrupts in which timers and input run; restore with the returned state. May nest.
 uint32_t board_irq_save(struct node *node);
 void board_irq_restore(struct node *node, uint32_t state);
 
-// ----------------------------------------------------------------------------------------------------- pins
+// Pins. The setup functions return -1 for a pin that cannot do it; the others are only called after setup.
+int board_gpio_out(struct node *node, uint32_t pin, int level);
+void board_gpio_write(struct node *node, uint32_t pin, int level);
+int board_gpio_in(struct node *node, uint32_t pin, int pull); // pull 1: up, 0: none, -1: down
+int board_gpio_read(struct node *node, uint32_t pin);
+int board_adc_setup(struct node *node, uint32_t pin);
+// Takes a sample of 0..ADC_MAX. Returns 0 with the sample, or the ticks after which to ask again.
+uint32_t board_adc_sample(struct node *node, uint32_t pin, uint16_t *value);
+// Hardware PWM with values 0..PWM_MAX.
+int board_pwm_setup(struct node *node, uint32_t pin, uint32_t cycle_ticks, uint16_t value);
+void board_pwm_write(struct node *node, uint32_t pin, uint16_t value);
 
-// A pin made ready for fast access; what the fields mean is the board's affair.
-struct board_pin {
-    void *port;
-    uint32_t mask;
-};
-
-// Set-up functions return 0, or -1 when the pin cannot do it.
-int board_gpio_out_setup(struct node *node, uint32_t pin, bool level, struct board_pin *out);
-void board_gpio_write(struct node *node, struct board_pin pin, bool level);
-void board_gpio_toggle(struct node *node, struct board_pin pin);
-// PULL_UP: 1 pull-up, 0 floating, -1 pull-down.
-int board_gpio_in_setup(struct node *node, uint32_t pin, int8_t pull_up, struct board_pin *out);
-bool board_gpio_read(struct node *node, struct board_pin pin);
-// Hardware PWM: VALUE is 0 .. the constant PWM_MAX.
-int board_pwm_setup(struct node *node, uint32_t pin, uint32_t cycle_ticks, uint32_t value,
-                    struct board_pin *out);
-void board_pwm_write(struct node *node, struct board_pin pin, uint32_t value);
-// One conversion, 0 .. the constant ADC_MAX; short enough for interrupt context.
-int board_adc_setup(struct node *node, uint32_t pin, struct board_pin *out);
-uint16_t board_adc_read(struct node *node, struct board_pin pin);
-
-// ------------------------------------------------------------------------------------------------ transport
-
-// Queues a frame of 0..8 bytes. Returns false when there is no room; then the board calls
-// link_transmit_ready() when there is.
-bool board_can_send(struct node *node, uint32_t id, const uint8_t *data, uint8_t size);
-// Accepts all FILTERS ids given here (3 at most) and may deliver others too.
-void board_can_filter(struct node *node, const uint32_t *ids, uint8_t count);
+// The CAN controller's own view of the bus (enumeration canbus_bus_state).
+enum { BOARD_CAN_ACTIVE, BOARD_CAN_WARN, BOARD_CAN_PASSIVE, BOARD_CAN_OFF };
 struct board_can_status {
-    uint32_t rx_error, tx_error, tx_retries, bus_state; // bus_state: 0 active, 1 warn, 2 passive, 3 off
+    uint32_t rx_error, tx_error, tx_retries, state;
 };
-void board_can_status(struct node *node, struct board_can_status *status);
-// Queues up to SIZE bytes; returns how many. When fewer, link_transmit_ready() follows.
-uint32_t board_uart_send(struct node *node, const uint8_t *data, uint32_t size);
+void board_can_status(struct node *node, struct board_can_status *out);
 
-// ---------------------------------------------------------------------------------------------------- reset
+// Both links offer their bytes whenever tasks run; a board that refuses calls node_wake_tasks() when there is
+// room again.
+int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t size); // 0, or -1: busy
+size_t board_uart_send(struct node *node, const uint8_t *data, size_t size);          // bytes taken
 
-// Restarts the node soon, as power-on does; returns.
-void board_request_reset(struct node *node);
+// Restart the node soon, as a power cycle would. Returns.
+void board_reset(struct node *node);
 
 #endif

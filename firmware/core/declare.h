@@ -1,53 +1,53 @@
 // SPDX-License-Identifier: Apache-2.0
-// Declarations: what a module offers is declared beside its implementation and collected at build time.
+// Declarations: a command, response, constant, task or hook is declared where it is implemented.
 //
-// For the compiler each macro is an ordinary declaration (so a wrong signature is a compile error). Under
-// -DCANDUCTOR_COLLECT it becomes a marker that tools/gen_dictionary.py reads from the preprocessor's output;
-// from all markers it makes the one C file with the tables of core/tables.h. Use them at file scope of a .c
-// file and end them with a semicolon.
+// In an ordinary compilation the macros give prototypes. Under -DCANDUCTOR_COLLECT, `gcc -E` turns them into
+// marked lines which tools/gen_dictionary.py gathers from all sources of a build; it writes one C file with
+// the tables of struct node_tables and the compressed dictionary. There is no central table to edit.
+//
+//   DECL_COMMAND(handler, "name p=%c", flags)   void handler(struct node *node, const struct wire_arg *args)
+//   DECL_RESPONSE(symbol, "name p=%c")          sent with RESPOND(node, symbol, INT(p))
+//   DECL_CONSTANT("NAME", value)                an integer or a string for the host
+//   DECL_ENUMERATION("enum", "NAME", value)     a name for a value
+//   DECL_ENUMERATION_RANGE("enum", "PA0", first, count)   PA0, PA1, … for first, first + 1, …
+//   DECL_TASK(function)                         void function(struct node *node), round robin
+//   DECL_INIT(function)                         likewise, once when the node starts
+//   DECL_SHUTDOWN_HOOK(function)                likewise, in interrupt context when the node shuts down
+//   DECL_STATIC_STRING(symbol, "Text")          a text reported by its number; used as STRING(symbol)
 #ifndef CORE_DECLARE_H
 #define CORE_DECLARE_H
 
-// Command flags.
-#define COMMAND_IN_SHUTDOWN 1 // is obeyed while the node is shut down
-#define COMMAND_FREQUENT 2    // gets one of the one-byte ids
+enum {
+    ALLOWED_IN_SHUTDOWN = 1, // runs although the node is shut down
+    FREQUENT = 2,            // gets one of the ids that take one byte on the wire
+};
 
 #ifdef CANDUCTOR_COLLECT
-// clang-format off: it would take the markers apart
-#define DECL_COMMAND_FLAGS(function, flags, format) @@command(function, flags, format)@@
-#define DECL_RESPONSE(name, format) @@response(name, format)@@
-#define DECL_CONSTANT(name, value) @@constant(name, value)@@
-#define DECL_CONSTANT_STR(name, text) @@constant_str(name, text)@@
-#define DECL_ENUMERATION_RANGE(of, name, value, count) @@enumeration(of, name, value, count)@@
-#define DECL_STATIC_STRING(name, text) @@string(name, text)@@
-#define DECL_TASK(function) @@task(function)@@
-#define DECL_INIT(function) @@init(function)@@
-#define DECL_SHUTDOWN_HOOK(function) @@shutdown(function)@@
-// clang-format on
+#define DECLARE_(...) CANDUCTOR_DECLARE_BEGIN __VA_ARGS__ CANDUCTOR_DECLARE_END
+#define DECL_COMMAND(handler, format, flags) DECLARE_("command", handler, format, flags)
+#define DECL_RESPONSE(symbol, format) DECLARE_("response", symbol, format)
+#define DECL_CONSTANT(name, value) DECLARE_("constant", name, value)
+#define DECL_ENUMERATION(enumeration, name, value) DECLARE_("enumeration", enumeration, name, value)
+#define DECL_ENUMERATION_RANGE(enumeration, name, first, count)                                              \
+    DECLARE_("range", enumeration, name, first, count)
+#define DECL_TASK(function) DECLARE_("task", function)
+#define DECL_INIT(function) DECLARE_("init", function)
+#define DECL_SHUTDOWN_HOOK(function) DECLARE_("hook", function)
+#define DECL_STATIC_STRING(symbol, text) DECLARE_("string", symbol, text)
 #else
-// void FUNCTION(struct node *, const struct wire_arg *) obeys the command FORMAT; one argument per parameter.
-#define DECL_COMMAND_FLAGS(function, flags, format)                                                          \
-    void function(struct node *node, const struct wire_arg *args)
-// A response NAME, sent by RESPOND(node, NAME, ...). FORMAT begins with NAME.
-#define DECL_RESPONSE(name, format) extern const struct response response_##name
-// A named number or text of the dictionary. VALUE is an integer constant the preprocessor can resolve.
-#define DECL_CONSTANT(name, value) struct node
-#define DECL_CONSTANT_STR(name, text) struct node
-// COUNT names beginning with NAME ("PA0", "PA1", ...) stand for VALUE and the numbers after it.
-#define DECL_ENUMERATION_RANGE(of, name, value, count) struct node
-// A text that travels as a number; string_NAME is the number. The same pair may be declared in several files.
-#define DECL_STATIC_STRING(name, text) extern const uint16_t string_##name
-// void FUNCTION(struct node *) runs, with interrupts on, some time after WAKE(node, FUNCTION).
-#define DECL_TASK(function)                                                                                  \
-    void function(struct node *node);                                                                        \
-    extern const uint8_t function##_index
-// void FUNCTION(struct node *) runs once at start (after the core is up) ...
+#define DECL_COMMAND(handler, format, flags)                                                                 \
+    void handler(struct node *node, const struct wire_arg *args);                                            \
+    _Static_assert((flags) >= 0, format)
+#define DECL_RESPONSE(symbol, format) extern const struct node_response response_##symbol
+#define DECL_CONSTANT(name, value) _Static_assert(1, name)
+#define DECL_ENUMERATION(enumeration, name, value) _Static_assert((value) >= 0, name)
+#define DECL_ENUMERATION_RANGE(enumeration, name, first, count) _Static_assert((count) > 0, name)
+#define DECL_TASK(function) void function(struct node *node)
 #define DECL_INIT(function) void function(struct node *node)
-// ... or whenever the node shuts down, with all timers already stopped: outputs go to their defaults.
 #define DECL_SHUTDOWN_HOOK(function) void function(struct node *node)
+#define DECL_STATIC_STRING(symbol, text) extern const uint16_t string_##symbol
 #endif
 
-#define DECL_COMMAND(function, format) DECL_COMMAND_FLAGS(function, 0, format)
-#define DECL_ENUMERATION(of, name, value) DECL_ENUMERATION_RANGE(of, name, value, 1)
+#define STRING(symbol) string_##symbol
 
 #endif

@@ -1,233 +1,261 @@
 // SPDX-License-Identifier: Apache-2.0
-// The core of a node: the manual.
+// The core of a node: scheduler, commands, configuration. This header is its manual.
 //
-// A node is one `struct node`. The caller owns it; everything the firmware knows stands in it or hangs off it
-// (arena, transport state, board), so one process can hold many. There are no mutable globals.
+// A node is one struct node that the board owns; nothing here allocates or keeps state elsewhere, so a
+// process may hold as many nodes as it likes. Chip-free: whatever touches hardware goes through
+// boards/board.h.
 //
-// Contexts. Timers run in interrupt context, in the order of their wake-up clocks, and take microseconds.
-// Commands and tasks run one after the other, interrupts on, and may be interrupted by timers and by
-// reception. Responses are sent from commands and tasks only; a timer that has something to say wakes a task.
-// Data shared with a timer is touched between board_irq_save() and board_irq_restore().
+// Contexts. Timers and shutdown hooks run "in interrupt context": short, never answering the host. Tasks and
+// command handlers run from node_run_tasks(); only they may RESPOND. What both touch is touched by tasks and
+// commands between board_irq_save() and board_irq_restore().
 //
-// A board does: node_init(), then for ever
-//     sched_dispatch() while a timer is due (from its timer interrupt),
-//     link_receive() / can_stream_receive() for what arrives (from its receive interrupt),
-//     node_run_tasks() while it returns true, then sleep until the next interrupt.
-//
-// Failing. node_shutdown() stops all timers, runs every shutdown hook (outputs go to their defaults) and
-// returns; whoever calls it returns at once. Until clear_shutdown or config_reset only commands declared
-// COMMAND_IN_SHUTDOWN are obeyed, the others are answered with is_shutdown.
-//
-// Memory. Nothing allocates but configuration: objects and the slots of the move queue come from one arena
-// that the caller hands over; config_reset empties it.
+// A board's loop, in words: take input from the wire (can_stream_receive, or node_receive for a UART); while
+// a timer is due, sched_run_first(); node_run_tasks(); sleep until node_next_deadline() or input.
 #ifndef CORE_NODE_H
 #define CORE_NODE_H
-
-#include <stdbool.h>
-#include <stddef.h>
-#include <stdint.h>
 
 #include "core/declare.h"
 #include "wire/wire.h"
 
+#include <stddef.h>
+#include <stdint.h>
+
 struct node;
 
-// --------------------------------------------------------------------------------------------------- clocks
+// ------------------------------------------------------------------------------------------------------ time
 
-// The one comparison of 32-bit clocks: A is earlier than B. Both lie within 2^31 ticks of each other.
-static inline bool clock_before(uint32_t a, uint32_t b) {
+// Is clock A before clock B? The one way to compare clocks: right over the 32-bit rollover, as long as both
+// lie within 2^31 ticks of each other.
+static inline int clock_before(uint32_t a, uint32_t b) {
     return (int32_t)(a - b) < 0;
 }
 
-// --------------------------------------------------------------------------------------------------- timers
+// ---------------------------------------------------------------------------------------------------- timers
 
-enum timer_result { TIMER_DONE, TIMER_RESCHEDULE };
+enum timer_result { TIMER_DONE, TIMER_AGAIN };
 
-// Owned by whoever embeds it. RUN is called when the clock reaches WAKE_CLOCK; to run again it sets
-// WAKE_CLOCK and returns TIMER_RESCHEDULE. It may add and remove any timer, its own included.
+// The owner embeds a timer in its own struct; FUNCTION runs at WAKETIME in interrupt context and either is
+// done or has set a later (or equal) waketime. Timers of equal waketime run in the order they were added.
 struct timer {
     struct timer *next;
-    enum timer_result (*run)(struct node *node, struct timer *timer);
-    uint32_t wake_clock;
+    enum timer_result (*function)(struct node *node, struct timer *timer);
+    uint32_t waketime;
 };
 
-// Adds a timer that is not in the list. A wake-up in the past shuts the node down ("Timer too close").
+// Queues TIMER (not queued yet). A waketime in the past shuts the node down with "Timer too close"; while the
+// node is shut down nothing is queued. Interrupts must be off.
 void sched_add_timer(struct node *node, struct timer *timer);
-// Removes a timer; does nothing when it is not in the list. Cost: one pass over the timers.
-void sched_del_timer(struct node *node, struct timer *timer);
-// Runs the earliest timer. A node always has one: the core's own.
-void sched_dispatch(struct node *node);
-// Forgets all timers (node_init, shutdown and config_reset do).
-void sched_reset(struct node *node);
+// Removes TIMER; nothing happens when it is not queued. Interrupts must be off.
+void sched_delete_timer(struct node *node, struct timer *timer);
+// Runs the first timer, which must exist and be due. A waketime set further back than the config's slack
+// shuts the node down with "Rescheduled timer in the past".
+void sched_run_first(struct node *node);
 
-// ---------------------------------------------------------------------------------------------------- tasks
+// -------------------------------------------------------------------------------------------------- shutdown
 
-#define WAKE(node, task) node_wake(node, task##_index)
-// Any context. INDEX: see WAKE.
-void node_wake(struct node *node, uint8_t index);
-// Runs each woken task once, in turn. Returns true when some have been woken meanwhile.
-bool node_run_tasks(struct node *node);
+// Stops everything: forgets all timers, runs the hooks (outputs go to their defaults) and reports the text
+// REASON (STRING(...)). From any context; the caller returns at once afterwards. The first reason counts.
+void node_shutdown(struct node *node, uint16_t reason);
 
-// ------------------------------------------------------------------------------------------------- messages
+// -------------------------------------------------------------------------------------------------- messages
 
-struct command {
-    void (*run)(struct node *node, const struct wire_arg *args); // NULL: no command has this id
+enum { NODE_ARGS_MAX = 12 };
+
+struct node_command {
+    void (*handler)(struct node *node, const struct wire_arg *args);
     const uint8_t *types;
-    uint8_t count, flags;
+    uint8_t arg_count, flags;
 };
 
-struct response {
+struct node_response {
+    const uint8_t *types;
     int16_t id;
-    uint8_t count;
-    const uint8_t *types;
+    uint8_t arg_count;
 };
 
-// The most parameters a command or response may have.
-enum { MESSAGE_ARGS_MAX = 12 };
+// Sends a response to the host. Returns 0, or -1 when it was dropped (counted in tx_dropped) because the
+// bounded transmit buffer is full. Commands start only when a whole response fits, so one response per
+// command always goes out; tasks with something that must not get lost ask node_can_respond() first.
+int node_respond(struct node *node, const struct node_response *response, const struct wire_arg *args,
+                 size_t count);
+int node_can_respond(const struct node *node);
 
-#define ARG(number) {.value = (uint32_t)(number), .data = NULL}
-#define ARG_BYTES(bytes, length) {.value = (uint32_t)(length), .data = (bytes)}
-// Sends the response NAME with one ARG or ARG_BYTES per parameter.
-#define RESPOND(node, name, ...)                                                                             \
-    node_respond(node, &response_##name, (const struct wire_arg[]){__VA_ARGS__},                             \
+#define INT(number)                                                                                          \
+    (struct wire_arg) {                                                                                      \
+        .value = (uint32_t)(number)                                                                          \
+    }
+#define BYTES(bytes, size)                                                                                   \
+    (struct wire_arg) {                                                                                      \
+        .value = (uint32_t)(size), .data = (bytes)                                                           \
+    }
+#define RESPOND(node, symbol, ...)                                                                           \
+    node_respond(node, &response_##symbol, (const struct wire_arg[]){__VA_ARGS__},                           \
                  sizeof((const struct wire_arg[]){__VA_ARGS__}) / sizeof(struct wire_arg))
-void node_respond(struct node *node, const struct response *response, const struct wire_arg *args,
-                  size_t count);
+#define RESPOND_EMPTY(node, symbol) node_respond(node, &response_##symbol, NULL, 0)
 
-// Obeys the commands in the content of one block.
-void command_dispatch(struct node *node, const uint8_t *content, size_t length);
+// ---------------------------------------------------------------------------------------------------- tables
 
-// ----------------------------------------------------------------------------------------------------- link
+// What tools/gen_dictionary.py makes of the declarations of a build. Commands are indexed by id; a slot
+// without handler is not in use.
+struct node_tables {
+    const struct node_command *commands;
+    void (*const *tasks)(struct node *node);
+    void (*const *inits)(struct node *node);
+    void (*const *hooks)(struct node *node);
+    const uint8_t *dictionary; // zlib-compressed JSON
+    uint32_t dictionary_size;
+    uint16_t command_count, task_count, init_count, hook_count;
+};
+extern const struct node_tables node_tables;
+
+// ----------------------------------------------------------------------------------------------------- state
 
 enum {
-    LINK_RECEIVE_WINDOW = 192, // bytes the host may have in flight; what does not fit is dropped
-    LINK_TRANSMIT_ROOM = 2048, // a power of two; holds the answers to a full window of identify commands
+    NODE_RECEIVE_WINDOW = 192, // bytes the host may have unacknowledged in flight
+    NODE_TRANSMIT_SIZE = 512,  // bytes of answers waiting for the wire; a power of two
+    NODE_UUID_SIZE = 6,
+    NODE_STATS_SECONDS = 5, // between two stats reports; in ticks less than 2^31
+    NODE_MOVE_SIZE = 24,    // largest record in a slot of the move queue
 };
 
-// How bytes leave: TRANSMIT moves what it can from the transmit buffer (link_peek, link_consume) to the board
-// and is called again when more was queued or link_transmit_ready() was called.
-struct transport {
-    void (*transmit)(struct node *node);
+// What the board decides before node_start(); the node keeps a copy.
+struct node_config {
+    uint32_t clock_freq;  // ticks per second
+    uint32_t timer_slack; // ticks by which a timer may be rescheduled behind the clock
+    uint32_t clock_high;  // upper half of the 64-bit clock at start, for get_uptime
+    uint16_t move_count;  // slots of the move queue
+    uint8_t uuid[NODE_UUID_SIZE];
+    void *arena; // memory for configured objects and the move queue, aligned for any type
+    size_t arena_size;
 };
 
-struct link {
-    uint8_t received[LINK_RECEIVE_WINDOW];
-    uint16_t received_size;
-    uint8_t expected_seq;
-    struct wire_scanner scanner;
-    uint8_t transmit[LINK_TRANSMIT_ROOM];
-    uint32_t transmit_head, transmit_tail; // free-running; tail - head bytes wait
-    // Counters since node_init.
-    uint32_t receive_dropped;  // bytes that found the receive buffer full
-    uint32_t losses;           // framing and checksum errors
-    uint32_t out_of_order;     // sound blocks with an unexpected sequence
-    uint32_t blocks;           // blocks obeyed
-    uint32_t transmit_dropped; // blocks that found the transmit buffer full
-};
-
-// Interrupt context: appends what arrived.
-void link_receive(struct node *node, const uint8_t *data, size_t size);
-// Interrupt context: the board can take bytes or frames again.
-void link_transmit_ready(struct node *node);
-// For transports. Copies up to ROOM waiting bytes to OUT; consuming is separate, so a busy board loses none.
-size_t link_peek(const struct node *node, uint8_t *out, size_t room);
-void link_consume(struct node *node, size_t size);
-// Forgets what waits in both directions (a new node id, no node id).
-void link_discard(struct node *node);
-
-// --------------------------------------------------------------------------------------------------- memory
-
-// Memory until config_reset, zeroed, aligned for any object. NULL after a shutdown ("alloc_chunk failed").
-void *arena_alloc(struct node *node, size_t size);
-
-// The type of an object is the address of its `struct oid_type`; the texts help debuggers only.
-struct oid_type {
-    const char *name;
-};
-struct oid_entry {
+struct oid_slot {
     const struct oid_type *type;
     void *object;
 };
-// Allocates the object OID. NULL after a shutdown ("Can't assign oid", "alloc_chunk failed").
-void *oid_alloc(struct node *node, uint8_t oid, const struct oid_type *type, size_t size);
-// Finds the object OID. NULL after a shutdown ("Invalid oid type").
-void *oid_lookup(struct node *node, uint8_t oid, const struct oid_type *type);
-// Walks over all objects of a type: start with *oid = 0; NULL at the end. *oid is the object's number + 1.
-void *oid_next(struct node *node, const struct oid_type *type, uint16_t *oid);
 
-// One slot of the move queue: what is due later, of any object.
 struct move {
     struct move *next;
-    union {
-        struct {
-            uint32_t interval;
-            int16_t add;
-            uint16_t count;
-            uint8_t flags;
-        } step;
-        struct {
-            uint32_t clock, value;
-        } output;
-    };
 };
+
+// First in, first out; zero-initialised is empty.
 struct move_queue {
     struct move *first, *last;
 };
-// Takes a slot. NULL after a shutdown ("Move queue overflow").
-struct move *move_alloc(struct node *node);
-void move_free(struct node *node, struct move *move);
-void move_push(struct move_queue *queue, struct move *move);
-struct move *move_pop(struct move_queue *queue);
-void move_clear(struct node *node, struct move_queue *queue);
 
-// ----------------------------------------------------------------------------------------------------- node
-
-struct node_config {
-    const uint8_t *dictionary; // compressed; NULL: the one generated at build time
-    uint32_t dictionary_size;
-    uint32_t clock_freq;
-    uint8_t *arena; // aligned for pointers
-    uint32_t arena_size;
-    uint16_t move_count;        // slots wanted; there are fewer when the arena is too small
-    uint32_t timer_slack_ticks; // a timer that reschedules itself this far into the past is an error
-    uint32_t uptime_high;       // upper half of the 64-bit clock at start
-    const struct transport *transport;
-    void *transport_state;
-    void *board;
+struct node_stats {
+    uint32_t rx_overflow_bytes; // did not fit into the receive buffer
+    uint32_t rx_lost;           // damaged stretches
+    uint32_t rx_out_of_order;   // sound blocks with another sequence number than the expected one
+    uint32_t rx_blocks;
+    uint32_t tx_dropped; // responses
+    uint32_t timers_run;
 };
 
 struct node {
     struct node_config config;
+    struct can_stream *can; // set by net/can_stream; null on a node without CAN
+    struct node_stats stats;
+    uint8_t tasks_pending; // something waits for node_run_tasks()
 
-    struct timer *timers;  // sorted, earliest first
-    struct timer *running; // popped for its run; NULL when it was removed or added meanwhile
-    uint32_t tasks_woken;  // one bit each
-
-    struct link link;
-
-    uint32_t arena_used;
-    struct oid_entry *oids;
-    uint16_t oid_count;
-    struct move *free_moves;
-    uint16_t move_count;
-
-    bool is_configured, is_shutdown;
-    uint32_t config_crc;
-    uint16_t shutdown_reason;
-    uint32_t shutdown_clock;
-
-    // Housekeeping: upper clock half, load figures.
-    struct timer housekeeping;
-    uint32_t uptime_high, uptime_last;
-    uint32_t load_count, load_sum, load_sumsq;
-    uint8_t load_periods;
+    struct {
+        struct timer *first;
+        uint32_t last_clock, run_at_once; // timers run since the clock last moved
+    } sched;
+    struct {
+        uint8_t active, reported;
+        uint16_t reason;
+        uint32_t clock;
+    } shutdown;
+    struct {
+        uint8_t buffer[NODE_RECEIVE_WINDOW];
+        uint16_t size;      // bytes in buffer
+        uint8_t block_size; // of the accepted block at the front that is being executed; 0: none
+        uint8_t block_at;   // its next command
+        uint8_t expected;   // sequence number, 4 bits
+        struct wire_scanner scanner;
+    } rx;
+    struct {
+        uint8_t buffer[NODE_TRANSMIT_SIZE];
+        uint16_t head, tail; // free-running; head - tail bytes are waiting
+    } tx;
+    struct {
+        size_t arena_used;
+        struct oid_slot *oids;
+        struct move *free_moves;
+        uint32_t crc;
+        uint16_t move_count;
+        uint8_t oid_count, oids_allocated, finalized;
+    } objects;
+    struct {
+        uint32_t last_clock, clock_high; // 64-bit uptime
+        uint32_t report_clock, count, sum, sumsq;
+        uint8_t starting; // "starting" still has to be said
+    } base;
 };
 
-// Starts a node, as after power-on. CONFIG is copied; what it points to stays the caller's.
-void node_init(struct node *node, const struct node_config *config);
-// Any context. REASON is a string_... number. A node that is shut down keeps its first reason.
-void node_shutdown(struct node *node, uint16_t reason);
-// Empties the arena and forgets the configuration.
-void node_reset_config(struct node *node);
+// ------------------------------------------------------------------------------------------ for boards and
+// nets
+
+// Starts (or restarts) NODE: everything in it is set anew; node->can is left to the board.
+void node_start(struct node *node, const struct node_config *config);
+// Runs every task once, and again while one left something pending.
+void node_run_tasks(struct node *node);
+// From any context: node_run_tasks() has something to do.
+static inline void node_wake_tasks(struct node *node) {
+    node->tasks_pending = 1;
+}
+// The clock at which the node next wants to be called without input.
+uint32_t node_next_deadline(const struct node *node);
+
+// Appends bytes from the host; what does not fit is dropped and counted. Interrupt context allowed.
+void node_receive(struct node *node, const uint8_t *data, size_t size);
+// Copies up to SIZE bytes waiting for the host to OUT; returns how many. They leave with node_transmitted().
+size_t node_transmit_peek(const struct node *node, uint8_t *out, size_t size);
+void node_transmitted(struct node *node, size_t size);
+
+// ------------------------------------------------------------------------------------------------- for
+// objects
+
+// A kind of configured object; its address tells kinds apart.
+struct oid_type {
+    const char *name;
+};
+
+// Makes object OID of SIZE zeroed bytes. Null (and a shutdown) when the oid is unusable or memory is out.
+void *oid_create(struct node *node, uint32_t oid, const struct oid_type *type, size_t size);
+// Object OID; null (and a shutdown, "Invalid oid type") when it is of another type or does not exist.
+void *oid_find(struct node *node, uint32_t oid, const struct oid_type *type);
+// The next object of TYPE from *OID on, which moves behind it; null at the end. Start with *oid = 0.
+void *oid_next(const struct node *node, unsigned *oid, const struct oid_type *type);
+// SIZE zeroed bytes until the next config_reset; null (and a shutdown) when there are none.
+void *node_alloc(struct node *node, size_t size);
+
+// A slot of the move queue shared by steppers and timed outputs: at most NODE_MOVE_SIZE bytes, uninitialised.
+// Null (and a shutdown, "Move queue overflow") when none is free. Interrupts must be off.
+void *move_alloc(struct node *node);
+void move_free(struct node *node, void *move);
+static inline int move_queue_push(struct move_queue *queue, struct move *move) {
+    int was_empty = queue->first == NULL;
+    move->next = NULL;
+    if (was_empty)
+        queue->first = move;
+    else
+        queue->last->next = move;
+    queue->last = move;
+    return was_empty;
+}
+static inline struct move *move_queue_pop(struct move_queue *queue) {
+    struct move *move = queue->first;
+    if (move)
+        queue->first = move->next;
+    return move;
+}
+void move_queue_clear(struct node *node, struct move_queue *queue);
+
+// --------------------------------------------------------------------------------------------- within the
+// core
+
+void node_forget_objects(struct node *node);
 
 #endif

@@ -1,133 +1,152 @@
 // SPDX-License-Identifier: Apache-2.0
-// The CAN transport. Unknown admin commands are ignored: that is what makes extensions possible.
+// CAN: assignment of the node's id, and message blocks as a stream of bytes in frames of at most eight.
+//
+// A node without an id hears only the admin channel and says nothing but its uuid when asked for it; what its
+// core has to say meanwhile is dropped, as a board's first words are that nobody listens to.
 #include "net/can_stream.h"
-
-#include <string.h>
 
 #include "boards/board.h"
 
+#include <string.h>
+
 DECL_STATIC_STRING(id_conflict, "Another CAN node assigned this ID");
+
 DECL_RESPONSE(canbus_id, "canbus_id canbus_uuid=%.*s canbus_nodeid=%u");
 DECL_RESPONSE(canbus_status, "canbus_status rx_error=%u tx_error=%u tx_retries=%u canbus_bus_state=%u");
+
 DECL_ENUMERATION("canbus_bus_state", "active", 0);
 DECL_ENUMERATION("canbus_bus_state", "warn", 1);
 DECL_ENUMERATION("canbus_bus_state", "passive", 2);
 DECL_ENUMERATION("canbus_bus_state", "off", 3);
 
-enum {
-    ADMIN_QUERY_UNASSIGNED = 0x00,
-    ADMIN_SET_NODEID = 0x01,
-    ADMIN_NEED_NODEID = 0x20,
-};
+enum { QUERY_UNASSIGNED = 0x00, SET_NODEID = 0x01, NEED_NODEID = 0x20 };
 
-static struct can_stream *state_of(struct node *node) {
-    return node->config.transport_state;
+static uint32_t receive_id(const struct can_stream *stream) {
+    return stream->node_id * 2u + 0x100;
 }
 
-static uint32_t host_id(const struct can_stream *can) {
-    return CAN_ID_DATA + 2 * (uint32_t)can->nodeid;
+static uint32_t transmit_id(const struct can_stream *stream) {
+    return stream->node_id * 2u + 0x101;
 }
 
-static void listen_for(struct node *node, const struct can_stream *can) {
-    // The id it sends with, too: a frame there means that another node has the same.
-    const uint32_t ids[] = {CAN_ID_ADMIN, host_id(can), host_id(can) + 1};
-    board_can_filter(node, ids, can->nodeid ? 3 : 1);
+void can_stream_attach(struct node *node, struct can_stream *stream) {
+    memset(stream, 0, sizeof(*stream));
+    node->can = stream;
 }
 
-void can_stream_start(struct node *node) {
-    listen_for(node, state_of(node));
+// ------------------------------------------------------------------------------------------------- receiving
+
+static void lose_id(struct node *node) {
+    node->can->node_id = 0;
+    node_shutdown(node, STRING(id_conflict));
 }
 
-// ------------------------------------------------------------------------------------------------- transmit
-
-static bool send_need_nodeid(struct node *node, const struct can_stream *can) {
-    uint8_t frame[CAN_FRAME_MAX] = {ADMIN_NEED_NODEID};
-    memcpy(frame + 1, can->uuid, CAN_UUID_SIZE);
-    frame[1 + CAN_UUID_SIZE] = ADMIN_SET_NODEID;
-    return board_can_send(node, CAN_ID_ADMIN_RESPONSE, frame, sizeof(frame));
-}
-
-static void transmit(struct node *node) {
-    struct can_stream *can = state_of(node);
-    if (can->wants_reply && !can->nodeid && !send_need_nodeid(node, can))
-        return;
-    can->wants_reply = 0;
-    uint8_t bytes[CAN_FRAME_MAX];
-    size_t size;
-    while ((size = link_peek(node, bytes, sizeof(bytes)))) {
-        // Without an id nobody could tell whose bytes these are: they are dropped.
-        if (can->nodeid && !board_can_send(node, host_id(can) + 1, bytes, (uint8_t)size))
-            return;
-        link_consume(node, size);
+static void set_node_id(struct node *node, const uint8_t *data) {
+    struct can_stream *stream = node->can;
+    uint8_t wanted = data[1 + NODE_UUID_SIZE];
+    if (memcmp(data + 1, node->config.uuid, NODE_UUID_SIZE) != 0) {
+        if (stream->node_id && wanted == stream->node_id)
+            lose_id(node);
+    } else if (wanted != stream->node_id) {
+        stream->node_id = wanted;
     }
 }
 
-const struct transport can_stream_transport = {transmit};
-
-// -------------------------------------------------------------------------------------------------- receive
-
-DECL_TASK(can_stream_conflict_task);
-void can_stream_conflict_task(struct node *node) {
-    struct can_stream *can = state_of(node);
-    if (!can->conflict)
-        return;
-    can->conflict = 0;
-    can->nodeid = 0;
-    link_discard(node);
-    listen_for(node, can);
-    node_shutdown(node, string_id_conflict);
-}
-
-static void id_is_taken(struct node *node, struct can_stream *can) {
-    can->conflict = 1;
-    WAKE(node, can_stream_conflict_task);
-}
-
-static void set_nodeid(struct node *node, struct can_stream *can, const uint8_t *data, size_t size) {
-    if (size < 2 + CAN_UUID_SIZE)
-        return;
-    uint8_t nodeid = data[1 + CAN_UUID_SIZE];
-    if (memcmp(data + 1, can->uuid, CAN_UUID_SIZE)) {
-        if (nodeid && nodeid == can->nodeid)
-            id_is_taken(node, can);
-    } else if (nodeid != can->nodeid) { // repeated assignments change nothing
-        can->nodeid = nodeid;
-        link_discard(node);
-        listen_for(node, can);
+static void receive_admin(struct node *node, const uint8_t *data, size_t size) {
+    if (size >= 1 && data[0] == QUERY_UNASSIGNED && !node->can->node_id) {
+        node->can->must_announce = 1;
+        node_wake_tasks(node);
+    } else if (size >= 2 + NODE_UUID_SIZE && data[0] == SET_NODEID) {
+        set_node_id(node, data);
     }
 }
 
 void can_stream_receive(struct node *node, uint32_t id, const uint8_t *data, size_t size) {
-    struct can_stream *can = state_of(node);
-    if (id == CAN_ID_ADMIN && size) {
-        if (data[0] == ADMIN_QUERY_UNASSIGNED && !can->nodeid) {
-            can->wants_reply = 1;
-            link_transmit_ready(node);
-        } else if (data[0] == ADMIN_SET_NODEID) {
-            set_nodeid(node, can, data, size);
-        }
-    } else if (can->nodeid && id == host_id(can)) {
-        link_receive(node, data, size);
-    } else if (can->nodeid && id == host_id(can) + 1) {
-        id_is_taken(node, can);
+    struct can_stream *stream = node->can;
+    if (size > CAN_FRAME_MAX)
+        return;
+    if (id == CAN_ID_ADMIN_REQUEST) {
+        receive_admin(node, data, size);
+    } else if (stream->node_id && id == receive_id(stream)) {
+        stream->frames_in++;
+        node_receive(node, data, size);
+    } else if (stream->node_id && id == transmit_id(stream)) {
+        lose_id(node);
     }
 }
 
-// ------------------------------------------------------------------------------------------------- commands
+// ---------------------------------------------------------------------------------------------- transmitting
 
-DECL_COMMAND_FLAGS(command_get_canbus_id, COMMAND_IN_SHUTDOWN, "get_canbus_id");
-void command_get_canbus_id(struct node *node, const struct wire_arg *args) {
-    (void)args;
-    static const struct can_stream none; // a board built for CAN may run on a UART
-    const struct can_stream *can = node->config.transport == &can_stream_transport ? state_of(node) : &none;
-    RESPOND(node, canbus_id, ARG_BYTES(can->uuid, CAN_UUID_SIZE), ARG(can->nodeid));
+static void announce(struct node *node) {
+    uint8_t data[CAN_FRAME_MAX] = {NEED_NODEID};
+    memcpy(data + 1, node->config.uuid, NODE_UUID_SIZE);
+    data[1 + NODE_UUID_SIZE] = SET_NODEID;
+    if (board_can_send(node, CAN_ID_ADMIN_RESPONSE, data, sizeof(data)) == 0)
+        node->can->must_announce = 0;
 }
 
-DECL_COMMAND_FLAGS(command_get_canbus_status, COMMAND_IN_SHUTDOWN, "get_canbus_status");
+void can_stream_task(struct node *node) {
+    struct can_stream *stream = node->can;
+    if (!stream)
+        return;
+    if (stream->must_announce)
+        announce(node);
+    uint8_t data[CAN_FRAME_MAX];
+    size_t size;
+    while ((size = node_transmit_peek(node, data, sizeof(data)))) {
+        if (stream->node_id && board_can_send(node, transmit_id(stream), data, size))
+            return;
+        stream->frames_out += stream->node_id != 0;
+        node_transmitted(node, size);
+    }
+}
+DECL_TASK(can_stream_task);
+
+// ------------------------------------------------------------------------------------------------- questions
+
+void command_get_canbus_id(struct node *node, const struct wire_arg *args) {
+    (void)args;
+    RESPOND(node, canbus_id, BYTES(node->config.uuid, NODE_UUID_SIZE),
+            INT(node->can ? node->can->node_id : 0));
+}
+DECL_COMMAND(command_get_canbus_id, "get_canbus_id", ALLOWED_IN_SHUTDOWN);
+
 void command_get_canbus_status(struct node *node, const struct wire_arg *args) {
     (void)args;
-    struct board_can_status status;
-    board_can_status(node, &status);
-    RESPOND(node, canbus_status, ARG(status.rx_error), ARG(status.tx_error), ARG(status.tx_retries),
-            ARG(status.bus_state));
+    struct board_can_status status = {0};
+    if (node->can)
+        board_can_status(node, &status);
+    else
+        status.state = BOARD_CAN_OFF;
+    RESPOND(node, canbus_status, INT(status.rx_error), INT(status.tx_error), INT(status.tx_retries),
+            INT(status.state));
+}
+DECL_COMMAND(command_get_canbus_status, "get_canbus_status", ALLOWED_IN_SHUTDOWN);
+
+// ------------------------------------------------------------------------------------------------------ uuid
+
+static uint64_t mix(uint64_t value) {
+    value ^= value >> 23;
+    value *= 0x2127599BF4325C37u;
+    return value ^ (value >> 47);
+}
+
+// fasthash64 (MIT-licensed, by Zilong Tan), from its definition: eight bytes at a time, the rest
+// zero-extended.
+static uint64_t fasthash64(const uint8_t *data, size_t size, uint64_t seed) {
+    const uint64_t multiplier = 0x880355F21E6D1965u;
+    uint64_t hash = seed ^ (size * multiplier);
+    for (size_t at = 0; at < size; at += 8) {
+        uint64_t word = 0;
+        for (size_t i = 0; i < 8 && at + i < size; i++)
+            word |= (uint64_t)data[at + i] << (8 * i);
+        hash = (hash ^ mix(word)) * multiplier;
+    }
+    return mix(hash);
+}
+
+void can_stream_uuid(const uint8_t *chip_id, size_t size, uint8_t uuid[NODE_UUID_SIZE]) {
+    uint64_t hash = fasthash64(chip_id, size, 0xA16231A7u);
+    for (unsigned i = 0; i < NODE_UUID_SIZE; i++)
+        uuid[i] = (uint8_t)(hash >> (8 * i));
 }

@@ -1,32 +1,24 @@
 // SPDX-License-Identifier: Apache-2.0
-// A node on a CAN bus: node id assignment by admin frames, and the byte stream of its link in data frames.
+// CAN: assignment of the node's id, and message blocks as a stream of bytes in frames of at most eight.
 #ifndef NET_CAN_STREAM_H
 #define NET_CAN_STREAM_H
 
 #include "core/node.h"
-#include "net/can_uuid.h"
 
-enum {
-    CAN_ID_ADMIN = 0x3F0,          // host to all nodes
-    CAN_ID_ADMIN_RESPONSE = 0x3F1, // node to host
-    CAN_ID_DATA = 0x100,           // host to node: this + 2·nodeid; node to host: one more
-    CAN_FRAME_MAX = 8,
-};
+enum { CAN_ID_ADMIN_REQUEST = 0x3F0, CAN_ID_ADMIN_RESPONSE = 0x3F1, CAN_FRAME_MAX = 8 };
 
-// The transport's state, owned by the board: node->config.transport_state.
+// One per node, owned by the board; zeroed by can_stream_attach().
 struct can_stream {
-    uint8_t uuid[CAN_UUID_SIZE];
-    uint8_t nodeid;      // 0: none yet
-    uint8_t wants_reply; // a query waits for its answer to be sent
-    uint8_t conflict;    // someone else has this node's id
+    uint8_t node_id;       // 0: none assigned
+    uint8_t must_announce; // a query for unassigned nodes is still to be answered
+    uint32_t frames_in, frames_out;
 };
 
-extern const struct transport can_stream_transport;
-
-// Asks the board for the ids a node without id listens to. Call after node_init().
-void can_stream_start(struct node *node);
-
-// Interrupt context: a frame of any id arrived.
+// Connects STREAM to NODE, before node_start() and again at every restart: the id is dropped.
+void can_stream_attach(struct node *node, struct can_stream *stream);
+// A frame of SIZE <= 8 bytes came. Interrupt context allowed.
 void can_stream_receive(struct node *node, uint32_t id, const uint8_t *data, size_t size);
+// A node's uuid from the chip's unique number.
+void can_stream_uuid(const uint8_t *chip_id, size_t size, uint8_t uuid[NODE_UUID_SIZE]);
 
 #endif

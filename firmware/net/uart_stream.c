@@ -1,18 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
-// The UART transport: bytes of blocks, as many as the board takes.
-#include "net/uart_stream.h"
-
+// UART: message blocks as they are. Received bytes go straight to node_receive().
 #include "boards/board.h"
+#include "core/node.h"
 
-static void transmit(struct node *node) {
-    uint8_t bytes[WIRE_BLOCK_MAX];
+enum { PIECE = 64 };
+
+void uart_stream_task(struct node *node) {
+    if (node->can)
+        return; // this node speaks CAN
+    uint8_t data[PIECE];
     size_t size;
-    while ((size = link_peek(node, bytes, sizeof(bytes)))) {
-        uint32_t sent = board_uart_send(node, bytes, (uint32_t)size);
-        link_consume(node, sent);
-        if (sent < size)
+    while ((size = node_transmit_peek(node, data, sizeof(data)))) {
+        size_t taken = board_uart_send(node, data, size);
+        if (!taken)
             return;
+        node_transmitted(node, taken);
     }
 }
-
-const struct transport uart_stream_transport = {transmit};
+DECL_TASK(uart_stream_task);

@@ -1,233 +1,265 @@
 // SPDX-License-Identifier: Apache-2.0
-// Steppers: queues of "count steps, interval ticks apart, the interval changing by add after each".
+// Steppers. A queued move means, COUNT times: wait INTERVAL ticks since the last step; step; INTERVAL += ADD.
 //
-// The timer's wake-up clock is the clock of the next edge. With steps on both edges one event is one step;
-// else a pulse is two events, the step and its end.
+// Step times are exact: each is computed from the previous one, never from when a timer really ran. Steps
+// come as pulses of pulse_ticks, or (both edges) as one change of level each, which halves the work.
 #include "boards/board.h"
 #include "objects/trsync.h"
 
+#include <string.h>
+
 DECL_CONSTANT("STEPPER_BOTH_EDGE", 1);
 DECL_CONSTANT("STEPPER_STEP_BOTH_EDGE", 1);
+
+DECL_STATIC_STRING(stepper_past, "Stepper too far in past");
 DECL_STATIC_STRING(stepper_active, "Can't reset time when stepper active");
 DECL_STATIC_STRING(invalid_count, "Invalid count parameter");
-DECL_STATIC_STRING(stepper_in_past, "Stepper too far in past");
+DECL_STATIC_STRING(invalid_pin, "Not a valid pin");
 
-enum { MOVE_TOGGLES_DIR = 1 };
+DECL_RESPONSE(stepper_position, "stepper_position oid=%c pos=%i");
+
+enum { MAX_LAG_PER_S = 1000 }; // the reciprocal of the longest lag: 1 ms
+
+struct stepper_move {
+    struct move link;
+    uint32_t interval;
+    uint32_t add; // two's complement
+    uint16_t count;
+    uint8_t dir;
+};
+_Static_assert(sizeof(struct stepper_move) <= NODE_MOVE_SIZE, "a move fits into a slot");
 
 struct stepper {
-    struct timer timer; // first: the timer leads back to the object
-    uint32_t interval, count;
-    int32_t add;
-    uint32_t step_clock;   // of the next step as commanded; when idle, of the last one
-    uint32_t pulse_ticks;  // 0: steps on both edges, or a pulse as short as the chip makes it
-    uint32_t end_position; // where the move under way ends
-    struct board_pin step_pin, dir_pin;
+    struct timer timer;
     struct move_queue queue;
-    struct move *current; // its slot is in use until the last step
-    struct trsync_signal signal;
-    bool both_edges, inverted;
-    bool dir;       // of the move under way
-    bool next_dir;  // of the next command
-    bool queue_dir; // of the last command queued
-    bool needs_reset;
+    uint32_t interval;   // from the last step to the next one
+    uint32_t step_clock; // of the last step while idle, of the next one while moving
+    uint32_t pulse_ticks;
+    uint32_t position; // where the loaded move ends; two's complement
+    uint32_t add;      // two's complement
+    uint16_t count;    // steps left in the loaded move
+    uint8_t step_pin, dir_pin;
+    uint8_t level;    // of the step pin
+    uint8_t inactive; // level between pulses
+    uint8_t both_edges, moving;
+    uint8_t dir, next_dir;       // of the loaded move, and of moves to be queued
+    uint8_t needs_reset;         // stopped: moves are ignored until reset_step_clock
+    struct stepper_move *loaded; // holds its slot until its last step
+    struct trsync_member member;
 };
 
 static const struct oid_type stepper_type = {"stepper"};
 
-// Begins the next move, or goes idle. The direction changes right after the last step of the move before.
-static bool load_next(struct node *node, struct stepper *s) {
-    if (s->current)
-        move_free(node, s->current);
-    struct move *move = s->current = move_pop(&s->queue);
-    if (!move)
-        return false;
-    if (move->step.flags & MOVE_TOGGLES_DIR) {
-        s->dir = !s->dir;
-        board_gpio_toggle(node, s->dir_pin);
+static struct stepper *find(struct node *node, uint32_t oid) {
+    return oid_find(node, oid, &stepper_type);
+}
+
+// -------------------------------------------------------------------------------------------------- stepping
+
+// Takes the next move; returns 0 when there is none. step_clock is that of the last step.
+static int load_move(struct node *node, struct stepper *stepper) {
+    if (stepper->loaded)
+        move_free(node, stepper->loaded);
+    struct stepper_move *move = stepper->loaded = (struct stepper_move *)move_queue_pop(&stepper->queue);
+    if (!move) {
+        stepper->moving = 0;
+        return 0;
     }
-    s->count = move->step.count;
-    s->add = move->step.add;
-    s->interval = move->step.interval + (uint32_t)s->add;
-    s->step_clock += move->step.interval;
-    s->end_position += s->dir ? s->count : -s->count;
-    return true;
+    if (move->dir != stepper->dir) {
+        stepper->dir = move->dir;
+        board_gpio_write(node, stepper->dir_pin, move->dir);
+    }
+    stepper->count = move->count;
+    stepper->add = move->add;
+    stepper->interval = move->interval + move->add;
+    stepper->step_clock += move->interval;
+    uint32_t steps = move->count;
+    stepper->position += move->dir ? steps : 0 - steps;
+    return 1;
 }
 
-// Plans the step after the one just made.
-static bool next_step(struct node *node, struct stepper *s) {
-    if (--s->count == 0)
-        return load_next(node, s);
-    s->step_clock += s->interval;
-    s->interval += (uint32_t)s->add;
-    return true;
+// One step of the loaded move is done: when is the next one? Returns 0 when there is none.
+static inline int plan_next(struct node *node, struct stepper *stepper) {
+    if (stepper->count == 0)
+        return load_move(node, stepper);
+    stepper->step_clock += stepper->interval;
+    stepper->interval += stepper->add;
+    return 1;
 }
 
-static enum timer_result edge_run(struct node *node, struct timer *timer) {
-    struct stepper *s = (struct stepper *)(void *)timer;
-    board_gpio_toggle(node, s->step_pin);
-    if (!next_step(node, s))
+static inline void toggle(struct node *node, struct stepper *stepper) {
+    stepper->level ^= 1;
+    board_gpio_write(node, stepper->step_pin, stepper->level);
+}
+
+static enum timer_result both_edges_event(struct node *node, struct timer *timer) {
+    struct stepper *stepper = (struct stepper *)timer;
+    toggle(node, stepper);
+    stepper->count--;
+    if (!plan_next(node, stepper))
         return TIMER_DONE;
-    timer->wake_clock = s->step_clock;
-    return TIMER_RESCHEDULE;
+    timer->waketime = stepper->step_clock;
+    return TIMER_AGAIN;
 }
 
-static enum timer_result step_run(struct node *node, struct timer *timer);
-
-static enum timer_result unstep_run(struct node *node, struct timer *timer) {
-    struct stepper *s = (struct stepper *)(void *)timer;
-    board_gpio_write(node, s->step_pin, s->inverted);
-    timer->run = step_run;
-    if (!next_step(node, s))
+// Alternates between the beginning of a pulse and its end. A step that is due sooner than a pulse's length
+// after the last pulse waits for that, and the steps behind it catch up; beyond MAX_LAG it is an error of the
+// host, which the scheduler finds.
+static enum timer_result pulse_event(struct node *node, struct timer *timer) {
+    struct stepper *stepper = (struct stepper *)timer;
+    toggle(node, stepper);
+    if (stepper->level != stepper->inactive) {
+        stepper->count--;
+        if (stepper->pulse_ticks) {
+            timer->waketime += stepper->pulse_ticks;
+            return TIMER_AGAIN;
+        }
+        toggle(node, stepper);
+    }
+    if (!plan_next(node, stepper))
         return TIMER_DONE;
-    // A pause is as long as a pulse at least; a step delayed by that does not delay the ones behind it.
-    uint32_t earliest = timer->wake_clock + s->pulse_ticks;
-    uint32_t step_clock = s->step_clock;
-    bool in_past = clock_before(step_clock, timer->wake_clock - s->pulse_ticks);
-    timer->wake_clock = !in_past && clock_before(step_clock, earliest) ? earliest : step_clock;
-    return TIMER_RESCHEDULE;
-}
-
-static enum timer_result step_run(struct node *node, struct timer *timer) {
-    struct stepper *s = (struct stepper *)(void *)timer;
-    board_gpio_write(node, s->step_pin, !s->inverted);
-    timer->run = unstep_run;
-    if (s->pulse_ticks == 0)
-        return unstep_run(node, timer);
-    timer->wake_clock += s->pulse_ticks;
-    return TIMER_RESCHEDULE;
-}
-
-static uint32_t position(const struct stepper *s) {
-    uint32_t left = s->current ? s->count : 0;
-    if (left && s->timer.run == unstep_run)
-        left--; // the pulse under way is a step made
-    return s->end_position - (s->dir ? left : -left);
-}
-
-// Stops at once. The queue is given up, and what still arrives for it, until the host resets the step clock.
-static void stop(struct node *node, struct stepper *s) {
-    sched_del_timer(node, &s->timer);
-    s->end_position = position(s);
-    if (s->current)
-        move_free(node, s->current);
-    s->current = NULL;
-    move_clear(node, &s->queue);
-    s->count = 0;
-    s->next_dir = s->queue_dir = s->dir;
-    s->needs_reset = true;
-    if (s->both_edges)
-        return; // an edge would be a step
-    s->timer.run = step_run;
-    board_gpio_write(node, s->step_pin, s->inverted);
-}
-
-static void signal_stop(struct node *node, struct trsync_signal *signal) {
-    stop(node, (struct stepper *)((char *)signal - offsetof(struct stepper, signal)));
-}
-
-static struct stepper *lookup(struct node *node, uint32_t oid) {
-    return oid_lookup(node, (uint8_t)oid, &stepper_type);
-}
-
-DECL_STATIC_STRING(not_a_pin, "Not a valid pin");
-DECL_COMMAND(command_config_stepper,
-             "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u");
-void command_config_stepper(struct node *node, const struct wire_arg *args) {
-    struct stepper *s = oid_alloc(node, (uint8_t)args[0].value, &stepper_type, sizeof(*s));
-    if (!s)
-        return;
-    int8_t invert = (int8_t)args[3].value;
-    s->pulse_ticks = args[4].value;
-    s->both_edges = invert < 0 && s->pulse_ticks == 0;
-    s->inverted = invert > 0;
-    s->timer.run = s->both_edges ? edge_run : step_run;
-    s->signal.stop = signal_stop;
-    if (board_gpio_out_setup(node, args[1].value, s->inverted, &s->step_pin) ||
-        board_gpio_out_setup(node, args[2].value, false, &s->dir_pin))
-        node_shutdown(node, string_not_a_pin);
+    uint32_t soonest = timer->waketime + stepper->pulse_ticks;
+    uint32_t lag = soonest - stepper->step_clock;
+    int late = stepper->pulse_ticks && lag < node->config.clock_freq / MAX_LAG_PER_S;
+    timer->waketime = late ? soonest : stepper->step_clock;
+    return TIMER_AGAIN;
 }
 
 // Starts an idle stepper on its queue.
-static void start(struct node *node, struct stepper *s) {
-    if (!load_next(node, s))
+static void start(struct node *node, struct stepper *stepper) {
+    load_move(node, stepper);
+    stepper->moving = 1;
+    if (clock_before(stepper->step_clock, board_clock(node))) {
+        node_shutdown(node, STRING(stepper_past));
         return;
-    s->timer.wake_clock = s->step_clock;
-    if (clock_before(s->step_clock, board_clock(node)))
-        node_shutdown(node, string_stepper_in_past);
-    else
-        sched_add_timer(node, &s->timer);
+    }
+    stepper->timer.waketime = stepper->step_clock;
+    sched_add_timer(node, &stepper->timer);
 }
 
-DECL_COMMAND_FLAGS(command_queue_step, COMMAND_FREQUENT, "queue_step oid=%c interval=%u count=%hu add=%hi");
+static uint32_t position_of(const struct stepper *stepper) {
+    uint32_t left = stepper->count;
+    return stepper->position - (stepper->dir ? left : 0 - left);
+}
+
+// Stops at once, in place; from now on moves are ignored until reset_step_clock.
+static void stop(struct node *node, struct stepper *stepper) {
+    sched_delete_timer(node, &stepper->timer);
+    stepper->position = position_of(stepper);
+    stepper->count = 0;
+    stepper->moving = 0;
+    stepper->next_dir = stepper->dir;
+    stepper->needs_reset = 1;
+    if (!stepper->both_edges && stepper->level != stepper->inactive) {
+        stepper->level = stepper->inactive;
+        board_gpio_write(node, stepper->step_pin, stepper->level);
+    }
+    if (stepper->loaded)
+        move_free(node, stepper->loaded);
+    stepper->loaded = NULL;
+    move_queue_clear(node, &stepper->queue);
+}
+
+static void member_stop(struct node *node, struct trsync_member *member) {
+    stop(node, (struct stepper *)((char *)member - offsetof(struct stepper, member)));
+}
+
+// -------------------------------------------------------------------------------------------------- commands
+
+void command_config_stepper(struct node *node, const struct wire_arg *args) {
+    int invert = (int8_t)args[3].value;
+    if (board_gpio_out(node, args[1].value, invert > 0) || board_gpio_out(node, args[2].value, 0)) {
+        node_shutdown(node, STRING(invalid_pin));
+        return;
+    }
+    struct stepper *stepper = oid_create(node, args[0].value, &stepper_type, sizeof(*stepper));
+    if (!stepper)
+        return;
+    stepper->step_pin = (uint8_t)args[1].value;
+    stepper->dir_pin = (uint8_t)args[2].value;
+    stepper->pulse_ticks = args[4].value;
+    stepper->both_edges = invert < 0 && stepper->pulse_ticks == 0;
+    stepper->inactive = stepper->level = invert > 0;
+    stepper->timer.function = stepper->both_edges ? both_edges_event : pulse_event;
+}
+DECL_COMMAND(command_config_stepper,
+             "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u", 0);
+
 void command_queue_step(struct node *node, const struct wire_arg *args) {
-    struct stepper *s = lookup(node, args[0].value);
-    if (!s)
+    struct stepper *stepper = find(node, args[0].value);
+    if (!stepper)
         return;
-    if (args[2].value == 0) {
-        node_shutdown(node, string_invalid_count);
+    if (!args[2].value) {
+        node_shutdown(node, STRING(invalid_count));
         return;
     }
-    if (s->needs_reset)
-        return; // sent before the host knew of the stop
-    struct move *move = move_alloc(node);
-    if (!move)
+    if (stepper->needs_reset)
         return;
-    move->step.interval = args[1].value;
-    move->step.count = (uint16_t)args[2].value;
-    move->step.add = (int16_t)args[3].value;
-    move->step.flags = s->next_dir != s->queue_dir ? MOVE_TOGGLES_DIR : 0;
-    s->queue_dir = s->next_dir;
     uint32_t irq = board_irq_save(node);
-    move_push(&s->queue, move);
-    if (!s->current)
-        start(node, s);
+    struct stepper_move *move = move_alloc(node);
+    if (move) {
+        move->interval = args[1].value;
+        move->count = (uint16_t)args[2].value;
+        move->add = args[3].value;
+        move->dir = stepper->next_dir;
+        move_queue_push(&stepper->queue, &move->link);
+        if (!stepper->moving)
+            start(node, stepper);
+    }
     board_irq_restore(node, irq);
 }
+DECL_COMMAND(command_queue_step, "queue_step oid=%c interval=%u count=%hu add=%hi", FREQUENT);
 
-DECL_COMMAND_FLAGS(command_set_next_step_dir, COMMAND_FREQUENT, "set_next_step_dir oid=%c dir=%c");
 void command_set_next_step_dir(struct node *node, const struct wire_arg *args) {
-    struct stepper *s = lookup(node, args[0].value);
-    if (s && !s->needs_reset)
-        s->next_dir = args[1].value != 0;
+    struct stepper *stepper = find(node, args[0].value);
+    if (stepper)
+        stepper->next_dir = args[1].value != 0;
 }
+DECL_COMMAND(command_set_next_step_dir, "set_next_step_dir oid=%c dir=%c", FREQUENT);
 
-DECL_COMMAND_FLAGS(command_reset_step_clock, COMMAND_FREQUENT, "reset_step_clock oid=%c clock=%u");
 void command_reset_step_clock(struct node *node, const struct wire_arg *args) {
-    struct stepper *s = lookup(node, args[0].value);
-    if (!s)
-        return;
-    if (s->current) {
-        node_shutdown(node, string_stepper_active);
-        return;
-    }
-    s->step_clock = args[1].value;
-    s->needs_reset = false;
-}
-
-DECL_RESPONSE(stepper_position, "stepper_position oid=%c pos=%i");
-DECL_COMMAND_FLAGS(command_stepper_get_position, COMMAND_IN_SHUTDOWN, "stepper_get_position oid=%c");
-void command_stepper_get_position(struct node *node, const struct wire_arg *args) {
-    struct stepper *s = lookup(node, args[0].value);
-    if (!s)
+    struct stepper *stepper = find(node, args[0].value);
+    if (!stepper)
         return;
     uint32_t irq = board_irq_save(node);
-    uint32_t at = position(s);
+    if (stepper->moving) {
+        node_shutdown(node, STRING(stepper_active));
+    } else {
+        stepper->step_clock = args[1].value;
+        stepper->needs_reset = 0;
+    }
     board_irq_restore(node, irq);
-    RESPOND(node, stepper_position, args[0], ARG(at));
 }
+DECL_COMMAND(command_reset_step_clock, "reset_step_clock oid=%c clock=%u", FREQUENT);
 
-DECL_COMMAND(command_stepper_stop_on_trigger, "stepper_stop_on_trigger oid=%c trsync_oid=%c");
+void command_stepper_get_position(struct node *node, const struct wire_arg *args) {
+    struct stepper *stepper = find(node, args[0].value);
+    if (!stepper)
+        return;
+    uint32_t irq = board_irq_save(node);
+    uint32_t position = position_of(stepper);
+    board_irq_restore(node, irq);
+    RESPOND(node, stepper_position, INT(args[0].value), INT(position));
+}
+DECL_COMMAND(command_stepper_get_position, "stepper_get_position oid=%c", 0);
+
 void command_stepper_stop_on_trigger(struct node *node, const struct wire_arg *args) {
-    struct stepper *s = lookup(node, args[0].value);
-    struct trsync *group = s ? trsync_lookup(node, (uint8_t)args[1].value) : NULL;
-    if (group)
-        trsync_join(node, group, &s->signal);
+    struct stepper *stepper = find(node, args[0].value);
+    if (!stepper)
+        return;
+    struct trsync *trsync = trsync_find(node, args[1].value);
+    if (!trsync)
+        return;
+    uint32_t irq = board_irq_save(node);
+    stepper->member.stop = member_stop;
+    trsync_join(node, trsync, &stepper->member);
+    board_irq_restore(node, irq);
 }
+DECL_COMMAND(command_stepper_stop_on_trigger, "stepper_stop_on_trigger oid=%c trsync_oid=%c", 0);
 
-DECL_SHUTDOWN_HOOK(stepper_shutdown);
 void stepper_shutdown(struct node *node) {
-    uint16_t oid = 0;
-    struct stepper *s;
-    while ((s = oid_next(node, &stepper_type, &oid)))
-        stop(node, s);
+    struct stepper *stepper;
+    for (unsigned oid = 0; (stepper = oid_next(node, &oid, &stepper_type));)
+        stop(node, stepper);
 }
+DECL_SHUTDOWN_HOOK(stepper_shutdown);

@@ -1,154 +1,158 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stop groups (trsync).
+// Stop groups: see trsync.h. While one is armed it reports itself periodically, which is also how the host
+// learns that the node is alive and may push the time-out further.
 #include "objects/trsync.h"
 
 #include "boards/board.h"
 
+DECL_STATIC_STRING(already_joined, "Can't add signal that is already active");
+
+DECL_RESPONSE(trsync_state, "trsync_state oid=%c can_trigger=%c trigger_reason=%c clock=%u");
+
 struct trsync {
-    struct timer report_timer, expire_timer; // first: timers lead back to the object
+    struct timer report_timer, expire_timer;
+    struct trsync_member *members;
     uint32_t report_ticks, report_clock;
-    struct trsync_signal *signals;
-    uint8_t reason, expire_reason;
-    bool can_trigger, has_triggered, report_due;
+    uint8_t can_trigger, reason, expire_reason, must_report;
 };
 
 static const struct oid_type trsync_type = {"trsync"};
-DECL_STATIC_STRING(signal_active, "Can't add signal that is already active");
-DECL_RESPONSE(trsync_state, "trsync_state oid=%c can_trigger=%c trigger_reason=%c clock=%u");
 
-DECL_TASK(trsync_task);
-void trsync_task(struct node *node) {
-    uint16_t oid = 0;
-    struct trsync *group;
-    while ((group = oid_next(node, &trsync_type, &oid))) {
-        uint32_t irq = board_irq_save(node);
-        bool due = group->report_due, can_trigger = group->can_trigger;
-        uint32_t clock = group->report_clock;
-        group->report_due = false;
-        board_irq_restore(node, irq);
-        if (due)
-            RESPOND(node, trsync_state, ARG(oid - 1), ARG(can_trigger), ARG(group->reason), ARG(clock));
+struct trsync *trsync_find(struct node *node, uint32_t oid) {
+    return oid_find(node, oid, &trsync_type);
+}
+
+static void stop_members(struct node *node, struct trsync *trsync) {
+    struct trsync_member *member = trsync->members;
+    trsync->members = NULL;
+    while (member) {
+        struct trsync_member *next = member->next;
+        void (*stop)(struct node *, struct trsync_member *) = member->stop;
+        member->stop = NULL;
+        stop(node, member);
+        member = next;
     }
 }
 
-static void report(struct node *node, struct trsync *group, uint32_t clock) {
-    group->report_clock = clock;
-    group->report_due = true;
-    WAKE(node, trsync_task);
-}
-
-void trsync_fire(struct node *node, struct trsync *group, uint8_t reason) {
-    if (!group->can_trigger)
+void trsync_trigger(struct node *node, struct trsync *trsync, uint8_t reason) {
+    if (!trsync->can_trigger)
         return;
-    group->can_trigger = false;
-    group->has_triggered = true;
-    group->reason = reason;
-    sched_del_timer(node, &group->report_timer);
-    sched_del_timer(node, &group->expire_timer);
-    while (group->signals) {
-        struct trsync_signal *signal = group->signals;
-        group->signals = signal->next;
-        signal->joined = false;
-        signal->stop(node, signal);
+    trsync->can_trigger = 0;
+    trsync->reason = reason;
+    trsync->report_clock = board_clock(node);
+    stop_members(node, trsync);
+    trsync->must_report = 1;
+    node_wake_tasks(node);
+}
+
+void trsync_join(struct node *node, struct trsync *trsync, struct trsync_member *member) {
+    void (*stop)(struct node *, struct trsync_member *) = member->stop;
+    for (const struct trsync_member *other = trsync->members; other; other = other->next)
+        if (other == member) {
+            node_shutdown(node, STRING(already_joined));
+            return;
+        }
+    if (!trsync->can_trigger) {
+        member->stop = NULL;
+        stop(node, member);
+        return;
     }
-    report(node, group, board_clock(node));
+    member->next = trsync->members;
+    trsync->members = member;
 }
 
-void trsync_join(struct node *node, struct trsync *group, struct trsync_signal *signal) {
-    uint32_t irq = board_irq_save(node);
-    bool twice = signal->joined, late = group->has_triggered;
-    if (!twice && !late) {
-        signal->joined = true;
-        signal->next = group->signals;
-        group->signals = signal;
-    }
-    board_irq_restore(node, irq);
-    if (twice)
-        node_shutdown(node, string_signal_active);
-    else if (late)
-        signal->stop(node, signal);
+static enum timer_result report_event(struct node *node, struct timer *timer) {
+    struct trsync *trsync = (struct trsync *)((char *)timer - offsetof(struct trsync, report_timer));
+    if (!trsync->can_trigger)
+        return TIMER_DONE;
+    trsync->report_clock = timer->waketime;
+    trsync->must_report = 1;
+    node_wake_tasks(node);
+    timer->waketime += trsync->report_ticks;
+    return TIMER_AGAIN;
 }
 
-struct trsync *trsync_lookup(struct node *node, uint8_t oid) {
-    return oid_lookup(node, oid, &trsync_type);
-}
-
-static enum timer_result report_run(struct node *node, struct timer *timer) {
-    struct trsync *group = (struct trsync *)((char *)timer - offsetof(struct trsync, report_timer));
-    report(node, group, timer->wake_clock);
-    timer->wake_clock += group->report_ticks;
-    return TIMER_RESCHEDULE;
-}
-
-static enum timer_result expire_run(struct node *node, struct timer *timer) {
-    struct trsync *group = (struct trsync *)((char *)timer - offsetof(struct trsync, expire_timer));
-    trsync_fire(node, group, group->expire_reason);
+static enum timer_result expire_event(struct node *node, struct timer *timer) {
+    struct trsync *trsync = (struct trsync *)((char *)timer - offsetof(struct trsync, expire_timer));
+    trsync_trigger(node, trsync, trsync->expire_reason);
     return TIMER_DONE;
 }
 
-DECL_COMMAND(command_config_trsync, "config_trsync oid=%c");
 void command_config_trsync(struct node *node, const struct wire_arg *args) {
-    struct trsync *group = oid_alloc(node, (uint8_t)args[0].value, &trsync_type, sizeof(*group));
-    if (!group)
+    struct trsync *trsync = oid_create(node, args[0].value, &trsync_type, sizeof(*trsync));
+    if (!trsync)
         return;
-    group->report_timer.run = report_run;
-    group->expire_timer.run = expire_run;
+    trsync->report_timer.function = report_event;
+    trsync->expire_timer.function = expire_event;
 }
+DECL_COMMAND(command_config_trsync, "config_trsync oid=%c", 0);
 
-DECL_COMMAND(command_trsync_start, "trsync_start oid=%c report_clock=%u report_ticks=%u expire_reason=%c");
 void command_trsync_start(struct node *node, const struct wire_arg *args) {
-    struct trsync *group = trsync_lookup(node, (uint8_t)args[0].value);
-    if (!group)
+    struct trsync *trsync = trsync_find(node, args[0].value);
+    if (!trsync)
         return;
     uint32_t irq = board_irq_save(node);
-    sched_del_timer(node, &group->report_timer);
-    sched_del_timer(node, &group->expire_timer);
-    group->report_due = false;
-    group->can_trigger = true;
-    group->has_triggered = false;
-    group->reason = 0;
-    group->report_timer.wake_clock = args[1].value;
-    group->report_ticks = args[2].value;
-    group->expire_reason = (uint8_t)args[3].value;
-    if (group->report_ticks)
-        sched_add_timer(node, &group->report_timer);
+    sched_delete_timer(node, &trsync->report_timer);
+    sched_delete_timer(node, &trsync->expire_timer);
+    stop_members(node, trsync); // of an earlier round that nobody ended
+    trsync->can_trigger = 1;
+    trsync->reason = trsync->must_report = 0;
+    trsync->report_timer.waketime = args[1].value;
+    trsync->report_ticks = args[2].value;
+    trsync->expire_reason = (uint8_t)args[3].value;
+    if (trsync->report_ticks)
+        sched_add_timer(node, &trsync->report_timer);
     board_irq_restore(node, irq);
 }
+DECL_COMMAND(command_trsync_start, "trsync_start oid=%c report_clock=%u report_ticks=%u expire_reason=%c", 0);
 
-DECL_COMMAND(command_trsync_set_timeout, "trsync_set_timeout oid=%c clock=%u");
 void command_trsync_set_timeout(struct node *node, const struct wire_arg *args) {
-    struct trsync *group = trsync_lookup(node, (uint8_t)args[0].value);
-    if (!group)
+    struct trsync *trsync = trsync_find(node, args[0].value);
+    if (!trsync)
         return;
     uint32_t irq = board_irq_save(node);
-    sched_del_timer(node, &group->expire_timer);
-    group->expire_timer.wake_clock = args[1].value;
-    if (group->can_trigger)
-        sched_add_timer(node, &group->expire_timer);
+    sched_delete_timer(node, &trsync->expire_timer);
+    trsync->expire_timer.waketime = args[1].value;
+    if (trsync->can_trigger)
+        sched_add_timer(node, &trsync->expire_timer);
     board_irq_restore(node, irq);
 }
+DECL_COMMAND(command_trsync_set_timeout, "trsync_set_timeout oid=%c clock=%u", 0);
 
-DECL_COMMAND(command_trsync_trigger, "trsync_trigger oid=%c reason=%c");
+static void report(struct node *node, uint32_t oid, struct trsync *trsync) {
+    trsync->must_report = 0;
+    RESPOND(node, trsync_state, INT(oid), INT(trsync->can_trigger), INT(trsync->reason),
+            INT(trsync->report_clock));
+}
+
+// The host ends a round with this: it is answered even when something else triggered first.
 void command_trsync_trigger(struct node *node, const struct wire_arg *args) {
-    struct trsync *group = trsync_lookup(node, (uint8_t)args[0].value);
-    if (!group)
+    struct trsync *trsync = trsync_find(node, args[0].value);
+    if (!trsync)
         return;
     uint32_t irq = board_irq_save(node);
-    if (group->can_trigger)
-        trsync_fire(node, group, (uint8_t)args[1].value);
-    else
-        report(node, group, board_clock(node)); // the asker learns that, and why, it had triggered before
+    trsync_trigger(node, trsync, (uint8_t)args[1].value);
+    sched_delete_timer(node, &trsync->report_timer);
+    sched_delete_timer(node, &trsync->expire_timer);
     board_irq_restore(node, irq);
+    report(node, args[0].value, trsync);
 }
+DECL_COMMAND(command_trsync_trigger, "trsync_trigger oid=%c reason=%c", 0);
 
-DECL_SHUTDOWN_HOOK(trsync_shutdown);
+void trsync_task(struct node *node) {
+    struct trsync *trsync;
+    for (unsigned oid = 0; (trsync = oid_next(node, &oid, &trsync_type));)
+        if (trsync->must_report && node_can_respond(node))
+            report(node, oid - 1, trsync);
+}
+DECL_TASK(trsync_task);
+
 void trsync_shutdown(struct node *node) {
-    uint16_t oid = 0;
-    struct trsync *group;
-    while ((group = oid_next(node, &trsync_type, &oid))) {
-        group->can_trigger = group->report_due = false;
-        for (struct trsync_signal *signal = group->signals; signal; signal = signal->next)
-            signal->joined = false; // the members stop by their own shutdown hooks
-        group->signals = NULL;
+    struct trsync *trsync;
+    for (unsigned oid = 0; (trsync = oid_next(node, &oid, &trsync_type));) {
+        trsync->can_trigger = 0;
+        trsync->must_report = 0;
+        stop_members(node, trsync);
     }
 }
+DECL_SHUTDOWN_HOOK(trsync_shutdown);

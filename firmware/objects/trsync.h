@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Stop groups: whatever joined is stopped at once when the group triggers or its time-out expires.
+// Stop groups: what has to stop joins one; a trigger, a time-out or a shutdown stops all members at once.
 #ifndef OBJECTS_TRSYNC_H
 #define OBJECTS_TRSYNC_H
 
@@ -7,18 +7,18 @@
 
 struct trsync;
 
-// Embedded in whoever wants to be stopped. STOP runs once, in interrupt context.
-struct trsync_signal {
-    struct trsync_signal *next;
-    void (*stop)(struct node *node, struct trsync_signal *signal);
-    bool joined;
+// Embedded by the owner; STOP runs once, in interrupt context, and the membership ends with it.
+struct trsync_member {
+    struct trsync_member *next;
+    void (*stop)(struct node *node, struct trsync_member *member);
 };
 
-// Finds the group OID. NULL after a shutdown.
-struct trsync *trsync_lookup(struct node *node, uint8_t oid);
-// Joins until the group triggers; at once when it did since trsync_start. Joining twice is a shutdown.
-void trsync_join(struct node *node, struct trsync *group, struct trsync_signal *signal);
-// Interrupt context: stops all members. Only the first trigger after trsync_start acts.
-void trsync_fire(struct node *node, struct trsync *group, uint8_t reason);
+// The trsync OID, or null after a shutdown.
+struct trsync *trsync_find(struct node *node, uint32_t oid);
+// Interrupts must be off. Joining twice is a shutdown; a trsync that already triggered stops the member at
+// once.
+void trsync_join(struct node *node, struct trsync *trsync, struct trsync_member *member);
+// Stops all members if nothing did before. Interrupt context.
+void trsync_trigger(struct node *node, struct trsync *trsync, uint8_t reason);
 
 #endif

@@ -1,314 +1,288 @@
-"""Collects the declarations of core/declare.h from C sources and writes the tables and the dictionary.
+"""Gathers the declarations of a firmware build (core/declare.h) and writes its tables and dictionary.
 
-Usage: gen_dictionary.py -o OUT.c [--json OUT.json] [-D NAME=VALUE]... [--cc CC] SOURCE.c...
+Usage: gen_dictionary.py --output TABLES.c [--json DICT.json] [-D NAME=VALUE]... [-I DIR]... SOURCE.c...
 
-Each source goes through ``CC -E -DCANDUCTOR_COLLECT``, where a declaration becomes ``@@kind(arguments)@@``. The
-result is one C file that defines what the declarations promise. It needs no file that lists commands, and only
-Python's standard library. A contradiction (one id symbol for two texts, two commands of one name, ...) ends the
-build with one sentence.
+Standard library only. Every error is one sentence on stderr, exit status 1.
 """
 
 import argparse
 import ast
-import hashlib
 import json
-import operator
 import re
 import subprocess
 import sys
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NoReturn, TypeVar
 
-V = TypeVar("V")
-FIRMWARE = Path(__file__).resolve().parent.parent
-RELEASE = "0.1.0"
-FIXED_IDS = {"identify": 1, "identify_response": 0}
-IN_SHUTDOWN, FREQUENT = 1, 2
 TYPES = {
     "%u": "WIRE_U32",
     "%i": "WIRE_I32",
     "%hu": "WIRE_U16",
     "%hi": "WIRE_I16",
     "%c": "WIRE_U8",
+    "%s": "WIRE_BYTES",
     "%*s": "WIRE_BYTES",
     "%.*s": "WIRE_BYTES",
 }
-MESSAGE_ARGS_MAX = 12
-MARKER = re.compile(r"@@(\w+)\((.*?)\)@@", re.DOTALL)
-STRING = re.compile(r'"(?:[^"\\]|\\.)*"')
-OPERATORS: dict[type[ast.AST], Callable[[int, int], int]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.FloorDiv: operator.floordiv,
-    ast.BitOr: operator.or_,
-    ast.LShift: operator.lshift,
-}
+FIXED_COMMAND, FIXED_RESPONSE = "identify", "identify_response"
+ARGS_MAX = 12  # NODE_ARGS_MAX in core/node.h
+ONE_BYTE_MIN, ONE_BYTE_MAX = -32, 95
+DECLARATION = re.compile(r"CANDUCTOR_DECLARE_BEGIN (.*?)\s*CANDUCTOR_DECLARE_END", re.DOTALL)
+STRING = r'"(?:[^"\\]|\\.)*"'
+ARGUMENT = re.compile(rf"\s*((?:{STRING}\s*)+|[^,\"]+)\s*(?:,|$)")
+ALLOWED_IN_SHUTDOWN, FREQUENT = 1, 2
 
 
-def fail(sentence: str) -> NoReturn:
-    """End the build with one sentence."""
-    sys.exit(f"gen_dictionary: {sentence}")
+class BuildError(Exception):
+    """A declaration that makes no sense; the sentence names it."""
 
 
 @dataclass
 class Declarations:
-    """Everything declared in one build, by kind, in the order of the sources."""
+    """All declarations of one build, in source order."""
 
-    commands: dict[str, tuple[str, int]] = field(default_factory=dict)  # format -> (function, flags)
-    responses: dict[str, str] = field(default_factory=dict)  # symbol -> format
+    commands: dict[str, tuple[str, int]] = field(default_factory=dict)  # format -> handler, flags
+    responses: dict[str, str] = field(default_factory=dict)  # format -> symbol
     constants: dict[str, int | str] = field(default_factory=dict)
     enumerations: dict[str, dict[str, int | list[int]]] = field(default_factory=dict)
     strings: dict[str, str] = field(default_factory=dict)  # symbol -> text
-    functions: dict[str, list[str]] = field(default_factory=lambda: {"task": [], "init": [], "shutdown": []})
+    functions: dict[str, list[str]] = field(default_factory=lambda: {"task": [], "init": [], "hook": []})
 
-    def add(self, kind: str, arguments: list[str]) -> None:
-        """Take one marker."""
-        if kind == "command":
-            self.once(self.commands, text(arguments[2]), (arguments[0], number(arguments[1])))
-        elif kind == "response":
-            self.once(self.responses, arguments[0], text(arguments[1]))
-        elif kind == "constant":
-            self.once(self.constants, text(arguments[0]), number(arguments[1]))
-        elif kind == "constant_str":
-            self.once(self.constants, text(arguments[0]), text(arguments[1]))
-        elif kind == "enumeration":
-            first, count = number(arguments[2]), number(arguments[3])
-            values = self.enumerations.setdefault(text(arguments[0]), {})
-            self.once(values, text(arguments[1]), first if count == 1 else [first, count])
-        elif kind == "string":
-            self.once(self.strings, arguments[0], text(arguments[1]))
-        elif kind in self.functions:
-            self.functions[kind].append(arguments[0])
-        else:
-            fail(f"unknown declaration {kind}")
-
-    @staticmethod
-    def once(into: dict[str, V], key: str, value: V) -> None:
-        """Add to a table; the same declaration may be repeated, a different one may not."""
-        if into.setdefault(key, value) != value:
-            fail(f"{key!r} is declared twice: as {into[key]!r} and as {value!r}")
+    def add(self, kind: str, args: Sequence[str]) -> None:
+        """Take one declaration; raises BuildError when it contradicts an earlier one."""
+        match kind:
+            case "command":
+                handler, text, flags = args[0], string(args[1]), args[2]
+                put(self.commands, text, (handler, number(flags)), "command")
+            case "response":
+                put(self.responses, string(args[1]), args[0], "response")
+            case "constant":
+                value = string(args[1]) if args[1].startswith('"') else number(args[1])
+                put(self.constants, string(args[0]), value, "constant")
+            case "enumeration":
+                names = self.enumerations.setdefault(string(args[0]), {})
+                put(names, string(args[1]), number(args[2]), "enumeration name")
+            case "range":
+                names = self.enumerations.setdefault(string(args[0]), {})
+                put(names, string(args[1]), [number(args[2]), number(args[3])], "enumeration name")
+            case "string":
+                put(self.strings, args[0], string(args[1]), "static string", repeat=True)
+            case _:
+                self.functions[kind].append(args[0])
 
 
-def number(expression: str) -> int:
-    """Evaluate an integer constant expression of C."""
-    plain = re.sub(r"\b(0[xX][0-9a-fA-F]+|\d+)[uUlL]*", r"\1", expression).replace("/", "//")
-
-    def value(node: ast.AST) -> int:
-        if isinstance(node, ast.Constant) and isinstance(node.value, int):
-            return node.value
-        if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
-            return OPERATORS[type(node.op)](value(node.left), value(node.right))
-        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-            return -value(node.operand)
-        return fail(f"{expression!r} is not an integer constant; write a number or a macro that is one")
-
-    try:
-        return value(ast.parse(plain.strip(), mode="eval").body)
-    except SyntaxError:
-        fail(f"{expression!r} is not an integer constant; write a number or a macro that is one")
+def put(table: dict, key: str, value: object, what: str, *, repeat: bool = False) -> None:
+    """Enter KEY into TABLE, once."""
+    if key in table and not (repeat and table[key] == value):
+        raise BuildError(f'the {what} "{key}" is declared twice')
+    table[key] = value
 
 
-def text(literals: str) -> str:
-    """Join the adjacent string literals of a C expression."""
-    parts = STRING.findall(literals)
-    if not parts or STRING.sub("", literals).strip():
-        fail(f"{literals!r} is not a string literal")
-    return "".join(str(ast.literal_eval(part)) for part in parts)
+def string(token: str) -> str:
+    """Read one C string, or several side by side."""
+    return "".join(ast.literal_eval(part) for part in re.findall(STRING, token))
 
 
-def split_arguments(inside: str) -> list[str]:
-    """Split at commas that stand neither in a string nor in parentheses."""
-    arguments, depth, start = [], 0, 0
-    for match in re.finditer(STRING.pattern + r"|[(),]", inside):
-        token = match.group()
-        depth += (token == "(") - (token == ")")
-        if token == "," and depth == 0:
-            arguments.append(inside[start : match.start()].strip())
-            start = match.end()
-    return [*arguments, inside[start:].strip()]
+def number(token: str) -> int:
+    """Read an integer expression of literals, `|`, `<<`, `*`, `+`, `-` and the flags of declare.h."""
+    names = {"ALLOWED_IN_SHUTDOWN": ALLOWED_IN_SHUTDOWN, "FREQUENT": FREQUENT}
+    text = re.sub(r"\b(0x[0-9a-fA-F]+|[0-9]+)[uUlL]+\b", r"\1", token.strip())
+    text = re.sub(r"[A-Za-z_]\w*", lambda match: str(names.get(match[0], match[0])), text)
+    if not re.fullmatch(r"[0-9a-fA-Fx|<*+()\s-]+", text):
+        raise BuildError(f'"{token}" is not a number the dictionary generator can read')
+    return int(eval(text, {"__builtins__": {}}))  # noqa: S307 - only digits and operators are left
 
 
-def collect(sources: Iterable[str], cc: str, defines: list[str]) -> Declarations:
-    """Run the preprocessor over each source and take its markers."""
+def arguments(text: str) -> list[str]:
+    """Split what stands between the marks at its commas."""
+    return [match[1].strip() for match in ARGUMENT.finditer(" ".join(text.split("\n"))) if match[1].strip()]
+
+
+def collect(sources: Sequence[Path], preprocess: Sequence[str]) -> Declarations:
+    """Preprocess every source and gather what it declares."""
     found = Declarations()
-    flags = [f"-I{FIRMWARE}", "-DCANDUCTOR_COLLECT", *(f"-D{define}" for define in defines)]
     for source in sources:
-        run = subprocess.run([cc, "-E", "-P", *flags, source], capture_output=True, text=True, check=False)
-        if run.returncode:
-            fail(f"{source} does not preprocess: {run.stderr.strip()}")
-        for kind, inside in MARKER.findall(run.stdout):
-            found.add(kind, split_arguments(inside))
+        command = [*preprocess, "-E", "-P", "-DCANDUCTOR_COLLECT", str(source)]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        if result.returncode:
+            raise BuildError(f"cannot preprocess {source}: {result.stderr.strip()}")
+        for match in DECLARATION.finditer(result.stdout):
+            kind, *args = arguments(match[1])
+            try:
+                found.add(string(kind), args)
+            except (BuildError, IndexError, ValueError, SyntaxError) as error:
+                raise BuildError(f"{source}: {error}") from error
     return found
 
 
-def name_of(message: str) -> str:
-    """Return the first word of a format."""
-    return message.split(" ", 1)[0]
-
-
-def parameter_types(message: str) -> list[str]:
-    """Return the C names of the parameters' types."""
+def parameter_types(text: str) -> list[str]:
+    """Return the wire types of the parameters of one format."""
     types = []
-    for parameter in message.split(" ")[1:]:
-        code = parameter.partition("=")[2]
-        if code not in TYPES:
-            fail(f"{message!r}: parameter {parameter!r} has none of the codes {', '.join(TYPES)}")
+    for word in text.split()[1:]:
+        name, _, code = word.partition("=")
+        if not re.fullmatch(r"\w+", name) or code not in TYPES:
+            raise BuildError(f'the format "{text}" has a bad parameter "{word}"')
         types.append(TYPES[code])
-    if len(types) > MESSAGE_ARGS_MAX:
-        fail(f"{message!r} has more than {MESSAGE_ARGS_MAX} parameters")
+    if len(types) > ARGS_MAX:
+        raise BuildError(f'the format "{text}" has more than {ARGS_MAX} parameters')
     return types
 
 
-def assign_ids(found: Declarations) -> dict[str, int]:
-    """Give each format its id: the fixed ones, then frequent commands first; ids up to 95 and -32 take one byte."""
-    frequent = [message for message, (_, flags) in found.commands.items() if flags & FREQUENT]
-    messages = list(dict.fromkeys([*frequent, *found.commands, *found.responses.values()]))
-    names = [name_of(message) for message in messages]
-    for name in names:
-        if names.count(name) > 1:
-            fail(f"{name!r} is declared with two formats")
-    free = iter([*range(2, 96), *range(-32, 0), *range(96, 4096)])
-    return {
-        message: FIXED_IDS[name] if name in FIXED_IDS else next(free)
-        for message, name in zip(messages, names)
-    }
+def assign_ids(found: Declarations) -> tuple[dict[str, int], dict[str, int]]:
+    """Give ids: commands up from 1, frequent ones first; responses down from 0, then behind the commands."""
+
+    def name(text: str) -> str:
+        return text.split(maxsplit=1)[0]
+
+    for kind, table in (("command", found.commands), ("response", found.responses)):
+        names = [name(text) for text in table]
+        twice = {n for n in names if names.count(n) > 1}
+        if twice:
+            raise BuildError(f'the {kind} "{min(twice)}" is declared with two formats')
+    order = sorted(
+        found.commands,
+        key=lambda text: (name(text) != FIXED_COMMAND, not found.commands[text][1] & FREQUENT, text),
+    )
+    if not order or name(order[0]) != FIXED_COMMAND:
+        raise BuildError(f'no command "{FIXED_COMMAND}" is declared')
+    commands = {text: index + 1 for index, text in enumerate(order)}
+    beyond = [
+        text
+        for text, value in commands.items()
+        if value > ONE_BYTE_MAX and found.commands[text][1] & FREQUENT
+    ]
+    if beyond:
+        raise BuildError(f'"{beyond[0]}" is one frequent command too many for one-byte ids')
+    rest = sorted(found.responses, key=lambda text: (name(text) != FIXED_RESPONSE, text))
+    if not rest or name(rest[0]) != FIXED_RESPONSE:
+        raise BuildError(f'no response "{FIXED_RESPONSE}" is declared')
+    one_byte = 1 - ONE_BYTE_MIN
+    responses = {text: -index for index, text in enumerate(rest[:one_byte])}
+    responses |= {text: len(commands) + 1 + index for index, text in enumerate(rest[one_byte:])}
+    return commands, responses
 
 
 def string_ids(found: Declarations) -> dict[str, int]:
-    """Number the static strings from 2 on, sorted so that the build does not depend on the order of sources."""
-    return {string: i for i, string in enumerate(sorted(set(found.strings.values())), start=2)}
+    """Give numbers to the distinct static strings, from 2 on: 0 and 1 stay free for 'none'."""
+    return {text: index + 2 for index, text in enumerate(sorted(set(found.strings.values())))}
 
 
-def fingerprint(sources: list[str]) -> str:
-    """Return eight digits of a hash over the sources and all firmware headers: which firmware is this."""
-    digest = hashlib.sha256()
-    for path in [*sorted(map(Path, sources)), *sorted(FIRMWARE.rglob("*.h")), Path(__file__)]:
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:8]
-
-
-def dictionary(found: Declarations, ids: dict[str, int], version: str, compiler: str) -> dict[str, object]:
-    """Return the dictionary as the host will see it."""
-    return {
+def dictionary(found: Declarations, version: str, build_versions: str) -> bytes:
+    """Return the dictionary's JSON."""
+    commands, responses = assign_ids(found)
+    content = {
         "app": "canductor",
-        "license": "Apache-2.0",
-        "version": version,
-        "build_versions": compiler,
-        "commands": {message: ids[message] for message in found.commands},
-        "responses": {message: ids[message] for message in found.responses.values()},
-        "output": {},
-        "enumerations": {**found.enumerations, "static_string_id": string_ids(found)},
+        "build_versions": build_versions,
+        "commands": commands,
         "config": found.constants,
+        "enumerations": found.enumerations | {"static_string_id": string_ids(found)},
+        "license": "Apache-2.0",
+        "output": {},
+        "responses": responses,
+        "version": version,
     }
+    return json.dumps(content, separators=(",", ":"), sort_keys=True).encode()
 
 
-def function_list(table: str, functions: list[str]) -> list[str]:
-    """Return the C of a list of functions; never empty, because C has no empty arrays."""
-    prototypes = [f"void {function}(struct node *);" for function in functions]
-    return [*prototypes, f"static const node_function {table}[] = {{{', '.join([*functions, 'NULL'])}}};"]
-
-
-def types_of(symbol: str, message: str) -> tuple[str, int]:
-    """Return the C array of a message's parameter types and its length."""
-    types = parameter_types(message)
-    return f"static const uint8_t {symbol}[] = {{{', '.join(types) or '0'}}};", len(types)
-
-
-def command_lines(found: Declarations, ids: dict[str, int]) -> list[str]:
-    """Return the C of the command table."""
-    numbers = [ids[message] for message in found.commands]
-    first, last = min(numbers), max(numbers)
-    lines, rows = [], []
-    for message, (function, flags) in found.commands.items():
-        array, count = types_of(f"types_of_{function}", message)
-        lines += [f"void {function}(struct node *, const struct wire_arg *);", array]
-        rows.append(f"    [{ids[message] - first}] = {{{function}, types_of_{function}, {count}, {flags}}},")
-    size = last - first + 1
-    return [
-        *lines,
-        f"static const struct command commands[{size}] = {{",
-        *rows,
-        "};",
-        f"enum {{ FIRST_ID = {first}, COMMAND_COUNT = {size} }};",
-    ]
-
-
-def c_source(found: Declarations, ids: dict[str, int], blob: bytes, version: str) -> str:
-    """Return the generated C file."""
-    lines = [
-        f"// Made by firmware/tools/gen_dictionary.py from the declarations of firmware {version}; do not edit.",
-        '#include "core/tables.h"',
-        *command_lines(found, ids),
-    ]
-    for symbol, message in found.responses.items():
-        if name_of(message) != symbol:
-            fail(f"response {symbol} has the format {message!r}, which must begin with its name")
-        array, count = types_of(f"types_of_response_{symbol}", message)
-        entry = f"{{{ids[message]}, {count}, types_of_response_{symbol}}}"
-        lines += [array, f"const struct response response_{symbol} = {entry};"]
+def tables(found: Declarations, blob: bytes) -> Iterator[str]:
+    """Yield the lines of the C file."""
+    commands, responses = assign_ids(found)
+    yield "// Made by firmware/tools/gen_dictionary.py; do not edit."
+    yield '#include "core/node.h"'
     numbers = string_ids(found)
-    lines += [
-        f"const uint16_t string_{symbol} = {numbers[string]};" for symbol, string in found.strings.items()
-    ]
-    tasks = found.functions["task"]
-    if len(tasks) > 32:
-        fail("more than 32 tasks; the set of woken tasks is one 32-bit word")
-    lines += [f"const uint8_t {task}_index = {i};" for i, task in enumerate(tasks)]
+    for symbol, text in found.strings.items():
+        yield f"const uint16_t string_{symbol} = {numbers[text]};"
+    for text, symbol in found.responses.items():
+        types = parameter_types(text)
+        yield f"static const uint8_t types_{symbol}[] = {{{', '.join([*types, '0'])}}};"
+        yield (
+            f"const struct node_response response_{symbol} = "
+            f"{{.types = types_{symbol}, .id = {responses[text]}, .arg_count = {len(types)}}};"
+        )
+    for handler, _ in found.commands.values():
+        yield f"void {handler}(struct node *node, const struct wire_arg *args);"
+    for text, (handler, _) in found.commands.items():
+        yield f"static const uint8_t types_{handler}[] = {{{', '.join([*parameter_types(text), '0'])}}};"
+    yield "static const struct node_command commands[] = {"
+    for text, value in commands.items():
+        handler, flags = found.commands[text]
+        count = len(parameter_types(text))
+        yield f"    [{value}] = {{{handler}, types_{handler}, {count}, {flags}}},"
+    yield "};"
     for kind, functions in found.functions.items():
-        lines += function_list(f"{kind}s", functions)
-    counts = {kind: len(functions) for kind, functions in found.functions.items()}
-    rows = [", ".join(map(str, blob[i : i + 24])) + "," for i in range(0, len(blob), 24)]
-    return "\n".join(
-        [
-            *lines,
-            f"static const uint8_t dictionary[{len(blob)}] = {{",
-            *rows,
-            "};",
-            "const struct tables node_tables = {commands, FIRST_ID, COMMAND_COUNT, inits, tasks, shutdowns,",
-            f"    {counts['init']}, {counts['task']}, {counts['shutdown']}, dictionary, sizeof(dictionary)}};",
-            "",
-        ]
-    )
+        for function in functions:
+            yield f"void {function}(struct node *node);"
+        # One null behind them: an empty array is not C.
+        yield f"static void (*const {kind}s[])(struct node *node) = {{{', '.join([*functions, 'NULL'])}}};"
+    yield "static const uint8_t dictionary[] = {"
+    for at in range(0, len(blob), 20):
+        yield "    " + "".join(f"{byte}," for byte in blob[at : at + 20])
+    yield "};"
+    yield "const struct node_tables node_tables = {"
+    yield "    .commands = commands, .tasks = tasks, .inits = inits, .hooks = hooks,"
+    yield f"    .dictionary = dictionary, .dictionary_size = {len(blob)},"
+    yield f"    .command_count = {max(commands.values()) + 1},"
+    yield ", ".join(f"    .{kind}_count = {len(found.functions[kind])}" for kind in found.functions) + ","
+    yield "};"
+
+
+def write_if_changed(path: Path, content: bytes) -> None:
+    """Write PATH only when its content is new, so that make rebuilds nothing in vain."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.exists() or path.read_bytes() != content:
+        path.write_bytes(content)
 
 
 def generate(
-    sources: list[str],
-    out: Path,
+    sources: Sequence[Path],
+    preprocess: Sequence[str],
+    output: Path,
     *,
-    cc: str = "gcc",
-    defines: Iterable[str] = (),
-    json_out: Path | None = None,
+    json_path: Path | None = None,
+    version: str = "unknown",
+    build_versions: str = "",
 ) -> None:
-    """Write OUT (and the dictionary to JSON_OUT) from the declarations in SOURCES."""
-    defines = list(defines)
-    found = collect(sources, cc, defines)
-    ids = assign_ids(found)
-    compiler = subprocess.run([cc, "--version"], capture_output=True, text=True, check=True).stdout
-    version = f"{RELEASE}-{fingerprint(sources)}"
-    content = dictionary(found, ids, version, compiler.splitlines()[0])
-    packed = json.dumps(content, separators=(",", ":"), sort_keys=True).encode()
-    source = c_source(found, ids, zlib.compress(packed, 9), version)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(source)
-    if json_out is not None:
-        json_out.write_bytes(packed)
+    """Write the tables of SOURCES to OUTPUT, and the inflated dictionary to JSON_PATH; raises BuildError."""
+    found = collect(sources, preprocess)
+    text = dictionary(found, version, build_versions)
+    write_if_changed(output, ("\n".join(tables(found, zlib.compress(text, 9))) + "\n").encode())
+    if json_path:
+        write_if_changed(json_path, text)
 
 
-def main() -> None:
-    """Command line; see the top of this file."""
-    parser = argparse.ArgumentParser(description="Collect declarations, write tables and dictionary.")
-    parser.add_argument("-o", dest="out", type=Path, required=True)
-    parser.add_argument("-D", dest="defines", action="append", default=[])
-    parser.add_argument("--json", type=Path, help="also write the dictionary, not compressed, here")
+def main() -> int:
+    """Run from a Makefile."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--json", type=Path)
     parser.add_argument("--cc", default="gcc")
-    parser.add_argument("sources", nargs="+")
+    parser.add_argument("--version", default="unknown")
+    parser.add_argument("--build-versions", default="")
+    parser.add_argument("-D", dest="defines", action="append", default=[])
+    parser.add_argument("-I", dest="includes", action="append", default=[])
+    parser.add_argument("sources", type=Path, nargs="+")
     options = parser.parse_args()
-    generate(options.sources, options.out, cc=options.cc, defines=options.defines, json_out=options.json)
+    preprocess = [
+        options.cc,
+        *(f"-D{define}" for define in options.defines),
+        *(f"-I{include}" for include in options.includes),
+    ]
+    try:
+        generate(
+            options.sources,
+            preprocess,
+            options.output,
+            json_path=options.json,
+            version=options.version,
+            build_versions=options.build_versions,
+        )
+    except BuildError as error:
+        print(f"gen_dictionary: {error}", file=sys.stderr)
+        return 1
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,9 +1,10 @@
 """A stepper motor on a node: its configuration, and where it stands."""
 
+import math
 from typing import Final
 
 from nodes.node import Node
-from nodes.node_config import NodeConfig
+from nodes.node_config import NodeConfig, NodeConfigError
 from nodes.node_errors import NodeError
 
 BOTH_EDGE_CONSTANTS: Final = ("STEPPER_BOTH_EDGE", "STEPPER_STEP_BOTH_EDGE")
@@ -19,8 +20,8 @@ COMMANDS: Final = (
 class Stepper:
     """Stepper NAME, on the pins of its node.
 
-    INVERT_STEP: a step is a falling edge. STEP_PULSE_S > 0 is how long the driver needs the step pin held.
-    BOTH_EDGES: the driver steps on every edge, and pulses are left out where the firmware can.
+    INVERT_STEP: a step is a falling edge. STEP_PULSE_S is how long the driver needs the step pin held, in s;
+    0 stands for a driver that is set to step on both edges, which needs no pulses.
     """
 
     def __init__(
@@ -31,28 +32,33 @@ class Stepper:
         dir_pin: str,
         invert_step: bool = False,
         step_pulse_s: float = 2e-6,
-        both_edges: bool = False,
     ) -> None:
         self.name = name
         self.oid: int | None = None
         """Its object id; known when its node's configuration is built."""
-        self.steps_on_both_edges = False
-        """Whether its node was configured so."""
         self.queue_step_id = self.set_next_step_dir_id = self.reset_step_clock_id = 0
         """Ids of the commands that move it, for the step compressor; from its node's dictionary."""
         self._step_pin = step_pin
         self._dir_pin = dir_pin
         self._invert_step = invert_step
         self._step_pulse_s = step_pulse_s
-        self._both_edges = both_edges
+
+    @property
+    def steps_on_both_edges(self) -> bool:
+        """Whether every change of the step pin is a step."""
+        return self._step_pulse_s == 0
 
     def configure(self, config: NodeConfig) -> None:
         """Add the stepper to its node's CONFIG; NodeConfigError when firmware or pins do not allow it."""
         dictionary = config.dictionary
         config.require(self.name, COMMANDS)
         able = any(dictionary.int_constant(name, 0) == 1 for name in BOTH_EDGE_CONSTANTS)
-        self.steps_on_both_edges = self._both_edges and able
-        pulse_ticks = 0 if self.steps_on_both_edges else round(self._step_pulse_s * dictionary.clock_freq_hz)
+        if self.steps_on_both_edges and not able:
+            raise NodeConfigError(
+                f"{self.name}: the firmware of node {config.name} ({dictionary.version}) cannot step on both "
+                "edges; set the driver to rising edges and give step_pulse_duration"
+            )
+        pulse_ticks = math.ceil(self._step_pulse_s * dictionary.clock_freq_hz)
         invert = -1 if self.steps_on_both_edges else int(self._invert_step)
         self.oid = config.create_oid()
         self.queue_step_id = dictionary.command("queue_step").message_id

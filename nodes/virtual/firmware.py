@@ -16,9 +16,7 @@ def firmware_path(build: str) -> Path:
     """Return the executable of BUILD; raises CanductorError when it is not there."""
     path = BIN / build
     if not path.is_file():
-        raise CanductorError(
-            f"the firmware {path} is missing; install the project again (make setup), it compiles the firmware"
-        )
+        raise CanductorError(f"the firmware {path} is missing; install the project again (make setup)")
     return path
 
 
@@ -28,5 +26,5 @@ def firmware_dictionary(build: str) -> Dictionary:
         return Dictionary.from_json((firmware_path(build).with_suffix(".json")).read_bytes())
     except OSError as error:
         raise CanductorError(
-            f"the dictionary of {build} cannot be read ({error.strerror}); install the project again (make setup)"
+            f"the dictionary of {build} cannot be read ({error.strerror}); install the project again"
         ) from None

@@ -58,14 +58,18 @@ class ChildProcess:
                 f"{name}: cannot be started without 'setpriv'; install the package util-linux"
             )
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (a pipe nobody reads would stop the process)
-        self._process: subprocess.Popen[bytes] = _starter.submit(
-            subprocess.Popen,
-            [setpriv, "--pdeathsig", "KILL", "--", *(str(word) for word in command)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=self._stderr,
-            start_new_session=True,
-        ).result()
+        try:
+            self._process: subprocess.Popen[bytes] = _starter.submit(
+                subprocess.Popen,
+                [setpriv, "--pdeathsig", "KILL", "--", *(str(word) for word in command)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=self._stderr,
+                start_new_session=True,
+            ).result()
+        except OSError as error:
+            self._stderr.close()
+            raise CanductorError(f"{name}: cannot start a process: {error.strerror}") from error
 
     @property
     def pid(self) -> int:
@@ -179,9 +183,9 @@ class NodeProcess(ChildProcess):
     """A virtual node: the project's firmware as a process.
 
     FLAVOUR is the board it plays. Exactly one of ``can`` (a virtual bus's socket), ``socketcan`` (an
-    interface) and ``uart`` (where to put the link to the node's pseudo-terminal) says how it is reached; the
-    last two parts of the clock are its rate error in ppm and its value at the start. ``jitter_us`` and
-    ``slice_us``: see the firmware.
+    interface) and ``uart`` (where to put the link to the node's pseudo-terminal) says how it is reached.
+    ``rate_ppm``: by how much its clock is too fast; ``start_clock``: where its clock starts. ``jitter_us``,
+    ``slice_us`` and ``seed``: see the firmware.
     """
 
     def __init__(

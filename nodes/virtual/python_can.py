@@ -38,7 +38,7 @@ class CanductorBus(can.BusABC):
         """Send MSG, waiting at most TIMEOUT seconds (None: 1) for room; raises can.CanOperationError."""
         if not is_plain(msg):
             raise can.CanOperationError(
-                f"{self.channel_info} carries only data frames with 11-bit ids, no extended, remote, error or FD"
+                f"{self.channel_info} carries only data frames with 11-bit ids, no extended, remote or FD"
                 " frames"
             )
         try:

@@ -48,17 +48,17 @@ def test_the_crc_tells_configurations_apart() -> None:
 
 
 @pytest.mark.parametrize(
-    ("constants", "wanted", "expected"),
+    ("constants", "pulse_s", "expected"),
     [
-        ({"STEPPER_BOTH_EDGE": 1}, True, "invert_step=-1 step_pulse_ticks=0"),
-        ({"STEPPER_STEP_BOTH_EDGE": 1}, True, "invert_step=-1 step_pulse_ticks=0"),
-        ({}, True, "invert_step=1 step_pulse_ticks=2"),
-        ({"STEPPER_BOTH_EDGE": 1}, False, "invert_step=1 step_pulse_ticks=2"),
+        ({"STEPPER_BOTH_EDGE": 1}, 0.0, "invert_step=-1 step_pulse_ticks=0"),
+        ({"STEPPER_STEP_BOTH_EDGE": 1}, 0.0, "invert_step=-1 step_pulse_ticks=0"),
+        ({}, 2e-6, "invert_step=1 step_pulse_ticks=2"),
+        ({"STEPPER_BOTH_EDGE": 1}, 1e-9, "invert_step=1 step_pulse_ticks=1"),
     ],
 )
-def test_both_edges_where_the_firmware_can(constants: dict[str, int], wanted: bool, expected: str) -> None:
+def test_pulses_or_both_edges(constants: dict[str, int], pulse_s: float, expected: str) -> None:
     dictionary = TwinNode(source=source_of(config={"CLOCK_FREQ": 1_000_000} | constants)).dictionary
-    stepper = stepper_x(both_edges=wanted, invert_step=True)
+    stepper = stepper_x(step_pulse_s=pulse_s, invert_step=True)
     config = make_config(stepper)(dictionary)
     assert config.config_commands[1].endswith(expected)
     assert stepper.steps_on_both_edges == ("-1" in expected)
@@ -67,6 +67,12 @@ def test_both_edges_where_the_firmware_can(constants: dict[str, int], wanted: bo
         -33,
         96,
     )
+
+
+def test_both_edges_need_firmware_that_can() -> None:
+    dictionary = TwinNode(source=source_of(config={"CLOCK_FREQ": 1_000_000})).dictionary
+    with pytest.raises(NodeConfigError, match="cannot step on both edges"):
+        make_config(stepper_x(step_pulse_s=0.0))(dictionary)
 
 
 def test_the_diagram_of_the_states_is_not_stale() -> None:

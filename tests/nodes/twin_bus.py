@@ -15,8 +15,9 @@ from typing import Any
 
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, Uuid
 from nodes.dictionary import Dictionary
+from nodes.link import LinkSettings
 from nodes.message_format import Message, Value
-from nodes.seams import LinkSettings, OnFrame, OnLost, OnResponses
+from nodes.seams import OnFrame, OnLost, OnResponses
 
 DATA = Path(__file__).parents[1] / "data" / "dictionary.json"
 DELAY_S = 0.0003

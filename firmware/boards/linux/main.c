@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// A virtual node as a process: its main loop.
-#include <inttypes.h>
+// The loop of a node that is a Linux process: linux.h says how it treats time.
+#define _GNU_SOURCE
+#include "boards/linux/linux.h"
+
 #include <poll.h>
 #include <signal.h>
 #include <stdio.h>
@@ -8,171 +10,198 @@
 #include <string.h>
 #include <sys/prctl.h>
 #include <sys/signalfd.h>
-#include <time.h>
 #include <unistd.h>
 
-#include "boards/linux/linux_board.h"
-#include "net/uart_stream.h"
+// DISPATCH_MAX: timers in one go, so that a node with more to do than this machine can still hears its host.
+enum { NS_PER_US = 1000, FAILED = 1, DISPATCH_MAX = 500000 };
 
-enum { US_NS = 1000, S_NS = 1000000000 };
-
-void board_request_reset(struct node *node) {
-    board_of(node)->reset_wanted = true;
-}
-
-// As after power-on; the clock goes on, nobody outside can tell.
 static void start_node(struct linux_board *board) {
-    board->reset_wanted = false;
-    board->can_stream.nodeid = board->can_stream.wants_reply = board->can_stream.conflict = 0;
-    memcpy(board->can_stream.uuid, board->options.uuid, CAN_UUID_SIZE);
-    pins_reset(board);
-    bool is_uart = board->options.uart != NULL;
+    struct node *node = &board->virtual.node;
     struct node_config config = {
-        .clock_freq = BOARD_CLOCK_FREQ,
+        .clock_freq = virtual_variant.clock_freq,
+        .move_count = virtual_variant.move_count,
+        .clock_high = (uint32_t)(virtual_clock(&board->virtual) >> 32),
         .arena = board->arena,
-        .arena_size = ARENA_SIZE,
-        .move_count = BOARD_MOVE_COUNT,
-        .timer_slack_ticks = BOARD_CLOCK_FREQ / 10000,
-        .uptime_high = (uint32_t)(clock_now(board) >> 32),
-        .transport = is_uart ? &uart_stream_transport : &can_stream_transport,
-        .transport_state = is_uart ? NULL : &board->can_stream,
-        .board = board,
+        .arena_size = sizeof(board->arena),
     };
-    node_init(&board->node, &config);
-    if (!is_uart)
-        can_stream_start(&board->node);
+    memcpy(config.uuid, board->options.uuid, sizeof(config.uuid));
+    virtual_pins_reset(&board->virtual);
+    if (board->options.link != LINK_UART)
+        can_stream_attach(node, &board->can);
+    node_start(node, &config);
 }
 
-// ---------------------------------------------------------------------------------------------------- timers
-
-// Widens a 32-bit clock that lies near the 64-bit one.
-static uint64_t widen(uint32_t clock, uint64_t near) {
-    return near + (uint64_t)(int64_t)(int32_t)(clock - (uint32_t)near);
+// A restart as by a power cycle, except that the clock goes on: the edge log stays readable.
+static void restart_node(struct linux_board *board) {
+    link_flush(board);
+    board->reset_wanted = 0;
+    board->resets++;
+    start_node(board);
 }
 
-static void run_timers(struct linux_board *board) {
-    uint64_t now = clock_now(board);
-    board->in_timer = true;
-    for (;;) {
-        uint64_t due = widen(board->node.timers->wake_clock, now);
-        if (due > now)
+// Until nothing is left to do, so that what waited for room to write goes on before anyone sleeps.
+static void run_tasks(struct linux_board *board) {
+    struct node *node = &board->virtual.node;
+    do {
+        node_run_tasks(node);
+        link_flush(board);
+        if (board->reset_wanted)
+            restart_node(board);
+    } while (node->tasks_pending);
+}
+
+void board_reset(struct node *node) {
+    ((struct linux_board *)node)->reset_wanted = 1;
+}
+
+// A 32-bit clock near the 64-bit clock NOW.
+static uint64_t extend(uint64_t now, uint32_t clock) {
+    return now + (uint64_t)(int64_t)(int32_t)(clock - (uint32_t)now);
+}
+
+static void dispatch_timers(struct linux_board *board) {
+    struct node *node = &board->virtual.node;
+    uint64_t now = clock_at(board, monotonic_ns());
+    board->dispatching = 1;
+    for (unsigned budget = DISPATCH_MAX; budget; budget--) {
+        const struct timer *first = node->sched.first;
+        if (!first || clock_before((uint32_t)now, first->waketime))
             break;
-        board->timer_clock = due;
-        uint64_t late = now - due;
-        board->late_ticks_sum += late;
-        board->late_ticks_max = late > board->late_ticks_max ? late : board->late_ticks_max;
-        board->timers++;
-        sched_dispatch(&board->node);
+        board->dispatch_clock = extend(now, first->waketime);
+        uint64_t late = now - board->dispatch_clock;
+        board->late_sum += late;
+        board->late_count++;
+        if (late > board->late_max)
+            board->late_max = late;
+        sched_run_first(node);
+        if (node->tasks_pending) // samples are handed on before the next ones come
+            node_run_tasks(node);
     }
-    board->in_timer = false;
+    board->dispatching = 0;
 }
 
-// How long to sleep: to the next timer, but not in slices so short that the process only wakes up.
-static struct timespec pause_of(const struct linux_board *board, int64_t now_ns) {
-    int64_t due_ns = ns_at(board, widen(board->node.timers->wake_clock, clock_at(board, now_ns)));
-    int64_t slice_ns = (int64_t)board->options.slice_us * US_NS;
-    int64_t wait_ns = due_ns - now_ns > slice_ns ? due_ns - now_ns : slice_ns;
-    return (struct timespec){.tv_sec = wait_ns / S_NS, .tv_nsec = wait_ns % S_NS};
+static uint64_t random_below(struct linux_board *board, uint64_t limit) {
+    // splitmix64
+    uint64_t z = (board->random += 0x9E3779B97F4A7C15u);
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9u;
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EBu;
+    return limit ? (z ^ (z >> 31)) % limit : 0;
 }
 
-// ---------------------------------------------------------------------------------------------------- main
-// loop
-
-static uint64_t next_random(struct linux_board *board) { // xorshift64*
-    board->random ^= board->random >> 12;
-    board->random ^= board->random << 25;
-    board->random ^= board->random >> 27;
-    return board->random * 0x2545F4914F6CDD1D;
+// Sleeps until input, room to write, a signal, HELD_UNTIL (if not 0) or the next timer, but at most once a
+// slice for timers. Returns -1 on a signal, else whether there is input to read.
+static int wait(struct linux_board *board, int signal_fd, uint64_t held_until) {
+    uint64_t now = monotonic_ns();
+    uint64_t clock = clock_at(board, now);
+    uint64_t until = ns_of_clock(board, extend(clock, node_next_deadline(&board->virtual.node))) + 1;
+    uint64_t slice_end = now + board->options.slice_us * NS_PER_US;
+    if (until < slice_end)
+        until = slice_end;
+    if (held_until && held_until < until)
+        until = held_until;
+    uint64_t wait_ns = until > now ? until - now : 0;
+    struct timespec timeout = {.tv_sec = (time_t)(wait_ns / 1000000000u),
+                               .tv_nsec = (long)(wait_ns % 1000000000u)};
+    struct pollfd fds[2] = {{.fd = signal_fd, .events = POLLIN}, {.fd = board->fd}};
+    fds[1].events = (short)((held_until ? 0 : POLLIN) | (board->out_size ? POLLOUT : 0));
+    // A hang-up is always reported: with input held back it would only spin.
+    if (!fds[1].events)
+        fds[1].fd = -1;
+    if (ppoll(fds, 2, &timeout, NULL) < 0)
+        return 0;
+    return fds[0].revents ? -1 : (fds[1].revents & ~POLLOUT) != 0;
 }
 
-static void delay_input(struct linux_board *board) {
-    if (!board->options.jitter_us)
-        return;
-    uint64_t us = next_random(board) % (board->options.jitter_us + 1);
-    struct timespec delay = {.tv_nsec = (long)(us * US_NS)};
-    nanosleep(&delay, NULL);
-}
-
-// Waits and handles what comes; returns false when it is time to end.
-static bool wait_and_read(struct linux_board *board) {
-    struct timespec pause = pause_of(board, monotonic_ns());
-    struct pollfd fds[2] = {
-        {.fd = board->fd, .events = POLLIN},
-        {.fd = board->signal_fd, .events = POLLIN},
-    };
-    if (board->out_from < board->out_to)
-        fds[0].events |= POLLOUT;
-    ppoll(fds, 2, &pause, NULL);
-    if (fds[0].revents & (POLLIN | POLLHUP | POLLERR)) {
-        delay_input(board);
-        wires_read(board);
-    }
-    return !fds[1].revents && !board->closed;
-}
-
-static void run(struct linux_board *board) {
-    while (wait_and_read(board)) {
-        run_timers(board);
-        while (node_run_tasks(&board->node))
-            run_timers(board);
-        wires_write(board);
-        if (board->reset_wanted) {
-            board->in_size = board->out_from = board->out_to = 0;
-            start_node(board);
+static void run(struct linux_board *board, int signal_fd) {
+    uint64_t held_until = 0; // jitter: input that is there is read only then
+    while (!board->closed) {
+        dispatch_timers(board);
+        run_tasks(board);
+        int readable = wait(board, signal_fd, held_until);
+        if (readable < 0)
+            break;
+        if (held_until) {
+            readable = monotonic_ns() >= held_until;
+            held_until = readable ? 0 : held_until;
+        } else if (readable && board->options.jitter_us) {
+            held_until = monotonic_ns() + random_below(board, board->options.jitter_us * NS_PER_US + 1);
+            readable = 0;
+        }
+        if (readable) {
+            dispatch_timers(board); // what was due before the input came
+            link_read(board);
         }
     }
+    link_flush(board);
 }
 
 static void print_statistics(const struct linux_board *board) {
-    const struct link *link = &board->node.link;
-    const double us = 1e6 / BOARD_CLOCK_FREQ;
-    double mean = board->timers ? (double)board->late_ticks_sum / (double)board->timers * us : 0;
-    printf("{\"edges\": %" PRIu64 ", \"timers\": %" PRIu64 ", \"timer_late_us_mean\": %.1f, "
-           "\"timer_late_us_max\": %.1f, \"bytes_in\": %" PRIu64 ", \"bytes_out\": %" PRIu64
-           ", \"frames_in\": %" PRIu64 ", \"frames_out\": %" PRIu64 ", \"frames_bad\": %" PRIu64
-           ", \"blocks\": %" PRIu32 ", \"blocks_damaged\": %" PRIu32 ", \"blocks_out_of_order\": %" PRIu32
-           ", \"bytes_dropped\": %" PRIu32 ", \"responses_dropped\": %" PRIu32 ", \"is_shutdown\": %s}\n",
-           board->edges, board->timers, mean, (double)board->late_ticks_max * us, board->bytes_in,
-           board->bytes_out, board->frames_in, board->frames_out, board->frames_bad, link->blocks,
-           link->losses, link->out_of_order, link->receive_dropped, link->transmit_dropped,
-           board->node.is_shutdown ? "true" : "false");
+    const struct node_stats *stats = &board->virtual.node.stats;
+    double us_per_tick = 1e6 / board->rate;
+    double mean = board->late_count ? (double)board->late_sum / (double)board->late_count : 0;
+    printf("{\"edges\":%llu,\"bytes_in\":%llu,\"bytes_out\":%llu,\"frames_in\":%llu,\"frames_out\":%llu,"
+           "\"timers\":%llu,\"late_us_max\":%.1f,\"late_us_mean\":%.1f,\"resets\":%llu,\"blocks\":%u,"
+           "\"lost\":%u,\"out_of_order\":%u,\"overflow_bytes\":%u,\"tx_dropped\":%u}\n",
+           (unsigned long long)board->virtual.edges_total, (unsigned long long)board->bytes_in,
+           (unsigned long long)board->bytes_out, (unsigned long long)board->frames_in,
+           (unsigned long long)board->frames_out, (unsigned long long)board->late_count,
+           (double)board->late_max * us_per_tick, mean * us_per_tick, (unsigned long long)board->resets,
+           stats->rx_blocks, stats->rx_lost, stats->rx_out_of_order, stats->rx_overflow_bytes,
+           stats->tx_dropped);
+    fflush(stdout);
 }
 
-static int open_signals(void) {
-    sigset_t ends;
-    sigemptyset(&ends);
-    sigaddset(&ends, SIGTERM);
-    sigaddset(&ends, SIGINT);
-    sigprocmask(SIG_BLOCK, &ends, NULL);
-    signal(SIGPIPE, SIG_IGN);
-    prctl(PR_SET_PDEATHSIG, SIGTERM); // a node does not outlive who started it
-    return signalfd(-1, &ends, SFD_CLOEXEC);
+// Prints TEXT as a JSON string.
+static void print_quoted(const char *text) {
+    putchar('"');
+    for (; *text; text++)
+        if (*text == '"' || *text == '\\')
+            printf("\\%c", *text);
+        else if ((unsigned char)*text < ' ')
+            printf("\\u%04x", (unsigned)*text);
+        else
+            putchar(*text);
+    putchar('"');
+}
+
+static void print_ready(const struct linux_board *board) {
+    printf("{\"ready\":true");
+    if (board->options.link == LINK_UART) {
+        printf(",\"uart\":");
+        print_quoted(board->options.target);
+    }
+    puts("}");
+    fflush(stdout);
 }
 
 int main(int argc, char **argv) {
     struct linux_board *board = calloc(1, sizeof(*board));
     if (!board)
-        return EXIT_FAILURE;
+        return FAILED;
     int status = options_parse(&board->options, argc, argv);
     if (status)
         return status;
-    board->random = board->options.seed * 2 + 1;
-    board->rate_mHz = (uint64_t)(BOARD_CLOCK_FREQ * (1 + board->options.rate_ppm * 1e-6) * 1000 + 0.5);
+    prctl(PR_SET_PDEATHSIG, SIGTERM);
+    signal(SIGPIPE, SIG_IGN);
+    sigset_t ending;
+    sigemptyset(&ending);
+    sigaddset(&ending, SIGTERM);
+    sigaddset(&ending, SIGINT);
+    sigprocmask(SIG_BLOCK, &ending, NULL);
+    int signal_fd = signalfd(-1, &ending, SFD_CLOEXEC);
+
+    board->rate = virtual_variant.clock_freq * (1.0 + board->options.rate_ppm * 1e-6);
+    board->random = board->options.seed;
+    board->start_clock = board->options.start_clock;
     board->start_ns = monotonic_ns();
-    board->signal_fd = open_signals();
-    if (wires_open(board))
-        return EXIT_FAILURE;
-    if (edge_log_open(board)) {
-        fprintf(stderr, "canductor-node: cannot write the log %s; name another file\n",
-                board->options.edge_log);
-        return EXIT_FAILURE;
-    }
+    if (signal_fd < 0 || link_open(board) || edge_log_open(board))
+        return FAILED;
     start_node(board);
-    printf("{\"ready\": true, \"uart\": \"%s\"}\n", board->options.uart ? board->options.uart : "");
-    fflush(stdout);
-    run(board);
-    wires_close(board);
+    print_ready(board);
+    run(board, signal_fd);
     edge_log_close(board);
+    link_close(board);
     print_statistics(board);
-    return EXIT_SUCCESS;
+    free(board);
+    return 0;
 }

@@ -33,7 +33,7 @@ def test_the_small_machine(tmp_path: Path) -> None:
         ("extruder", "toolhead", (0, 0, 0, 1)),
     ]
     assert [s.step_distance for s in machine.steppers] == [0.0125, 0.0125, 0.0025, 22.5 / 3200]
-    assert all(s.step_pulse_s is None and s.enable_pin is None for s in machine.steppers)
+    assert all(s.step_pulse_s == 2e-6 and s.enable_pin is None for s in machine.steppers)
     assert machine.not_yet_acting == ()
     assert machine.notes == ()
 

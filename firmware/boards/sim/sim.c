@@ -1,0 +1,231 @@
+// SPDX-License-Identifier: Apache-2.0
+// The simulated board: see sim.h.
+#include "boards/sim/sim.h"
+
+#include "boards/virtual/virtual.h"
+#include "net/can_stream.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+enum { EDGES_AT_FIRST = 1024, ARENA = 64 * 1024 };
+
+struct sim_board {
+    struct virtual_board virtual;
+    struct can_stream can;
+    uint64_t clock;
+    uint64_t edges_lost;
+    uint8_t uuid[NODE_UUID_SIZE];
+    uint8_t on_can, reset_wanted;
+    uint8_t out[SIM_OUT_ROOM];
+    size_t out_size;
+    _Alignas(16) uint8_t arena[ARENA];
+};
+
+// ------------------------------------------------------------------------------------------------ life and
+// time
+
+static void start(struct sim_board *board) {
+    struct node_config config = {
+        .clock_freq = virtual_variant.clock_freq,
+        .move_count = virtual_variant.move_count,
+        .clock_high = (uint32_t)(board->clock >> 32),
+        .arena = board->arena,
+        .arena_size = sizeof(board->arena),
+    };
+    memcpy(config.uuid, board->uuid, sizeof(config.uuid));
+    board->reset_wanted = 0;
+    virtual_pins_reset(&board->virtual);
+    if (board->on_can)
+        can_stream_attach(&board->virtual.node, &board->can);
+    node_start(&board->virtual.node, &config);
+    node_run_tasks(&board->virtual.node);
+}
+
+static void run_tasks(struct sim_board *board) {
+    struct node *node = &board->virtual.node;
+    if (node->tasks_pending)
+        node_run_tasks(node);
+    if (board->reset_wanted)
+        start(board);
+}
+
+struct sim_board *sim_new(const uint8_t *uuid, uint64_t start_clock, int on_can) {
+    struct sim_board *board = calloc(1, sizeof(*board));
+    if (!board)
+        return NULL;
+    board->virtual.edges = malloc(EDGES_AT_FIRST * sizeof(uint64_t));
+    if (!board->virtual.edges) {
+        free(board);
+        return NULL;
+    }
+    board->virtual.edge_room = EDGES_AT_FIRST;
+    board->clock = start_clock;
+    board->on_can = on_can != 0;
+    memcpy(board->uuid, uuid, sizeof(board->uuid));
+    start(board);
+    return board;
+}
+
+void sim_free(struct sim_board *board) {
+    free(board->virtual.edges);
+    free(board);
+}
+
+void sim_restart(struct sim_board *board) {
+    start(board);
+}
+
+static uint64_t extend(const struct sim_board *board, uint32_t clock) {
+    return board->clock + (uint64_t)(int64_t)(int32_t)(clock - (uint32_t)board->clock);
+}
+
+uint64_t sim_next_deadline(const struct sim_board *board) {
+    return extend(board, node_next_deadline(&board->virtual.node));
+}
+
+void sim_run_until(struct sim_board *board, uint64_t clock) {
+    struct node *node = &board->virtual.node;
+    for (;;) {
+        uint64_t deadline = sim_next_deadline(board);
+        if (deadline > clock)
+            break;
+        if (deadline > board->clock)
+            board->clock = deadline;
+        const struct timer *first = node->sched.first;
+        if (first && first->waketime == (uint32_t)deadline)
+            sched_run_first(node);
+        else
+            node_wake_tasks(node); // the periodic report
+        run_tasks(board);
+    }
+    if (clock > board->clock)
+        board->clock = clock;
+}
+
+uint64_t sim_clock(const struct sim_board *board) {
+    return board->clock;
+}
+
+uint32_t board_clock(struct node *node) {
+    return (uint32_t)((struct sim_board *)node)->clock;
+}
+
+uint64_t virtual_clock(struct virtual_board *virtual) {
+    return ((struct sim_board *)virtual)->clock;
+}
+
+void board_reset(struct node *node) {
+    ((struct sim_board *)node)->reset_wanted = 1;
+}
+
+// ----------------------------------------------------------------------------------------------------- wires
+
+void sim_receive_frame(struct sim_board *board, uint32_t id, const uint8_t *data, size_t size) {
+    if (!board->on_can)
+        return;
+    can_stream_receive(&board->virtual.node, id, data, size);
+    run_tasks(board);
+}
+
+void sim_receive_bytes(struct sim_board *board, const uint8_t *data, size_t size) {
+    if (board->on_can)
+        return;
+    node_receive(&board->virtual.node, data, size);
+    run_tasks(board);
+}
+
+static int put(struct sim_board *board, const void *data, size_t size) {
+    if (size > SIM_OUT_ROOM - board->out_size)
+        return -1;
+    memcpy(board->out + board->out_size, data, size);
+    board->out_size += size;
+    return 0;
+}
+
+int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t size) {
+    uint8_t record[SIM_FRAME_SIZE] = {0};
+    memcpy(record, &id, sizeof(id));
+    record[4] = (uint8_t)size;
+    memcpy(record + 8, data, size);
+    return put((struct sim_board *)node, record, sizeof(record));
+}
+
+size_t board_uart_send(struct node *node, const uint8_t *data, size_t size) {
+    return put((struct sim_board *)node, data, size) ? 0 : size;
+}
+
+size_t sim_take(struct sim_board *board, uint8_t *out, size_t size) {
+    if (size > board->out_size)
+        size = board->out_size;
+    if (board->on_can)
+        size -= size % SIM_FRAME_SIZE;
+    memcpy(out, board->out, size);
+    board->out_size -= size;
+    memmove(board->out, board->out + size, board->out_size);
+    node_wake_tasks(&board->virtual.node); // there is room again
+    run_tasks(board);
+    return size;
+}
+
+// ------------------------------------------------------------------------------------------------------ pins
+
+int sim_set_input(struct sim_board *board, uint32_t pin, int level) {
+    if (pin >= VIRTUAL_PINS)
+        return -1;
+    board->virtual.level[pin] = level != 0;
+    return 0;
+}
+
+int sim_set_adc(struct sim_board *board, uint32_t pin, uint16_t value) {
+    if (pin >= VIRTUAL_PINS || value > VIRTUAL_ADC_MAX)
+        return -1;
+    board->virtual.adc[pin] = value;
+    return 0;
+}
+
+int sim_level(const struct sim_board *board, uint32_t pin) {
+    return pin < VIRTUAL_PINS ? board->virtual.level[pin] : -1;
+}
+
+int sim_pwm(const struct sim_board *board, uint32_t pin) {
+    return pin < VIRTUAL_PINS ? board->virtual.pwm[pin] : -1;
+}
+
+void virtual_edges_full(struct virtual_board *virtual) {
+    uint64_t *more = realloc(virtual->edges, 2 * virtual->edge_room * sizeof(uint64_t));
+    if (more) {
+        virtual->edges = more;
+        virtual->edge_room *= 2;
+    } else {
+        ((struct sim_board *)virtual)->edges_lost += virtual->edge_count;
+        virtual->edge_count = 0;
+    }
+}
+
+const uint64_t *sim_edges(const struct sim_board *board, size_t *count) {
+    *count = board->virtual.edge_count;
+    return board->virtual.edges;
+}
+
+void sim_edges_forget(struct sim_board *board) {
+    board->virtual.edge_count = 0;
+}
+
+uint64_t sim_edges_lost(const struct sim_board *board) {
+    return board->edges_lost;
+}
+
+void sim_counters(const struct sim_board *board, struct sim_counters *out) {
+    const struct node *node = &board->virtual.node;
+    *out = (struct sim_counters){
+        .rx_overflow_bytes = node->stats.rx_overflow_bytes,
+        .rx_lost = node->stats.rx_lost,
+        .rx_out_of_order = node->stats.rx_out_of_order,
+        .rx_blocks = node->stats.rx_blocks,
+        .tx_dropped = node->stats.tx_dropped,
+        .timers_run = node->stats.timers_run,
+        .clock_freq = node->config.clock_freq,
+        .node_id = board->can.node_id,
+    };
+}

@@ -1,0 +1,57 @@
+// SPDX-License-Identifier: Apache-2.0
+// The simulated board: one node whose time and wires are in its owner's hand. Nothing is read from the
+// system.
+//
+// Time only moves in sim_run_until(), from event to event; an input acts at the clock reached so far. Answers
+// are gathered until they are taken; the room for them is bounded (SIM_OUT_ROOM), behind it the node's own
+// transmit buffer fills up and its commands wait. Edges are kept until taken.
+#ifndef BOARDS_SIM_H
+#define BOARDS_SIM_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+// cffi: begin
+struct sim_board;
+
+enum { SIM_FRAME_SIZE = 16, SIM_OUT_ROOM = 65536 };
+
+// A node that starts at START_CLOCK (below 2^47), on CAN or on a UART. Null when memory is out.
+struct sim_board *sim_new(const uint8_t *uuid, uint64_t start_clock, int on_can);
+void sim_free(struct sim_board *board);
+// As after a power cycle: unconfigured, without node id. The clock goes on.
+void sim_restart(struct sim_board *board);
+
+void sim_receive_frame(struct sim_board *board, uint32_t id, const uint8_t *data, size_t size);
+void sim_receive_bytes(struct sim_board *board, const uint8_t *data, size_t size);
+// Executes everything that is due up to and including CLOCK, then lets CLOCK be now. Earlier clocks do
+// nothing.
+void sim_run_until(struct sim_board *board, uint64_t clock);
+uint64_t sim_clock(const struct sim_board *board);
+// The clock of the next event without input.
+uint64_t sim_next_deadline(const struct sim_board *board);
+
+// Copies out up to SIZE bytes of what the node said, oldest first, and forgets them. On CAN they are records
+// of SIM_FRAME_SIZE bytes: u32 id, u8 length, three zeros, eight bytes of data; only whole records are taken.
+size_t sim_take(struct sim_board *board, uint8_t *out, size_t size);
+
+// Pins (0..143): level of an input, sample of a converter, value of a PWM. Return -1 for another pin.
+int sim_set_input(struct sim_board *board, uint32_t pin, int level);
+int sim_set_adc(struct sim_board *board, uint32_t pin, uint16_t value);
+int sim_level(const struct sim_board *board, uint32_t pin);
+int sim_pwm(const struct sim_board *board, uint32_t pin);
+
+// Changes of outputs since the last sim_edges_forget(): clock << 16 | pin << 1 | level.
+const uint64_t *sim_edges(const struct sim_board *board, size_t *count);
+void sim_edges_forget(struct sim_board *board);
+// Edges that were lost because memory was out.
+uint64_t sim_edges_lost(const struct sim_board *board);
+
+struct sim_counters {
+    uint32_t rx_overflow_bytes, rx_lost, rx_out_of_order, rx_blocks, tx_dropped, timers_run;
+    uint32_t clock_freq, node_id;
+};
+void sim_counters(const struct sim_board *board, struct sim_counters *out);
+// cffi: end
+
+#endif

@@ -1,0 +1,103 @@
+// SPDX-License-Identifier: Apache-2.0
+// Pins in memory. An input reads what the board's owner (or an output on the same pin) last put there.
+#include "boards/virtual/virtual.h"
+
+DECL_ENUMERATION_RANGE("pin", "PA0", 0, 16);
+DECL_ENUMERATION_RANGE("pin", "PB0", 16, 16);
+DECL_ENUMERATION_RANGE("pin", "PC0", 32, 16);
+DECL_ENUMERATION_RANGE("pin", "PD0", 48, 16);
+DECL_ENUMERATION_RANGE("pin", "PE0", 64, 16);
+DECL_ENUMERATION_RANGE("pin", "PF0", 80, 16);
+DECL_ENUMERATION_RANGE("pin", "PG0", 96, 16);
+DECL_ENUMERATION_RANGE("pin", "PH0", 112, 16);
+DECL_ENUMERATION_RANGE("pin", "PI0", 128, 16);
+
+DECL_CONSTANT("ADC_MAX", 4095);
+DECL_CONSTANT("PWM_MAX", 32768);
+_Static_assert(VIRTUAL_ADC_MAX == 4095 && VIRTUAL_PWM_MAX == 32768, "the constants above tell the host");
+
+static struct virtual_board *board_of(struct node *node) {
+    return (struct virtual_board *)node;
+}
+
+static int check(uint32_t pin) {
+    return pin < VIRTUAL_PINS ? 0 : -1;
+}
+
+static void set_output(struct virtual_board *board, uint32_t pin, int level) {
+    uint8_t value = level != 0;
+    if (board->level[pin] == value)
+        return;
+    board->level[pin] = value;
+    if (board->edge_count == board->edge_room)
+        virtual_edges_full(board);
+    board->edges[board->edge_count++] = virtual_clock(board) << 16 | pin << 1 | value;
+    board->edges_total++;
+}
+
+void virtual_pins_reset(struct virtual_board *board) {
+    for (uint32_t pin = 0; pin < VIRTUAL_PINS; pin++) {
+        set_output(board, pin, 0);
+        board->adc[pin] = VIRTUAL_ADC_IDLE;
+        board->pwm[pin] = 0;
+    }
+}
+
+int board_gpio_out(struct node *node, uint32_t pin, int level) {
+    if (check(pin))
+        return -1;
+    set_output(board_of(node), pin, level);
+    return 0;
+}
+
+void board_gpio_write(struct node *node, uint32_t pin, int level) {
+    set_output(board_of(node), pin, level);
+}
+
+int board_gpio_in(struct node *node, uint32_t pin, int pull) {
+    (void)node;
+    (void)pull; // nothing floats here
+    return check(pin);
+}
+
+int board_gpio_read(struct node *node, uint32_t pin) {
+    return board_of(node)->level[pin];
+}
+
+int board_adc_setup(struct node *node, uint32_t pin) {
+    (void)node;
+    return check(pin);
+}
+
+uint32_t board_adc_sample(struct node *node, uint32_t pin, uint16_t *value) {
+    *value = board_of(node)->adc[pin];
+    return 0;
+}
+
+int board_pwm_setup(struct node *node, uint32_t pin, uint32_t cycle_ticks, uint16_t value) {
+    (void)cycle_ticks;
+    if (check(pin))
+        return -1;
+    board_of(node)->pwm[pin] = value;
+    return 0;
+}
+
+void board_pwm_write(struct node *node, uint32_t pin, uint16_t value) {
+    board_of(node)->pwm[pin] = value;
+}
+
+// Everything runs in one thread: nothing to mask.
+uint32_t board_irq_save(struct node *node) {
+    (void)node;
+    return 0;
+}
+
+void board_irq_restore(struct node *node, uint32_t state) {
+    (void)node;
+    (void)state;
+}
+
+void board_can_status(struct node *node, struct board_can_status *out) {
+    (void)node;
+    *out = (struct board_can_status){.state = BOARD_CAN_ACTIVE};
+}

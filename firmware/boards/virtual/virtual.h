@@ -1,0 +1,35 @@
+// SPDX-License-Identifier: Apache-2.0
+// What the boards without a chip (linux, sim) share: pins in memory, and a log of every change of an output.
+#ifndef BOARDS_VIRTUAL_H
+#define BOARDS_VIRTUAL_H
+
+#include "boards/board.h"
+
+enum { VIRTUAL_PINS = 144, VIRTUAL_ADC_MAX = 4095, VIRTUAL_PWM_MAX = 32768, VIRTUAL_ADC_IDLE = 2048 };
+
+// First member of a board's own struct; its first member in turn is the node.
+struct virtual_board {
+    struct node node;
+    uint8_t level[VIRTUAL_PINS];
+    uint16_t adc[VIRTUAL_PINS], pwm[VIRTUAL_PINS];
+    // Changes of outputs, oldest first: clock (48 bits) << 16 | pin << 1 | level.
+    uint64_t *edges;
+    size_t edge_count, edge_room;
+    uint64_t edges_total;
+};
+
+// What one variant of the boards is built as (constants.c).
+struct virtual_variant {
+    uint32_t clock_freq;
+    uint16_t move_count;
+};
+extern const struct virtual_variant virtual_variant;
+
+// All pins low, all converters in the middle of their range. Outputs that were high are logged as falling.
+void virtual_pins_reset(struct virtual_board *board);
+
+// From the board: its clock in 64 bits, and more room in (or a flush of) the full edge buffer.
+uint64_t virtual_clock(struct virtual_board *board);
+void virtual_edges_full(struct virtual_board *board);
+
+#endif

@@ -1,0 +1,250 @@
+// SPDX-License-Identifier: Apache-2.0
+// sources: firmware/wire/*.c firmware/core/*.c firmware/objects/*.c firmware/net/*.c
+// sources: firmware/boards/virtual/*.c firmware/boards/sim/sim.c build/sim/tables.c
+// Whatever a wire brings, a node survives: random commands with random arguments in sound blocks, and the
+// same with damage, under the sanitizers. Everything follows from the seed that a failure prints.
+#include "boards/sim/sim.h"
+#include "core/node.h"
+#include "tests/check.h"
+
+#include <string.h>
+
+enum { ROUNDS = 60, BLOCKS = 600, OIDS = 8 };
+
+DECL_COMMAND(command_config_reset, "", 0);
+DECL_COMMAND(command_allocate_oids, "", 0);
+DECL_COMMAND(command_finalize_config, "", 0);
+DECL_COMMAND(command_config_stepper, "", 0);
+DECL_COMMAND(command_config_trsync, "", 0);
+DECL_COMMAND(command_config_endstop, "", 0);
+DECL_COMMAND(command_config_digital_out, "", 0);
+DECL_COMMAND(command_config_pwm_out, "", 0);
+DECL_COMMAND(command_config_analog_in, "", 0);
+DECL_COMMAND(command_config_buttons, "", 0);
+
+DECL_COMMAND(command_queue_step, "", 0);
+DECL_COMMAND(command_set_next_step_dir, "", 0);
+DECL_COMMAND(command_reset_step_clock, "", 0);
+DECL_COMMAND(command_stepper_get_position, "", 0);
+DECL_COMMAND(command_stepper_stop_on_trigger, "", 0);
+DECL_COMMAND(command_trsync_start, "", 0);
+DECL_COMMAND(command_trsync_set_timeout, "", 0);
+DECL_COMMAND(command_trsync_trigger, "", 0);
+DECL_COMMAND(command_endstop_home, "", 0);
+DECL_COMMAND(command_endstop_query_state, "", 0);
+DECL_COMMAND(command_set_digital_out_pwm_cycle, "", 0);
+DECL_COMMAND(command_queue_digital_out, "", 0);
+DECL_COMMAND(command_update_digital_out, "", 0);
+DECL_COMMAND(command_queue_pwm_out, "", 0);
+DECL_COMMAND(command_query_analog_in, "", 0);
+DECL_COMMAND(command_buttons_query, "", 0);
+DECL_COMMAND(command_buttons_ack, "", 0);
+
+// What each object of configure() is used for; with `timed` the second argument is a clock.
+static const struct {
+    void (*handler)(struct node *node, const struct wire_arg *args);
+    uint8_t oid, timed;
+} uses[] = {
+    {command_queue_step, 0, 0},
+    {command_set_next_step_dir, 0, 1},
+    {command_reset_step_clock, 0, 1},
+    {command_stepper_get_position, 0, 1},
+    {command_stepper_stop_on_trigger, 0, 1},
+    {command_trsync_start, 2, 1},
+    {command_trsync_set_timeout, 2, 1},
+    {command_trsync_trigger, 2, 1},
+    {command_endstop_home, 3, 1},
+    {command_endstop_query_state, 3, 1},
+    {command_set_digital_out_pwm_cycle, 4, 0},
+    {command_queue_digital_out, 4, 1},
+    {command_update_digital_out, 4, 1},
+    {command_queue_pwm_out, 5, 1},
+    {command_query_analog_in, 6, 1},
+    {command_buttons_query, 7, 1},
+    {command_buttons_ack, 7, 1},
+    {command_queue_step, 1, 0},
+    {command_queue_step, 0, 0},
+    {command_queue_step, 1, 0},
+    {command_reset_step_clock, 1, 1},
+    {command_set_next_step_dir, 1, 1},
+};
+
+struct fuzz {
+    uint64_t state;
+    struct sim_board *board;
+    unsigned seq;
+    uint8_t out[SIM_OUT_ROOM];
+};
+
+static uint32_t below(struct fuzz *fuzz, uint32_t limit) {
+    uint64_t z = (fuzz->state += 0x9E3779B97F4A7C15u);
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9u;
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EBu;
+    return (uint32_t)((z ^ (z >> 31)) % limit);
+}
+
+// Mostly what makes sense somewhere: small numbers, clocks soon, sometimes anything.
+static uint32_t argument(struct fuzz *fuzz, uint8_t type, unsigned index) {
+    if (index == 0 && type == WIRE_U8 && below(fuzz, 20))
+        return below(fuzz, OIDS);
+    switch (below(fuzz, type == WIRE_U8 ? 3 : 6)) {
+    case 0:
+        return below(fuzz, 4);
+    case 1:
+        return below(fuzz, 150);
+    case 2:
+        return below(fuzz, 0xFFFFFFFF) + below(fuzz, 2);
+    default:
+        return (uint32_t)sim_clock(fuzz->board) + below(fuzz, 20000);
+    }
+}
+
+static size_t random_command(struct fuzz *fuzz, uint8_t *out, size_t room) {
+    static const uint8_t text[40] = "0123456789";
+    uint32_t id;
+    do
+        id = below(fuzz, node_tables.command_count);
+    while (!node_tables.commands[id].handler);
+    const struct node_command *command = &node_tables.commands[id];
+    struct wire_arg args[NODE_ARGS_MAX];
+    for (unsigned i = 0; i < command->arg_count; i++) {
+        args[i] = (struct wire_arg){.value = argument(fuzz, command->types[i], i)};
+        if (command->types[i] == WIRE_BYTES)
+            args[i] = (struct wire_arg){.value = below(fuzz, sizeof(text)), .data = text};
+    }
+    uint8_t number[WIRE_VLQ_MAX];
+    size_t size = wire_vlq_encode(number, (int32_t)id);
+    if (size > room)
+        return 0;
+    memcpy(out, number, size);
+    size_t packed = wire_pack(command->types, command->arg_count, args, out + size, room - size);
+    return packed || !command->arg_count ? size + packed : 0;
+}
+
+static size_t command(uint8_t *out, void (*handler)(struct node *, const struct wire_arg *),
+                      const struct wire_arg *args) {
+    uint32_t id = 0;
+    while (node_tables.commands[id].handler != handler)
+        CHECK(++id < node_tables.command_count);
+    const struct node_command *found = &node_tables.commands[id];
+    size_t size = wire_vlq_encode(out, (int32_t)id);
+    return size + wire_pack(found->types, found->arg_count, args, out + size, WIRE_CONTENT_MAX - size);
+}
+
+// One object of every kind, so that random commands find something to act on.
+static void configure(struct fuzz *fuzz) {
+    const struct {
+        void (*handler)(struct node *, const struct wire_arg *);
+        struct wire_arg args[6];
+    } setup[] = {
+        {command_config_reset, {INT(0)}},
+        {command_allocate_oids, {INT(OIDS)}},
+        {command_config_stepper, {INT(0), INT(1), INT(2), INT(255), INT(0)}},
+        {command_config_stepper, {INT(1), INT(3), INT(4), INT(below(fuzz, 2)), INT(below(fuzz, 50))}},
+        {command_config_trsync, {INT(2)}},
+        {command_config_endstop, {INT(3), INT(5), INT(1)}},
+        {command_config_digital_out, {INT(4), INT(6), INT(0), INT(1), INT(below(fuzz, 9000))}},
+        {command_config_pwm_out, {INT(5), INT(7), INT(9), INT(0), INT(0), INT(below(fuzz, 9000))}},
+        {command_config_analog_in, {INT(6), INT(8)}},
+        {command_config_buttons, {INT(7), INT(8)}},
+        {command_finalize_config, {INT(1)}},
+    };
+    for (size_t i = 0; i < sizeof(setup) / sizeof(*setup); i++) {
+        uint8_t block[WIRE_BLOCK_MAX];
+        size_t size = command(block + WIRE_HEADER, setup[i].handler, setup[i].args);
+        sim_receive_bytes(fuzz->board, block, wire_block_finish(block, size, fuzz->seq++));
+    }
+}
+
+// A command that makes sense, most of the time.
+static size_t sensible_command(struct fuzz *fuzz, uint8_t *out) {
+    uint32_t use = below(fuzz, sizeof(uses) / sizeof(*uses));
+    struct wire_arg args[NODE_ARGS_MAX] = {INT(uses[use].oid)};
+    uint32_t now = (uint32_t)sim_clock(fuzz->board);
+    for (unsigned i = 1; i < NODE_ARGS_MAX; i++)
+        args[i] = i == 1 && uses[use].timed ? INT(now + 100 + below(fuzz, 9000)) : INT(below(fuzz, 2000));
+    if (uses[use].handler == command_queue_step) {
+        args[1] = INT(1 + below(fuzz, 5000));
+        args[2] = INT(1 + below(fuzz, 20));
+        args[3] = INT(below(fuzz, 3));
+    } else if (uses[use].handler == command_query_analog_in) {
+        args[5] = INT(2 * below(fuzz, 5));
+        args[6] = INT(0);
+        args[7] = INT(40000);
+    } else if (uses[use].handler == command_endstop_home ||
+               uses[use].handler == command_stepper_stop_on_trigger) {
+        args[uses[use].oid ? 6 : 1] = INT(2);
+    }
+    return command(out, uses[use].handler, args);
+}
+
+static void send_block(struct fuzz *fuzz, int damage) {
+    uint8_t block[WIRE_BLOCK_MAX];
+    size_t size = 0, more, commands = 1 + below(fuzz, 4);
+    if (below(fuzz, 25))
+        size = sensible_command(fuzz, block + WIRE_HEADER);
+    else
+        while (commands-- &&
+               (more = random_command(fuzz, block + WIRE_HEADER + size, WIRE_CONTENT_MAX - size)))
+            size += more;
+    size = wire_block_finish(block, size, fuzz->seq++);
+    if (damage && !below(fuzz, 3))
+        block[below(fuzz, (uint32_t)size)] ^= (uint8_t)(1 + below(fuzz, 255));
+    sim_receive_bytes(fuzz->board, block, size);
+}
+
+// Follows the node's numbers, and checks that all it says is sound.
+static void listen(struct fuzz *fuzz) {
+    struct wire_scanner scanner = {0};
+    size_t size = sim_take(fuzz->board, fuzz->out, sizeof(fuzz->out)), at = 0;
+    for (;;) {
+        size_t skip, length;
+        enum wire_scan found = wire_scan(&scanner, fuzz->out + at, size - at, &skip, &length);
+        CHECK(found != WIRE_LOST && skip == 0);
+        if (found == WIRE_MORE)
+            break;
+        fuzz->seq = fuzz->out[at + 1] & WIRE_SEQ_MASK;
+        at += length;
+    }
+    CHECK_EQUAL(at, size);
+}
+
+static void one_round(uint64_t seed, int damage) {
+    static const uint8_t uuid[NODE_UUID_SIZE] = {0};
+    static struct fuzz fuzz;
+    fuzz = (struct fuzz){.state = seed, .board = sim_new(uuid, 0xFFFF0000u, 0)};
+    CHECK(fuzz.board);
+    configure(&fuzz);
+    unsigned lives = 0;
+    for (unsigned i = 0; i < BLOCKS; i++) {
+        send_block(&fuzz, damage);
+        sim_run_until(fuzz.board, sim_clock(fuzz.board) + below(&fuzz, 3000));
+        sim_set_input(fuzz.board, below(&fuzz, 144), (int)below(&fuzz, 2));
+        listen(&fuzz);
+        if (!below(&fuzz, 100)) {
+            sim_restart(fuzz.board);
+            fuzz.seq = 0;
+            configure(&fuzz);
+        } else if (((const struct node *)fuzz.board)->shutdown.active) {
+            lives++;
+            configure(&fuzz);
+        }
+        sim_edges_forget(fuzz.board);
+    }
+    CHECK(lives > 5); // it did get into trouble
+    // It still is a node: after a restart it can be asked.
+    sim_restart(fuzz.board);
+    sim_take(fuzz.board, fuzz.out, sizeof(fuzz.out));
+    uint8_t block[WIRE_BLOCK_MAX] = {[WIRE_HEADER] = 1, [WIRE_HEADER + 1] = 0, [WIRE_HEADER + 2] = 40};
+    sim_receive_bytes(fuzz.board, block, wire_block_finish(block, 3, 0));
+    CHECK_EQUAL(sim_take(fuzz.board, fuzz.out, sizeof(fuzz.out)), 43 + 2 * WIRE_BLOCK_MIN);
+    sim_free(fuzz.board);
+}
+
+int main(void) {
+    for (uint64_t seed = 1; seed <= ROUNDS; seed++) {
+        one_round(seed, 0);
+        one_round(seed + 1000, 1);
+    }
+    return 0;
+}
