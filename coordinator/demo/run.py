@@ -177,7 +177,7 @@ def _report(
                 min_lead_s=node.link.min_lead_s,
                 round_trip_s=node.link.srtt_s,
                 clock_error_bound_s=node.clock_error_s,
-                dispatch_late_s=float(figures[node.name].get("timer_late_us_max", 0.0)) * 1e-6,
+                dispatch_late_s=float(figures[node.name]["late_us_max"]) * 1e-6,
             )
             for node in outcome.nodes
         ),
