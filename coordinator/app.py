@@ -81,6 +81,11 @@ class Machine:
                 raise _first_cause(error) from None
             raise
         self._ready = True
+        for node in self.nodes.values():
+            self._node_changed(node)  # one may have failed while others still started
+        if self.stopped is not None:
+            await self.close()
+            raise self.stopped
 
     async def close(self) -> None:
         """Leave the nodes as they are and release everything."""
@@ -143,11 +148,11 @@ class Machine:
         return time_base.secondary_map(node.clock, node.dictionary.clock_freq_hz, print_time)
 
     async def stepper_positions(self) -> dict[str, int]:
-        """Ask every node how many steps its steppers stand from where they began."""
-        node_of = {stepper.name: stepper.node for stepper in self.description.steppers}
+        """Ask every node where its steppers stand: steps from where they began, positive as motion counts."""
         return {
-            name: await stepper.position(self.nodes[node_of[name]])
-            for name, stepper in self.devices.steppers.items()
+            stepper.name: (-1 if stepper.dir_pin.invert else 1)
+            * await self.devices.steppers[stepper.name].position(self.nodes[stepper.node])
+            for stepper in self.description.steppers
         }
 
     # ------------------------------------------------------------------------------------------ assembly

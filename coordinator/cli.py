@@ -7,6 +7,7 @@ that every failure ends in one place: one sentence on stderr, with --json also o
 import importlib
 import os
 import select
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Annotated, TypeVar, cast
 
 import typer
 
-from coordinator.commands import DemoOptions, PlanOptions, Report, RunOptions, find_machine
+from coordinator.commands import DemoOptions, PlanOptions, Report, RunOptions, Terminated, find_machine
 from nodes.errors import CanductorError
 
 Job = Callable[[], Report]
@@ -26,6 +27,7 @@ EXIT_USAGE = 2
 EXIT_BUG = 70
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
+EXIT_TERMINATED = 143
 
 # rich_markup_mode=None: plain help, and rich is not imported before something is to be drawn.
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -41,6 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit status; never raises but for SystemExit."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     as_json = "--json" in words
+    before = signal.signal(signal.SIGTERM, _terminate)
     try:
         status = _run(words, as_json)
         sys.stdout.flush()
@@ -49,7 +52,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _report_bug(as_json)
         _drop_stdout()
         return EXIT_BROKEN_PIPE
+    finally:
+        signal.signal(signal.SIGTERM, before)
     return status
+
+
+def _terminate(*_: object) -> None:
+    raise Terminated
 
 
 def _run(words: list[str], as_json: bool) -> int:
@@ -64,8 +73,13 @@ def _run(words: list[str], as_json: bool) -> int:
         return _fail(str(error), EXIT_FAILED, as_json)
     except _CommandLineError as error:
         return _fail(_usage_sentence(error), EXIT_USAGE, as_json)
-    except (KeyboardInterrupt, typer.Abort):
-        return _fail("stopped by Ctrl-C", EXIT_INTERRUPTED, as_json)
+    except (KeyboardInterrupt, typer.Abort) as error:
+        terminated = isinstance(error, Terminated)
+        return _fail(
+            "stopped by SIGTERM" if terminated else "stopped by Ctrl-C",
+            EXIT_TERMINATED if terminated else EXIT_INTERRUPTED,
+            as_json,
+        )
     except BrokenPipeError:
         raise
     except Exception:  # noqa: BLE001 (the last line of defence: whatever comes here is a bug, and is told so)

@@ -16,6 +16,10 @@ DEMO_MACHINE = EXAMPLES / "demo" / "machine.cfg"
 DEMO_GCODE = EXAMPLES / "demo" / "part.gcode"
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM ended a command, as Ctrl-C does."""
+
+
 class Report(Protocol):
     """What a command hands back: shown as text, or as one JSON object on the last line."""
 

@@ -1,22 +1,23 @@
 """One job on one machine: connect, run, ask the nodes where they stand; shared by ``run`` and ``demo``."""
 
-import asyncio
-import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from coordinator.app import Machine, link_of
+from coordinator.app import Machine, MachineStopped, link_of
+from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.machine.description import MachineDescription
 from coordinator.motion.planner import Planner
 from coordinator.pipeline import PlanRecord
-from coordinator.progress import NodeFigures, Progress, ProgressDisplay
+from coordinator.progress import NodeFigures, Progress
 from coordinator.streamer import JobState, Streamer, Told
 from coordinator.timebase import ClockMap
 from nodes.errors import CanductorError
 from nodes.link import LinkStats
+
+OnProgress = Callable[[Progress], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class Outcome:
     steps: int
     queue_steps: int
     positions: dict[str, int]
-    """By stepper: steps from where it began, as its node counts them."""
+    """By stepper: steps that the job moved it by, as its node counts them."""
     issued: dict[str, int]
     """By stepper: steps that the host's commands add up to."""
     maps: dict[str, ClockMap]
@@ -56,7 +57,7 @@ def homed_positions(description: MachineDescription) -> dict[str, float]:
 async def run_job(
     description: MachineDescription,
     program: Program,
-    display: ProgressDisplay,
+    on_progress: OnProgress,
     *,
     record: PlanRecord | None = None,
     on_told: Callable[[Told], None],
@@ -64,37 +65,44 @@ async def run_job(
 ) -> Outcome:
     """Connect to the machine, run PROGRAM on it and return what became of it.
 
-    Raises CanductorError. Whatever ends the job before its end (a failure, Ctrl-C, SIGTERM) stops all nodes.
+    Raises CanductorError. Whatever ends the job before its end stops all nodes, but for a bad line of the
+    program: what came before it is carried out, and the machine stands.
     """
-    task = asyncio.current_task()
-    assert task is not None
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
     machine = Machine(description)
     await machine.start()
     if on_ready is not None:
         on_ready(machine)
     try:
-        return await _print(machine, program, display, record, on_told)
-    except asyncio.CancelledError:
-        machine.stop("stopped by the user")
+        return await _print(machine, program, on_progress, record, on_told)
+    except GCodeError:
+        raise
+    except BaseException as error:
+        machine.stop(f"{error or 'stopped by the user'}")
+        confirmed = await machine.confirm_stop()
+        if isinstance(error, CanductorError):
+            raise MachineStopped(f"{machine.stopped}{_confirmation(confirmed)}") from None
         raise
     finally:
-        if machine.stopped is not None:
-            await machine.confirm_stop()
         await machine.close()
+
+
+def _confirmation(confirmed_s: dict[str, float]) -> str:
+    """Return the part of the sentence that tells how fast the other nodes stopped."""
+    others = [f"{name} after {delay_s * 1e3:.0f} ms" for name, delay_s in confirmed_s.items()]
+    return f" ({', '.join(others)})" if others else ""
 
 
 async def _print(
     machine: Machine,
     program: Program,
-    display: ProgressDisplay,
+    on_progress: OnProgress,
     record: PlanRecord | None,
     on_told: Callable[[Told], None],
 ) -> Outcome:
     began = time.monotonic()
 
     def show(state: JobState) -> None:
-        display.update(
+        on_progress(
             Progress(
                 done=state.done_bytes,
                 total=state.size_bytes or 0,
@@ -104,13 +112,15 @@ async def _print(
             )
         )
 
+    began_at = await machine.stepper_positions()
     job = Job(program, Planner(machine.description.limits), homed_positions(machine.description))
     streamer = Streamer(machine, job, record=record, on_told=on_told, on_state=show)
     await streamer.run()
-    return await _outcome(machine, streamer)
+    return await _outcome(machine, streamer, began_at)
 
 
-async def _outcome(machine: Machine, streamer: Streamer) -> Outcome:
+async def _outcome(machine: Machine, streamer: Streamer, began_at: dict[str, int]) -> Outcome:
+    ended_at = await machine.stepper_positions()
     stats = streamer.steps.stats()
     return Outcome(
         moves=streamer.pipeline.moves,
@@ -118,7 +128,7 @@ async def _outcome(machine: Machine, streamer: Streamer) -> Outcome:
         span=(streamer.began_s, streamer.ended_s),
         steps=sum(s.steps for s in stats.steppers),
         queue_steps=sum(s.queue_steps for s in stats.steppers),
-        positions=await machine.stepper_positions(),
+        positions={name: ended_at[name] - began for name, began in began_at.items()},
         issued={s.name: s.issued for s in stats.steppers},
         maps={node.name: m for node, m in zip(machine.moving, streamer.maps, strict=True)},
         nodes=tuple(

@@ -17,7 +17,6 @@ from coordinator.gcode.events import (
     End,
     Event,
     Full,
-    Idle,
     Notice,
     PositionSet,
     Progress,
@@ -87,6 +86,7 @@ class Streamer:
         self._job = job
         self._on_told = on_told
         self._on_state = on_state
+        self._keeps_maps = record is not None
         self._nodes = machine.moving
         self._time_base = machine.time_base()
         self._batches: list[tuple[int, bytes]] = []
@@ -95,7 +95,7 @@ class Streamer:
             job, self.steps, lambda n, b: self._batches.append((n, b)), nodes=len(self._nodes), record=record
         )
         self.maps: list[ClockMap] = []
-        """Per moving node: print time to ticks, as the steps were timed."""
+        """Per moving node: print time to ticks, as the steps were timed; without a record only its end."""
         self.began_s = 0.0
         """Print time at which the job began."""
         self.ended_s = 0.0
@@ -213,7 +213,7 @@ class Streamer:
                 self._failure = error
         if self._failure is not None:
             event = self._end_early()
-        if isinstance(event, Idle) or self._runs_dry(now):
+        if self._runs_dry(now):
             self._planner.flush()
         self._generate(now)
         return self._cycle(told, event)
@@ -292,3 +292,5 @@ class Streamer:
             if node is not self._machine.primary and border > clock_map.last.print_time:
                 piece = self._time_base.steer(node.name, clock_map, node.clock, border)
                 self.steps.set_clock(index, piece.ticks_per_s)
+                if not self._keeps_maps:
+                    clock_map.forget()

@@ -73,6 +73,10 @@ class ClockMap:
             self._pieces.append(piece)
         return piece
 
+    def forget(self) -> None:
+        """Forget every piece but the one in force: a map that is only steered by stays small."""
+        del self._pieces[:-1]
+
     def ticks(self, print_time: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the node's ticks at these print times, none before the first piece."""
         begins = np.array([p.print_time for p in self._pieces])

@@ -1,6 +1,5 @@
 """``canductor demo``: prints on virtual nodes in real time, then proves every step against the plan."""
 
-import asyncio
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -16,6 +15,7 @@ from coordinator.demo.proof import ClockProof, PrimaryClock, StepperProof, prove
 from coordinator.demo.report import DemoReport, NodeReport
 from coordinator.demo.stage import Stage
 from coordinator.gcode.program import Program
+from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, StepperDescription, load_machine
 from coordinator.pipeline import PlanRecord
 from coordinator.progress import ProgressDisplay
@@ -40,11 +40,11 @@ def run_demo(options: DemoOptions) -> DemoReport:
         program = stack.enter_context(Program.open(options.gcode or DEMO_GCODE))
         stage = stack.enter_context(Stage(description, options, folder))
         display = stack.enter_context(ProgressDisplay(f"printing {program.name}", quiet=options.json))
-        outcome = asyncio.run(
-            run_job(
+        outcome = run_to_end(
+            lambda: run_job(
                 stage.description,
                 program,
-                display,
+                display.update,
                 record=record,
                 on_told=lambda event: told.append(_text(event)),
                 on_ready=ready,
@@ -133,7 +133,7 @@ class _Prover:
             stepper.node,
             self._expected(stepper),
             self._executed(stepper, log),
-            counted=self._signed(stepper) * self._outcome.positions[stepper.name],
+            counted=self._outcome.positions[stepper.name],
             clock_map=self._outcome.maps[stepper.node],
             truth=log,
             primary=self._primary,
@@ -145,7 +145,7 @@ class _Prover:
             yield from expected_steps(moves, stepper.weights, stepper.step_distance, origin)
 
     def _executed(self, stepper: StepperDescription, log: EdgeLog) -> Iterator[tuple[Any, Any]]:
-        sign = np.int8(self._signed(stepper))
+        sign = np.int8(-1 if stepper.dir_pin.invert else 1)
         for clock, direction in log.steps(
             self._pins[stepper.step_pin.name],
             self._pins[stepper.dir_pin.name],
@@ -153,10 +153,6 @@ class _Prover:
             step_idle_level=int(stepper.step_pin.invert),
         ):
             yield clock, direction * sign
-
-    @staticmethod
-    def _signed(stepper: StepperDescription) -> int:
-        return -1 if stepper.dir_pin.invert else 1
 
 
 def _report(
@@ -181,7 +177,7 @@ def _report(
                 min_lead_s=node.link.min_lead_s,
                 round_trip_s=node.link.srtt_s,
                 clock_error_bound_s=node.clock_error_s,
-                dispatch_late_s=float(figures[node.name].get("timer_late_us_max", 0.0)) * 1e-6,
+                dispatch_late_s=float(figures[node.name]["late_us_max"]) * 1e-6,
             )
             for node in outcome.nodes
         ),

@@ -141,13 +141,13 @@ static void print_statistics(const struct linux_board *board) {
     double mean = board->late_count ? (double)board->late_sum / (double)board->late_count : 0;
     printf("{\"edges\":%llu,\"bytes_in\":%llu,\"bytes_out\":%llu,\"frames_in\":%llu,\"frames_out\":%llu,"
            "\"timers\":%llu,\"late_us_max\":%.1f,\"late_us_mean\":%.1f,\"resets\":%llu,\"blocks\":%u,"
-           "\"lost\":%u,\"out_of_order\":%u,\"overflow_bytes\":%u,\"tx_dropped\":%u}\n",
+           "\"lost\":%u,\"out_of_order\":%u,\"overflow_bytes\":%u,\"tx_dropped\":%u,\"is_shutdown\":%s}\n",
            (unsigned long long)board->virtual.edges_total, (unsigned long long)board->bytes_in,
            (unsigned long long)board->bytes_out, (unsigned long long)board->frames_in,
            (unsigned long long)board->frames_out, (unsigned long long)board->late_count,
            (double)board->late_max * us_per_tick, mean * us_per_tick, (unsigned long long)board->resets,
            stats->rx_blocks, stats->rx_lost, stats->rx_out_of_order, stats->rx_overflow_bytes,
-           stats->tx_dropped);
+           stats->tx_dropped, board->virtual.node.shutdown.active ? "true" : "false");
     fflush(stdout);
 }
 
