@@ -121,16 +121,11 @@ def plan_file(options: PlanOptions) -> PlanReport:
     with ExitStack() as stack:
         program = stack.enter_context(Program.open(options.gcode))
         files = [stack.enter_context(f) for f in _output_files(options, moving)]
-        job = Job(program, Planner(description.limits), homed_positions(description))
+        job = Job(program, Planner(description.limits), description.homed_position)
         pipeline = Pipeline(job, steps, lambda n, b: _keep(files, n, b), nodes=len(moving))
         display = stack.enter_context(ProgressDisplay(f"planning {program.name}", quiet=options.json))
         notices, end = _run(pipeline, display)
     return _report(description, pipeline, notices, end)
-
-
-def homed_positions(description: MachineDescription) -> dict[str, float]:
-    """Return where each axis stands after G28, mm."""
-    return {rail.axis.upper(): rail.homing.position_endstop or 0.0 for rail in description.rails}
 
 
 def _dictionaries(description: MachineDescription, options: PlanOptions) -> dict[str, Dictionary]:

@@ -49,11 +49,6 @@ class Outcome:
     nodes: tuple[NodeOutcome, ...]
 
 
-def homed_positions(description: MachineDescription) -> dict[str, float]:
-    """Return where each axis stands after G28, mm."""
-    return {rail.axis.upper(): rail.homing.position_endstop or 0.0 for rail in description.rails}
-
-
 async def run_job(
     description: MachineDescription,
     program: Program,
@@ -113,7 +108,7 @@ async def _print(
         )
 
     began_at = await machine.stepper_positions()
-    job = Job(program, Planner(machine.description.limits), homed_positions(machine.description))
+    job = Job(program, Planner(machine.description.limits), machine.description.homed_position)
     streamer = Streamer(machine, job, record=record, on_told=on_told, on_state=show)
     await streamer.run()
     return await _outcome(machine, streamer, began_at)

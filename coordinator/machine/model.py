@@ -145,6 +145,11 @@ class MachineDescription:
     """Sentences about what has no effect."""
 
     @property
+    def homed_position(self) -> dict[str, float]:
+        """Where each axis (X, Y, Z) stands after G28, mm."""
+        return {rail.axis.upper(): rail.homing.position_endstop or 0.0 for rail in self.rails}
+
+    @property
     def steppers(self) -> tuple[StepperDescription, ...]:
         """All steppers: rails X Y Z, then the extruder."""
         extruder = (self.extruder.stepper,) if self.extruder else ()
