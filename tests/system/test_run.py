@@ -8,7 +8,7 @@ from tests.system.stage import SQUARE, Command, Ended, Hardware, canductor, writ
 def steps(ended: Ended) -> dict[str, int]:
     """Return what each stepper moved by, when all went well."""
     assert ended.status == 0, ended
-    assert ended.stderr == ""
+    assert all(line.startswith("printing ") for line in ended.stderr.splitlines()), "only progress"
     report = ended.json
     assert report["ok"] is True
     for stepper in report["steppers"].values():
