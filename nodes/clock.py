@@ -38,8 +38,9 @@ RATE_PRIOR: Final = 1e-3
 """Standard deviation of a clock's rate against its nominal one, before anything is measured."""
 CURVATURE_PRIOR_PER_S: Final = 1.5e-8
 """Standard deviation of a rate's change per second: a crystal in a warming board."""
-READING_FLOOR_S: Final = 3e-6
-"""No reading is trusted better than this."""
+READING_FLOOR_S: Final = 10e-6
+"""No reading is trusted better than this: threads wake up late by as much, on either side. A lower floor lets
+one lucky exchange outweigh all others and bend the rate of a young estimate."""
 CONFIDENCE: Final = 3.0
 """Standard deviations in the published error bound."""
 _HALF: Final = 1 << 31
