@@ -1,6 +1,7 @@
 """The Python skin of a bus's I/O thread (io_thread.h): links, raw frames, events in the asyncio loop."""
 
 import asyncio
+import errno
 import os
 
 from nodes.link._link import ffi, lib
@@ -19,6 +20,11 @@ from nodes.link.types import (
 
 _BATCH = 512
 """Events taken from the thread in one call."""
+_ENDED_ADVICE = {
+    errno.ENETDOWN: "somebody set the interface down: set it up with 'ip link set {0} up'",
+    errno.ENODEV: "the interface is gone: plug the adapter in",
+}
+"""What a user can do about an end, by errno; {0} is the transport's name."""
 
 
 class LinkIO:
@@ -161,9 +167,8 @@ class LinkIO:
 
     def _handle_ended(self, cause: int) -> None:
         reason = os.strerror(cause) if cause else "its other end closed it"
-        self._bus.ended = (
-            f"{self.name}: the connection ended ({reason}); check cable and device, then start again"
-        )
+        advice = _ENDED_ADVICE.get(cause, "check cable and device").format(self.name)
+        self._bus.ended = f"{self.name}: the connection ended ({reason}); {advice}, then start again"
         for link in list(self._links.values()):
             link.handle_ended(self._bus.ended)
         if self._on_closed:

@@ -6,8 +6,9 @@
 
 // A block whose bytes stop coming for so long was cut off or has a damaged length byte. It is given up so
 // that the sound blocks in its bytes, often the acknowledgement just waited for, do not wait for it to fill
-// up.
-#define GAP_NS (25 * NS_PER_MS)
+// up. Not sooner, though: a bus without room (other nodes' frames first, ENOBUFS at the sender) holds the
+// rest of a sound block back for tens of milliseconds, and a response given up is never sent again.
+#define GAP_NS (100 * NS_PER_MS)
 
 // ----------------------------------------------------------------------------------------- acknowledgement
 

@@ -1,5 +1,6 @@
 """Transport over SocketCAN: the CAN interfaces of the Linux kernel, ``vcan`` included."""
 
+import contextlib
 import errno
 import os
 import select
@@ -15,11 +16,20 @@ from nodes.transport.stream import wait_for
 SEND_BUFFER = 8_192
 """Bytes asked of the kernel for what waits to be sent: fewer frames than the default queue of an interface
 (10) holds, so that poll() tells when there is room and sending does not fail with ENOBUFS."""
+RECEIVE_BUFFER = 4 << 20
+"""Bytes asked of the kernel for what has arrived: half a second of a full bus; users without rights get at
+most net.core.rmem_max. The default holds some 280 frames, 30 ms of a full bus."""
 _RETRY_S = 0.001
+# Constants of the kernel that the socket module lacks.
+_SO_RCVBUFFORCE = 33
+_SO_MEMINFO = 55
+_MEMINFO = struct.Struct("=9I")
+_MEMINFO_DROPS = 8
 
 _ERRORS = {
-    errno.ENODEV: "there is no such interface; list those there are with 'ip link show type can'",
-    errno.ENETDOWN: "the interface is down; bring it up with 'ip link set {0} up type can bitrate 1000000'",
+    errno.ENODEV: "there is no such interface; list those there are with 'ip link show'",
+    errno.ENETDOWN: "the interface is down; bring it up with 'ip link set {0} up type can bitrate 1000000'"
+    " (a virtual one without 'type …')",
     errno.EAFNOSUPPORT: "this kernel has no CAN; load the module can-raw, or use a virtual bus: virtual:PATH",
     errno.EPROTONOSUPPORT: "this kernel has no raw CAN sockets; load the module can-raw",
     errno.EPERM: "this user may not open CAN sockets",
@@ -56,6 +66,12 @@ class SocketCanTransport:
     def fileno(self) -> int:
         """Return the socket's file descriptor."""
         return self._open_socket().fileno()
+
+    @property
+    def dropped(self) -> int:
+        """Frames the kernel dropped because they were not read in time; 0 is as it should be."""
+        info = self._open_socket().getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+        return int(_MEMINFO.unpack(info)[_MEMINFO_DROPS])
 
     def close(self) -> None:
         """Close the socket. A real bus goes on; other nodes do not notice."""
@@ -115,6 +131,10 @@ class SocketCanTransport:
 def _configure(sock: socket.socket) -> None:
     sock.setblocking(False)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER // 2)  # the kernel doubles it
+    # The kernel doubles this too, and gives less than asked for without complaint.
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER // 2)
+    with contextlib.suppress(PermissionError):
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER // 2)
     # Only what a node can send: no extended and no remote frames. Error frames are off unless asked for.
     filters = struct.pack("=II", 0, socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG)
     sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)

@@ -18,6 +18,10 @@
 #include <termios.h>
 #include <unistd.h>
 
+// SocketCAN says ENOBUFS while the interface's queue is full, and yet poll() calls the socket writable: only
+// time helps. A full frame lasts 111 µs and more.
+enum { NO_BUFFERS_NS = 300000, INTERFACE_DOWN_NS = 10000000 };
+
 _Static_assert(sizeof(struct can_frame) == 16, "records of the virtual bus");
 
 static int complain(const char *what, const char *target) {
@@ -48,6 +52,10 @@ static int open_socketcan(const char *interface) {
     int fd = socket(PF_CAN, SOCK_RAW | SOCK_CLOEXEC, CAN_RAW);
     if (fd < 0 || bind(fd, (const struct sockaddr *)&address, sizeof(address)))
         return complain("cannot open the CAN interface", interface);
+    // Extended and remote frames are not ours: they need not even wake this process.
+    const struct can_filter plain = {.can_id = 0, .can_mask = CAN_EFF_FLAG | CAN_RTR_FLAG};
+    if (setsockopt(fd, SOL_CAN_RAW, CAN_RAW_FILTER, &plain, sizeof(plain)))
+        return complain("cannot set up the CAN interface", interface);
     return fd;
 }
 
@@ -95,6 +103,23 @@ void link_close(struct linux_board *board) {
     unlink(board->options.target);
 }
 
+// The descriptor failed with errno. A board outlives a bus that is dead for a while, and so does this one;
+// only an interface that is gone does not come back.
+static void handle_failure(struct linux_board *board) {
+    int socketcan = board->options.link == LINK_SOCKETCAN;
+    if (errno == EAGAIN || errno == EINTR)
+        return;
+    if (socketcan && (errno == ENOBUFS || errno == ENETDOWN)) {
+        board->retry_ns = monotonic_ns() + (errno == ENOBUFS ? NO_BUFFERS_NS : INTERFACE_DOWN_NS);
+        return;
+    }
+    if (socketcan && !board->failed) {
+        complain("cannot go on without the CAN interface", board->options.target);
+        board->failed = 1;
+    }
+    board->closed = 1;
+}
+
 // ------------------------------------------------------------------------------------------------- receiving
 
 // Gives SIZE bytes of a UART to the node in pieces its receive buffer takes.
@@ -126,11 +151,11 @@ static size_t receive_frames(struct linux_board *board, const uint8_t *data, siz
 
 void link_read(struct linux_board *board) {
     ssize_t got = read(board->fd, board->in + board->in_size, sizeof(board->in) - board->in_size);
-    if (got == 0 || (got < 0 && errno != EAGAIN && errno != EINTR)) {
+    if (got == 0)
         board->closed = 1;
-        return;
-    }
     if (got < 0)
+        handle_failure(board);
+    if (got <= 0)
         return;
     board->bytes_in += (uint64_t)got;
     board->in_size += (size_t)got;
@@ -147,6 +172,9 @@ void link_read(struct linux_board *board) {
 
 void link_flush(struct linux_board *board) {
     size_t sent = 0;
+    if (board->retry_ns && monotonic_ns() < board->retry_ns)
+        return;
+    board->retry_ns = 0;
     while (sent < board->out_size) {
         size_t size = board->out_size - sent;
         if (board->options.link == LINK_SOCKETCAN)
@@ -154,8 +182,8 @@ void link_flush(struct linux_board *board) {
         ssize_t done = write(board->fd, board->out + sent, size);
         if (done < 0 && errno == EINTR)
             continue;
-        if (done < 0 && errno != EAGAIN && errno != ENOBUFS)
-            board->closed = 1;
+        if (done < 0)
+            handle_failure(board);
         if (done <= 0)
             break;
         sent += (size_t)done;

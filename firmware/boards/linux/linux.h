@@ -32,11 +32,13 @@ struct linux_board {
     uint64_t start_ns, start_clock;
     uint64_t dispatch_clock; // what the firmware sees while dispatching
     uint8_t dispatching, reset_wanted, closed;
+    uint8_t failed;  // closed, and that is not how it should end
     uint8_t refused; // the node has more to say than `out` could take
 
     int fd, slave_fd, edge_fd;
     uint8_t out[OUT_BUFFER]; // waiting for the descriptor; whole frames on CAN
     size_t out_size;
+    uint64_t retry_ns;     // when an interface that took no frame is tried again; 0: poll() tells
     uint8_t in[IN_BUFFER]; // read, not yet given to the node; a partial frame stays
     size_t in_size;
     uint64_t random;

@@ -99,11 +99,13 @@ static int wait(struct linux_board *board, int signal_fd, uint64_t held_until) {
         until = slice_end;
     if (held_until && held_until < until)
         until = held_until;
+    if (board->out_size && board->retry_ns && board->retry_ns < until)
+        until = board->retry_ns;
     uint64_t wait_ns = until > now ? until - now : 0;
     struct timespec timeout = {.tv_sec = (time_t)(wait_ns / 1000000000u),
                                .tv_nsec = (long)(wait_ns % 1000000000u)};
     struct pollfd fds[2] = {{.fd = signal_fd, .events = POLLIN}, {.fd = board->fd}};
-    fds[1].events = (short)((held_until ? 0 : POLLIN) | (board->out_size ? POLLOUT : 0));
+    fds[1].events = (short)((held_until ? 0 : POLLIN) | (board->out_size && !board->retry_ns ? POLLOUT : 0));
     // A hang-up is always reported: with input held back it would only spin.
     if (!fds[1].events)
         fds[1].fd = -1;
@@ -202,6 +204,7 @@ int main(int argc, char **argv) {
     edge_log_close(board);
     link_close(board);
     print_statistics(board);
+    status = board->failed ? FAILED : 0;
     free(board);
-    return 0;
+    return status;
 }

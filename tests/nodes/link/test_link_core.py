@@ -114,6 +114,22 @@ def test_an_acknowledgement_of_what_was_never_sent_is_ignored_and_counted() -> N
     assert line.node.executed == [store(1, 50)]
 
 
+def test_a_block_may_pause_on_its_way_but_a_rest_that_does_not_come_is_not_waited_for() -> None:
+    line = connected()
+    sound = block(line.node.expected, answer(7))
+    for size in range(1, len(sound)):
+        assert line.link.receive(sound[:size], line.now) == []
+        line.now += 95 * MS
+        assert line.link.receive(b"", line.now) == []
+        assert [content for content, _ in line.link.receive(sound[size:], line.now)] == [answer(7)]
+    assert line.link.stats.bytes_invalid == 0
+    line.link.receive(sound[:-1], line.now)
+    line.now += 105 * MS
+    assert line.link.receive(b"", line.now) == []
+    assert line.link.stats.bytes_invalid == len(sound) - 1
+    assert [content for content, _ in line.link.receive(sound, line.now)] == [answer(7)]
+
+
 def test_a_repeat_starts_with_a_sync_byte_and_a_timeout_flushes_the_node() -> None:
     line = connected()
     line.fault = lambda way, index, data: []
