@@ -189,7 +189,7 @@ def demo(
     ] = "demo",
     gcode: Annotated[Path | None, typer.Option("--gcode", help="G-code file to print.")] = None,
     json_: JsonFlag = False,
-    no_web: Annotated[bool, typer.Option("--no-web", help="Do not serve the live page.")] = False,
+    no_web: Annotated[bool, typer.Option("--no-web", help="For scripts: there is no live page yet.")] = False,
     loss: Annotated[str, typer.Option("--loss", help="Share of frames the bus loses: 0.01 or 1%.")] = "0",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Decides which frames are lost.")] = 1,
     rate_ppm: Annotated[
