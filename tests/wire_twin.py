@@ -25,6 +25,13 @@ def vlq_decode(data: bytes) -> tuple[int, bytes] | None:
     return None
 
 
+def read_vlq(data: bytes, at: int) -> tuple[int, int]:
+    """Return the number that stands at AT, signed, and where the next one begins; for sound data."""
+    decoded = vlq_decode(data[at:])
+    assert decoded is not None
+    return signed32(decoded[0]), len(data) - len(decoded[1])
+
+
 def signed32(value: int) -> int:
     return value - (1 << 32) if value & 0x80000000 else value
 
@@ -38,7 +45,7 @@ def crc16(data: bytes) -> int:
     return crc
 
 
-def block(sequence: int, content: bytes) -> bytes:
+def block(sequence: int, content: bytes = b"") -> bytes:
     body = bytes([len(content) + BLOCK_MIN, 0x10 | sequence & 0x0F]) + content
     return body + crc16(body).to_bytes(2, "big") + bytes([SYNC])
 

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.virtual.sim import SimNode, edge_clocks
+from tests import wire_twin
 from tests.firmware import twin
 
 NODE_ID = 4
@@ -67,7 +68,7 @@ class Host:
     def send(self, *commands: str) -> list[twin.Answer]:
         """Send COMMANDS in one block, which must be acknowledged; return all answers."""
         before = len(self.unasked)
-        self.write(twin.block(self.seq, b"".join(self.words.encode(text) for text in commands)))
+        self.write(wire_twin.block(self.seq, b"".join(self.words.encode(text) for text in commands)))
         self.seq = (self.seq + 1) & 15
         found = self.receive()
         assert found, "nothing came back"

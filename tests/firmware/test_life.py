@@ -7,6 +7,7 @@ import pytest
 
 from nodes.errors import CanductorError
 from nodes.virtual.sim import SimNode, edge_clocks
+from tests import wire_twin
 from tests.firmware import twin
 from tests.firmware.host import FROM_NODE, NODE_ID, TO_NODE, Host
 
@@ -114,7 +115,7 @@ def test_shut_down_it_answers_and_refuses_and_can_be_cleared() -> None:
 def test_reset_restarts_the_node() -> None:
     host = Host()
     host.configure("config_digital_out oid=0 pin=5 value=1 default_value=1 max_duration=0")
-    host.write(twin.block(host.seq, host.words.encode("reset")))
+    host.write(wire_twin.block(host.seq, host.words.encode("reset")))
     names = [host.words.decode(s, c).name for s, c in twin.blocks(host.read()) if c]
     assert names == ["starting"]
     assert host.node.level(5) == 0
@@ -125,10 +126,10 @@ def test_reset_restarts_the_node() -> None:
 def test_reset_on_can_drops_the_id() -> None:
     host = Host(transport="can")
     assert host.node.node_id == NODE_ID
-    host.write(twin.block(host.seq, host.words.encode("reset")))
+    host.write(wire_twin.block(host.seq, host.words.encode("reset")))
     assert host.node.node_id == 0
     host.node.take_frames()
-    host.node.receive_frame(TO_NODE, twin.block(0, b"")[:8])
+    host.node.receive_frame(TO_NODE, wire_twin.block(0, b"")[:8])
     assert host.node.take_frames() == []
 
 
@@ -198,7 +199,7 @@ def test_data_on_its_own_transmit_id_is_a_conflict() -> None:
 def test_the_same_id_again_changes_nothing_and_other_ids_are_not_heard() -> None:
     host = Host(transport="can")
     host.assign()
-    block = twin.block(host.seq, host.words.encode("get_config"))
+    block = wire_twin.block(host.seq, host.words.encode("get_config"))
     for can_id in (TO_NODE + 2, TO_NODE - 2, 0x010, 0x020, 0x7FF):
         for at in range(0, len(block), 8):
             host.node.receive_frame(can_id, block[at : at + 8])
@@ -212,7 +213,7 @@ def test_frames_may_cut_blocks_anywhere() -> None:
     host = Host(transport="can")
     stream = b""
     for _ in range(30):
-        stream += twin.block(
+        stream += wire_twin.block(
             host.seq, host.words.encode("debug_ping data=" + rng.randbytes(rng.randrange(30)).hex())
         )
         host.seq = (host.seq + 1) & 15

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from nodes.virtual.sim import SimNode
+from tests import wire_twin
 from tests.firmware import twin
 from tests.firmware.host import Host
 
@@ -68,7 +69,7 @@ def test_formats_are_those_of_real_boards() -> None:
 def test_a_block_is_acknowledged_with_the_next_number_and_so_is_every_answer() -> None:
     host = Host()
     for _ in range(40):
-        host.write(twin.block(host.seq, host.words.encode("get_clock")))
+        host.write(wire_twin.block(host.seq, host.words.encode("get_clock")))
         host.seq = (host.seq + 1) & 15
         answer, ack = twin.blocks(host.read())
         assert (answer[0], ack) == (host.seq, (host.seq, b""))
@@ -78,7 +79,7 @@ def test_duplicates_and_blocks_out_of_order_are_refused_with_the_expected_number
     host = Host()
     nop = host.words.encode("debug_ping data=01")
     for wrong in (1, 2, 7, 8, 15):
-        host.write(twin.block(host.seq + wrong, nop))
+        host.write(wire_twin.block(host.seq + wrong, nop))
         assert list(twin.blocks(host.read())) == [(host.seq, b"")]
     assert host.node.counters()["rx_out_of_order"] == 5
     assert host.ask("debug_ping data=0203").args == {"data": b"\x02\x03"}
@@ -86,7 +87,7 @@ def test_duplicates_and_blocks_out_of_order_are_refused_with_the_expected_number
 
 def test_every_single_damaged_byte_costs_one_nak_and_nothing_else() -> None:
     host = Host()
-    good = twin.block(host.seq, host.words.encode("debug_ping data=0102030405"))
+    good = wire_twin.block(host.seq, host.words.encode("debug_ping data=0102030405"))
     for place in range(len(good)):
         for flip in (1, 0x80, 0x7E):
             bad = bytearray(good)
@@ -114,13 +115,15 @@ def test_a_stretch_of_garbage_is_nakked_once() -> None:
 
 def test_sync_bytes_before_a_block_are_ignored() -> None:
     host = Host()
-    host.write(b"\x7e" * 5 + twin.block(host.seq, host.words.encode("get_config")) + b"\x7e")
+    host.write(b"\x7e" * 5 + wire_twin.block(host.seq, host.words.encode("get_config")) + b"\x7e")
     assert len(list(twin.blocks(host.read()))) == 2
 
 
 def test_what_exceeds_the_window_is_lost_and_can_be_repeated() -> None:
     host = Host()
-    blocks = [twin.block(host.seq + k, host.words.encode("debug_ping data=" + "ab" * 40)) for k in range(5)]
+    blocks = [
+        wire_twin.block(host.seq + k, host.words.encode("debug_ping data=" + "ab" * 40)) for k in range(5)
+    ]
     host.write(b"".join(blocks))  # 5 * 47 = 235 bytes at once; 192 fit: four whole blocks
     seqs = [seq for seq, content in twin.blocks(host.read()) if not content]
     assert seqs == [(host.seq + k + 1) & 15 for k in range(4)]
@@ -138,7 +141,7 @@ def test_a_flood_of_answers_waits_for_the_wire_and_loses_none() -> None:
     sent = 0
     # Nothing is taken: the outbound room fills up, then the node stops executing, then its window overflows.
     while host.node.counters()["rx_overflow_bytes"] == 0:
-        host.write(twin.block(host.seq + sent, content))
+        host.write(wire_twin.block(host.seq + sent, content))
         sent += 1
         assert sent < 1000
     stalled = host.node.counters()["rx_blocks"]
@@ -156,13 +159,13 @@ def test_unknown_and_unreadable_commands_shut_down() -> None:
         (b"\x60", "Invalid command"),
     ):
         host = Host()
-        host.write(twin.block(host.seq, content))
+        host.write(wire_twin.block(host.seq, content))
         host.seq = (host.seq + 1) & 15
         host.receive()
         (report,) = host.unasked
         assert host.text(report) == text
     host = Host()
-    host.write(twin.block(host.seq, host.words.encode("identify offset=1000 count=4")[:-1]))
+    host.write(wire_twin.block(host.seq, host.words.encode("identify offset=1000 count=4")[:-1]))
     host.seq = (host.seq + 1) & 15
     host.receive()
     assert host.text(host.unasked[0]) == "Command parser error"
@@ -186,5 +189,5 @@ def test_random_bytes_never_upset_the_node() -> None:
         junk = rng.randbytes(rng.randrange(1, 80))
         node.receive_bytes(junk)
         assert all(content == b"" for _, content in twin.blocks(node.take_bytes()))
-    node.receive_bytes(b"\x7e" * 64 + twin.block(0, bare("identify offset=0 count=9")))
+    node.receive_bytes(b"\x7e" * 64 + wire_twin.block(0, bare("identify offset=0 count=9")))
     assert any(content for _, content in twin.blocks(node.take_bytes()))

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from nodes.virtual.sim import edge_clocks
+from tests import wire_twin
 from tests.firmware import twin
 from tests.firmware.host import FROM_NODE, NODE_ID, TO_NODE
 
@@ -103,7 +104,7 @@ class Process:
 
     def send(self, *commands: str) -> list[twin.Answer]:
         """Send one block; return the answers that came before its acknowledgement, but for statistics."""
-        self.write(twin.block(self.seq, b"".join(map(self.words.encode, commands))))
+        self.write(wire_twin.block(self.seq, b"".join(map(self.words.encode, commands))))
         self.seq = (self.seq + 1) & 15
         answers: list[twin.Answer] = []
         while True:
@@ -220,7 +221,7 @@ def test_a_late_command_is_late(process: Process) -> None:
 def test_reset_makes_it_forget_but_live(process: Process) -> None:
     process.start()
     process.send("allocate_oids count=0", "finalize_config crc=9")
-    process.write(twin.block(process.seq, process.words.encode("reset")))
+    process.write(wire_twin.block(process.seq, process.words.encode("reset")))
     assert process.read_block() == ((process.seq + 1) & 15, b""), "the last acknowledgement still leaves"
     process.seq = 0
     process.start()

@@ -1,4 +1,4 @@
-"""A slow, obvious twin of the wire protocol, written from its description: the oracle of these tests."""
+"""What a node understands and says, from its dictionary and the slow twin of the wire protocol."""
 
 import json
 import zlib
@@ -6,53 +6,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+from tests import wire_twin
+from tests.wire_twin import read_vlq, vlq_encode
+
 Value = int | bytes
-
-
-def vlq(value: int) -> bytes:
-    """Encode -2^31 .. 2^32-1."""
-    groups = 1
-    while groups < 5 and not -(32 * 128 ** (groups - 1)) <= value < 96 * 128 ** (groups - 1):
-        groups += 1
-    digits = [(value >> (7 * k)) & 0x7F for k in reversed(range(groups))]
-    return bytes(digit | 0x80 for digit in digits[:-1]) + bytes(digits[-1:])
-
-
-def unvlq(data: bytes, at: int) -> tuple[int, int]:
-    """Decode to a signed number; return it and the place behind it."""
-    value = data[at] & 0x7F
-    if value & 0x60 == 0x60:
-        value -= 0x80
-    while data[at] & 0x80:
-        at += 1
-        value = value * 128 + (data[at] & 0x7F)
-    return value, at + 1
-
-
-def crc16(data: bytes) -> int:
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0x8408 if crc & 1 else 0)
-    return crc
-
-
-def block(seq: int, content: bytes = b"") -> bytes:
-    body = bytes([len(content) + 5, 0x10 | seq & 15]) + content
-    return body + crc16(body).to_bytes(2, "big") + b"\x7e"
 
 
 def blocks(stream: bytes) -> Iterator[tuple[int, bytes]]:
     """Split a flawless stream into (seq, content); asserts that it is flawless."""
-    while stream:
-        length = stream[0]
-        one, stream = stream[:length], stream[length:]
-        assert len(one) == length >= 5, one
-        assert one[-1] == 0x7E
-        assert crc16(one[:-3]) == int.from_bytes(one[-3:-1], "big")
-        assert one[1] & 0xF0 == 0x10
-        yield one[1] & 15, one[2:-3]
+    found, losses, rest = wire_twin.blocks(stream)
+    assert not losses
+    assert not rest
+    for one in found:
+        yield one.sequence, one.content
 
 
 @dataclass(frozen=True)
@@ -85,21 +51,21 @@ class Vocabulary:
         for fmt, number in self.raw["commands"].items():
             if fmt.split()[0] != name:
                 continue
-            out = vlq(number)
+            out = vlq_encode(number)
             for parameter in fmt.split()[1:]:
                 key, _, code = parameter.partition("=")
                 value = given.pop(key)
                 if code.endswith("s"):
                     data = bytes.fromhex(value)
-                    out += vlq(len(data)) + data
+                    out += vlq_encode(len(data)) + data
                 else:
-                    out += vlq(int(value))
+                    out += vlq_encode(int(value))
             assert not given, given
             return out
         raise AssertionError(name)
 
     def decode(self, seq: int, content: bytes) -> Answer:
-        number, at = unvlq(content, 0)
+        number, at = read_vlq(content, 0)
         for fmt, known in self.raw["responses"].items():
             if known != number:
                 continue
@@ -107,7 +73,7 @@ class Vocabulary:
             args: dict[str, Value] = {}
             for parameter in parameters:
                 key, _, code = parameter.partition("=")
-                value, at = unvlq(content, at)
+                value, at = read_vlq(content, at)
                 if code.endswith("s"):
                     args[key], at = content[at : at + value], at + value
                 else:

@@ -6,8 +6,9 @@ from collections.abc import Iterable
 import pytest
 
 from nodes.link._link import lib
-from tests.nodes.link.twin import STOP, NodeTwin, WindowObserver, answer, ask, block, store
+from tests.nodes.link.twin import STOP, NodeTwin, WindowObserver, answer, ask, store
 from tests.nodes.link.virtual import MS, NEVER, TO_HOST, TO_NODE, CoreLink, Delivery, Line
+from tests.wire_twin import block
 
 HZ = 1_000_000
 

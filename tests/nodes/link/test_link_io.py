@@ -11,7 +11,8 @@ import pytest
 
 from nodes.link import LinkError, LinkIO, LinkSettings, TransportKind
 from tests.nodes.link.peers import TIMEOUT_S, FdTransport, Inbox, bench, open_files, pack_frame
-from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, block, store
+from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, store
+from tests.wire_twin import block
 
 KINDS = list(TransportKind)
 CAN_KINDS = [TransportKind.CAN_STREAM, TransportKind.CAN_PACKET]

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from tests.nodes.link.test_link_faults import DAMAGES
-from tests.nodes.link.twin import STOP, NodeTwin, WindowObserver, ask, read_vlq, store
+from tests.nodes.link.twin import STOP, NodeTwin, WindowObserver, ask, store
 from tests.nodes.link.virtual import MS, CoreLink, Delivery, Line
+from tests.wire_twin import read_vlq
 
 HZ = 1_000_000
 NAMES = sorted(DAMAGES)

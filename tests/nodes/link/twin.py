@@ -5,39 +5,8 @@ Its commands: ``1 <n> <data>`` store, ``2 <n>`` ask (answered by ``3 <n>``), ``4
 
 from dataclasses import dataclass, field
 
-SYNC = 0x7E
-
-
-def crc16(data: bytes) -> int:
-    crc = 0xFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0x8408 if crc & 1 else 0)
-    return crc
-
-
-def block(seq: int, content: bytes = b"") -> bytes:
-    body = bytes([len(content) + 5, 0x10 | seq & 15]) + content
-    return body + crc16(body).to_bytes(2, "big") + bytes([SYNC])
-
-
-def vlq(value: int) -> bytes:
-    groups = 1
-    while not -32 * 128 ** (groups - 1) <= value < 96 * 128 ** (groups - 1):
-        groups += 1
-    digits = [value >> 7 * i & 127 for i in reversed(range(groups))]
-    return bytes([d | 128 for d in digits[:-1]] + digits[-1:])
-
-
-def read_vlq(data: bytes, at: int) -> tuple[int, int]:
-    value = data[at] & 127
-    if value & 96 == 96:
-        value -= 128
-    while data[at] & 128:
-        at += 1
-        value = value * 128 + (data[at] & 127)
-    return value, at + 1
+from tests.wire_twin import SYNC, block, crc16, read_vlq
+from tests.wire_twin import vlq_encode as vlq
 
 
 def store(number: int, size: int = 0) -> bytes:
