@@ -95,8 +95,11 @@ def _read_node(section: RawSection, later: list[NotYetActing]) -> NodeDescriptio
             section.place,
             f"[{section.name}] does not say how to reach the node; add 'canbus_uuid' or 'serial'",
         )
-    if waiting := reader.finish():
-        later.append(NotYetActing(section.name, section.place, tuple(option.name for option in waiting)))
+    waiting = [option.name for option in reader.finish()]
+    if isinstance(connection, UartConnection) and reader.find(RESTART_METHOD) not in (None, "command"):
+        waiting.append(RESTART_METHOD.name)  # so far a node is only reset by its own commands
+    if waiting:
+        later.append(NotYetActing(section.name, section.place, tuple(waiting)))
     return NodeDescription(name, connection, section.place)
 
 
