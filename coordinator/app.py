@@ -2,10 +2,10 @@
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from coordinator.host import Host, Port
 from coordinator.machine.description import (
     CanConnection,
     MachineDescription,
@@ -17,15 +17,12 @@ from coordinator.motion.specs import NodeStreamSpec
 from coordinator.timebase import ClockMap, TimeBase
 from nodes.assign import Uuid
 from nodes.bus import CanBus, UartBus
-from nodes.clock import HostTime
 from nodes.dictionary import Dictionary
 from nodes.errors import CanductorError
-from nodes.link import Link, LinkIO
+from nodes.link import Link
 from nodes.node import Node
 from nodes.node_config import NodeConfig
 from nodes.node_states import NodeState
-from nodes.seams import IoFactory, LinkIOLike, OnFrame, OnLost
-from nodes.transport import ByteTransport, CanTransport, open_can, open_uart
 
 
 class MachineStopped(CanductorError):  # noqa: N818
@@ -36,32 +33,28 @@ CONFIRM_STOP_S = 0.5
 """How long the nodes have to confirm an emergency stop before the host gives up on them."""
 
 
-def host_now() -> HostTime:
-    """Return the host time: CLOCK_MONOTONIC, as the links stamp their messages."""
-    return HostTime(time.monotonic_ns())
-
-
 @dataclass(frozen=True, slots=True)
 class _OpenBus:
     bus: CanBus | UartBus
-    transport: CanTransport | ByteTransport
+    port: Port
 
 
 class Machine:
-    """All nodes of DESCRIPTION as one machine; lives on one asyncio loop.
+    """All nodes of DESCRIPTION as one machine, on the ports and in the time of HOST; lives on one loop.
 
     ``start``, then ``close`` whatever happened. When any node is lost or shuts down, all others are
     stopped at once and ``stopped`` tells why.
     """
 
-    def __init__(self, description: MachineDescription) -> None:
+    def __init__(self, description: MachineDescription, host: Host) -> None:
         self.description = description
+        self.host = host
         self.devices = MachineDevices(description)
         self.nodes: dict[str, Node] = {}
         self.stopped: MachineStopped | None = None
         self._open: list[_OpenBus] = []
         self._failed = asyncio.Event()
-        self._stopped_at_s = 0.0
+        self._stopped_at_ns = 0
         self._all_down = asyncio.Event()
         self._confirmed_s: dict[str, float] = {}
         self._ready = False
@@ -92,7 +85,7 @@ class Machine:
         self._ready = False
         for opened in self._open:
             await opened.bus.close()
-            opened.transport.close()
+            opened.port.close()
         self._open.clear()
 
     def stop(self, cause: str) -> None:
@@ -100,7 +93,7 @@ class Machine:
         if self.stopped is not None:
             return
         self.stopped = MachineStopped(cause)
-        self._stopped_at_s = time.monotonic()
+        self._stopped_at_ns = self.host.now()
         for node in self.nodes.values():
             node.emergency_stop()
         self._failed.set()
@@ -174,15 +167,15 @@ class Machine:
             )
 
     def _open_can(self, connection: CanConnection) -> CanBus:
-        transport = open_can(connection.interface)
-        bus = CanBus(transport.name, _io_factory(transport))
-        self._open.append(_OpenBus(bus, transport))
+        port = self.host.open_can(connection)
+        bus = CanBus(port.name, port.start_io)
+        self._open.append(_OpenBus(bus, port))
         return bus
 
     def _add_uart(self, node: NodeDescription, connection: UartConnection) -> None:
-        transport = open_uart(connection.path, connection.baud)
-        bus = UartBus(transport.name, _io_factory(transport))
-        self._open.append(_OpenBus(bus, transport))
+        port = self.host.open_uart(connection)
+        bus = UartBus(port.name, port.start_io)
+        self._open.append(_OpenBus(bus, port))
         self.nodes[node.name] = bus.add_node(node.name, self._build_config(node), on_state=self._node_changed)
 
     def _build_config(self, node: NodeDescription) -> Callable[[Dictionary], NodeConfig]:
@@ -193,16 +186,9 @@ class Machine:
             return
         self.stop(f"{node.failure}; all other nodes were stopped")
         if node.state is NodeState.SHUTDOWN:
-            self._confirmed_s[node.name] = time.monotonic() - self._stopped_at_s
+            self._confirmed_s[node.name] = (self.host.now() - self._stopped_at_ns) * 1e-9
         if all(other.state in (NodeState.LOST, NodeState.SHUTDOWN) for other in self.nodes.values()):
             self._all_down.set()
-
-
-def _io_factory(transport: CanTransport | ByteTransport) -> IoFactory:
-    def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike:
-        return LinkIO(transport, asyncio.get_running_loop(), on_frame=on_frame, on_closed=on_closed)
-
-    return start
 
 
 def _first_cause(group: BaseExceptionGroup[BaseException]) -> BaseException:

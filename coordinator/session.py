@@ -1,6 +1,5 @@
 """One job on one machine: connect, run, ask the nodes where they stand; shared by ``run`` and ``demo``."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -8,6 +7,7 @@ from coordinator.app import Machine, MachineStopped, link_of
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
+from coordinator.host import Host, LinuxHost
 from coordinator.machine.description import MachineDescription
 from coordinator.motion.planner import Planner
 from coordinator.pipeline import PlanRecord
@@ -57,13 +57,14 @@ async def run_job(
     record: PlanRecord | None = None,
     on_told: Callable[[Told], None],
     on_ready: Callable[[Machine], None] | None = None,
+    host: Host | None = None,
 ) -> Outcome:
     """Connect to the machine, run PROGRAM on it and return what became of it.
 
     Raises CanductorError. Whatever ends the job before its end stops all nodes, but for a bad line of the
     program: what came before it is carried out, and the machine stands.
     """
-    machine = Machine(description)
+    machine = Machine(description, host or LinuxHost())
     await machine.start()
     if on_ready is not None:
         on_ready(machine)
@@ -94,7 +95,7 @@ async def _print(
     record: PlanRecord | None,
     on_told: Callable[[Told], None],
 ) -> Outcome:
-    began = time.monotonic()
+    began_ns = machine.host.now()
 
     def show(state: JobState) -> None:
         on_progress(
@@ -102,7 +103,7 @@ async def _print(
                 done=state.done_bytes,
                 total=state.size_bytes or 0,
                 print_time_s=state.print_time_s,
-                wall_time_s=time.monotonic() - began,
+                wall_time_s=(machine.host.now() - began_ns) * 1e-9,
                 nodes=tuple(_figures(machine, name) for name in machine.nodes),
             )
         )

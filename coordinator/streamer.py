@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from coordinator.app import Machine, MachineStopped, host_now, link_of
+from coordinator.app import Machine, MachineStopped, link_of
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import (
     Emergency,
@@ -108,7 +108,7 @@ class Streamer:
 
     def print_time_now(self) -> float:
         """Return the present print time."""
-        return self._time_base.print_time_at(host_now())
+        return self._time_base.print_time_at(self._machine.host.now())
 
     async def run(self) -> None:
         """Run the job to its end: until the last step is executed.
