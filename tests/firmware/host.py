@@ -92,6 +92,11 @@ class Host:
         del self.unasked[before:]
         return answers
 
+    def pour(self, command: str, count: int) -> None:
+        """Send a block of COUNT times COMMAND and take nothing of what comes back."""
+        self.write(wire_twin.block(self.seq, self.words.encode(command) * count))
+        self.seq = (self.seq + 1) & 15
+
     def ask(self, command: str) -> twin.Answer:
         """Send a command with exactly one answer."""
         (answer,) = self.send(command)
