@@ -125,17 +125,11 @@ def test_older_firmware_answers_at_once_and_does_not_know_the_other_query() -> N
 
 def test_an_answer_which_the_board_refuses_comes_when_there_is_room() -> None:
     host = Host(transport="can")
-    fill(host)
+    host.fill()
     host.node.receive_frame(ADMIN, WHO)
     host.node.run_until(host.now + 2 * SPREAD)
     said = host.node.take_frames()
     assert said.count((0x3F1, b"\x21" + UUID + bytes([NODE_ID]))) == 1
-
-
-def fill(host: Host) -> None:
-    """Ask until the board takes no frames any more and the node stops executing."""
-    while host.node.counters()["rx_overflow_bytes"] == 0:
-        host.pour("get_uptime", 59)
 
 
 def test_two_chips_with_one_uuid_answer_apart() -> None:
