@@ -100,9 +100,10 @@ void io_note_states(struct io_bus *bus); // notes what Python has to hear of
 void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, size_t size, uint64_t now);
 
 // io_schedule.c: the link that shall send next of the classes in ALLOWED, or NULL. What is left to cut of a
-// block counts as an offer, but not that of ENDING, which has come to a block's end. And that it did.
+// block counts as an offer, but not that of ENDING, which has come to a block's end. *best: its offer. And
+// that it did.
 struct io_link *io_next_link(const struct io_bus *bus, uint64_t now, unsigned allowed,
-                             const struct io_link *ending);
+                             const struct io_link *ending, struct link_offer *best);
 void io_served(struct io_bus *bus, const struct io_link *node);
 
 // Bits of a frame for the budget; 0 while the bit rate is unknown.

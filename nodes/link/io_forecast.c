@@ -112,7 +112,7 @@ static void fill_bins(struct io_bus *bus, uint64_t now, struct bin *bins, struct
 // after idle time must not be weighed against time that has passed unused.
 static void serve(const struct bin *bins, uint64_t now, struct io_forecast *out) {
     uint64_t start_ns = now;
-    double needed_ns = 0; // since then
+    double needed_ns = 0, all_ns = 0; // since then; since now
     for (size_t i = 0; i < BINS; i++) {
         if (!bins[i].due_ns)
             continue;
@@ -120,10 +120,13 @@ static void serve(const struct bin *bins, uint64_t now, struct io_forecast *out)
             start_ns = bins[i].ready_ns;
             needed_ns = 0;
         }
-        needed_ns += bins[i].bits / out->motion_bits_per_s * (double)NS_PER_S;
+        double bin_ns = bins[i].bits / out->motion_bits_per_s * (double)NS_PER_S;
+        needed_ns += bin_ns;
+        all_ns += bin_ns;
         uint64_t end_ns = now + (i + 1) * BIN_NS; // what is in the bin is due until then, spread over it
         double stretch_ns = end_ns > start_ns + BIN_NS ? (double)(end_ns - start_ns) : (double)BIN_NS;
-        double ratio = needed_ns / stretch_ns;
+        double ratio = needed_ns / stretch_ns, from_now = all_ns / (double)(end_ns - now);
+        ratio = ratio > from_now ? ratio : from_now;
         if (ratio > out->worst_ratio) {
             out->worst_ratio = ratio;
             out->at_ns = end_ns;

@@ -7,9 +7,8 @@ enum { BITS_PER_BYTE = 10 }; // of a serial line: start, eight, stop
 
 // Earliest deadline first over all nodes; among equals the turn goes round.
 struct io_link *io_next_link(const struct io_bus *bus, uint64_t now, unsigned allowed,
-                             const struct io_link *ending) {
+                             const struct io_link *ending, struct link_offer *best) {
     struct io_link *chosen = NULL;
-    struct link_offer best = {0};
     for (size_t i = 0; i < bus->link_count; i++) {
         struct io_link *node = bus->links[(bus->turn + i) % bus->link_count];
         struct link_offer offer;
@@ -17,9 +16,9 @@ struct io_link *io_next_link(const struct io_bus *bus, uint64_t now, unsigned al
             offer = node->cut_offer;
         else if (!link_next_offer(&node->link, now, allowed, &offer))
             continue;
-        if (!chosen || schedule_before(&offer, &best, now)) {
+        if (!chosen || schedule_before(&offer, best, now)) {
             chosen = node;
-            best = offer;
+            *best = offer;
         }
     }
     return chosen;

@@ -223,11 +223,16 @@ void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in) {
         link->lead_in = (uint8_t)lead_in;
 }
 
-static uint64_t repeat_deadline(const struct link *link) {
+uint64_t link_unanswered_since(const struct link *link) {
     if (link->cursor == link->first)
         return LINK_NEVER;
     uint64_t sent_ns = const_block_of(link, link->first)->sent_ns;
-    return (sent_ns > link->progress_ns ? sent_ns : link->progress_ns) + link_rto(link);
+    return sent_ns > link->progress_ns ? sent_ns : link->progress_ns;
+}
+
+static uint64_t repeat_deadline(const struct link *link) {
+    uint64_t since_ns = link_unanswered_since(link);
+    return since_ns == LINK_NEVER ? LINK_NEVER : since_ns + link_rto(link);
 }
 
 static uint64_t lost_deadline(const struct link *link) {

@@ -167,7 +167,8 @@ struct link_offer {
     uint8_t pressing; // motion whose due_ns has come, its repeat, or an urgent command
 };
 
-// What the link would send now of the classes in the set ALLOWED (repeats always may go); returns 0: nothing.
+// What the link would send now of the classes in the set ALLOWED (repeats and pressing motion always may go);
+// returns 0: nothing.
 int link_next_offer(const struct link *link, uint64_t now, unsigned allowed, struct link_offer *out);
 
 // Writes that transmission (at most LINK_WIRE_MAX bytes) and returns its size; 0: nothing to send now. The
@@ -177,6 +178,9 @@ size_t link_next_block(struct link *link, uint64_t now, unsigned allowed, uint8_
 // When link_handle_timer, link_receive or link_next_block with ALLOWED has something to do that it has not
 // now. UINT64_MAX: nothing but an event changes anything.
 uint64_t link_deadline(const struct link *link, uint64_t now, unsigned allowed);
+
+// Since when the oldest transmission waits for its acknowledgement; UINT64_MAX: none does.
+uint64_t link_unanswered_since(const struct link *link);
 
 // Host time by which a motion command of REQ_CLOCK should go: a loss on the way can be noticed and repaired
 // before it is due. 0: the clock is unknown.

@@ -103,7 +103,7 @@ static void order_classes(const struct link *link, uint64_t now, unsigned allowe
         enum link_class kind = ranks[rank];
         const struct link_queue *queue = &link->queues[kind];
         plan->fronts[kind].end = queue->head;
-        if (queue->head == queue->tail || !(allowed & 1u << kind))
+        if (queue->head == queue->tail || (kind != LINK_MOTION && !(allowed & 1u << kind)))
             continue;
         struct link_command head;
         link_queue_peek(queue, queue->head, &head);
@@ -113,6 +113,10 @@ static void order_classes(const struct link *link, uint64_t now, unsigned allowe
             continue;
         }
         offers[kind] = offer_of(link, kind, &head, now);
+        if (!(allowed & 1u << kind) && !offers[kind].pressing) { // motion may not be sent ahead
+            plan->at_ns = offers[kind].due_ns < plan->at_ns ? offers[kind].due_ns : plan->at_ns;
+            continue;
+        }
         size_t at = plan->classes++;
         for (; at > 0 && is_before(&offers[kind], &offers[plan->order[at - 1]]); at--)
             plan->order[at] = plan->order[at - 1];

@@ -4,9 +4,14 @@
 //
 // Time on the line is the currency: a frame costs its true bits, counted in ns. Credit comes in at the
 // ceiling (a share of the bit rate) and everything that is on the bus, sent or received, is paid from it.
-//     motion   always may go; what it overdraws, the others lack
-//     control  overdraws by up to OVERDRAFT_NS, so that a question never waits for data
-//     bulk     only while there is credit, which is capped at about one block: no bursts
+//     motion   whose time has come always may go, and what it overdraws the others lack; sent ahead, as
+//     control control  overdraws by up to OVERDRAFT_NS, so that a question never waits for data bulk     only
+//     while there is credit, which is capped at about one block: no bursts
+// Sending ahead below the ceiling is what keeps the nodes' acknowledgements alive: the host's frames to a
+// node win arbitration over the frames of all nodes with a higher id, and a host that never pauses is never
+// answered by those. Where motion is pressing and there are no pauses by themselves, schedule_breathe() makes
+// them.
+//
 // Received data and motion may take all there is for ever. So that the others get through nevertheless, each
 // has a share of its own that nobody else can spend (CONTROL_SHARE, BULK_SHARE).
 #ifndef LINK_SCHEDULE_H
@@ -34,6 +39,7 @@ struct schedule {
     uint64_t now_ns, begun_ns;      // last refill; the start
     uint8_t serial;                 // each direction has a line of its own
     uint64_t line_free_ns;          // when all that was handed over will have left, as far as is known
+    uint64_t pause_ns, paused_ns;   // the line is left alone until then; when it last was
     uint64_t held_ns;               // time for which the budget held something back
     uint64_t held_since_ns;         // 0: it does not, now
     uint64_t sent_bits[LINK_CLASSES], received_bits;
@@ -62,13 +68,17 @@ void schedule_received(struct schedule *schedule, unsigned flow, uint32_t bits);
 // The budget holds something back from now on, or holds nothing.
 void schedule_held(struct schedule *schedule, int held);
 
+// An acknowledgement is awaited since SINCE. Returns whether the line has to be left alone now, so that
+// frames of others get through; until when tells schedule_room_at().
+int schedule_breathe(struct schedule *schedule, uint64_t since_ns);
+
 // How many frames wait, when QUEUED are said to sit in the kernel (UINT64_MAX: unknown).
 uint64_t schedule_queued(const struct schedule *schedule, uint64_t queued);
 
 // How many frames may be handed over when QUEUED sit in the kernel (UINT64_MAX: unknown, it is estimated).
 uint64_t schedule_room(const struct schedule *schedule, uint64_t queued);
 
-// When a frame of a full queue should have left.
+// When a frame of a full queue should have left, or a pause ends.
 uint64_t schedule_room_at(const struct schedule *schedule);
 
 // Whether offer A goes before B when both could go at NOW. What is overdue and not motion is overdue alike.

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/can_bits.c
-// can. Also built by hand with -fsanitize=thread: what the mutex guards, it guards.
+// The thread of a bus between several calling threads and a node that answers as fast as it can. Also built
+// by hand with -fsanitize=thread: what the mutex guards, it guards.
 #include "tests/check.h"
 
 #include <fcntl.h>
