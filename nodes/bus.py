@@ -65,7 +65,6 @@ class _Base:
         self._cache = cache if cache is not None else DictionaryCache()
         self._on_notice = on_notice
         self._may_be_absent: set[Node] = set()
-        self._reopening = asyncio.Lock()
         self._io: LinkIOLike | None = None
 
     @property
@@ -110,22 +109,17 @@ class _Base:
             if node not in self._may_be_absent:
                 raise
 
-    async def bring_back(self, node: Node) -> None:
-        """Restart NODE, opening the bus again if that is what it needs; raises CanductorError, node LOST."""
-        async with self._reopening:
-            if self.closed_because is not None:
-                self._reopen()
-        await node.restart()
+    def ensure_open(self) -> None:
+        """Open the bus again when it closed, for its nodes to be restarted; raises CanductorError."""
+        if self.closed_because is not None:
+            io, self._io = self._io, None
+            if io is not None:
+                io.close()
+            self._open()
+            self.closed_because = None
 
     def _open(self) -> None:
         self._io = self._start_io(on_frame=self._frame_handler(), on_closed=self._io_closed)
-
-    def _reopen(self) -> None:
-        io, self._io = self._io, None
-        if io is not None:
-            io.close()
-        self._open()
-        self.closed_because = None
 
     async def close(self) -> None:
         """Close all nodes and the bus; nothing is left running."""

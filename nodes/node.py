@@ -213,9 +213,9 @@ class Node:
         await self.start()
 
     async def sleep(self) -> None:
-        """Let go of the node, from READY, SHUTDOWN or LOST, so that its power can be switched off.
+        """Let go of the node, so that its power can be switched off: it is neither talked to nor missed.
 
-        From then on it is neither talked to nor missed. Raises NodeError.
+        A start that was under way must have been cancelled. Raises NodeError when it sleeps or is closed.
         """
         if following(self.state, NodeEvent.SLEEP) is None:
             raise NodeError(f"node {self.name} is {self.state.value} and cannot be put to sleep")
