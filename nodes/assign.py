@@ -249,7 +249,7 @@ class IdAssignment:
         seen.here += 1
         if seen.nodeid is not None:
             seen.settled = seen.nodeid == nodeid
-            seen.needs_id = not seen.settled
+            seen.needs_id |= not seen.settled
             return
         for other in self._seen.values():
             if other.nodeid == nodeid:

@@ -199,11 +199,13 @@ def _read(path: Path, beginning: bytes) -> bytes | None:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
         return None
-    with os.fdopen(descriptor, "rb") as file:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+    try:
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_COMPRESSED_BYTES:
             return None
-        head = file.read(len(beginning))
-        if head != beginning:
-            return None
-        compressed = head + file.read(MAX_COMPRESSED_BYTES + 1 - len(head))
-    return compressed if len(compressed) <= MAX_COMPRESSED_BYTES else None
+        compressed = os.read(descriptor, MAX_COMPRESSED_BYTES)
+    except OSError:
+        return None
+    finally:
+        os.close(descriptor)
+    return compressed if compressed.startswith(beginning) else None

@@ -85,10 +85,14 @@ def test_another_host_that_configures_a_node_is_found_out() -> None:
 
 
 def test_the_clock_of_a_node_with_a_long_uptime_rolls_over_without_suspicion() -> None:
-    machine = Machine(TwinNode(start_ticks=(1 << 32) - round((virtual_time.START_S + 5) * 1e6)))
+    twin = TwinNode()
+    twin.start_ticks = (1 << 32) - twin.ticks(virtual_time.START_S + 5)
+    machine = Machine(twin)
 
     async def check() -> None:
+        assert twin.ticks(now_s()) < 1 << 32
         await asyncio.sleep(20)
+        assert twin.ticks(now_s()) > 1 << 32
         assert machine.node.state is NodeState.READY
 
     machine.run(machine.bus.start, check)
