@@ -179,8 +179,11 @@ class Node:
         try:
             await self._start()
         except CanductorError as error:
+            failure = error if isinstance(error, NodeError) else NodeError(str(error))
             if self.failure is None:
-                self._fail(NodeEvent.LOST, error if isinstance(error, NodeError) else NodeError(str(error)))
+                self._fail(NodeEvent.LOST, failure)
+            elif self.state is NodeState.LOST:
+                self.failure = failure  # says more than its link, which only found it silent
             raise
 
     async def _start(self) -> None:

@@ -1,4 +1,4 @@
-"""What the machine does when a node goes that may: notices, waiting jobs, sleep; on twin nodes, without time."""
+"""What the machine does when a node goes that may: notices, waiting jobs, sleep; on twin nodes."""
 
 import asyncio
 from collections.abc import Callable, Coroutine

@@ -8,6 +8,7 @@ from nodes.bus import BUS_OFF, CanBus
 from nodes.errors import CanductorError
 from nodes.node_errors import NodeError, NodeRestarted
 from nodes.node_states import NodeState
+from nodes.seams import OnFrame, OnLost
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
 from tests.nodes.twin_bus import Frame, TwinIO, TwinNode, source_of, with_canbus_id
@@ -117,10 +118,11 @@ def test_a_second_board_with_a_nodes_uuid_is_named_and_the_node_goes_on() -> Non
         await bus.close()
 
     virtual_time.run(main())
-    assert said == [
+    [sentence] = said
+    assert sentence == (
         "two boards on bus can0 have the uuid 010203040501 (cloned chips?); take one of them off; "
         "the second one waits for an id and is not used"
-    ]
+    )
 
 
 def test_a_board_that_answers_in_anothers_place_is_found_out() -> None:
@@ -237,10 +239,10 @@ def test_a_bus_of_nodes_that_may_be_absent_can_be_missing_and_come_later() -> No
     class Plugged(TwinIO):
         there = False
 
-        def __call__(self, **handlers: object) -> TwinIO:  # type: ignore[override]
+        def __call__(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> TwinIO:
             if not self.there:
                 raise CanductorError("CAN interface can7: there is no such interface")
-            return super().__call__(**handlers)  # type: ignore[arg-type]
+            return super().__call__(on_frame=on_frame, on_closed=on_closed)
 
     io = Plugged([TwinNode(uuid(1))])
     bus = CanBus("can7", io)
