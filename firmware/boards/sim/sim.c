@@ -15,7 +15,7 @@ struct sim_board {
     struct can_stream can;
     uint64_t clock;
     uint64_t edges_lost;
-    uint8_t uuid[NODE_UUID_SIZE];
+    struct node_config config; // but for clock_high, which every start sets anew
     uint8_t on_can, reset_wanted;
     uint8_t out[SIM_OUT_ROOM];
     size_t out_size;
@@ -26,19 +26,12 @@ struct sim_board {
 // time
 
 static void start(struct sim_board *board) {
-    struct node_config config = {
-        .clock_freq = virtual_variant.clock_freq,
-        .move_count = virtual_variant.move_count,
-        .clock_high = (uint32_t)(board->clock >> 32),
-        .arena = board->arena,
-        .arena_size = sizeof(board->arena),
-    };
-    memcpy(config.uuid, board->uuid, sizeof(config.uuid));
+    board->config.clock_high = (uint32_t)(board->clock >> 32);
     board->reset_wanted = 0;
     virtual_pins_reset(&board->virtual);
     if (board->on_can)
         can_stream_attach(&board->virtual.node, &board->can);
-    node_start(&board->virtual.node, &config);
+    node_start(&board->virtual.node, &board->config);
     node_run_tasks(&board->virtual.node);
 }
 
@@ -50,7 +43,20 @@ static void run_tasks(struct sim_board *board) {
         start(board);
 }
 
-struct sim_board *sim_new(const uint8_t *uuid, uint64_t start_clock, int on_can) {
+static void configure(struct sim_board *board, const struct sim_options *options) {
+    board->config = (struct node_config){
+        .clock_freq = options->clock_freq ? options->clock_freq : virtual_variant.clock_freq,
+        .move_count = options->move_count ? options->move_count : virtual_variant.move_count,
+        .arena = board->arena,
+        .arena_size = sizeof(board->arena),
+        .dictionary = options->dictionary,
+        .dictionary_size = options->dictionary_size,
+        .legacy = options->legacy != 0,
+    };
+    memcpy(board->config.uuid, options->uuid, sizeof(board->config.uuid));
+}
+
+struct sim_board *sim_new_with(const struct sim_options *options) {
     struct sim_board *board = calloc(1, sizeof(*board));
     if (!board)
         return NULL;
@@ -60,11 +66,16 @@ struct sim_board *sim_new(const uint8_t *uuid, uint64_t start_clock, int on_can)
         return NULL;
     }
     board->virtual.edge_room = EDGES_AT_FIRST;
-    board->clock = start_clock;
-    board->on_can = on_can != 0;
-    memcpy(board->uuid, uuid, sizeof(board->uuid));
+    board->clock = options->start_clock;
+    board->on_can = options->on_can != 0;
+    configure(board, options);
     start(board);
     return board;
+}
+
+struct sim_board *sim_new(const uint8_t *uuid, uint64_t start_clock, int on_can) {
+    const struct sim_options options = {.uuid = uuid, .start_clock = start_clock, .on_can = on_can};
+    return sim_new_with(&options);
 }
 
 void sim_free(struct sim_board *board) {
@@ -135,12 +146,15 @@ void sim_receive_bytes(struct sim_board *board, const uint8_t *data, size_t size
     run_tasks(board);
 }
 
-static int put(struct sim_board *board, const void *data, size_t size) {
-    if (size > SIM_OUT_ROOM - board->out_size)
-        return -1;
-    memcpy(board->out + board->out_size, data, size);
-    board->out_size += size;
-    return 0;
+// Bytes of urgent frames at the front of what waits: data never goes before them.
+static size_t urgent_size(const struct sim_board *board) {
+    size_t at = 0;
+    for (uint32_t id; at < board->out_size; at += SIM_FRAME_SIZE) {
+        memcpy(&id, board->out + at, sizeof(id));
+        if (id >= CAN_ID_URGENT_END)
+            break;
+    }
+    return at;
 }
 
 int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t size) {
@@ -148,11 +162,23 @@ int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t s
     memcpy(record, &id, sizeof(id));
     record[4] = (uint8_t)size;
     memcpy(record + 8, data, size);
-    return put((struct sim_board *)node, record, sizeof(record));
+    struct sim_board *board = (struct sim_board *)node;
+    size_t at = id < CAN_ID_URGENT_END ? urgent_size(board) : board->out_size;
+    if (sizeof(record) > SIM_OUT_ROOM - board->out_size)
+        return -1;
+    memmove(board->out + at + sizeof(record), board->out + at, board->out_size - at);
+    memcpy(board->out + at, record, sizeof(record));
+    board->out_size += sizeof(record);
+    return 0;
 }
 
 size_t board_uart_send(struct node *node, const uint8_t *data, size_t size) {
-    return put((struct sim_board *)node, data, size) ? 0 : size;
+    struct sim_board *board = (struct sim_board *)node;
+    if (size > SIM_OUT_ROOM - board->out_size)
+        return 0;
+    memcpy(board->out + board->out_size, data, size);
+    board->out_size += size;
+    return size;
 }
 
 size_t sim_take(struct sim_board *board, uint8_t *out, size_t size) {
