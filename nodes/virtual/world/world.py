@@ -231,7 +231,7 @@ class WorldNode:
         """From now on its clock runs PPM above nominal, rising by PPM_PER_S: a board that warms up."""
         if lib.world_node_set_rate(self.raw, ppm, ppm_per_s):
             raise WorldError(
-                f"node {self.uuid}: its clock's rate was changed {lib.CLOCK_PIECES_MAX} times already"
+                f"node {self.uuid}: its clock's rate was changed {lib.WORLD_RATES_MAX} times already"
             )
 
     def set_input(self, pin: int, level: int, at_ns: int = 0) -> None:
@@ -260,6 +260,7 @@ class WorldNode:
         position: int = 0,
         direction: int = 1,
         dir_inverted: bool = False,
+        step_inverted: bool = False,
         both_edges: bool = False,
         input_inverted: bool = False,
         delay_s: float = 0.0,
@@ -270,7 +271,8 @@ class WorldNode:
         """
         fields = {"step_pin": step_pin, "dir_pin": dir_pin, "target_pin": target_pin, "target": target.raw}
         fields |= {"at": at, "position": position, "direction": direction}
-        fields |= {"dir_inverted": dir_inverted, "both_edges": both_edges, "input_inverted": input_inverted}
+        fields |= {"dir_inverted": dir_inverted, "step_inverted": step_inverted}
+        fields |= {"both_edges": both_edges, "input_inverted": input_inverted}
         fields["delay_ns"] = to_ns(delay_s, "an endstop's delay")
         number = lib.world_node_add_axis(self.raw, ffi.new("struct world_axis *", fields))
         if number < 0:
