@@ -17,6 +17,7 @@ struct sim_board {
     uint64_t edges_lost;
     struct node_config config; // but for clock_high, which every start sets anew
     uint8_t on_can, reset_wanted;
+    struct sim_owner owner; // all null: none
     uint8_t out[SIM_OUT_ROOM];
     size_t out_size;
     _Alignas(16) uint8_t arena[ARENA];
@@ -32,11 +33,14 @@ static void start(struct sim_board *board) {
     if (board->on_can)
         can_stream_attach(&board->virtual.node, &board->can);
     node_start(&board->virtual.node, &board->config);
-    node_run_tasks(&board->virtual.node);
+    if (!board->owner.context)
+        node_run_tasks(&board->virtual.node);
 }
 
 static void run_tasks(struct sim_board *board) {
     struct node *node = &board->virtual.node;
+    if (board->owner.context)
+        return; // it says when
     if (node->tasks_pending)
         node_run_tasks(node);
     if (board->reset_wanted)
@@ -92,7 +96,11 @@ static uint64_t extend(const struct sim_board *board, uint32_t clock) {
 }
 
 uint64_t sim_next_deadline(const struct sim_board *board) {
-    return extend(board, node_next_deadline(&board->virtual.node));
+    const struct node *node = &board->virtual.node;
+    // With an owner, tasks that are wanted already run when it says so: only timers are due by themselves.
+    if (board->owner.context && node->tasks_pending)
+        return node->sched.first ? extend(board, node->sched.first->waketime) : UINT64_MAX;
+    return extend(board, node_next_deadline(node));
 }
 
 void sim_run_until(struct sim_board *board, uint64_t clock) {
@@ -114,6 +122,10 @@ void sim_run_until(struct sim_board *board, uint64_t clock) {
         board->clock = clock;
 }
 
+uint32_t sim_node_id(const struct sim_board *board) {
+    return board->can.node_id;
+}
+
 uint64_t sim_clock(const struct sim_board *board) {
     return board->clock;
 }
@@ -128,6 +140,54 @@ uint64_t virtual_clock(struct virtual_board *virtual) {
 
 void board_reset(struct node *node) {
     ((struct sim_board *)node)->reset_wanted = 1;
+}
+
+// ----------------------------------------------------------------------------------------------------- owner
+
+static void tell_edge(struct virtual_board *virtual, uint32_t pin, int level) {
+    struct sim_board *board = (struct sim_board *)virtual;
+    virtual->edge_count = 0; // the owner keeps it
+    board->owner.edge(board->owner.context, board->clock, pin, level);
+}
+
+static void ask_can_status(struct virtual_board *virtual, struct board_can_status *out) {
+    const struct sim_owner *owner = &((struct sim_board *)virtual)->owner;
+    owner->can_status(owner->context, out);
+}
+
+void sim_own(struct sim_board *board, const struct sim_owner *owner) {
+    board->owner = *owner;
+    board->out_size = 0;
+    board->virtual.on_edge = tell_edge;
+    if (board->on_can)
+        board->virtual.can_status = ask_can_status;
+}
+
+int sim_tasks_wanted(const struct sim_board *board) {
+    return board->virtual.node.tasks_pending;
+}
+
+int sim_reset_wanted(const struct sim_board *board) {
+    return board->reset_wanted;
+}
+
+void sim_run_tasks(struct sim_board *board) {
+    node_run_tasks(&board->virtual.node);
+}
+
+void sim_sent(struct sim_board *board) {
+    node_wake_tasks(&board->virtual.node);
+}
+
+void sim_power_off(struct sim_board *board) {
+    virtual_pins_reset(&board->virtual);
+    board->virtual.node.tasks_pending = 0;
+    board->virtual.node.sched.first = NULL;
+}
+
+void sim_power_on(struct sim_board *board, uint64_t start_clock) {
+    board->clock = start_clock;
+    start(board);
 }
 
 // ----------------------------------------------------------------------------------------------------- wires
@@ -163,6 +223,8 @@ int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t s
     record[4] = (uint8_t)size;
     memcpy(record + 8, data, size);
     struct sim_board *board = (struct sim_board *)node;
+    if (board->owner.context)
+        return board->owner.send_frame(board->owner.context, id, data, size);
     size_t at = id < CAN_ID_URGENT_END ? urgent_size(board) : board->out_size;
     if (sizeof(record) > SIM_OUT_ROOM - board->out_size)
         return -1;
@@ -174,6 +236,8 @@ int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t s
 
 size_t board_uart_send(struct node *node, const uint8_t *data, size_t size) {
     struct sim_board *board = (struct sim_board *)node;
+    if (board->owner.context)
+        return board->owner.send_bytes(board->owner.context, data, size);
     if (size > SIM_OUT_ROOM - board->out_size)
         return 0;
     memcpy(board->out + board->out_size, data, size);
