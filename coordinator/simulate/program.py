@@ -105,11 +105,11 @@ class _Pen:
         yield f"G1 X{self._x:.3f} F{round(60 * self._speed)}"
 
     def _hop(self) -> Iterator[str]:
-        yield f"G1 E-{RETRACT_MM} F2400"
+        yield f"G1 E-{RETRACT_MM} F1500"
         yield f"G1 Z{self._z + HOP_MM:.3f} F900"
         yield self._to(*self._anywhere(), self._feed(), extrude=False)
         yield f"G1 Z{self._z:.3f} F900"
-        yield f"G1 E{RETRACT_MM} F2400"
+        yield f"G1 E{RETRACT_MM} F1500"
 
     def _pause(self) -> Iterator[str]:
         yield f"G4 P{self._rng.randrange(5, 300)}"

@@ -58,6 +58,8 @@ class NodeSetting:
     """Of a node that is on the bus but not in the configuration: its own uuid, 12 hex digits."""
     bus: str = option(text, "")
     """Likewise: the interface it is attached to."""
+    has_id: int = option(whole(1, 255), 0)
+    """Likewise: the node id that another host gave it; 0: none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +129,7 @@ class Program:
 
     lines: str = option(text, "")
     """The g-code itself; the seed decides nothing then."""
-    strokes: Range = option(span(1, 2000), Range(30, 60))
+    strokes: Range = option(span(1, 2000), Range(8, 20))
     """How many pieces (a line, a curve of short segments, a zigzag, a hop, a pause …) are put together."""
     speed_mm_s: Range = option(span(1, 500, "mm/s"), Range(60, 250))
     """The fastest of them; the slowest takes a tenth."""

@@ -49,7 +49,7 @@ class Dice:
 # ---------------------------------------------------------------------------------------- kinds of values
 
 
-def number(low: float, high: float, unit: str = "") -> Convert:
+def number(low: float, high: float, unit: str = "") -> Callable[[object], float]:
     """Take one number from LOW to HIGH."""
 
     def convert(value: object) -> float:
@@ -72,7 +72,7 @@ def span(low: float, high: float, unit: str = "") -> Convert:
             begin, end = 1.0, 0.0
         if begin > end:
             raise ValueError(f"a number or a range [low, high] {_bounds(low, high, unit)}")
-        return Range(begin, end)  # type: ignore[arg-type] (number gives floats)
+        return Range(begin, end)
 
     return convert
 
@@ -144,7 +144,8 @@ def read(kind: type[T], table: object, where: str) -> T:
     """Return the KIND (a dataclass of ``option`` fields) that TABLE describes; raises ScenarioError."""
     if not isinstance(table, Mapping):
         raise ScenarioError(f"{where} must be a table")
-    fields = {field.name: field for field in dataclasses.fields(kind) if _CONVERT in field.metadata}  # type: ignore[arg-type] (T is a dataclass)
+    assert dataclasses.is_dataclass(kind)
+    fields = {field.name: field for field in dataclasses.fields(kind) if _CONVERT in field.metadata}
     for name in table:
         if name not in fields:
             hint = nearest(name, fields) or f"; it has {', '.join(sorted(fields))}"
