@@ -110,7 +110,7 @@ def steps_of(
     both_edges: bool,
     step_idle_level: int = 0,
 ) -> Iterator[tuple[Clocks, Directions]]:
-    """Yield the steps in CHUNKS (clock, pin and level) of a step pin and its direction pin; see EdgeLog.steps."""
+    """Yield the steps in CHUNKS of clock, pin and level of a step and a direction pin; see EdgeLog.steps."""
     step_level, dir_level = step_idle_level, 0
     for clock, pin, level in chunks:
         is_step_pin = pin == step_pin
