@@ -9,7 +9,7 @@ from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program as GCode
 from coordinator.machine.description import load_machine
 from coordinator.motion.planner import Planner
-from coordinator.simulate import scenario
+from coordinator.simulate import reference, scenario
 from coordinator.simulate.program import make_program
 from coordinator.simulate.values import Dice, Range, ScenarioError
 
@@ -134,3 +134,9 @@ def test_a_made_program_can_be_planned(tmp_path: Path) -> None:
     with GCode.open(path) as gcode:
         job = Job(gcode, Planner(machine.limits), machine.homed_position)
         assert job.planner.at_standstill
+
+
+def test_the_page_has_the_tables() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text(encoding="utf-8")
+    for part in (*map(reference.table, reference.TABLES), reference.faults()):
+        assert part in page, "stale: paste what `python -m coordinator.simulate.reference` prints"
