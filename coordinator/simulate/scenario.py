@@ -104,6 +104,7 @@ class FaultSetting:
     """One thing that goes wrong."""
 
     kind: str = option(choice(*FAULT_KINDS))
+    """What: see below."""
     at_s: Range = option(span(0, 100, "s"))
     """When, counted from ``since``."""
     for_s: Range = option(span(0, 100, "s"), Range(0, 0))
