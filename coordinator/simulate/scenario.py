@@ -120,8 +120,9 @@ class FaultSetting:
     id: int = option(whole(0, 0x7FF), 0x700)
     """``babble``: the CAN id that is sent."""
     times: Range = option(span(1, 50), Range(1, 1))
-    """How often, evenly spaced by ``every_s``."""
+    """How often it happens."""
     every_s: Range = option(span(0.01, 60, "s"), Range(1, 1))
+    """From one begin to the next."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
