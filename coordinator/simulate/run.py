@@ -113,12 +113,12 @@ def run_all(tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
 
 def _begin_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command itself hears Ctrl-C and ends the pool
-    import coordinator.simulate.stage  # noqa: F401, PLC0415 (import once, not in the first seed)
+    import coordinator.simulate.play  # noqa: F401, PLC0415 (import once, not in the first seed)
 
 
 def run_one(scenario: Scenario, seed: int) -> Result:
     """Run one seed; a bug that shows as an exception is a violation like any other."""
-    from coordinator.simulate.stage import play  # noqa: PLC0415 (--list needs no native code)
+    from coordinator.simulate.play import play  # noqa: PLC0415 (--list needs no native code)
 
     began_s = time.process_time()
     try:

@@ -41,7 +41,7 @@ def test_many_seeds_are_spread_over_the_scenarios_by_weight() -> None:
 
 
 def test_a_seed_falls_to_the_same_scenario_whatever_runs_beside_it() -> None:
-    whole = dict((seed, name) for name, seed in tasks(seeds=range(300)))
+    whole = {seed: name for name, seed in tasks(seeds=range(300))}
     assert all(whole[seed] == name for name, seed in tasks(seeds=range(100, 200)))
 
 
