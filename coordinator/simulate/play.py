@@ -67,6 +67,8 @@ class _Run:
     links: dict[str, Link] = field(default_factory=dict)
     both_edges: dict[str, bool] = field(default_factory=dict)
     found: list[Violation] = field(default_factory=list)
+    watch: asyncio.Task[None] | None = None
+    """Keeps the task that notes the stop alive."""
 
     def perform(self) -> None:
         """Connect, run the job, and let the boards go on for a while afterwards."""
@@ -108,7 +110,7 @@ class _Run:
         self.links = {name: link_of(node) for name, node in machine.nodes.items()}
         self.both_edges = {name: s.steps_on_both_edges for name, s in machine.devices.steppers.items()}
         self.stage.faults.begin("job", self._interrupt())
-        self._watch = asyncio.get_running_loop().create_task(self._note_stop(machine))
+        self.watch = asyncio.get_running_loop().create_task(self._note_stop(machine))
 
     async def _note_stop(self, machine: Machine) -> None:
         await machine.wait_stopped()

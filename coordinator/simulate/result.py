@@ -64,7 +64,9 @@ class Result:
 
     def to_text(self) -> str:
         """Return it as lines for a reader."""
-        how = "completed" if self.cause is None else f"stopped: {self.cause}"
+        died = any(violation.rule == "exception" for violation in self.violations)
+        ended = "did not come to its end" if died else "completed"
+        how = ended if self.cause is None else f"stopped: {self.cause}"
         lines = [
             f"{self.scenario}, seed {self.seed}: {how}",
             (
