@@ -29,7 +29,7 @@ def make_program(program: Program, dice: Dice) -> str:
     for _ in range(round(dice.draw(program.strokes, "strokes"))):
         lines += pen.stroke()
     lines += pen.to_and_fro(dice.draw(program.long_s, "long"))
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, program.end, ""])
 
 
 class _Pen:

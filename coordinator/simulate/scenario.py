@@ -139,6 +139,8 @@ class Program:
     """The square in which they lie."""
     long_s: Range = option(span(0, 60, "s"), Range(0, 0))
     """Adds moves to and fro that take about so long."""
+    end: str = option(text, "")
+    """Lines behind all that."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
