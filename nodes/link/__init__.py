@@ -3,6 +3,8 @@
 from nodes.link.bus_io import LinkIO
 from nodes.link.link import Link
 from nodes.link.types import (
+    BusDriver,
+    BusSettings,
     Frame,
     IOStats,
     LinkError,
@@ -14,6 +16,8 @@ from nodes.link.types import (
 )
 
 __all__ = [
+    "BusDriver",
+    "BusSettings",
     "Frame",
     "IOStats",
     "Link",

@@ -30,9 +30,9 @@ enum io_status io_open_link(struct io_bus *bus, unsigned nodeid, const struct li
     if (nodeid > 255 || (bus->kind == IO_BYTES) != (nodeid == 0) || !settings->lost_after_ns ||
         settings->receive_window < LINK_WINDOW_MIN)
         return IO_INVALID;
-    pthread_mutex_lock(&bus->mutex);
+    io_lock(bus);
     enum io_status status = bus->ended ? IO_CLOSED : add_link(bus, nodeid, settings, number);
-    pthread_mutex_unlock(&bus->mutex);
+    io_unlock(bus);
     return status;
 }
 
@@ -44,21 +44,22 @@ static size_t index_of(const struct io_bus *bus, uint32_t number) {
 }
 
 void io_close_link(struct io_bus *bus, uint32_t number) {
-    pthread_mutex_lock(&bus->mutex);
+    io_lock(bus);
     size_t at = index_of(bus, number);
     if (at < bus->link_count) {
         struct io_link *node = bus->links[at];
         bus->by_nodeid[node->nodeid] = NULL;
         bus->link_count--;
+        bus->cutting = bus->cutting == node ? NULL : bus->cutting;
         memmove(bus->links + at, bus->links + at + 1, (bus->link_count - at) * sizeof *bus->links);
         free(node);
     }
-    pthread_mutex_unlock(&bus->mutex);
+    io_unlock(bus);
 }
 
 // Locks the bus and finds the link; NULL (and *status): it cannot be used.
 static struct io_link *enter(struct io_bus *bus, uint32_t number, enum io_status *status) {
-    pthread_mutex_lock(&bus->mutex);
+    io_lock(bus);
     size_t at = index_of(bus, number);
     *status = bus->ended ? IO_CLOSED : at == bus->link_count ? IO_GONE : IO_OK;
     return *status == IO_OK ? bus->links[at] : NULL;
@@ -66,8 +67,8 @@ static struct io_link *enter(struct io_bus *bus, uint32_t number, enum io_status
 
 static enum io_status leave(struct io_bus *bus, enum io_status status) {
     if (status == IO_OK)
-        io_send_now(bus);
-    pthread_mutex_unlock(&bus->mutex);
+        bus->driver.kick(bus->context);
+    io_unlock(bus);
     return status;
 }
 
@@ -130,9 +131,9 @@ enum io_status io_watch_drained(struct io_bus *bus, uint32_t number) {
 }
 
 enum io_status io_send_frame(struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size) {
-    if (size > CAN_MAX_DLEN || bus->kind == IO_BYTES)
+    if (size > IO_DATA_MAX || bus->kind == IO_BYTES)
         return IO_INVALID;
-    pthread_mutex_lock(&bus->mutex);
+    io_lock(bus);
     if (bus->ended || bus->admin_count == IO_ADMIN_MAX)
         return leave(bus, bus->ended ? IO_CLOSED : IO_FULL);
     struct can_frame *frame = &bus->admin[(bus->admin_first + bus->admin_count++) % IO_ADMIN_MAX];
@@ -170,12 +171,12 @@ enum io_status io_get_link_stats(struct io_bus *bus, uint32_t number, struct io_
         };
         link_get_stats(link, &out->link);
     }
-    pthread_mutex_unlock(&bus->mutex);
+    io_unlock(bus);
     return node ? IO_OK : status;
 }
 
 void io_get_stats(struct io_bus *bus, struct io_stats *out) {
-    pthread_mutex_lock(&bus->mutex);
+    io_lock(bus);
     *out = bus->stats;
-    pthread_mutex_unlock(&bus->mutex);
+    io_unlock(bus);
 }

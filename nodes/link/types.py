@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import Any, Protocol
 
 from nodes.errors import CanductorError
 
@@ -39,6 +39,63 @@ class LinkTransport(Protocol):
 
     def close(self) -> None:
         """Close the file descriptor."""
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """What is known of a bus or serial line (``struct io_settings`` of io_core.h)."""
+
+    bitrate: int = 0
+    """Bits per second; 0: unlimited or unknown, nothing is budgeted."""
+    ceiling: float = 0.9
+    """Share of the bit rate that is given out, 0.1..1."""
+    queue_frames: int = 0
+    """Most frames (a serial line: bytes) that may sit in the kernel or adapter; 0: from the bit rate."""
+
+    def __post_init__(self) -> None:
+        """Raise LinkError when a value is out of its range."""
+        if not 0 <= self.bitrate <= 100_000_000:
+            raise LinkError(f"a bus of {self.bitrate} bit/s; give 1..100000000, or 0 when it is unknown")
+        if not 0.1 <= self.ceiling <= 1.0:
+            raise LinkError(f"a ceiling of {self.ceiling} of the bit rate; give 0.1..1")
+        if not 0 <= self.queue_frames <= 1000:
+            raise LinkError(
+                f"a kernel queue of {self.queue_frames} frames; give 1..1000, or 0 for the default"
+            )
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the fields for cffi."""
+        return {"bitrate": self.bitrate, "ceiling": self.ceiling, "queue_frames": self.queue_frames}
+
+
+class BusDriver(Protocol):
+    """What moves the bytes of a bus: its I/O thread, or a simulation (io_core.h)."""
+
+    @property
+    def name(self) -> str:
+        """How messages to the user call the bus."""
+
+    @property
+    def serial(self) -> bool:
+        """Whether it is a serial line: one link, without a node id."""
+
+    @property
+    def ffi(self) -> Any:
+        """The cffi module that the bus was made with, and its lib."""
+
+    @property
+    def lib(self) -> Any:
+        """With the functions of io_api.h."""
+
+    @property
+    def bus(self) -> Any:
+        """The ``struct io_bus *``."""
+
+    def listen(self, handler: Callable[[], None]) -> None:
+        """Call HANDLER in the event loop's thread whenever io_take() has something."""
+
+    def close(self) -> None:
+        """End the driver and free the bus; nothing is called any more."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// See frame_bits.h. ISO 11898-1: stuffing acts from the start bit to the last bit of the checksum.
-#include "nodes/virtual/frame_bits.h"
+// See can_bits.h. ISO 11898-1: stuffing acts from the start bit to the last bit of the checksum.
+#include "nodes/can_bits.h"
 
 enum {
     CRC_BITS = 15,

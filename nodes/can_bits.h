@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The true length of a CAN frame on the wire.
-#ifndef VIRTUAL_FRAME_BITS_H
-#define VIRTUAL_FRAME_BITS_H
+#ifndef CAN_BITS_H
+#define CAN_BITS_H
 
 #include <stdint.h>
 

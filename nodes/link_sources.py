@@ -1,0 +1,12 @@
+"""What a cffi module needs that contains the core of a bus, whatever its driver."""
+
+CORE_HEADERS = (
+    "firmware/wire/wire.h",
+    *(f"nodes/link/{name}.h" for name in ("queue", "link", "io_core", "io_api")),
+)
+"""In this order."""
+CORE_SOURCES = (
+    *(f"firmware/wire/{name}.c" for name in ("vlq", "message", "block")),
+    *(f"nodes/link/{name}.c" for name in ("queue", "link", "link_receive")),
+    *(f"nodes/link/{name}.c" for name in ("io_core", "io_receive", "io_send", "io_schedule", "io_links")),
+)
