@@ -1,8 +1,7 @@
 """From the pins of simulated boards and the record of the plan to what the checker compares."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,29 +12,23 @@ from coordinator.pipeline import PlanRecord
 from coordinator.simulate.checker import ExecutedSteps, concatenate
 from nodes.virtual.edge_log import steps_of
 
-_PIN_MASK: Final = np.uint64(0x7FFF)
-_ONE: Final = np.uint64(1)
-_CLOCK_SHIFT: Final = np.uint64(16)
-
-Clocks = NDArray[np.uint64]
-
 
 @dataclass(frozen=True, slots=True)
 class BoardTruth:
-    """What a simulated board did: nothing in here was told by the code under test."""
+    """All changes of a simulated board's outputs, oldest first; nothing here was told by the code under test."""
 
-    edges: Clocks
-    """All changes of outputs: clock << 16 | pin << 1 | level, oldest first."""
-    true_ns: Callable[[Clocks], Ints]
-    """True times at which the board's clock (48 bits) read these."""
-    resets_ns: Sequence[int] = ()
-    """When it restarted: then all pins fall at once, which is no step."""
+    at_ns: Ints
+    """True time."""
+    pin: NDArray[np.uint16]
+    level: NDArray[np.uint8]
+    life: NDArray[np.uint32]
+    """How often the board had restarted."""
 
 
 def executed(
     board: BoardTruth,
     stepper: StepperDescription,
-    pins: dict[str, int],
+    pins: Mapping[str, int],
     *,
     both_edges: bool,
     since_ns: int,
@@ -45,23 +38,24 @@ def executed(
     PINS are the numbers of the board's pins; BOTH_EDGES: every change of the step pin is a step.
     """
     step_pin, dir_pin = pins[stepper.step_pin.name], pins[stepper.dir_pin.name]
-    pin = ((board.edges >> _ONE) & _PIN_MASK).astype(np.uint16)
-    own = (pin == step_pin) | (pin == dir_pin)
-    records, pin = board.edges[own], pin[own]
-    clock = records >> _CLOCK_SHIFT
-    at_ns = board.true_ns(clock)
-    level = (records & _ONE).astype(np.uint8)
-    # Clock and true time go through the pairing together: the time stands in for the clock.
-    chunks = [(at_ns.view(np.uint64), pin, level)]
+    own = (board.pin == step_pin) | (board.pin == dir_pin)
+    at_ns, pin, level = board.at_ns[own], board.pin[own], board.level[own]
+    if not len(pin):
+        return ExecutedSteps(np.empty(0, np.int64), np.empty(0, np.int8))
     idle = int(stepper.step_pin.invert)
-    parts = list(steps_of(chunks, step_pin, both_edges=both_edges, step_idle_level=idle)) if len(pin) else []
-    times = np.concatenate([t for t, _ in parts]).view(np.int64) if parts else np.empty(0, np.int64)
-    ways = np.concatenate([d for _, d in parts]) if parts else np.empty(0, np.int8)
-    wanted = times > since_ns
-    for reset_ns in board.resets_ns:
-        wanted &= times != reset_ns
+    # True time goes through the pairing in place of the clock; it is not negative.
+    chunks = [(at_ns.view(np.uint64), pin, level)]
+    parts = list(steps_of(chunks, step_pin, both_edges=both_edges, step_idle_level=idle))
+    times, ways = np.concatenate([t for t, _ in parts]).view(np.int64), np.concatenate([d for _, d in parts])
+    wanted = (times > since_ns) & ~np.isin(times, _restarts(board))
     sign = np.int8(-1 if stepper.dir_pin.invert else 1)
     return ExecutedSteps(times[wanted], (ways[wanted] * sign).astype(np.int8))
+
+
+def _restarts(board: BoardTruth) -> Ints:
+    """Return when pins fell because the board restarted: that is no step. Its own first step comes later."""
+    first = np.flatnonzero(np.diff(board.life)) + 1
+    return board.at_ns[first[board.level[first] == 0]]
 
 
 def planned(record: PlanRecord, stepper: StepperDescription) -> ExpectedSteps:

@@ -11,8 +11,6 @@ from coordinator.simulate.truth import BoardTruth
 
 STEP, DIR, OTHER = 20, 21, 5
 PINS = {"STEP": STEP, "DIR": DIR}
-FREQ_HZ = 50e6
-START_CLOCK = 2**32 - 1000
 
 
 def stepper(*, invert_step: bool = False, invert_dir: bool = False) -> StepperDescription:
@@ -24,14 +22,15 @@ def stepper(*, invert_step: bool = False, invert_dir: bool = False) -> StepperDe
     )
 
 
-def board(*edges: tuple[int, int, int], resets_ns: tuple[int, ...] = ()) -> BoardTruth:
-    """Return a board whose pins changed at (µs after the start, pin, level); its clock rolls over."""
-    records = [((START_CLOCK + at_us * 50) << 16) | (pin << 1) | level for at_us, pin, level in edges]
-
-    def true_ns(clock: truth.Clocks) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-        return np.asarray((clock.astype(np.int64) - START_CLOCK) * 20)
-
-    return BoardTruth(np.array(records, np.uint64), true_ns, resets_ns)
+def board(*edges: tuple[int, int, int], restart_us: int = 1000) -> BoardTruth:
+    """Return a board whose pins changed at (µs after the start, pin, level)."""
+    at_us, pin, level = zip(*edges, strict=True) if edges else ((), (), ())
+    return BoardTruth(
+        at_ns=np.array(at_us, np.int64) * 1000,
+        pin=np.array(pin, np.uint16),
+        level=np.array(level, np.uint8),
+        life=np.array([at >= restart_us for at in at_us], np.uint32),
+    )
 
 
 def steps(made: BoardTruth, described: StepperDescription, **how: bool) -> list[tuple[int, int]]:
@@ -60,7 +59,7 @@ def test_both_edges_count_where_the_driver_takes_both() -> None:
 
 
 def test_pins_that_fall_at_a_reset_are_no_steps_but_later_ones_are() -> None:
-    made = board((20, STEP, 1), (30, STEP, 0), (40, STEP, 1), resets_ns=(30_000,))
+    made = board((20, STEP, 1), (30, STEP, 0), (40, STEP, 1), restart_us=30)
     assert steps(made, stepper(), both_edges=True) == [(20, -1), (40, -1)]
 
 
