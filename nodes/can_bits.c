@@ -12,20 +12,27 @@ enum {
 
 struct bit_writer {
     uint32_t crc;
-    uint32_t bits;  // on the wire so far, stuff bits included
-    uint32_t level; // of the last one
-    uint32_t run;   // how many bits the wire has had this level
+    uint32_t bits;   // on the wire so far, stuff bits included
+    uint32_t level;  // of the last one
+    uint32_t run;    // how many bits the wire has had this level
+    uint8_t *levels; // where they are written to, or null
 };
 
-static void put_bit(struct bit_writer *writer, uint32_t bit) {
+static void count(struct bit_writer *writer, uint32_t bit) {
+    if (writer->levels)
+        writer->levels[writer->bits] = (uint8_t)bit;
     writer->bits++;
+}
+
+static void put_bit(struct bit_writer *writer, uint32_t bit) {
+    count(writer, bit);
     writer->run = bit == writer->level ? writer->run + 1 : 1;
     writer->level = bit;
     if (writer->run == RUN_MAX) {
         // The stuff bit itself begins the next run.
-        writer->bits++;
         writer->run = 1;
         writer->level = !bit;
+        count(writer, writer->level);
     }
 }
 
@@ -38,9 +45,10 @@ static void put(struct bit_writer *writer, uint32_t value, uint32_t width) {
     }
 }
 
-uint32_t can_frame_bits(uint32_t id, uint32_t length, const uint8_t *data) {
-    struct bit_writer writer = {.level = 1}; // the idle bus is recessive, its run does not count
-    put(&writer, 0, 1);                      // start of frame
+static uint32_t write(uint32_t id, uint32_t length, const uint8_t *data, uint8_t *levels) {
+    struct bit_writer writer = {.level = 1,
+                                .levels = levels}; // the idle bus is recessive, its run does not count
+    put(&writer, 0, 1);                            // start of frame
     put(&writer, id, 11);
     put(&writer, 0, 3); // data frame, base format, reserved
     put(&writer, length, 4);
@@ -48,5 +56,13 @@ uint32_t can_frame_bits(uint32_t id, uint32_t length, const uint8_t *data) {
         put(&writer, data[i], 8);
     for (uint32_t crc = writer.crc, left = CRC_BITS; left-- > 0;)
         put_bit(&writer, crc >> left & 1);
-    return writer.bits + UNSTUFFED_BITS;
+    return writer.bits;
+}
+
+uint32_t can_frame_bits(uint32_t id, uint32_t length, const uint8_t *data) {
+    return write(id, length, data, 0) + UNSTUFFED_BITS;
+}
+
+uint32_t can_frame_levels(uint32_t id, uint32_t length, const uint8_t *data, uint8_t *levels) {
+    return write(id, length, data, levels);
 }

@@ -127,6 +127,9 @@ struct node_config {
     uint8_t uuid[NODE_UUID_SIZE];
     void *arena; // memory for configured objects and the move queue, aligned for any type
     size_t arena_size;
+    const uint8_t *dictionary; // what identify gives, zlib-compressed; null: that of node_tables
+    uint32_t dictionary_size;
+    uint8_t legacy; // 1: behave as firmware without this project's CAN extensions (net/bus_signals.h)
 };
 
 struct oid_slot {

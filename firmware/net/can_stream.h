@@ -7,6 +7,9 @@
 
 enum { CAN_ID_ADMIN_REQUEST = 0x3F0, CAN_ID_ADMIN_RESPONSE = 0x3F1, CAN_FRAME_MAX = 8 };
 
+// Ids below this one win against all data; a board sends them before whatever else waits in it.
+enum { CAN_ID_URGENT_END = 0x100 };
+
 // One per node, owned by the board; zeroed by can_stream_attach().
 struct can_stream {
     uint8_t node_id;       // 0: none assigned
