@@ -92,6 +92,28 @@ class Host:
         del self.unasked[before:]
         return answers
 
+    def pour(self, command: str, count: int) -> None:
+        """Send a block of COUNT times COMMAND and take nothing of what comes back."""
+        self.write(wire_twin.block(self.seq, self.words.encode(command) * count))
+        self.seq = (self.seq + 1) & 15
+
+    def fill(self) -> None:
+        """Ask until the board takes no frames any more and the node stops executing."""
+        while self.node.counters()["rx_overflow_bytes"] == 0:
+            self.pour("get_uptime", 59)
+
+    def fill_board(self) -> None:
+        """Fill the board's room for frames, but not the node's own transmit buffer."""
+        for _ in range(4096 + 4):
+            self.pour("debug_nop", 1)
+
+    def restart(self) -> None:
+        """Power-cycle the node, and drop its first words."""
+        self.node.reset()
+        self.seq = 0
+        self.receive()
+        self.unasked.clear()
+
     def ask(self, command: str) -> twin.Answer:
         """Send a command with exactly one answer."""
         (answer,) = self.send(command)
