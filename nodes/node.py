@@ -7,26 +7,30 @@ from typing import Final
 
 from nodes.clock import ClockEstimate, ClockEstimator
 from nodes.conversation import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, Callback, Conversation, QueryTimeout
-from nodes.dictionary import MAX_COMPRESSED_BYTES, Dictionary
+from nodes.dictionary import Dictionary
+from nodes.dictionary_cache import DictionaryCache
 from nodes.dictionary_parts import DictionaryError
 from nodes.errors import CanductorError
+from nodes.identify import identify
 from nodes.load import NodeLoad, load_of
 from nodes.message_format import Message, Value
 from nodes.node_config import NodeConfig
-from nodes.node_errors import NodeError, NodeLost, NodeShutdown
+from nodes.node_errors import NodeError, NodeLost, NodeShutdown, shutdown_sentence
 from nodes.node_states import NodeEvent, NodeState, following
 from nodes.seams import BuildConfig, Connector, LinkLike
-from nodes.vocabulary import check_vocabulary
+from nodes.vigil import Vigil, get_config, restarted
+from nodes.vocabulary import carries_identity, check_vocabulary
 from nodes.wire_time import narrow
 
-IDENTIFY_PIECE: Final = 40
 MAX_STARTS: Final = 3
 """How often a node is connected anew in one start because only a reset rids it of an old configuration."""
 CONFIG_RESET_TRIES: Final = 4
 RESET_SETTLE_S: Final = 0.3
 """For the reset command to arrive, repeated if need be, and the node to come up again."""
-SHUTDOWN_GRACE_S: Final = 0.05
-"""For a node that is seen to be shut down to say why."""
+SILENCE_S: Final = 0.25
+"""A node that owes an acknowledgement and says nothing for so long may have restarted: the bus is asked."""
+ALIVE_TIMEOUT_S: Final = 0.1
+"""For a node of which another board claims to be it to show that it lives."""
 CLOCK_TIMEOUT_S: Final = 15.0
 """On a bus that loses one frame in twenty every fourth sample is lost or of no use."""
 
@@ -43,7 +47,8 @@ class Node:
     """Node NAME, reached through CONNECTOR and configured as BUILD_CONFIG says.
 
     ON_STATE is called after every change of ``state``, ON_CLOCK with every new estimate of its clock, both on
-    the control loop. ``failure`` says why it is lost or shut down.
+    the control loop. ``failure`` says why it is lost or shut down. Without a CACHE every start downloads the
+    dictionary.
     """
 
     def __init__(
@@ -54,6 +59,7 @@ class Node:
         *,
         on_state: OnState = _ignore,
         on_clock: OnClock = _ignore,
+        cache: DictionaryCache | None = None,
     ) -> None:
         self.name = name
         self.state = NodeState.CONNECTING
@@ -65,10 +71,12 @@ class Node:
         self._build_config = build_config
         self._on_state = on_state
         self._on_clock = on_clock
+        self._cache = cache
         self._talk = Conversation(name)
         self._clock: ClockEstimator | None = None
         self._clock_ready = asyncio.Event()
         self._clock_task: asyncio.Task[None] | None = None
+        self._vigil = Vigil(self._talk, 0)
         self._starting_over = True  # until an old configuration is judged, old news mean nothing
         self._generation = 0
         for response, handler in (
@@ -144,6 +152,20 @@ class Node:
         """Take note that the node can no longer be reached."""
         self._fail(NodeEvent.LOST, NodeLost(f"lost node {self.name}: {cause}"))
 
+    def restarted(self, how: str) -> None:
+        """Take note that the node restarted by itself; HOW that is known."""
+        self._fail(NodeEvent.RESTARTED, restarted(self.name, how))
+
+    async def lives(self) -> bool:
+        """Tell whether the node answers at once, and has its configuration."""
+        try:
+            answer = await self._talk.ask(
+                "get_config", "config", tries=1, timeout_s=ALIVE_TIMEOUT_S, survives_shutdown=True
+            )
+        except CanductorError:
+            return False
+        return bool(answer.message.integer("is_config"))
+
     def _check_usable(self) -> None:
         if self.failure is not None:
             raise self.failure
@@ -157,8 +179,11 @@ class Node:
         try:
             await self._start()
         except CanductorError as error:
+            failure = error if isinstance(error, NodeError) else NodeError(str(error))
             if self.failure is None:
-                self._fail(NodeEvent.LOST, error if isinstance(error, NodeError) else NodeError(str(error)))
+                self._fail(NodeEvent.LOST, failure)
+            elif self.state is NodeState.LOST:
+                self.failure = failure  # says more than its link, which only found it silent
             raise
 
     async def _start(self) -> None:
@@ -190,6 +215,25 @@ class Node:
         self._enter(NodeEvent.RESET)
         await self.start()
 
+    async def sleep(self) -> None:
+        """Let go of the node, so that its power can be switched off: it is neither talked to nor missed.
+
+        A start that was under way must have been cancelled. Raises NodeError when it sleeps or is closed.
+        """
+        if following(self.state, NodeEvent.SLEEP) is None:
+            raise NodeError(f"node {self.name} is {self.state.value} and cannot be put to sleep")
+        await self._disconnect()
+        self._connector.forget()
+        self.failure = None
+        self._enter(NodeEvent.SLEEP)
+
+    async def wake(self) -> None:
+        """Start the node again, from SLEEPING; raises like ``start``."""
+        if following(self.state, NodeEvent.WAKE) is None:
+            raise NodeError(f"node {self.name} is {self.state.value} and cannot be woken")
+        self._enter(NodeEvent.WAKE)
+        await self.start()
+
     async def close(self) -> None:
         """End the conversation; the node itself is left as it is."""
         await self._disconnect()
@@ -207,38 +251,27 @@ class Node:
             link.close()
 
     async def _identify(self) -> None:
-        data = bytearray()
-        while True:
-            try:
-                answer = await self._talk.ask(
-                    "identify",
-                    "identify_response",
-                    {"offset": len(data), "count": IDENTIFY_PIECE},
-                    matching={"offset": len(data)},
-                )
-            except (QueryTimeout, NodeLost):
-                better = None if data else self._connector.why_silent()
-                if better is not None:
-                    raise better from None
-                raise
-            piece = answer.message.data("data")
-            if not piece:
-                break
-            data += piece
-            if len(data) > MAX_COMPRESSED_BYTES:
-                raise DictionaryError(f"node {self.name}: its dictionary does not end; other firmware?")
+        cache = self._cache or DictionaryCache()
+        dictionary = await identify(self._talk, cache, self._connector.why_silent)
         try:
-            self._talk.dictionary = Dictionary.parse(bytes(data))
-            check_vocabulary(self.dictionary)
-            self._talk.link.set_receive_window(self.dictionary.receive_window)
+            check_vocabulary(dictionary)
+            self._talk.dictionary = dictionary
+            self._talk.link.set_receive_window(dictionary.receive_window)
         except DictionaryError as error:
             raise DictionaryError(f"node {self.name}: {error}") from None
+        await self._check_identity()
+
+    async def _check_identity(self) -> None:
+        """Make sure that the board that answers is the one that was given the node's id."""
+        if carries_identity(self.dictionary):
+            answer = await self._talk.ask("get_canbus_id", "canbus_id", survives_shutdown=True)
+            self._connector.check_identity(answer.message.data("canbus_uuid"))
 
     # ------------------------------------------------------------------------------------------ configuring
 
     async def _configure(self, wanted: NodeConfig) -> bool:
         """Make the node what WANTED says; False when it had to be reset and must be connected anew."""
-        found = await self._get_config()
+        found = await get_config(self._talk)
         other = bool(found.integer("is_config")) and found.integer("crc") != wanted.crc
         if other or found.integer("is_shutdown"):
             if "config_reset" not in self.dictionary.commands:
@@ -250,9 +283,10 @@ class Node:
             for command in wanted.config_commands:
                 self._talk.send_text(command)
             self._talk.send("finalize_config", crc=wanted.crc)
-            found = await self._get_config()
+            found = await get_config(self._talk)
         self._check_configured(found, wanted)
         self.move_count = found.integer("move_count")
+        self._vigil = Vigil(self._talk, wanted.crc)
         for command in wanted.init_commands:
             self._talk.send_text(command)
         return True
@@ -264,19 +298,6 @@ class Node:
             raise NodeShutdown(f"node {self.name} shut down while being configured; see its pins and limits")
         if not found.integer("is_config") or found.integer("crc") != wanted.crc:
             raise NodeError(f"node {self.name} did not take its configuration; restart it and try again")
-
-    async def _get_config(self, tries: int = QUERY_TRIES) -> Message:
-        answer = await self._talk.ask("get_config", "config", tries=tries, survives_shutdown=True)
-        return answer.message
-
-    async def _judge(self, found: Message) -> None:
-        """Notice what the node said only once, when that message got lost."""
-        if not found.integer("is_config"):
-            self.lose("it restarted by itself; check its power supply")
-        elif found.integer("is_shutdown"):
-            await asyncio.sleep(SHUTDOWN_GRACE_S)
-            reason = "the message with the reason got lost"
-            self._fail(NodeEvent.SHUTDOWN, NodeShutdown(f"node {self.name} shut down: {reason}"))
 
     async def _reset(self) -> None:
         if "reset" not in self.dictionary.commands:
@@ -290,10 +311,10 @@ class Node:
         for _ in range(CONFIG_RESET_TRIES):
             self._talk.send("emergency_stop")
             self._talk.send("config_reset")
-            found = await self._get_config()
+            found = await get_config(self._talk)
             if found.integer("is_shutdown") and "clear_shutdown" in self.dictionary.commands:
                 self._talk.send("clear_shutdown")
-                found = await self._get_config()
+                found = await get_config(self._talk)
             if not found.integer("is_config") and not found.integer("is_shutdown"):
                 return found
         raise NodeError(f"node {self.name} does not let go of its old configuration; power-cycle it")
@@ -319,13 +340,30 @@ class Node:
             try:
                 self._sampled(clock, await self._ask_clock(clock))
                 if self.state is NodeState.READY:
-                    await self._judge(await self._get_config(tries=1))
+                    self._note(await self._vigil.look())
             except QueryTimeout:
-                pass  # the link decides when a silent node is lost
+                self._connector.suspect()  # the link decides when a silent node is lost
             except CanductorError as error:
                 self.lose(str(error))
                 return
-            await asyncio.sleep(clock.next_sample_ns(0) * 1e-9)
+            await self._wait_watching(clock.next_sample_ns(0) * 1e-9)
+
+    def _note(self, trouble: NodeError | None) -> None:
+        if trouble is not None:
+            shutdown = isinstance(trouble, NodeShutdown)
+            self._fail(NodeEvent.SHUTDOWN if shutdown else NodeEvent.RESTARTED, trouble)
+
+    async def _wait_watching(self, wait_s: float) -> None:
+        """Wait, and suspect the node when it owes answers and gives none."""
+        while wait_s > 0:
+            heard = self._talk.heard
+            await asyncio.sleep(min(wait_s, SILENCE_S))
+            wait_s -= SILENCE_S
+            if wait_s > 0 and heard == self._talk.heard and self._owes():
+                self._connector.suspect()
+
+    def _owes(self) -> bool:
+        return self._talk.connected and self._talk.link.pending() > 0
 
     def _sampled(self, clock: ClockEstimator, answer: Answer) -> None:
         if not self._take_sample(clock, answer):
@@ -397,11 +435,11 @@ class Node:
             return
         value = message.integer("static_string_id")
         text = self.dictionary.enum_name("static_string_id", value)
-        self._fail(NodeEvent.SHUTDOWN, NodeShutdown(f"node {self.name} shut down: {text}"))
+        self._fail(NodeEvent.SHUTDOWN, NodeShutdown(shutdown_sentence(self.name, text)))
 
     def _starting_came(self, _: Message) -> None:
         if not self._starting_over:
-            self.lose("it restarted by itself; check its power supply")
+            self.restarted("it said so")
 
 
 _SHUTDOWN_MEANS: Final = (NodeState.CONFIGURING, NodeState.READY)

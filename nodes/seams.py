@@ -81,6 +81,12 @@ class Connector(Protocol):
     def why_silent(self) -> Exception | None:
         """Return a better explanation than "no answer" when a node never answered at all."""
 
+    def check_identity(self, found: bytes) -> None:
+        """Raise when a board that answers get_canbus_id with FOUND is not the node."""
+
+    def suspect(self) -> None:
+        """Find out whether a node that is silent restarted; the bus tells the node when it did."""
+
 
 BuildConfig = Callable[[Dictionary], NodeConfig]
 """Makes a node's configuration when its dictionary is known; called again at every restart."""
