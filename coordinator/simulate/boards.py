@@ -24,7 +24,13 @@ class Board:
     """One simulated board: NAME as SETTING and DICE make it, at WIRE of WORLD."""
 
     def __init__(
-        self, world: ScriptedWorld, wire: CanWire | Uart, name: str, uuid: str, setting: NodeSetting, dice: Dice
+        self,
+        world: ScriptedWorld,
+        wire: CanWire | Uart,
+        name: str,
+        uuid: str,
+        setting: NodeSetting,
+        dice: Dice,
     ) -> None:
         self.name = name
         self.wire = wire
@@ -77,6 +83,10 @@ class Board:
             level=np.ascontiguousarray(edges["level"]),
             life=np.ascontiguousarray(edges["life"]),
         )
+
+    def overflow(self) -> int:
+        """Return how many bytes found its receive buffer full, since its last start."""
+        return self.node.counters()["rx_overflow_bytes"]
 
     @property
     def pins(self) -> dict[str, int]:

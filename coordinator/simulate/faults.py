@@ -10,7 +10,7 @@ from coordinator.simulate.values import Dice
 NS: Final = 1_000_000_000
 SILENCE_S: Final = 1.5
 """A stop whose only cause can be a bad wire comes so long after the last that was sound, at most."""
-ISOLATING: Final = ("cut", "power", "stall", "babble", "bus_off", "errors", "loss")
+ISOLATING: Final = ("cut", "power", "stall", "babble", "errors", "loss")
 """What may keep a stop from reaching a node."""
 
 

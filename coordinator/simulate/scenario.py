@@ -92,8 +92,7 @@ FAULT_KINDS: Final = {
     "babble": "the node sends frames without end",
     "loss": "a share of the bus's frames vanishes",
     "corruption": "a share of the bus's frames changes without anybody noticing",
-    "errors": "a share of the bus's frames becomes error frames",
-    "bus_off": "the node's, or the host's, CAN controller goes bus-off",
+    "errors": "a share of the bus's frames becomes error frames; all of them: who sends goes bus-off",
     "interrupt": "the user presses Ctrl-C",
 }
 HOST: Final = "host"
@@ -269,7 +268,7 @@ def _faults(entries: object, where: str) -> tuple[FaultSetting, ...]:
 
 
 def _needs_node(fault: FaultSetting) -> bool:
-    return not fault.node and fault.kind in ("cut", "reset", "power", "stall", "babble", "bus_off")
+    return not fault.node and fault.kind in ("cut", "reset", "power", "stall", "babble")
 
 
 # ---------------------------------------------------------------------------------------------- finding

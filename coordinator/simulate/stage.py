@@ -1,10 +1,7 @@
 """The stage of a scenario: a simulated world with wires and boards, and the host that the machine is run on."""
 
-import dataclasses
-import errno
 from collections.abc import Callable
 from functools import lru_cache, partial
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -85,7 +82,7 @@ class Stage:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._boards.clear()
+        """Nothing is left: the world is memory."""
 
     # ------------------------------------------------------------------------------------------ assembly
 
@@ -305,7 +302,7 @@ class Stage:
                 count += found["lost"] + found["corrupted"] + found["noise"]
             else:
                 assert isinstance(port, CanPort)
-                count += wire.counters()["errors"]
+                count += wire.counters()["disturbed"]
                 for controller in (port.controller, *self._controllers(wire)):
                     found = controller.counters()
                     count += found["lost"] + found["corrupted"]
@@ -315,8 +312,12 @@ class Stage:
         return [b.node.controller for b in self._boards.values() if b.wire is wire]
 
     def queues(self) -> list[QueueDepth]:
-        """Return how deep the queues of the host's adapters were."""
-        depths = []
+        """Return how deep the queues of the host's adapters were, and what found no room on a board."""
+        depths = [
+            QueueDepth(f"bytes beyond the receive buffer of {name}", board.overflow(), 0)
+            for name, board in self._boards.items()
+            if isinstance(board.wire, CanWire)
+        ]
         for name, port in self._ports.items():
             if isinstance(port, CanPort):
                 bound = self.scenario.buses.get(name, BusSetting()).queue_frames or ControllerSettings().queue
