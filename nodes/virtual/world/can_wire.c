@@ -105,30 +105,75 @@ static uint32_t arbitrate(struct can_segment *segment) {
 
 // ----------------------------------------------------------------------------------------------- outcome
 
-// The first bit in which two frames of one id differ, UINT32_MAX: none.
-static uint32_t first_difference(const struct can_bits *a, const struct can_bits *b) {
-    uint8_t levels_a[CAN_LEVELS_MAX], levels_b[CAN_LEVELS_MAX];
-    uint32_t count_a = can_frame_levels(a->id, a->size, a->data, levels_a);
-    uint32_t count_b = can_frame_levels(b->id, b->size, b->data, levels_b);
-    for (uint32_t i = 0; i < count_a && i < count_b; i++)
-        if (levels_a[i] != levels_b[i])
-            return i;
-    return UINT32_MAX; // frames of different length differ in the length's bits
-}
+struct rivals {
+    struct can_controller *controllers[CAN_CONTROLLERS_MAX];
+    const struct can_bits *frames[CAN_CONTROLLERS_MAX];
+    uint8_t levels[CAN_CONTROLLERS_MAX][CAN_LEVELS_MAX];
+    uint32_t count;
+};
 
-static uint32_t first_collision(const struct can_segment *segment) {
+static void find_rivals(const struct can_segment *segment, struct rivals *rivals) {
     const struct can_wire *wire = segment->wire;
-    uint32_t first = UINT32_MAX;
+    rivals->count = 0;
     for (uint32_t i = 0; i < wire->count; i++) {
-        const struct can_controller *controller = wire->controllers[i];
+        struct can_controller *controller = wire->controllers[i];
         uint64_t number;
         if (!controller->on_wire || controller->segment != segment->number)
             continue;
         const struct can_bits *frame = contender(controller, segment, &number);
-        uint32_t bit = frame ? first_difference(&segment->frame, frame) : UINT32_MAX;
-        first = bit < first ? bit : first;
+        if (!frame)
+            continue;
+        uint32_t at = rivals->count++;
+        rivals->controllers[at] = controller;
+        rivals->frames[at] = frame;
+        memset(rivals->levels[at], 1, CAN_LEVELS_MAX);
+        can_frame_levels(frame->id, frame->size, frame->data, rivals->levels[at]);
     }
-    return first;
+}
+
+// An error-passive sender of a recessive bit that is overruled cannot disturb the others: it gives up, and
+// hears nothing of the frame that goes on.
+static void give_up(struct can_segment *segment, struct can_controller *controller) {
+    can_controller_send_failed(controller, TEC_STEP);
+    controller->joined_ns = segment->wire->agenda->now_ns;
+    segment->wire->counters.yielded++;
+}
+
+// Judges BIT: those who send recessive while another sends dominant see it. Returns whether an active error
+// flag follows; passive ones leave the rivals.
+static int collide(struct can_segment *segment, struct rivals *rivals, uint32_t bit) {
+    uint32_t dominant = 0, left = 0;
+    for (uint32_t i = 0; i < rivals->count; i++)
+        dominant += rivals->levels[i][bit] == 0;
+    if (dominant == 0 || dominant == rivals->count)
+        return 0;
+    for (uint32_t i = 0; i < rivals->count; i++)
+        if (rivals->levels[i][bit] && can_state_of(rivals->controllers[i]) != CAN_PASSIVE)
+            return 1;
+    for (uint32_t i = 0; i < rivals->count; i++) {
+        if (rivals->levels[i][bit]) {
+            give_up(segment, rivals->controllers[i]);
+            continue;
+        }
+        rivals->controllers[left] = rivals->controllers[i];
+        rivals->frames[left] = rivals->frames[i];
+        memmove(rivals->levels[left++], rivals->levels[i], CAN_LEVELS_MAX);
+    }
+    rivals->count = left;
+    return 0;
+}
+
+// The bit at which senders of one id destroy each other's frames, or UINT32_MAX; then the segment's frame is
+// the one that survives.
+static uint32_t first_collision(struct can_segment *segment) {
+    struct rivals rivals;
+    find_rivals(segment, &rivals);
+    for (uint32_t bit = 0; bit < CAN_LEVELS_MAX && rivals.count > 1; bit++)
+        if (collide(segment, &rivals, bit))
+            return bit;
+    segment->frame = *rivals.frames[0];
+    segment->wire->counters.same += rivals.count > 1;
+    return UINT32_MAX;
 }
 
 // The first disturbed bit of BITS, or UINT32_MAX: geometrically distributed.
@@ -145,16 +190,17 @@ static uint32_t first_disturbed(struct can_wire *wire, uint32_t bits) {
 static int anyone_answers(const struct can_segment *segment) {
     const struct can_wire *wire = segment->wire;
     for (uint32_t i = 0; i < wire->count; i++)
-        if (is_on(wire->controllers[i], segment) && !wire->controllers[i]->on_wire)
+        if (is_on(wire->controllers[i], segment) && !wire->controllers[i]->on_wire &&
+            wire->controllers[i]->joined_ns <= segment->start_ns)
             return 1;
     return 0;
 }
 
 // What will become of the frame that begins; returns the bits until it is known.
 static uint32_t decide(struct can_segment *segment, uint32_t senders) {
+    uint32_t wrong = senders > 1 ? first_collision(segment) : UINT32_MAX;
     const struct can_bits *frame = &segment->frame;
     uint32_t bits = can_frame_bits(frame->id, frame->size, frame->data);
-    uint32_t wrong = senders > 1 ? first_collision(segment) : UINT32_MAX;
     segment->outcome = wrong == UINT32_MAX ? GOOD : COLLISION;
     uint32_t disturbed = first_disturbed(segment->wire, bits - GAP_BITS);
     if (disturbed < wrong) {
@@ -171,8 +217,6 @@ static uint32_t decide(struct can_segment *segment, uint32_t senders) {
         segment->free_bits = wrong + 1 + CAN_ERROR_BITS;
         return wrong + 1;
     }
-    if (senders > 1)
-        segment->wire->counters.same++;
     segment->free_bits = bits;
     return bits - GAP_BITS;
 }

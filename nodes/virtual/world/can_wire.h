@@ -48,6 +48,7 @@ struct can_wire_counters {
     uint64_t collisions;     // of those: senders of one id with different content
     uint64_t unacknowledged; // of those
     uint64_t disturbed;      // of those: bit errors, and frames cut off
+    uint64_t yielded;        // error-passive senders that gave way to another of the same id
     uint64_t same;           // frames that two sent at once, bit for bit
 };
 struct can_controller_counters {

@@ -1,7 +1,6 @@
 """An asyncio loop in the time of a simulated world: waiting lets the world run, nothing else takes time."""
 
 import asyncio
-import contextvars
 import math
 from asyncio import base_events
 from collections.abc import Callable, Coroutine
@@ -86,17 +85,6 @@ class VirtualLoop(base_events.BaseEventLoop):
         else:
             self.call_later(self._executor_s, _finish, future, result, None)
         return future
-
-    def call_soon_threadsafe(
-        self, callback: Callable[..., object], *args: Any, context: contextvars.Context | None = None
-    ) -> asyncio.Handle:
-        """Call soon; there are no other threads."""
-        return self.call_soon(callback, *args, context=context)
-
-    def close(self) -> None:
-        """Close the loop; the world stays."""
-        if not self.is_running():
-            super().close()
 
     def _process_events(self, event_list: list[Callable[[], None]]) -> None:
         for handler in event_list:

@@ -300,8 +300,8 @@ class WorldNode:
         """Return the true times, in ps, at which its clock became CLOCKS (of its present life)."""
         clocks = np.ascontiguousarray(clocks, np.uint64)
         out = np.empty(len(clocks), np.int64)
-        raw_in = ffi.cast("uint64_t *", ffi.from_buffer(clocks))
-        lib.world_node_true_ps(self.raw, raw_in, len(clocks), ffi.cast("int64_t *", ffi.from_buffer(out)))
+        raw_in = ffi.cast("uint64_t *", clocks.ctypes.data)
+        lib.world_node_true_ps(self.raw, raw_in, len(clocks), ffi.cast("int64_t *", out.ctypes.data))
         return out
 
     def edges(self) -> npt.NDArray[Any]:
