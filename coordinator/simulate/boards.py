@@ -28,6 +28,7 @@ class Board:
         world: ScriptedWorld,
         wire: CanWire | Uart,
         name: str,
+        *,
         uuid: str,
         setting: NodeSetting,
         dice: Dice,

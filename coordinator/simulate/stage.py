@@ -1,7 +1,6 @@
-"""The stage of a scenario: a simulated world with wires and boards, and the host that the machine is run on."""
+"""The stage of a scenario: a simulated world with wires and boards, and the host a machine is run on."""
 
-from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -16,10 +15,11 @@ from coordinator.machine.description import (
     UartConnection,
     load_machine,
 )
+from coordinator.simulate.actor import FRAME_BITS, SimActor, bit_errors
 from coordinator.simulate.boards import PS_PER_NS, Board
 from coordinator.simulate.checker import QueueDepth
-from coordinator.simulate.faults import NS, Fault, Faults
-from coordinator.simulate.scenario import HOST, BusSetting, NodeSetting, Scenario
+from coordinator.simulate.faults import NS, Faults
+from coordinator.simulate.scenario import BusSetting, NodeSetting, Scenario
 from coordinator.simulate.script import ScriptedWorld
 from coordinator.simulate.truth import BoardTruth
 from coordinator.simulate.values import Dice, ScenarioError
@@ -40,8 +40,6 @@ from nodes.virtual.world import (
 
 GRID_S: Final = 0.005
 """Between two points of the primary clock's map; a ramp of 20 ppm/s bends by 0.1 ns over it."""
-FRAME_BITS: Final = 110
-"""Of a usual frame: turns a share of frames into a share of bits."""
 ADMIN_ID: Final = 0x3F0
 SET_NODE_ID: Final = 1
 LOAD_ID: Final = 0x7E0
@@ -72,7 +70,8 @@ class Stage:
                 self._add_stranger(name, setting)
         self.host = SimHost(self._world, self._ports)
         bus_of = {name: board.wire.name for name, board in self._boards.items()}
-        self.faults = Faults(scenario, self.dice, self, bus_of)
+        actor = SimActor(scenario.name, self._world, self._boards, self._wires, self._ports)
+        self.faults = Faults(scenario, self.dice, actor, bus_of)
         for name, bus in scenario.buses.items():
             self._burden(name, bus)
 
@@ -91,7 +90,7 @@ class Stage:
 
     def _add_board(self, name: str, wire: str, uuid: str, setting: NodeSetting | None) -> None:
         self._boards[name] = Board(
-            self._world, self._wire(wire), name, uuid, setting or NodeSetting(), self.dice
+            self._world, self._wire(wire), name, uuid=uuid, setting=setting or NodeSetting(), dice=self.dice
         )
         self._lose(self._boards[name], wire)
 
@@ -105,7 +104,7 @@ class Stage:
         else:
             known = ", ".join(node.name for node in self.description.nodes)
             raise ScenarioError(
-                f"{where}: the machine has no such node ({known}); a stranger needs uuid and bus, or same_uuid_as"
+                f"{where}: the machine has {known}; a stranger needs uuid and bus, or same_uuid_as"
             )
         if setting.has_id:
             content = bytes([SET_NODE_ID]) + bytes.fromhex(setting.uuid) + bytes([setting.has_id])
@@ -134,7 +133,7 @@ class Stage:
 
     def _add_can(self, name: str, setting: BusSetting, port: PortSettings) -> None:
         wire = self._world.add_can(
-            name, bitrate=setting.bitrate, bit_errors=_bit_errors(self._draw(setting, name, "errors"))
+            name, bitrate=setting.bitrate, bit_errors=bit_errors(self._draw(setting, name, "errors"))
         )
         self._wires[name] = wire
         controller = ControllerSettings(
@@ -194,59 +193,6 @@ class Stage:
     def now_ns(self) -> int:
         """Return true time, which is also the host's."""
         return self._world.now_ns
-
-    def call(self, at_ns: int, what: Callable[[], object]) -> None:
-        """Call WHAT at AT_NS, and let the host go on."""
-        self._world.at(at_ns, what, wakes=True)
-
-    def act(self, fault: Fault) -> None:
-        """Plan FAULT."""
-        begin, end = _ACTS[fault.kind]
-        self._world.at(fault.begin_ns, partial(begin, self, fault))
-        if end is not None:
-            self._world.at(fault.end_ns, partial(end, self, fault))
-
-    def _board(self, fault: Fault) -> Board:
-        if fault.node not in self._boards:
-            raise ScenarioError(f"{self.scenario.name}: a fault names '{fault.node}', which is no node")
-        return self._boards[fault.node]
-
-    def _cut(self, fault: Fault, segment: int) -> None:
-        board = self._board(fault)
-        if board.node.controller is not None:
-            board.node.controller.cut(segment)
-        else:
-            assert isinstance(board.wire, Uart)
-            board.wire.set_faults(loss=float(segment != 0))
-
-    def _stall(self, fault: Fault) -> None:
-        duration_s = (fault.end_ns - fault.begin_ns) / NS
-        if fault.node == HOST:
-            self._world.stall(duration_s)
-        else:
-            self._board(fault).stall(duration_s)
-
-    def _babble(self, fault: Fault) -> None:
-        controller = self._board(fault).node.controller
-        assert controller is not None
-        controller.babble(fault.can_id, b"\xff" * 8, (fault.end_ns - fault.begin_ns) / NS)
-
-    def _disturb(self, fault: Fault, share: float) -> None:
-        wire = self._wires[fault.bus]
-        if isinstance(wire, CanWire):
-            wire.set_bit_errors(_bit_errors(share))
-
-    def _fault_rate(self, fault: Fault, share: float) -> None:
-        wire, port = self._wires[fault.bus], self._ports[fault.bus]
-        rate = {fault.kind: share}
-        if isinstance(wire, Uart):
-            wire.set_faults(**rate)
-            return
-        assert isinstance(port, CanPort)
-        controllers = [b.node.controller for b in self._boards.values() if b.wire is wire]
-        for controller in (port.controller, *controllers):
-            assert controller is not None
-            controller.set_faults(**rate)
 
     # ------------------------------------------------------------------------------------------ truth
 
@@ -359,22 +305,3 @@ def _wire_of(node: NodeDescription) -> str:
 
 def _uuid_of(node: NodeDescription) -> str:
     return node.connection.uuid if isinstance(node.connection, CanConnection) else "000000000001"
-
-
-def _bit_errors(share: float) -> float:
-    """Return the probability of a disturbed bit that disturbs SHARE of the frames."""
-    return 1.0 - (1.0 - share) ** (1.0 / FRAME_BITS)
-
-
-_Act = Callable[[Stage, Fault], None]
-
-_ACTS: Final[dict[str, tuple[_Act, _Act | None]]] = {
-    "cut": (lambda s, f: s._cut(f, 1), lambda s, f: s._cut(f, 0)),
-    "reset": (lambda s, f: s._board(f).node.reset(), None),
-    "power": (lambda s, f: s._board(f).node.power_off(), lambda s, f: s._board(f).node.power_on()),
-    "stall": (Stage._stall, None),
-    "babble": (Stage._babble, None),
-    "loss": (lambda s, f: s._fault_rate(f, f.share), lambda s, f: s._fault_rate(f, 0.0)),
-    "corruption": (lambda s, f: s._fault_rate(f, f.share), lambda s, f: s._fault_rate(f, 0.0)),
-    "errors": (lambda s, f: s._disturb(f, f.share), lambda s, f: s._disturb(f, 0.0)),
-}

@@ -55,7 +55,8 @@ def executed(
 def _restarts(board: BoardTruth) -> Ints:
     """Return when pins fell because the board restarted: that is no step. Its own first step comes later."""
     first = np.flatnonzero(np.diff(board.life)) + 1
-    return board.at_ns[first[board.level[first] == 0]]
+    falls: Ints = board.at_ns[first[board.level[first] == 0]]
+    return falls
 
 
 def planned(record: PlanRecord, stepper: StepperDescription) -> ExpectedSteps:

@@ -72,7 +72,11 @@ def test_a_lost_batch_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_batch_sent_twice_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
-    nth_batch(monkeypatch, 12, lambda _link, batch, send: (send(batch), send(batch))[0])
+    def twice(_link: Link, batch: bytes, send: Callable[[bytes], None]) -> None:
+        send(batch)
+        send(batch)
+
+    nth_batch(monkeypatch, 12, twice)
     assert rules(play(scenario.find("clean"), 1)) & {"unplanned", "band", "ending"}
 
 
