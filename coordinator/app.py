@@ -212,7 +212,7 @@ class Machine:
         """Return the map from print time to NODE's ticks, beginning at PRINT_TIME."""
         if node is self.primary:
             return time_base.primary_map(print_time)
-        return time_base.secondary_map(node.clock, node.dictionary.clock_freq_hz, print_time)
+        return time_base.secondary_map(node.best_clock, node.dictionary.clock_freq_hz, print_time)
 
     async def stepper_positions(self) -> dict[str, int]:
         """Ask every node where its steppers stand: steps from where they began, positive as motion counts."""

@@ -312,7 +312,7 @@ class Streamer:
         border = self.steps.generated_until
         for index, (node, clock_map) in enumerate(zip(self._nodes, self.maps, strict=True)):
             if node is not self._machine.primary and border > clock_map.last.print_time:
-                piece = self._time_base.steer(node.name, clock_map, node.clock, border)
+                piece = self._time_base.steer(node.name, clock_map, node.best_clock, border)
                 self.steps.set_clock(index, piece.ticks_per_s)
                 if not self._keeps_maps:
                     clock_map.forget()

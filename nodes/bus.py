@@ -15,6 +15,7 @@ from nodes.assign import (
     number_nodes,
     waiting_uuid,
 )
+from nodes.clock import HostTime
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 from nodes.link import LinkSettings
@@ -30,6 +31,7 @@ from nodes.seams import (
     OnLost,
     OnResponses,
 )
+from nodes.sync_pulse import CONSTANT, PulseKeeper
 from nodes.wire_time import can_wire_ns
 
 LOST_AFTER_S: Final = 1.0
@@ -235,6 +237,7 @@ class CanBus(_Base):
         self._assignment: IdAssignment | None = None
         self._asked_s = float("-inf")
         self._doubts: dict[Uuid, asyncio.Task[None]] = {}
+        self._pulses: asyncio.Task[None] | None = None
         self._said: set[Uuid] = set()
 
     def add_node(
@@ -257,10 +260,13 @@ class CanBus(_Base):
 
     async def close(self) -> None:
         """Close all nodes and the bus; nothing is left running."""
-        doubts = tuple(self._doubts.values())
-        for task in doubts:
+        tasks = [*self._doubts.values(), *([self._pulses] if self._pulses is not None else [])]
+        self._pulses = None
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(*doubts, return_exceptions=True)
+        for result in await asyncio.gather(*tasks, return_exceptions=True):
+            if isinstance(result, Exception):
+                raise result  # a bug of those tasks, which expect all that may happen
         await super().close()
 
     async def assign(self, uuids: Iterable[Uuid]) -> Assignment:
@@ -287,6 +293,9 @@ class CanBus(_Base):
             with contextlib.suppress(CanductorError):  # the bus may be gone: that is told elsewhere
                 self.io.send_frame(ADMIN_ID, bytes((QUERY_UNASSIGNED,)))
 
+    def _send_frame(self, can_id: int, data: bytes) -> None:
+        self.io.send_frame(can_id, data)
+
     def nodeid(self, uuid: Uuid) -> int:
         """Return the id UUID has, or gets."""
         return self._nodeids[uuid]
@@ -308,6 +317,14 @@ class CanBus(_Base):
         assignment = await self.assign(self._nodeids)
         for connector in self._connectors:
             connector.assignment = assignment
+        loop = asyncio.get_running_loop()
+        keeper = PulseKeeper(
+            lambda: [node for node in self.nodes if _knows_pulses(node)],
+            self._send_frame,
+            lambda: HostTime(_ns(loop.time())),
+        )
+        # From the start, so that the clocks agree when the nodes are ready.
+        self._pulses = loop.create_task(keeper.run())
 
     def _frame_handler(self) -> Callable[[FrameLike], None]:
         return self._frame_came
@@ -393,6 +410,11 @@ class _CanConnector:
 
     def suspect(self) -> None:
         self._bus.suspect()
+
+
+def _knows_pulses(node: Node) -> bool:
+    talks = node.state in (NodeState.CONFIGURING, NodeState.READY)
+    return talks and bool(node.dictionary.int_constant(CONSTANT, 0))
 
 
 def _twins(uuid: Uuid, bus: str) -> str:

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import Callable
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from nodes.clock import ClockEstimate, ClockEstimator
 from nodes.conversation import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, Callback, Conversation, QueryTimeout
@@ -11,6 +11,7 @@ from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
 from nodes.dictionary_parts import DictionaryError
 from nodes.errors import CanductorError
+from nodes.estimated_clock import EstimatedClock
 from nodes.identify import identify
 from nodes.load import NodeLoad, load_of
 from nodes.message_format import Message, Value
@@ -21,6 +22,9 @@ from nodes.seams import BuildConfig, Connector, LinkLike
 from nodes.vigil import Vigil, get_config, restarted
 from nodes.vocabulary import carries_identity, check_vocabulary
 from nodes.wire_time import narrow
+
+if TYPE_CHECKING:
+    from nodes.sync_pulse import PulseClock
 
 MAX_STARTS: Final = 3
 """How often a node is connected anew in one start because only a reset rids it of an old configuration."""
@@ -67,6 +71,8 @@ class Node:
         self.move_count = 0
         """Queue slots shared by all steppers and timed outputs; known when READY."""
         self.load: NodeLoad | None = None
+        self.pulse_clock: PulseClock | None = None
+        """The node's clock by sync pulses, while its bus has such; kept by the bus."""
         self._connector = connector
         self._build_config = build_config
         self._on_state = on_state
@@ -100,6 +106,16 @@ class Node:
         if self._clock is None or not self._clock.accepted:
             raise NodeError(f"the clock of node {self.name} is not known yet: the node is {self.state.value}")
         return self._clock
+
+    @property
+    def best_clock(self) -> EstimatedClock:
+        """The node's clock as well as it is known: by sync pulses, else by exchanges; NodeError before."""
+        return self.pulse_clock or self.clock
+
+    @property
+    def clock_freq_hz(self) -> int:
+        """Nominal ticks per second."""
+        return self.dictionary.clock_freq_hz
 
     @property
     def link(self) -> LinkLike:

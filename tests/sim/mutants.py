@@ -90,7 +90,9 @@ def build(folder: Path, mutant: Mutant) -> None:
             check=False,
         )
         if done.returncode:
-            raise RuntimeError(f"mutant {mutant.name} does not compile:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+            raise RuntimeError(
+                f"mutant {mutant.name} does not compile:\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
+            )
 
 
 def judge(mutant: Mutant) -> Verdict:
