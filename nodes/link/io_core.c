@@ -78,6 +78,7 @@ void io_handle_time(struct io_bus *bus, uint64_t now) {
         link_handle_timer(&node->link, now);
         node->changed |= node->link.stats.timeouts + node->link.state != before;
     }
+    io_publish(bus);
     io_note_states(bus);
 }
 

@@ -174,6 +174,7 @@ size_t io_next(struct io_bus *bus, uint64_t now, uint64_t queued, uint8_t *out, 
         bus->stats.queued_max = waiting > bus->stats.queued_max ? waiting : bus->stats.queued_max;
     }
     note_holds(bus, &outlet, now);
-    io_publish(bus);
+    if (outlet.size == 0)
+        io_publish(bus); // the end of a round
     return outlet.size;
 }

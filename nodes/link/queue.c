@@ -53,16 +53,19 @@ int link_queue_put_stamped(struct link_queue *queue, const struct link_command *
 }
 
 uint64_t link_queue_peek(const struct link_queue *queue, uint64_t at, struct link_command *out) {
-    uint8_t header[BATCH_HEADER + STAMP];
-    size_t size = header_of(queue);
-    copy_out(queue, at, header, size);
+    uint8_t header[BATCH_HEADER + STAMP]; // a fixed size, since this is the hottest line of sending
+    size_t start = at & (queue->size - 1);
+    if (queue->size - start >= sizeof header)
+        memcpy(header, queue->memory + start, sizeof header);
+    else
+        copy_out(queue, at, header, sizeof header);
     memcpy(&out->min_clock, header, 8);
     memcpy(&out->req_clock, header + 8, 8);
     out->size = header[16];
     out->queued_ns = 0;
     if (queue->stamped)
         memcpy(&out->queued_ns, header + BATCH_HEADER, STAMP);
-    return at + size + out->size;
+    return at + header_of(queue) + out->size;
 }
 
 void link_queue_payload(const struct link_queue *queue, uint64_t at, const struct link_command *command,

@@ -74,6 +74,8 @@ void schedule_advance(struct schedule *schedule, uint64_t now) {
         return;
     uint64_t passed_ns = now - schedule->now_ns < NS_PER_S ? now - schedule->now_ns : NS_PER_S;
     schedule->now_ns = now;
+    if (!schedule->bitrate)
+        return;
     turn_slots(schedule);
     if (schedule->held_since_ns) {
         schedule->held_ns += now - schedule->held_since_ns;
@@ -123,6 +125,8 @@ static void pay(struct schedule *schedule, int64_t cost_ns) {
 }
 
 void schedule_sent(struct schedule *schedule, enum link_class kind, uint32_t bits) {
+    if (!schedule->bitrate)
+        return;
     int64_t cost_ns = line_ns(schedule, bits);
     schedule->sent_bits[kind] += bits;
     schedule->slots[schedule->slot % SCHEDULE_SLOTS][kind] += bits;
@@ -135,6 +139,8 @@ void schedule_sent(struct schedule *schedule, enum link_class kind, uint32_t bit
 }
 
 void schedule_received(struct schedule *schedule, unsigned flow, uint32_t bits) {
+    if (!schedule->bitrate)
+        return;
     schedule->received_bits += bits;
     schedule->slots[schedule->slot % SCHEDULE_SLOTS][flow] += bits;
     if (schedule->serial) // a line for each direction
