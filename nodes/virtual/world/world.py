@@ -130,12 +130,11 @@ class World:
         settings: PortSettings | None = None,
     ) -> CanPort:
         """Add an interface of the host on WIRE."""
-        c_controller = ffi.new(
-            "struct can_controller_settings *", (controller or ControllerSettings()).as_dict()
-        )
+        controller = controller or ControllerSettings()
+        if not 1 <= controller.queue <= lib.CAN_QUEUE_MAX:
+            raise WorldError(f"{wire.name}: a transmit queue of {controller.queue} frames; give 1..1024")
+        c_controller = ffi.new("struct can_controller_settings *", controller.as_dict())
         c_settings = ffi.new("struct world_port_settings *", (settings or PortSettings()).as_dict())
-        if not 1 <= c_controller.queue <= lib.CAN_QUEUE_MAX:
-            raise WorldError(f"{wire.name}: a transmit queue of {c_controller.queue} frames; give 1..1024")
         raw = _made(lib.world_add_can_port(self._raw, wire.raw, c_controller, c_settings))
         return CanPort(self, raw, name or wire.name, wire.bitrate)
 
