@@ -64,6 +64,7 @@ class _Run:
     cause: str | None = None
     stopped_ns: int | None = None
     job_ns: int = 0
+    ready_s: float = 0.0
     links: dict[str, Link] = field(default_factory=dict)
     both_edges: dict[str, bool] = field(default_factory=dict)
     found: list[Violation] = field(default_factory=list)
@@ -107,6 +108,7 @@ class _Run:
 
     def _ready(self, machine: Machine) -> None:
         self.job_ns = self.stage.now_ns()
+        self.ready_s = self.stage.elapsed_s()
         self.links = {name: link_of(node) for name, node in machine.nodes.items()}
         self.both_edges = {name: s.steps_on_both_edges for name, s in machine.devices.steppers.items()}
         self.stage.faults.begin("job", self._interrupt())
@@ -142,6 +144,7 @@ def _judge(stage: Stage, run: _Run, began_s: float) -> Result:
         steps=sum(len(s.executed.at_ns) for s in steppers),
         planned=sum(len(s.planned.print_time) for s in steppers),
         virtual_s=stage.elapsed_s(),
+        ready_s=run.ready_s,
         faults=stage.fault_count(),
         worst_primary_us=max((errors_us[s.stepper] for s in steppers if s.node == primary), default=0.0),
         worst_secondary_us=max((errors_us[s.stepper] for s in steppers if s.node != primary), default=0.0),

@@ -21,6 +21,8 @@ class Result:
     planned: int = 0
     virtual_s: float = 0.0
     """Simulated time."""
+    ready_s: float = 0.0
+    """Simulated time until every board was ready; 0: never."""
     faults: int = 0
     """That happened: those the scenario plans, and frames lost or damaged."""
     worst_primary_us: float = 0.0
@@ -53,6 +55,7 @@ class Result:
             "steps": self.steps,
             "steps_planned": self.planned,
             "virtual_s": round(self.virtual_s, 6),
+            "ready_s": round(self.ready_s, 6),
             "faults": self.faults,
             "worst_primary_us": round(self.worst_primary_us, 3),
             "worst_secondary_us": round(self.worst_secondary_us, 3),
@@ -70,7 +73,8 @@ class Result:
         lines = [
             f"{self.scenario}, seed {self.seed}: {how}",
             (
-                f"  {self.steps:,} of {self.planned:,} steps in {self.virtual_s:.2f} s of simulated time, "
+                f"  {self.steps:,} of {self.planned:,} steps in {self.virtual_s:.2f} s of simulated time "
+                f"(ready after {self.ready_s:.2f}), "
                 f"{self.faults:,} faults, at most {self.worst_primary_us:.1f} µs (primary) and "
                 f"{self.worst_secondary_us:.1f} µs (others) off"
             ),
