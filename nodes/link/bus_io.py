@@ -20,6 +20,7 @@ from nodes.link.types import (
     LinkSettings,
     LinkTransport,
     Response,
+    TransportKind,
 )
 
 _BATCH = 512
@@ -37,7 +38,8 @@ class LinkIO:
     LinkIO(transport, loop) starts an I/O thread for the transport, which stays the caller's: close() here
     first, then the transport. LinkIO.driven_by() takes a bus that something else drives, for example a
     simulation. ON_FRAME gets CAN frames that belong to no link, ON_CLOSED one sentence when the transport
-    ends by itself. Not thread-safe: use from the loop's thread.
+    ends by itself. SETTINGS say what the bus can carry; without them a CAN transport's bit rate counts, where
+    it knows it. Not thread-safe: use from the loop's thread.
     """
 
     def __init__(
@@ -50,7 +52,9 @@ class LinkIO:
         settings: BusSettings | None = None,
     ) -> None:
         if settings is None:
-            settings = BusSettings(bitrate=getattr(transport, "bitrate", None) or 0)
+            # A serial line's rate may be a mere word, as on USB: nothing is budgeted unless asked for.
+            serial = transport.kind == TransportKind.BYTES
+            settings = BusSettings(bitrate=0 if serial else getattr(transport, "bitrate", None) or 0)
         self._attach(ThreadDriver(transport, loop, settings), on_frame, on_closed)
 
     @classmethod

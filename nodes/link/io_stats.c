@@ -6,12 +6,13 @@
 
 #include "nodes/link/io_bus.h"
 
-// Word by word and atomic, so that a torn copy is a retry and no data race.
+// Word by word and atomic, so that a torn copy is a retry and no data race. Whoever reads a word that was
+// written after the sequence became odd sees that it did; neither costs anything on common processors.
 static void copy_words(void *to, const void *from, size_t size) {
     uint64_t *out = to;
     const uint64_t *in = from;
     for (size_t i = 0; i < size / sizeof *out; i++)
-        __atomic_store_n(&out[i], __atomic_load_n(&in[i], __ATOMIC_RELAXED), __ATOMIC_RELAXED);
+        __atomic_store_n(&out[i], __atomic_load_n(&in[i], __ATOMIC_ACQUIRE), __ATOMIC_RELEASE);
 }
 
 _Static_assert(sizeof(struct io_link_stats) % sizeof(uint64_t) == 0, "copied by words");
@@ -20,7 +21,6 @@ _Static_assert(sizeof(struct io_stats) % sizeof(uint64_t) == 0, "copied by words
 static void write_snapshot(uint64_t *sequence, void *to, const void *from, size_t size) {
     uint64_t next = __atomic_load_n(sequence, __ATOMIC_RELAXED) + 1;
     __atomic_store_n(sequence, next, __ATOMIC_RELAXED);
-    __atomic_thread_fence(__ATOMIC_RELEASE);
     copy_words(to, from, size);
     __atomic_store_n(sequence, next + 1, __ATOMIC_RELEASE);
 }
@@ -29,7 +29,6 @@ static void read_snapshot(const uint64_t *sequence, void *to, const void *from, 
     for (;;) {
         uint64_t before = __atomic_load_n(sequence, __ATOMIC_ACQUIRE);
         copy_words(to, from, size);
-        __atomic_thread_fence(__ATOMIC_ACQUIRE);
         if (!(before & 1) && __atomic_load_n(sequence, __ATOMIC_RELAXED) == before)
             return;
     }
