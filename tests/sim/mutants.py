@@ -57,8 +57,9 @@ def read_list() -> list[Mutant]:
     """Return all mutants; raises ValueError when one does not apply to the sources as they are."""
     mutants = []
     for name, entry in tomllib.loads(LIST.read_text()).items():
-        values = {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
-        mutant = Mutant(name, **values)
+        entry["scenarios"] = tuple(entry["scenarios"])
+        entry["modules"] = tuple(entry.get("modules", ()))
+        mutant = Mutant(name, **entry)
         found = (ROOT / mutant.file).read_text().count(mutant.find)
         if found != 1:
             raise ValueError(f"mutant {name}: its text occurs {found} times in {mutant.file}, not once")
@@ -111,8 +112,10 @@ def judge(mutant: Mutant) -> Verdict:
         except subprocess.TimeoutExpired:
             return Verdict(True, time.monotonic() - began, "the simulation hung")
     lines = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
-    evidence = next((line for line in lines if "FAILED" in line), lines[-1] if lines else "no output")
-    return Verdict(done.returncode != 0, time.monotonic() - began, evidence.strip())
+    failures = [line for line in lines if line.strip().startswith("FAILED")]
+    # A bug counts as found when the simulation says what is wrong, not when it merely ends.
+    evidence = failures[0] if failures else lines[-1] if lines else "no output"
+    return Verdict(bool(failures) and done.returncode != 0, time.monotonic() - began, evidence.strip())
 
 
 def main() -> int:
