@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from coordinator.host import Host
+from coordinator.load_watch import LoadWatch
 from coordinator.machine.description import (
     CanConnection,
     MachineDescription,
@@ -41,6 +42,7 @@ CONFIRM_STOP_S = 0.5
 class _OpenBus:
     bus: CanBus | UartBus
     wire: Wire
+    watch: LoadWatch
 
 
 def _ignore(_: str) -> None:
@@ -214,6 +216,12 @@ class Machine:
             return time_base.primary_map(print_time)
         return time_base.secondary_map(node.best_clock, node.dictionary.clock_freq_hz, print_time)
 
+    def check_load(self) -> None:
+        """Raise BusOverload when a bus will not carry the motion queued on it in time."""
+        for opened in self._open:
+            if opened.bus.closed_because is None:
+                opened.watch.look(opened.bus.io.forecast(), self.host.now())
+
     async def stepper_positions(self) -> dict[str, int]:
         """Ask every node where its steppers stand: steps from where they began, positive as motion counts."""
         return {
@@ -248,13 +256,13 @@ class Machine:
     def _add_can(self, connection: CanConnection) -> CanBus:
         wire = Wire(lambda: self.host.open_can(connection))
         bus = CanBus(connection.interface, wire.start_io, cache=self._cache, on_notice=self._on_notice)
-        self._open.append(_OpenBus(bus, wire))
+        self._open.append(_OpenBus(bus, wire, LoadWatch(bus.name)))
         return bus
 
     def _add_uart(self, node: NodeDescription, connection: UartConnection) -> None:
         wire = Wire(lambda: self.host.open_uart(connection))
         bus = UartBus(connection.path, wire.start_io, cache=self._cache, on_notice=self._on_notice)
-        self._open.append(_OpenBus(bus, wire))
+        self._open.append(_OpenBus(bus, wire, LoadWatch(bus.name)))
         self._add(
             bus,
             bus.add_node(

@@ -193,6 +193,8 @@ class Streamer:
     def _hand_over(self, cycle: _Cycle) -> None:
         for node, batch in cycle.batches:
             link_of(self._nodes[node]).send_batch(batch)
+        if cycle.batches:
+            self._machine.check_load()
         for told in cycle.told:
             self._on_told(told)
         self._report()

@@ -107,6 +107,7 @@ class _Base:
     async def _start_node(self, node: Node) -> None:
         try:
             await node.start()
+            self._node_started(node)
         except CanductorError:
             if node not in self._may_be_absent:
                 raise
@@ -143,6 +144,9 @@ class _Base:
         return node
 
     async def _prepare(self) -> None:
+        pass
+
+    def _node_started(self, node: Node) -> None:
         pass
 
     def _frame_handler(self) -> Callable[[FrameLike], None] | None:
@@ -292,6 +296,10 @@ class CanBus(_Base):
             self._asked_s = now_s
             with contextlib.suppress(CanductorError):  # the bus may be gone: that is told elsewhere
                 self.io.send_frame(ADMIN_ID, bytes((QUERY_UNASSIGNED,)))
+
+    def _node_started(self, node: Node) -> None:
+        # Boards are built for one bit rate, and this one has just been heard at it.
+        self.io.learn_bitrate(node.dictionary.int_constant("CANBUS_FREQUENCY", 0))
 
     def _send_frame(self, can_id: int, data: bytes) -> None:
         self.io.send_frame(can_id, data)

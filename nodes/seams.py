@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from nodes.dictionary import Dictionary
-from nodes.link import LinkSettings
+from nodes.link import Forecast, LinkSettings
 from nodes.node_config import NodeConfig
 
 
@@ -57,6 +57,8 @@ class LinkIOLike(Protocol):
         self, settings: LinkSettings, *, on_responses: OnResponses, on_lost: OnLost
     ) -> LinkLike: ...
     def send_frame(self, can_id: int, data: bytes) -> None: ...  # noqa: D102
+    def learn_bitrate(self, bitrate: int) -> None: ...  # noqa: D102
+    def forecast(self) -> Forecast: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
 
 

@@ -127,6 +127,11 @@ class LinkIO:
         self._links[number[0]] = link
         return link
 
+    def learn_bitrate(self, bitrate: int) -> None:
+        """Take BITRATE (bit/s) for what the bus carries, unless that is known already."""
+        if self.stats().bitrate == 0 < bitrate:
+            self._lib.io_set_bitrate(self._bus.live(), bitrate)
+
     def send_frame(self, can_id: int, data: bytes) -> None:
         """Send one CAN frame that belongs to no link, before all data. Raises LinkError when it cannot."""
         status = self._lib.io_send_frame(self._bus.live(), can_id, self._ffi.from_buffer(data), len(data))

@@ -63,6 +63,7 @@ struct io_ring {
 struct io_bus {
     struct io_driver driver;
     void *context;
+    struct io_settings settings;
     struct schedule schedule;
     enum io_kind kind;
     unsigned allowed;                   // classes that may send, at the last io_next()

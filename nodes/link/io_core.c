@@ -24,6 +24,7 @@ struct io_bus *io_new(enum io_kind kind, const struct io_settings *settings, con
     bus->allowed = LINK_ALL;
     bus->hold_ns = UINT64_MAX;
     bus->context = context;
+    bus->settings = *settings;
     schedule_init(&bus->schedule, settings->bitrate, settings->ceiling, settings->queue_frames,
                   kind == IO_BYTES, driver->now(context));
     if (make_ring(&bus->responses, IO_RESPONSES_MAX) && make_ring(&bus->unclaimed, IO_FRAMES_MAX))
@@ -38,6 +39,18 @@ void io_free(struct io_bus *bus) {
     free(bus->responses.events);
     free(bus->unclaimed.events);
     free(bus);
+}
+
+void io_set_bitrate(struct io_bus *bus, uint32_t bitrate) {
+    io_lock(bus);
+    if (bitrate != bus->schedule.bitrate)
+        schedule_init(&bus->schedule, bitrate, bus->settings.ceiling, bus->settings.queue_frames,
+                      bus->kind == IO_BYTES, bus->driver.now(bus->context));
+    io_unlock(bus);
+}
+
+int io_bounds_queue(const struct io_bus *bus) {
+    return bus->schedule.queue_frames != 0;
 }
 
 void io_lock(struct io_bus *bus) {

@@ -63,6 +63,9 @@ void io_handle_time(struct io_bus *bus, uint64_t now);
 // frames.
 size_t io_next(struct io_bus *bus, uint64_t now, uint64_t queued, uint8_t *out, size_t room);
 
+// Whether the core bounds what sits in the kernel, so that it pays to read how much that is.
+int io_bounds_queue(const struct io_bus *bus);
+
 // When io_handle_time() or io_next() has something to do that it has not now; UINT64_MAX: never, by itself.
 uint64_t io_deadline(const struct io_bus *bus, uint64_t now);
 

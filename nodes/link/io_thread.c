@@ -26,7 +26,6 @@ enum { KERNEL_FRAMES = 16, FRAME = sizeof(struct can_frame), SKB_BYTES = 768, WR
 struct io_thread {
     int fd, wake_fd, notice_fd;
     enum io_kind kind;
-    uint8_t bounded; // the core bounds what sits in the kernel, and wants to know it
     struct io_bus *bus;
     pthread_t thread;
     pthread_mutex_t mutex;
@@ -99,7 +98,7 @@ static int flush(struct io_thread *thread, uint64_t now) {
 // own). Whether frames wait behind the kernel, in an adapter or in the virtual bus, nobody tells: the core
 // estimates that from the bit rate, so the greater of the two counts.
 static uint64_t queued(const struct io_thread *thread) {
-    if (!thread->bounded)
+    if (!io_bounds_queue(thread->bus))
         return 0;
     int bytes = 0;
     if (thread->kind == IO_BYTES)
@@ -249,7 +248,6 @@ struct io_thread *io_start(int fd, enum io_kind kind, const struct io_settings *
         return NULL;
     thread->fd = fd;
     thread->kind = kind;
-    thread->bounded = settings->queue_frames || (settings->bitrate && kind != IO_BYTES);
     thread->wake_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
     thread->notice_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
     thread->bus = io_new(kind, settings, &driver, thread);

@@ -15,7 +15,7 @@ from typing import Any
 
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, Uuid
 from nodes.dictionary import Dictionary
-from nodes.link import LinkSettings
+from nodes.link import Forecast, LinkSettings
 from nodes.message_format import Message, Value
 from nodes.seams import OnFrame, OnLost, OnResponses
 
@@ -288,6 +288,12 @@ class TwinIO:
         self.links.append(link)
         self.settings.append(settings)
         return link
+
+    def learn_bitrate(self, bitrate: int) -> None:
+        self.bitrate = bitrate
+
+    def forecast(self) -> Forecast:
+        raise AssertionError("a twin bus has no budget")
 
     def send_frame(self, can_id: int, data: bytes) -> None:
         assert can_id == ADMIN_ID

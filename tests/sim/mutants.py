@@ -69,7 +69,7 @@ def read_list() -> list[Mutant]:
 
 def simulate(folder: Path, scenarios: tuple[str, ...], seeds: int) -> subprocess.CompletedProcess[str]:
     """Run the simulation of the project in FOLDER."""
-    command = [sys.executable, "-m", "coordinator.entry", "simulate", "--seeds", f"0:{seeds}", *scenarios]
+    command = [sys.executable, "-m", "coordinator.cli", "simulate", "--seeds", f"0:{seeds}", *scenarios]
     environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
     return subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
@@ -127,7 +127,7 @@ def main() -> int:
     scenarios = tuple(dict.fromkeys(s for mutant in mutants for s in mutant.scenarios))
     seeds = max(mutant.seeds for mutant in mutants)
     sound = simulate(ROOT, scenarios, seeds)
-    if sound.returncode:
+    if sound.returncode or " 0 failed" not in sound.stdout:
         print(f"the project itself fails: {sound.stdout[-1500:]}{sound.stderr[-1500:]}")
         return 1
     print(f"unchanged: passes {seeds} seeds of {', '.join(scenarios)}", flush=True)
