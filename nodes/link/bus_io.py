@@ -3,14 +3,16 @@
 import asyncio
 import errno
 import os
-from typing import Self
+from typing import Any, Self
 
 from nodes.link.handle import BusHandle
 from nodes.link.link import Link, ResponsesHandler, TextHandler
 from nodes.link.thread_driver import ThreadDriver
 from nodes.link.types import (
     BusDriver,
+    BusLoad,
     BusSettings,
+    Forecast,
     Frame,
     FrameHandler,
     IOStats,
@@ -138,7 +140,20 @@ class LinkIO:
         """Return the counters so far; after close(), the last ones."""
         if self._bus.open:
             self._lib.io_get_stats(self._bus.live(), self._final)
-        return IOStats(**{name: getattr(self._final, name) for name in IOStats.__slots__})
+        return _convert(self._final, self._lib)
+
+    def forecast(self) -> Forecast:
+        """Return whether the queued motion will be in time; raises LinkError after close()."""
+        out = self._ffi.new("struct io_forecast *")
+        self._lib.io_forecast(self._bus.live(), out)
+        return Forecast(
+            now_ns=out.now_ns,
+            worst_ratio=out.worst_ratio,
+            at_ns=out.at_ns,
+            late_ns=out.late_ns or None,
+            motion_bits_per_s=out.motion_bits_per_s,
+            queued_bits=out.queued_bits,
+        )
 
     def close(self) -> None:
         """Close the links and join the thread. Further calls do nothing."""
@@ -195,3 +210,29 @@ class LinkIO:
             link.handle_ended(self._bus.ended)
         if self._on_closed:
             self._on_closed(self._bus.ended)
+
+
+_COUNTERS = (
+    *("frames_sent", "frames_received", "frames_unclaimed", "frames_dropped", "frames_malformed"),
+    *("responses_dropped", "responses_max", "unclaimed_max", "admin_max", "bytes_sent", "bytes_received"),
+    *("waits", "wakeups", "bitrate", "received_bits", "queue_frames", "queued_max", "queue_waits"),
+)
+
+
+def _convert(raw: Any, lib: Any) -> IOStats:
+    rate = raw.bitrate or 1
+    flows = {
+        "motion": lib.LINK_MOTION,
+        "control": lib.LINK_CONTROL,
+        "bulk": lib.LINK_BULK,
+        "acks": lib.SCHEDULE_ACKS,
+        "data": lib.SCHEDULE_DATA,
+    }
+    return IOStats(
+        **{name: getattr(raw, name) for name in _COUNTERS},
+        motion_bits=raw.sent_bits[lib.LINK_MOTION],
+        control_bits=raw.sent_bits[lib.LINK_CONTROL],
+        bulk_bits=raw.sent_bits[lib.LINK_BULK],
+        load=BusLoad(**{name: raw.recent_bits[number] / rate for name, number in flows.items()}),
+        held_s=raw.held_ns * 1e-9,
+    )

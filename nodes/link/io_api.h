@@ -13,12 +13,14 @@
 
 #include "nodes/link/io_core.h"
 #include "nodes/link/link.h"
+#include "nodes/link/schedule.h"
 
 // cffi: begin
 enum {
     IO_LINKS_MAX = 128,
     IO_CONTROL_BYTES = 1 << 15, // queue of control commands, per link
     IO_MOTION_BYTES = 1 << 20,  // queue of motion commands, per link
+    IO_BULK_BYTES = 1 << 16,    // queue of bulk data, per link
     IO_RESPONSES_MAX = 4096,    // ring of responses, per bus
     IO_FRAMES_MAX = 1024,       // ring of received frames that belong to no link, per bus
     IO_ADMIN_MAX = 256,         // queue of frames to send that belong to no link, per bus
@@ -55,6 +57,15 @@ struct io_stats {
     uint64_t bytes_sent, bytes_received;   // through the file descriptor
     uint64_t waits;                        // times the kernel took no more and sending paused
     uint64_t wakeups;                      // rounds of the thread
+    // Bits are the true length of each frame; they count only where the bit rate is known.
+    uint64_t bitrate;
+    uint64_t sent_bits[LINK_CLASSES], received_bits;
+    uint64_t recent_bits[SCHEDULE_FLOWS]; // within the last second
+    uint64_t queue_frames;                // most that may sit in the kernel; 0: not bounded here
+    uint64_t queued_max;                  // most that ever did
+    uint64_t queue_waits;                 // times something waited for the kernel's queue to get shorter
+    uint64_t held_ns;                     // time for which the budget held something back
+    uint64_t at_ns;                       // when these were counted
 };
 
 // Moves up to ROOM events to OUT, notices after the responses that came before them; returns their number.
@@ -69,8 +80,8 @@ void io_close_link(struct io_bus *bus, uint32_t number);
 
 // As the functions of link.h; IO_CLOSED when the transport has ended, IO_GONE when the link is lost or
 // closed.
-enum io_status io_send(struct io_bus *bus, uint32_t number, const uint8_t *content, size_t size,
-                       uint64_t min_clock, uint64_t req_clock);
+enum io_status io_send(struct io_bus *bus, uint32_t number, enum link_class kind, const uint8_t *content,
+                       size_t size, uint64_t min_clock, uint64_t req_clock);
 enum io_status io_send_batch(struct io_bus *bus, uint32_t number, const uint8_t *batch, size_t size);
 enum io_status io_send_urgent(struct io_bus *bus, uint32_t number, const uint8_t *content, size_t size);
 enum io_status io_set_receive_window(struct io_bus *bus, uint32_t number, uint64_t size);
@@ -83,16 +94,40 @@ enum io_status io_watch_drained(struct io_bus *bus, uint32_t number);
 // Queues one frame ahead of all data. IO_FULL, IO_INVALID (longer than 8 bytes, or a serial line), IO_CLOSED.
 enum io_status io_send_frame(struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size);
 
-// What one link has counted, what waits in its queues, and how much ever did.
+// What a link has put on the wire of one class, or has received. A frame that two blocks share counts for the
+// later one.
+struct io_flow {
+    uint64_t frames, bits, blocks;
+};
+
+// What waits in a queue, and how much ever did.
+struct io_depth {
+    uint64_t commands, bytes, commands_max, bytes_max;
+};
+
 struct io_link_stats {
     struct link_stats link;
     uint64_t pending;
-    uint64_t control_commands, control_bytes, control_commands_max, control_bytes_max;
-    uint64_t motion_commands, motion_bytes, motion_commands_max, motion_bytes_max;
     uint64_t flying_bytes, flying_blocks;
+    struct io_depth queues[LINK_CLASSES];
+    struct io_flow flows[LINK_CLASSES], received; // received.blocks: see link
 };
-enum io_status io_get_link_stats(struct io_bus *bus, uint32_t number, struct io_link_stats *out);
-void io_get_stats(struct io_bus *bus, struct io_stats *out);
+
+// The counters, without waiting for anybody; never older than what io_take() has handed over.
+enum io_status io_get_link_stats(const struct io_bus *bus, uint32_t number, struct io_link_stats *out);
+void io_get_stats(const struct io_bus *bus, struct io_stats *out);
+
+// Whether the queued motion of all links will be in time, if the bus goes on as in the last second. Looks
+// ahead over FORECAST_NS; what is due later counts once it comes near.
+struct io_forecast {
+    uint64_t now_ns;
+    double worst_ratio; // highest demand of any stretch of time relative to what the bus can carry in it
+    uint64_t at_ns;     // host time at which that stretch ends; 0: no motion is queued, or nothing is known
+    uint64_t late_ns;   // host time at which the first command is due that would be late; 0: none would
+    double motion_bits_per_s; // that the bus can carry, 0: unknown
+    uint64_t queued_bits;     // that the queued motion needs, acknowledgements included
+};
+void io_forecast(struct io_bus *bus, struct io_forecast *out);
 // cffi: end
 
 #endif

@@ -20,9 +20,12 @@ struct io_bus *io_new(enum io_kind kind, const struct io_settings *settings, con
     if (!bus)
         return NULL;
     bus->kind = kind;
-    bus->settings = *settings;
     bus->driver = *driver;
+    bus->allowed = LINK_ALL;
+    bus->hold_ns = UINT64_MAX;
     bus->context = context;
+    schedule_init(&bus->schedule, settings->bitrate, settings->ceiling, settings->queue_frames,
+                  kind == IO_BYTES, driver->now(context));
     if (make_ring(&bus->responses, IO_RESPONSES_MAX) && make_ring(&bus->unclaimed, IO_FRAMES_MAX))
         return bus;
     io_free(bus);
@@ -69,16 +72,20 @@ void io_count_wakeup(struct io_bus *bus) {
 
 void io_handle_time(struct io_bus *bus, uint64_t now) {
     for (size_t i = 0; i < bus->link_count && !bus->ended; i++) {
-        io_deliver(bus, bus->links[i], NULL, 0, now);
-        link_handle_timer(&bus->links[i]->link, now);
+        struct io_link *node = bus->links[i];
+        uint64_t before = node->link.stats.timeouts + node->link.state;
+        io_deliver(bus, node, NULL, 0, now);
+        link_handle_timer(&node->link, now);
+        node->changed |= node->link.stats.timeouts + node->link.state != before;
     }
+    io_publish(bus);
     io_note_states(bus);
 }
 
 uint64_t io_deadline(const struct io_bus *bus, uint64_t now) {
-    uint64_t at_ns = UINT64_MAX;
+    uint64_t at_ns = bus->ended ? UINT64_MAX : bus->hold_ns;
     for (size_t i = 0; i < bus->link_count && !bus->ended; i++) {
-        uint64_t link_ns = link_deadline(&bus->links[i]->link, now);
+        uint64_t link_ns = link_deadline(&bus->links[i]->link, now, bus->allowed);
         at_ns = link_ns < at_ns ? link_ns : at_ns;
     }
     return at_ns;
@@ -159,6 +166,7 @@ size_t io_take(struct io_bus *bus, struct io_event *out, size_t room) {
     size_t taken = take_ring(&bus->responses, out, room);
     taken += take_ring(&bus->unclaimed, out + taken, room - taken);
     taken += take_notices(bus, out + taken, room - taken);
+    io_publish(bus);
     if (taken < room && bus->noticed) {
         bus->noticed = 0;
         if (bus->driver.quiet)

@@ -5,10 +5,12 @@
 
 #include <errno.h>
 #include <linux/can.h>
+#include <linux/sock_diag.h>
 #include <poll.h>
 #include <pthread.h>
 #include <stdlib.h>
 #include <sys/eventfd.h>
+#include <sys/ioctl.h>
 #include <sys/prctl.h>
 #include <sys/socket.h>
 #include <time.h>
@@ -19,11 +21,12 @@
 // helps. A full frame lasts 111 µs and more.
 #define NO_BUFFERS_NS 300000ULL
 
-enum { KERNEL_FRAMES = 16, FRAME = sizeof(struct can_frame) };
+enum { KERNEL_FRAMES = 16, FRAME = sizeof(struct can_frame), SKB_BYTES = 768, WRITES = 32 };
 
 struct io_thread {
     int fd, wake_fd, notice_fd;
     enum io_kind kind;
+    uint8_t bounded; // the core bounds what sits in the kernel, and wants to know it
     struct io_bus *bus;
     pthread_t thread;
     pthread_mutex_t mutex;
@@ -35,6 +38,8 @@ struct io_thread {
     uint8_t out[IO_OUT_FRAMES * FRAME];
     size_t out_at, out_size;
     uint8_t in[64 * FRAME];
+    uint8_t write_frames[WRITES]; // of the last writes, to tell frames from the kernel's buffers
+    unsigned writes;
 };
 
 static uint64_t monotonic_ns(void) {
@@ -72,6 +77,7 @@ static int flush(struct io_thread *thread, uint64_t now) {
         ssize_t done = write(thread->fd, thread->out + thread->out_at, size);
         if (done > 0) {
             thread->out_at += (size_t)done;
+            thread->write_frames[thread->writes++ % WRITES] = (uint8_t)((size_t)done / FRAME);
             continue;
         }
         if (done < 0 && errno == EINTR)
@@ -88,13 +94,34 @@ static int flush(struct io_thread *thread, uint64_t now) {
     return 1;
 }
 
+// How many frames the kernel still has, as far as it tells; a serial line: bytes. It counts buffers,
+// SKB_BYTES for a write of up to some ten frames (measured: AF_UNIX on x86-64; a CAN frame has one of its
+// own). Whether frames wait behind the kernel, in an adapter or in the virtual bus, nobody tells: the core
+// estimates that from the bit rate, so the greater of the two counts.
+static uint64_t queued(const struct io_thread *thread) {
+    if (!thread->bounded)
+        return 0;
+    int bytes = 0;
+    if (thread->kind == IO_BYTES)
+        return ioctl(thread->fd, TIOCOUTQ, &bytes) == 0 ? (uint64_t)bytes : IO_QUEUED_UNKNOWN;
+    uint32_t memory[SK_MEMINFO_VARS];
+    socklen_t size = sizeof memory;
+    if (getsockopt(thread->fd, SOL_SOCKET, SO_MEMINFO, memory, &size) != 0)
+        return IO_QUEUED_UNKNOWN;
+    uint64_t frames = 0;
+    unsigned buffers = memory[SK_MEMINFO_WMEM_ALLOC] / SKB_BYTES;
+    for (unsigned i = 1; i <= buffers && i <= WRITES && i <= thread->writes; i++)
+        frames += thread->write_frames[(thread->writes - i) % WRITES];
+    return frames;
+}
+
 static void write_all(struct io_thread *thread, uint64_t now) {
     if (io_ended(thread->bus) || thread->kernel_full || now < thread->retry_ns)
         return;
     thread->retry_ns = 0;
     while (flush(thread, now)) {
         thread->out_at = 0;
-        thread->out_size = io_next(thread->bus, now, 0, thread->out, sizeof thread->out);
+        thread->out_size = io_next(thread->bus, now, queued(thread), thread->out, sizeof thread->out);
         if (thread->out_size == 0)
             return;
     }
@@ -222,6 +249,7 @@ struct io_thread *io_start(int fd, enum io_kind kind, const struct io_settings *
         return NULL;
     thread->fd = fd;
     thread->kind = kind;
+    thread->bounded = settings->queue_frames || (settings->bitrate && kind != IO_BYTES);
     thread->wake_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
     thread->notice_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
     thread->bus = io_new(kind, settings, &driver, thread);

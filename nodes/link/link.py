@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from nodes.link.handle import BusHandle
-from nodes.link.types import LinkError, LinkSettings, LinkStats, Response
+from nodes.link.types import Flow, LinkError, LinkSettings, LinkStats, Response
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -48,14 +48,16 @@ class Link:
         """How messages to the user call it: transport and node id."""
         return self._name
 
-    def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0) -> None:
-        """Queue one encoded control command: in order, before motion, not before MIN_CLOCK (node ticks).
+    def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False) -> None:
+        """Queue one encoded command: in order within its class, not before MIN_CLOCK (node ticks).
 
+        A control command goes within milliseconds, BULK data with what motion and control leave of the bus.
         Raises LinkError when the queue is full, the command is too long, or the link is closed or lost.
         """
         data = self._ffi.from_buffer(content)
-        status = self._lib.io_send(self._live(), self._number, data, len(content), min_clock, req_clock)
-        self._check_command(status, len(content))
+        kind = self._lib.LINK_BULK if bulk else self._lib.LINK_CONTROL
+        status = self._lib.io_send(self._live(), self._number, kind, data, len(content), min_clock, req_clock)
+        self._check_command(status, len(content), "bulk" if bulk else "control")
 
     def send_batch(self, batch: "Buffer") -> None:
         """Queue the motion commands of a batch (format: batch.h), all or none; raises LinkError as send()."""
@@ -111,7 +113,7 @@ class Link:
         if not self._closed:
             raw = self._ffi.new("struct io_link_stats *")
             if self._lib.io_get_link_stats(self._bus.live(), self._number, raw) == self._lib.IO_OK:
-                self._final = _convert(raw)
+                self._final = _convert(raw, self._lib)
         return self._final
 
     def close(self) -> None:
@@ -176,10 +178,11 @@ class Link:
             raise LinkError(f"{self._name}: the link is lost; open it again when the node is back")
         self._bus.check(status, self._name)
 
-    def _check_command(self, status: int, size: int) -> None:
+    def _check_command(self, status: int, size: int, queue: str = "control") -> None:
         if status == self._lib.IO_FULL:
+            limit = self._lib.IO_BULK_BYTES if queue == "bulk" else self._lib.IO_CONTROL_BYTES
             raise LinkError(
-                f"{self._name}: the control queue ({self._lib.IO_CONTROL_BYTES} bytes) is full; "
+                f"{self._name}: the {queue} queue ({limit} bytes) is full; "
                 "wait until drained() before sending more"
             )
         if status == self._lib.IO_INVALID:
@@ -195,21 +198,35 @@ _COUNTERS = (
     *("naks", "timeouts", "blocks_received", "bytes_received", "bytes_invalid", "acks_duplicate"),
     *("acks_never_sent", "lead_count"),
 )
-_DEPTHS = (
-    *("pending", "flying_bytes", "flying_blocks"),
-    *("control_commands", "control_commands_max", "control_bytes", "control_bytes_max"),
-    *("motion_commands", "motion_commands_max", "motion_bytes", "motion_bytes_max"),
-)
+_DEPTHS = ("pending", "flying_bytes", "flying_blocks")
 
 
-def _convert(raw: Any) -> LinkStats:
+def _flow(raw: Any) -> Flow:
+    return Flow(raw.frames, raw.bits, raw.blocks)
+
+
+def _convert(raw: Any, lib: Any) -> LinkStats:
     link = raw.link
+    depths: dict[str, int] = {}
+    for kind, number in (("control", lib.LINK_CONTROL), ("motion", lib.LINK_MOTION), ("bulk", lib.LINK_BULK)):
+        depth = raw.queues[number]
+        depths |= {
+            f"{kind}_commands": depth.commands,
+            f"{kind}_commands_max": depth.commands_max,
+            f"{kind}_bytes": depth.bytes,
+            f"{kind}_bytes_max": depth.bytes_max,
+        }
     return LinkStats(
         **{name: getattr(link, name) for name in _COUNTERS},
         **{name: getattr(raw, name) for name in _DEPTHS},
+        **depths,
         srtt_s=link.srtt_ns * _S_PER_NS,
         rttvar_s=link.rttvar_ns * _S_PER_NS,
         rto_s=link.rto_ns * _S_PER_NS,
         min_lead_s=link.lead_min_ns * _S_PER_NS if link.lead_count else None,
         lead_histogram=tuple(link.lead_histogram),
+        motion=_flow(raw.flows[lib.LINK_MOTION]),
+        control=_flow(raw.flows[lib.LINK_CONTROL]),
+        bulk=_flow(raw.flows[lib.LINK_BULK]),
+        received=Flow(raw.received.frames, raw.received.bits, link.blocks_received),
     )

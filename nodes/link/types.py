@@ -132,6 +132,15 @@ class LinkSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class Flow:
+    """What passed on the wire. Bits are the true lengths of frames, 0 while the bit rate is unknown."""
+
+    frames: int = 0
+    bits: int = 0
+    blocks: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class LinkStats:
     """Counters of one link, since it was opened. Times in s; queue depths in commands and bytes."""
 
@@ -175,6 +184,33 @@ class LinkStats:
     """The smallest lead of all; negative: a command came too late. None: no lead is known."""
     lead_histogram: tuple[int, ...] = ()
     """Commands by lead: late, < 1 ms, < 2 ms, < 4 ms, …, and the last: 2^13 ms or more."""
+    bulk_commands: int = 0
+    bulk_commands_max: int = 0
+    bulk_bytes: int = 0
+    bulk_bytes_max: int = 0
+    motion: Flow = Flow()
+    """What was sent, by the class of each block's first command; repeats included."""
+    control: Flow = Flow()
+    bulk: Flow = Flow()
+    received: Flow = Flow()
+
+
+@dataclass(frozen=True, slots=True)
+class BusLoad:
+    """Shares of the bit rate within the last second; all 0 while it is unknown."""
+
+    motion: float = 0.0
+    control: float = 0.0
+    bulk: float = 0.0
+    acks: float = 0.0
+    """Received acknowledgements."""
+    data: float = 0.0
+    """Received otherwise; a serial line: all that was received."""
+
+    @property
+    def total(self) -> float:
+        """All of it together."""
+        return self.motion + self.control + self.bulk + self.acks + self.data
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +234,45 @@ class IOStats:
     waits: int
     """Times the kernel took no more and sending paused."""
     wakeups: int
+    bitrate: int
+    """The line's, 0: unknown; all that follows is 0 then, too."""
+    motion_bits: int
+    """Sent so far, true frame lengths."""
+    control_bits: int
+    """With admin frames."""
+    bulk_bits: int
+    received_bits: int
+    load: BusLoad
+    queue_frames: int
+    """Most frames that may sit in the kernel (a serial line: bytes; 0: not bounded)."""
+    queued_max: int
+    """Most that ever did."""
+    queue_waits: int
+    held_s: float
+    """Time for which the budget held something back."""
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """Whether the queued motion of a bus will be in time, if the bus goes on as in the last second."""
+
+    now_ns: int
+    """Host time of this forecast."""
+    worst_ratio: float
+    """Highest demand of any stretch of time, relative to what the bus can carry in it; above 1: too much."""
+    at_ns: int
+    """Host time at which that stretch ends; 0 without demand, or while the bit rate is unknown."""
+    late_ns: int | None
+    """Host time at which the first command is due that would be late; None: none would."""
+    motion_bits_per_s: float
+    """What the bus can carry of motion, beside the other traffic and below the ceiling; 0: unknown."""
+    queued_bits: int
+    """What the queued motion needs, acknowledgements included."""
+
+    @property
+    def warning_s(self) -> float | None:
+        """How early that is known; None: nothing would be late."""
+        return None if self.late_ns is None else (self.late_ns - self.now_ns) * 1e-9
 
 
 FrameHandler = Callable[[Frame], None]

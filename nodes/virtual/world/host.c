@@ -200,6 +200,8 @@ struct io_bus *world_port_open(struct world_port *port, const struct io_settings
     if (port->bus)
         return NULL;
     port->bus = io_new(port->uart ? IO_BYTES : IO_CAN_STREAM, settings, &driver, port);
+    if (port->bus && port->can && !port->controller.powered)
+        can_power(&port->controller, 1); // it was plugged in again
     if (port->bus && port->uart)
         uart_noise(port->uart);
     if (port->bus)

@@ -2,6 +2,8 @@
 // What the world does to a node and reads of it: inputs, axes, clock, counters.
 #include "nodes/virtual/world/parts.h"
 
+_Static_assert((int)WORLD_RATES_MAX == (int)CLOCK_PIECES_MAX, "the world tells its users");
+
 // ------------------------------------------------------------------------------------------------- inputs
 
 static void catch_up(struct world_node *node) {
@@ -61,7 +63,7 @@ void axes_edge(struct world_node *node, uint64_t clock, uint32_t pin, int level)
     node->step_level[pin] = (uint8_t)level;
     for (int i = 0; i < node->axis_count; i++) {
         struct world_axis *axis = &node->axes[i];
-        if (axis->step_pin == pin && (level || axis->both_edges))
+        if (axis->step_pin == pin && (axis->both_edges || (level != 0) != (axis->step_inverted != 0)))
             move(node, axis, clock, node->step_level[axis->dir_pin] != (axis->dir_inverted != 0));
     }
 }

@@ -91,9 +91,10 @@ def _check_frame(can_id: int, data: bytes) -> None:
 class CanWire:
     """A CAN bus."""
 
-    def __init__(self, raw: Any, name: str, bitrate: int) -> None:
+    def __init__(self, world: "World", raw: Any, name: str, bitrate: int) -> None:
         self.name = name
         self.bitrate = bitrate
+        self._world = world  # owns RAW
         self.raw = raw
 
     def set_bit_errors(self, probability: float) -> None:
@@ -108,9 +109,10 @@ class CanWire:
 class Uart:
     """A serial line."""
 
-    def __init__(self, raw: Any, name: str, baud: int) -> None:
+    def __init__(self, world: "World", raw: Any, name: str, baud: int) -> None:
         self.name = name
         self.baud = baud
+        self._world = world  # owns RAW
         self.raw = raw
 
     def set_faults(self, *, loss: float | None = None, corruption: float | None = None) -> None:

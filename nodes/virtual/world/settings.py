@@ -7,6 +7,7 @@ from typing import Any, Final
 from nodes.errors import CanductorError
 
 NEVER_NS: Final = (1 << 64) - 1
+RECEIVE_QUEUE_MAX: Final = 4096
 _NS: Final = 1_000_000_000
 
 
@@ -76,6 +77,8 @@ class PortSettings:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields for cffi."""
+        if not 1 <= self.receive_queue <= RECEIVE_QUEUE_MAX:
+            raise WorldError(f"a receive queue of {self.receive_queue} frames; give 1..{RECEIVE_QUEUE_MAX}")
         return {"wake": self.wake.as_dict(), "receive_queue": self.receive_queue}
 
 

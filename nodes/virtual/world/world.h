@@ -31,6 +31,7 @@ struct can_controller;
 enum {
     WORLD_PORTS_MAX = 64,
     WORLD_PINS = 144,
+    WORLD_RATES_MAX = 64,      // changes of a clock's rate, its start included
     WORLD_AXES_MAX = 32,       // per node
     WORLD_ACTIONS_MAX = 4096,  // planned changes of inputs
     WORLD_EDGES_MAX = 1 << 24, // remembered per node
@@ -132,8 +133,9 @@ const struct world_edge *world_node_edges(const struct world_node *node, size_t 
 // beyond AT (>= AT for direction 1, <= AT for -1), else at 0; the input follows DELAY_NS after the step.
 struct world_axis {
     uint32_t step_pin, dir_pin;
-    int dir_inverted; // forward is dir = 0
-    int both_edges;   // each change of the step pin is a step, not only its rise
+    int dir_inverted;  // forward is dir = 0
+    int step_inverted; // a step is a fall of its pin, not a rise
+    int both_edges;    // each change of the step pin is a step, not only its rise
     int64_t position, at;
     int direction;
     int input_inverted;

@@ -32,6 +32,8 @@ EDGE_DTYPE: Final = np.dtype(
 )
 _SEED_LIMIT: Final = 1 << 64
 _CLOCK_LIMIT: Final = 1 << 47
+_CLOCK_FREQ_LIMIT: Final = (1 << 31) // 5  # five seconds between statistics have to fit into 2^31 ticks
+_MOVE_COUNT_MAX: Final = 0xFFFF
 
 
 class World:
@@ -117,7 +119,7 @@ class World:
         if not 10_000 <= bitrate <= 1_000_000:
             raise WorldError(f"{name}: a CAN bus of {bitrate} bit/s; give 10000..1000000")
         settings = ffi.new("struct can_wire_settings *", {"bitrate": bitrate})
-        wire = CanWire(_made(lib.world_add_can(self._raw, settings)), name, bitrate)
+        wire = CanWire(self, _made(lib.world_add_can(self._raw, settings)), name, bitrate)
         wire.set_bit_errors(bit_errors)
         return wire
 
@@ -130,12 +132,11 @@ class World:
         settings: PortSettings | None = None,
     ) -> CanPort:
         """Add an interface of the host on WIRE."""
-        c_controller = ffi.new(
-            "struct can_controller_settings *", (controller or ControllerSettings()).as_dict()
-        )
+        controller = controller or ControllerSettings()
+        if not 1 <= controller.queue <= lib.CAN_QUEUE_MAX:
+            raise WorldError(f"{wire.name}: a transmit queue of {controller.queue} frames; give 1..1024")
+        c_controller = ffi.new("struct can_controller_settings *", controller.as_dict())
         c_settings = ffi.new("struct world_port_settings *", (settings or PortSettings()).as_dict())
-        if not 1 <= c_controller.queue <= lib.CAN_QUEUE_MAX:
-            raise WorldError(f"{wire.name}: a transmit queue of {c_controller.queue} frames; give 1..1024")
         raw = _made(lib.world_add_can_port(self._raw, wire.raw, c_controller, c_settings))
         return CanPort(self, raw, name or wire.name, wire.bitrate)
 
@@ -147,7 +148,7 @@ class World:
         raw = _made(
             lib.world_add_uart(self._raw, ffi.new("struct world_uart_settings *", settings.as_dict()))
         )
-        return Uart(raw, name, settings.baud)
+        return Uart(self, raw, name, settings.baud)
 
     def add_uart_port(self, uart: Uart, *, settings: PortSettings | None = None) -> UartPort:
         """Add the host's end of UART; there is one."""
@@ -171,6 +172,10 @@ class World:
         if len(uuid) != 12 or set(uuid) - set("0123456789abcdefABCDEF"):
             raise WorldError(f"the uuid {uuid!r} of a simulated node must be 12 hex digits")
         _check_clock(start_clock)
+        if not (0 <= clock_freq < _CLOCK_FREQ_LIMIT and 0 <= move_count <= _MOVE_COUNT_MAX):
+            raise WorldError(
+                f"node {uuid}: no clock of {clock_freq} Hz or queue of {move_count} slots; 0: the default"
+            )
         on_can = isinstance(wire, CanWire)
         c_dictionary = ffi.NULL if dictionary is None else ffi.new("uint8_t[]", dictionary)
         self._keep.append(c_dictionary)  # the node reads it as long as it lives
@@ -231,7 +236,7 @@ class WorldNode:
         """From now on its clock runs PPM above nominal, rising by PPM_PER_S: a board that warms up."""
         if lib.world_node_set_rate(self.raw, ppm, ppm_per_s):
             raise WorldError(
-                f"node {self.uuid}: its clock's rate was changed {lib.CLOCK_PIECES_MAX} times already"
+                f"node {self.uuid}: its clock's rate was changed {lib.WORLD_RATES_MAX} times already"
             )
 
     def set_input(self, pin: int, level: int, at_ns: int = 0) -> None:
@@ -260,6 +265,7 @@ class WorldNode:
         position: int = 0,
         direction: int = 1,
         dir_inverted: bool = False,
+        step_inverted: bool = False,
         both_edges: bool = False,
         input_inverted: bool = False,
         delay_s: float = 0.0,
@@ -270,7 +276,8 @@ class WorldNode:
         """
         fields = {"step_pin": step_pin, "dir_pin": dir_pin, "target_pin": target_pin, "target": target.raw}
         fields |= {"at": at, "position": position, "direction": direction}
-        fields |= {"dir_inverted": dir_inverted, "both_edges": both_edges, "input_inverted": input_inverted}
+        fields |= {"dir_inverted": dir_inverted, "step_inverted": step_inverted}
+        fields |= {"both_edges": both_edges, "input_inverted": input_inverted}
         fields["delay_ns"] = to_ns(delay_s, "an endstop's delay")
         number = lib.world_node_add_axis(self.raw, ffi.new("struct world_axis *", fields))
         if number < 0:

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/io_*.c nodes/link/queue.c
+// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/can_bits.c
 // SocketCAN's ENOBUFS: a full interface queue costs time, no frame and no busy loop. The kernels of build
 // machines have no CAN, so the one call that tells it is replaced: this file's write() refuses first.
 #define _GNU_SOURCE
@@ -62,7 +62,7 @@ int main(void) {
     for (int round = 0; round < QUERIES; round++) {
         atomic_store(&refusals, round == 10 ? REFUSALS : round % 4);
         atomic_store(&refused_fd, fds[0]);
-        CHECK_EQUAL(io_send(bus, link, query, sizeof query, 0, 0), IO_OK);
+        CHECK_EQUAL(io_send(bus, link, LINK_CONTROL, query, sizeof query, 0, 0), IO_OK);
         await_responses(thread, 1);
     }
     struct io_stats stats;

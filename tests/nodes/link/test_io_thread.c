@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/io_*.c nodes/link/queue.c
+// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/can_bits.c
 // The thread of a bus between several calling threads and a node that answers as fast as it can. Also built
 // by hand with -fsanitize=thread: what the mutex guards, it guards.
 #include "tests/check.h"
@@ -37,7 +37,7 @@ static void *call(void *argument) {
             CHECK_EQUAL(io_send_batch(scene->bus, scene->link, batch, size), IO_OK);
         } else {
             CHECK_EQUAL(io_set_clock(scene->bus, scene->link, 1e6, 1000, 0), IO_OK);
-            while (io_send(scene->bus, scene->link, query, sizeof query, 0, 0) == IO_FULL)
+            while (io_send(scene->bus, scene->link, LINK_CONTROL, query, sizeof query, 0, 0) == IO_FULL)
                 ;
             CHECK_EQUAL(io_get_link_stats(scene->bus, scene->link, &stats), IO_OK);
             io_get_stats(scene->bus, &bus_stats);
@@ -86,7 +86,7 @@ static void converse(enum io_kind kind) {
     CHECK_EQUAL(stats.link.blocks_repeated, 0);
     shutdown(fds[1], SHUT_RDWR);
     take_until(scene.thread, IO_ENDED);
-    CHECK_EQUAL(io_send(scene.bus, scene.link, (const uint8_t *)"\4", 1, 0, 0), IO_CLOSED);
+    CHECK_EQUAL(io_send(scene.bus, scene.link, LINK_CONTROL, (const uint8_t *)"\4", 1, 0, 0), IO_CLOSED);
     io_stop(scene.thread);
     CHECK_EQUAL(pthread_join(server, NULL), 0);
     close(fds[0]);

@@ -1,14 +1,17 @@
 """Whole machines in a simulated world: real CanBus and Node over real link C and real firmware."""
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from nodes.assign import Uuid
 from nodes.bus import CanBus, UartBus
 from nodes.link import LinkIO
-from nodes.node import Node
 from nodes.seams import IoFactory, LinkIOLike, OnFrame, OnLost
 from nodes.virtual.world import CanPort, CanWire, Port, UartSettings, World, WorldNode
-from tests.nodes.machine import make_config
+from tests.nodes.machine import make_config, stepper_x
+
+if TYPE_CHECKING:
+    from nodes.node import Node
 
 
 def uuid(number: int) -> str:
@@ -25,7 +28,9 @@ def start_io(port: Port) -> IoFactory:
 class CanMachine:
     """COUNT nodes on one bus."""
 
-    def __init__(self, seed: int, count: int = 1, *, bitrate: int = 1_000_000) -> None:
+    def __init__(
+        self, seed: int, count: int = 1, *, bitrate: int = 1_000_000, steppers: bool = False
+    ) -> None:
         self.world = World(seed)
         self.wire: CanWire = self.world.add_can(bitrate=bitrate)
         self.port: CanPort = self.world.add_can_port(self.wire)
@@ -34,8 +39,10 @@ class CanMachine:
             for n in range(1, count + 1)
         ]
         self.bus = CanBus("can0", start_io(self.port))
+        self.steppers = [stepper_x() for _ in range(count)] if steppers else []
+        configs = [make_config(stepper) for stepper in self.steppers] or [make_config()] * count
         self.nodes: list[Node] = [
-            self.bus.add_node(f"n{n}", Uuid.parse(uuid(n)), make_config()) for n in range(1, count + 1)
+            self.bus.add_node(f"n{n}", Uuid.parse(uuid(n)), config) for n, config in enumerate(configs, 1)
         ]
 
     def each(self, act: Callable[[WorldNode], None]) -> None:

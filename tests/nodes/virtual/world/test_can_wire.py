@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from nodes.virtual._hub import lib as hub
 from nodes.virtual._sim import lib
 from nodes.virtual.world import CanController, CanState, CanWire, ControllerSettings, World, WorldError
 from tests.nodes.virtual.world.machines import uuid
@@ -36,8 +37,12 @@ class Bench:
         raise AssertionError(f"{counter} never became {value}")
 
 
+def state_of(bench: Bench) -> CanState:
+    return bench.at[0].state
+
+
 def frame_bits(can_id: int, data: bytes) -> int:
-    return int(lib.can_frame_bits(can_id, len(data), data))
+    return int(hub.can_frame_bits(can_id, len(data), data))
 
 
 @pytest.mark.parametrize("data", [b"", b"\0" * 8, b"\x55" * 8, bytes(range(5))])
@@ -57,7 +62,7 @@ def test_arbitration_is_by_id_whoever_came_first() -> None:
     for controller, can_id in ((1, 0x300), (2, 0x100), (3, 0x200)):
         bench.at[controller].send(can_id)
     bench.until("frames", 1)
-    order = []
+    order: list[int] = []
     while len(order) < 3:
         bench.run_bits(1)
         order += [i for i in (1, 2, 3) if bench.at[i].counters()["sent"] and i not in order]
@@ -125,7 +130,7 @@ def broken(bench: Bench) -> None:
     """Take controller 0 to bus-off: 32 frames in a row are disturbed."""
     bench.wire.set_bit_errors(1.0)
     bench.at[0].send(SAME)
-    while bench.at[0].state is not CanState.OFF:
+    while state_of(bench) != CanState.OFF:
         bench.run_bits(1)
     bench.wire.set_bit_errors(0.0)
 
@@ -138,9 +143,9 @@ def test_bus_off_after_32_errors_and_recovery_after_128_times_11_recessive_bits(
     assert counters["dropped"] == 1
     assert bench.at[1].status()["rec"] == 32
     bench.run_bits(lib.CAN_ERROR_BITS + 128 * 11 - 1)
-    assert bench.at[0].state is CanState.OFF
+    assert state_of(bench) == CanState.OFF
     bench.run_bits(2)
-    assert bench.at[0].state is CanState.ACTIVE
+    assert state_of(bench) == CanState.ACTIVE
     assert bench.at[0].status()["tec"] == 0
 
 
@@ -150,21 +155,21 @@ def test_on_a_busy_bus_every_frame_counts_one_sequence() -> None:
     bench.at[1].babble(0x10, b"\x55" * 8, 1.0)
     bits = frame_bits(0x10, b"\x55" * 8)
     bench.run_bits(120 * bits)
-    assert bench.at[0].state is CanState.OFF
+    assert state_of(bench) == CanState.OFF
     bench.run_bits(12 * bits)
-    assert bench.at[0].state is CanState.ACTIVE
+    assert state_of(bench) == CanState.ACTIVE
 
 
 def test_without_restart_bus_off_lasts_until_somebody_restarts_it() -> None:
     bench = Bench(2)
     broken(bench)
     bench.run_bits(100_000)
-    assert bench.at[0].state is CanState.OFF
+    assert state_of(bench) == CanState.OFF
     assert bench.at[0].send(SAME)  # as SocketCAN: taken, and lost
     assert bench.at[0].counters()["dropped"] == 2
     bench.at[0].restart()
     bench.run_bits(128 * 11 + 1)
-    assert bench.at[0].state is CanState.ACTIVE
+    assert state_of(bench) == CanState.ACTIVE
 
 
 def test_a_full_transmit_queue_refuses() -> None:
@@ -250,7 +255,7 @@ def test_what_cannot_be_is_refused_in_words() -> None:
     bench = Bench(1)
     with pytest.raises(WorldError, match=r"probability lies in 0\.\.1"):
         bench.at[0].set_faults(loss=1.5)
-    with pytest.raises(WorldError, match="segments 0..3"):
+    with pytest.raises(WorldError, match=r"segments 0\.\.3"):
         bench.at[0].cut(4)
     with pytest.raises(WorldError, match="0x800"):
         bench.at[0].send(0x800)
