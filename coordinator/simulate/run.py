@@ -1,5 +1,6 @@
 """``canductor simulate``: which seed runs which scenario, one after the other or in a pool of processes."""
 
+import math
 import multiprocessing
 import os
 import signal
@@ -69,17 +70,17 @@ def plan(chosen: Sequence[Scenario], options: SimulateOptions) -> Iterator[Task]
 
 def _in_turn(chosen: Iterable[Scenario]) -> list[Scenario]:
     """Return the scenarios in the order in which seeds fall to them: as often as they weigh, well mixed."""
-    credit = {s.name: 0.0 for s in chosen}
-    by_name = {s.name: s for s in chosen}
+    by_name = {s.name: s for s in chosen if s.weight > 0}
     total = sum(s.weight for s in by_name.values())
-    if total <= 0:
+    if not by_name:
         raise CanductorError("no scenario has a weight above 0; name the one to run")
+    credit = dict.fromkeys(by_name, 0.0)
     turn = []
-    for _ in range(max(len(credit), round(total))):
+    for _ in range(math.ceil(total)):
         for name in credit:
-            credit[name] += by_name[name].weight / total
+            credit[name] += by_name[name].weight
         first = max(credit, key=lambda name: credit[name])
-        credit[first] -= 1
+        credit[first] -= total
         turn.append(by_name[first])
     return turn
 
