@@ -99,3 +99,27 @@ def test_bad_words_are_told_in_one_sentence(
     err = capsys.readouterr().err
     assert sentence in err
     assert len(err.splitlines()) == 1
+
+
+def test_what_is_raised_is_a_failure_with_its_place(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(*_: object) -> Result:
+        raise ZeroDivisionError("by design")
+
+    monkeypatch.setattr("coordinator.simulate.play.play", fails)
+    assert cli.main(["simulate", "clean", "--seed", "4"]) == cli.EXIT_FAILED
+    out = capsys.readouterr().out
+    assert "FAILED exception: ZeroDivisionError: by design (tests/sim/test_run.py:" in out
+    assert "replay: canductor simulate clean --seed 4" in out
+
+
+def test_a_seed_that_does_not_end_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def hangs(*_: object) -> Result:
+        while True:
+            pass
+
+    monkeypatch.setattr("coordinator.simulate.play.play", hangs)
+    monkeypatch.setattr(run, "SEED_LIMIT_S", 0.05)
+    found = run.run_one(scenario.find("clean"), 1)
+    assert [v.text for v in found.violations] == ["not over after 0.05 s"]
