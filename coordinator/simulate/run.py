@@ -18,6 +18,7 @@ from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.checker import Violation
 from coordinator.simulate.result import Result, ScenarioList, SimulationReport
 from coordinator.simulate.scenario import Scenario
+from coordinator.simulate.values import ScenarioError
 from nodes.errors import CanductorError
 
 SEED_LIMIT_S: Final = 120.0
@@ -106,7 +107,9 @@ def run_all(tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
                         running[pool.submit(run_one, *task)] = task
         except BrokenProcessPool:
             # One of these took its process down: alone, it says so itself.
-            suspects = "; ".join(f"canductor simulate {s.name} --seed {seed}" for s, seed in running.values())
+            suspects = "; ".join(
+                f"canductor simulate {s.given} --seed {seed}" for s, seed in running.values()
+            )
             raise CanductorError(f"a simulation crashed its process, one of: {suspects}") from None
         finally:
             pool.shutdown(cancel_futures=True)
@@ -125,10 +128,12 @@ def run_one(scenario: Scenario, seed: int) -> Result:
     try:
         with _limit(SEED_LIMIT_S):
             return play(scenario, seed)
+    except ScenarioError:
+        raise
     except (Exception, _Hangs) as error:  # noqa: BLE001 (the seed is what is tested)
         text = f"not over after {SEED_LIMIT_S:g} s" if isinstance(error, _Hangs) else _where(error)
         return Result(
-            scenario=scenario.name,
+            scenario=scenario.given,
             seed=seed,
             violations=(Violation("exception", text),),
             cpu_s=time.process_time() - began_s,
