@@ -1,6 +1,7 @@
 """One seed of one scenario: perform it on its stage, then let the checker judge."""
 
 import asyncio
+import contextlib
 import hashlib
 import time
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from coordinator.simulate.program import make_program
 from coordinator.simulate.result import Result
 from coordinator.simulate.scenario import Scenario
 from coordinator.simulate.stage import Stage
+from coordinator.simulate.values import ScenarioError
 from nodes.errors import CanductorError
 from nodes.link import Link
 
@@ -33,10 +35,10 @@ BY_THE_USER: Final = "stopped by the user"
 def play(scenario: Scenario, seed: int) -> Result:
     """Run SEED of SCENARIO and return what became of it; what the code under test raises goes through."""
     began_s = time.process_time()
-    with Stage(scenario, seed) as stage:
-        run = _Run(stage)
-        run.perform()
-        return _judge(stage, run, began_s)
+    stage = Stage(scenario, seed)
+    run = _Run(stage)
+    run.perform()
+    return _judge(stage, run, began_s)
 
 
 class _Text:
@@ -77,6 +79,8 @@ class _Run:
             runner.get_loop().set_exception_handler(self._exception)
             try:
                 self.outcome = runner.run(self._main())
+            except ScenarioError:
+                raise  # a mistake in the file, not the machine's doing
             except CanductorError as error:
                 self.cause = str(error)
             except asyncio.CancelledError:
@@ -109,7 +113,9 @@ class _Run:
     def _ready(self, machine: Machine) -> None:
         self.job_ns = self.stage.now_ns()
         self.ready_s = self.stage.elapsed_s()
-        self.links = {name: link_of(node) for name, node in machine.nodes.items()}
+        for name, node in machine.nodes.items():
+            with contextlib.suppress(CanductorError):  # one that may be absent is
+                self.links[name] = link_of(node)
         self.both_edges = {name: s.steps_on_both_edges for name, s in machine.devices.steppers.items()}
         self.stage.faults.begin("job", self._interrupt())
         self.watch = asyncio.get_running_loop().create_task(self._note_stop(machine))
@@ -137,7 +143,7 @@ def _judge(stage: Stage, run: _Run, began_s: float) -> Result:
     errors_us = {s.stepper: checker.worst_error_s(s, stage.print_time) * 1e6 for s in steppers}
     primary = stage.description.nodes[0].name
     return Result(
-        scenario=scenario.name,
+        scenario=scenario.given,
         seed=stage.seed,
         violations=tuple(found),
         cause=run.cause,

@@ -1,5 +1,6 @@
 """``canductor simulate``: which seed runs which scenario, one after the other or in a pool of processes."""
 
+import math
 import multiprocessing
 import os
 import signal
@@ -17,6 +18,7 @@ from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.checker import Violation
 from coordinator.simulate.result import Result, ScenarioList, SimulationReport
 from coordinator.simulate.scenario import Scenario
+from coordinator.simulate.values import ScenarioError
 from nodes.errors import CanductorError
 
 SEED_LIMIT_S: Final = 120.0
@@ -69,17 +71,17 @@ def plan(chosen: Sequence[Scenario], options: SimulateOptions) -> Iterator[Task]
 
 def _in_turn(chosen: Iterable[Scenario]) -> list[Scenario]:
     """Return the scenarios in the order in which seeds fall to them: as often as they weigh, well mixed."""
-    credit = {s.name: 0.0 for s in chosen}
-    by_name = {s.name: s for s in chosen}
+    by_name = {s.name: s for s in chosen if s.weight > 0}
     total = sum(s.weight for s in by_name.values())
-    if total <= 0:
+    if not by_name:
         raise CanductorError("no scenario has a weight above 0; name the one to run")
+    credit = dict.fromkeys(by_name, 0.0)
     turn = []
-    for _ in range(max(len(credit), round(total))):
+    for _ in range(math.ceil(total)):
         for name in credit:
-            credit[name] += by_name[name].weight / total
+            credit[name] += by_name[name].weight
         first = max(credit, key=lambda name: credit[name])
-        credit[first] -= 1
+        credit[first] -= total
         turn.append(by_name[first])
     return turn
 
@@ -105,7 +107,9 @@ def run_all(tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
                         running[pool.submit(run_one, *task)] = task
         except BrokenProcessPool:
             # One of these took its process down: alone, it says so itself.
-            suspects = "; ".join(f"canductor simulate {s.name} --seed {seed}" for s, seed in running.values())
+            suspects = "; ".join(
+                f"canductor simulate {s.given} --seed {seed}" for s, seed in running.values()
+            )
             raise CanductorError(f"a simulation crashed its process, one of: {suspects}") from None
         finally:
             pool.shutdown(cancel_futures=True)
@@ -124,10 +128,12 @@ def run_one(scenario: Scenario, seed: int) -> Result:
     try:
         with _limit(SEED_LIMIT_S):
             return play(scenario, seed)
+    except ScenarioError:
+        raise
     except (Exception, _Hangs) as error:  # noqa: BLE001 (the seed is what is tested)
         text = f"not over after {SEED_LIMIT_S:g} s" if isinstance(error, _Hangs) else _where(error)
         return Result(
-            scenario=scenario.name,
+            scenario=scenario.given,
             seed=seed,
             violations=(Violation("exception", text),),
             cpu_s=time.process_time() - began_s,

@@ -115,7 +115,7 @@ class FaultSetting:
     bus: str = option(text, "")
     """Which wire."""
     share: Range = option(span(0, 1), Range(0, 0))
-    """How much of it: of the frames; of the bus's time for ``babble``."""
+    """How much of the bus's frames; afterwards there are no such faults on it, whatever its setting says."""
     id: int = option(whole(0, 0x7FF), 0x700)
     """``babble``: the CAN id that is sent."""
     times: Range = option(span(1, 50), Range(1, 1))
@@ -168,6 +168,8 @@ class Scenario:
     """A scenario file, read."""
 
     name: str
+    given: str
+    """As the command line names it: a name, or the path of a file of the user's own."""
     about: str
     """One sentence: what it is about."""
     machine: Path
@@ -205,6 +207,7 @@ def load(path: Path) -> Scenario:
     head = read(_Head, head_values, where)
     scenario = Scenario(
         name=path.stem,
+        given=path.stem if path.parent == SCENARIOS else str(path),
         about=head.about,
         machine=_machine(head.machine, path),
         expect=head.expect,

@@ -1,8 +1,7 @@
 """The stage of a scenario: a simulated world with wires and boards, and the host a machine is run on."""
 
 from functools import lru_cache
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 
@@ -51,7 +50,7 @@ _machine = lru_cache(load_machine)
 
 
 class Stage:
-    """What SCENARIO and SEED make: a context manager. Everything about it is in true time."""
+    """What SCENARIO and SEED make. Everything about it is in true time."""
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self.scenario = scenario
@@ -74,14 +73,6 @@ class Stage:
         self.faults = Faults(scenario, self.dice, actor, bus_of)
         for name, bus in scenario.buses.items():
             self._burden(name, bus)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nothing is left: the world is memory."""
 
     # ------------------------------------------------------------------------------------------ assembly
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 
@@ -99,3 +100,63 @@ def test_bad_words_are_told_in_one_sentence(
     err = capsys.readouterr().err
     assert sentence in err
     assert len(err.splitlines()) == 1
+
+
+def test_what_is_raised_is_a_failure_with_its_place(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(*_: object) -> Result:
+        raise ZeroDivisionError("by design")
+
+    monkeypatch.setattr("coordinator.simulate.play.play", fails)
+    assert cli.main(["simulate", "clean", "--seed", "4"]) == cli.EXIT_FAILED
+    out = capsys.readouterr().out
+    assert "FAILED exception: ZeroDivisionError: by design (tests/sim/test_run.py:" in out
+    assert "replay: canductor simulate clean --seed 4" in out
+
+
+def test_a_seed_that_does_not_end_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def hangs(*_: object) -> Result:
+        while True:
+            pass
+
+    monkeypatch.setattr("coordinator.simulate.play.play", hangs)
+    monkeypatch.setattr(run, "SEED_LIMIT_S", 0.05)
+    found = run.run_one(scenario.find("clean"), 1)
+    assert [v.text for v in found.violations] == ["not over after 0.05 s"]
+
+
+@pytest.mark.parametrize(
+    ("tail", "sentence"),
+    [
+        ("[buses.can7]\nloss = 0", "mine: [buses.can7]: the machine has no such bus"),
+        (
+            "[nodes.stray]\nppm = 0",
+            "mine: [nodes.stray]: the machine has mcu, toolhead; a stranger needs uuid",
+        ),
+        (
+            '[[faults]]\nkind = "cut"\nnode = "toolhed"\nat_s = 0',
+            "mine: a fault names the node 'toolhed'; there are mcu, toolhead",
+        ),
+    ],
+)
+def test_a_mistake_in_a_file_is_told_as_such(
+    tmp_path: Path, tail: str, sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(f'about = "Wrong."\n{tail}\n', encoding="utf-8")
+    assert cli.main(["simulate", str(path)]) == cli.EXIT_FAILED
+    err = capsys.readouterr().err
+    assert sentence in err
+    assert len(err.splitlines()) == 1
+
+
+def test_a_file_of_ones_own_is_replayed_by_its_path(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('about = "Never."\nexpect = "stops"\ncauses = ["never"]\n', encoding="utf-8")
+    assert cli.main(["simulate", str(path), "--seed", "9"]) == cli.EXIT_FAILED
+    out = capsys.readouterr().out
+    assert "FAILED ending: the job completed, but it had to stop" in out
+    assert f"replay: canductor simulate {path} --seed 9" in out
