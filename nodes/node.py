@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 from nodes.clock import ClockEstimate, ClockEstimator
-from nodes.conversation import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, Callback, Conversation, QueryTimeout
+from nodes.clock_keeper import ClockKeeper
+from nodes.conversation import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, Conversation
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
 from nodes.dictionary_parts import DictionaryError
@@ -21,7 +22,6 @@ from nodes.node_states import NodeEvent, NodeState, following
 from nodes.seams import BuildConfig, Connector, LinkLike
 from nodes.vigil import Vigil, get_config, restarted
 from nodes.vocabulary import carries_identity, check_vocabulary
-from nodes.wire_time import narrow
 
 if TYPE_CHECKING:
     from nodes.sync_pulse import PulseClock
@@ -31,8 +31,6 @@ MAX_STARTS: Final = 3
 CONFIG_RESET_TRIES: Final = 4
 RESET_SETTLE_S: Final = 0.3
 """For the reset command to arrive, repeated if need be, and the node to come up again."""
-SILENCE_S: Final = 0.25
-"""A node that owes an acknowledgement and says nothing for so long may have restarted: the bus is asked."""
 ALIVE_TIMEOUT_S: Final = 0.1
 """For a node of which another board claims to be it to show that it lives."""
 CLOCK_TIMEOUT_S: Final = 15.0
@@ -79,9 +77,7 @@ class Node:
         self._on_clock = on_clock
         self._cache = cache
         self._talk = Conversation(name)
-        self._clock: ClockEstimator | None = None
-        self._clock_ready = asyncio.Event()
-        self._clock_task: asyncio.Task[None] | None = None
+        self._keeper: ClockKeeper | None = None
         self._vigil = Vigil(self._talk, 0)
         self._starting_over = True  # until an old configuration is judged, old news mean nothing
         self._generation = 0
@@ -103,9 +99,9 @@ class Node:
     @property
     def clock(self) -> ClockEstimator:
         """The node's clock; NodeError before its first sample."""
-        if self._clock is None or not self._clock.accepted:
+        if self._keeper is None or not self._keeper.estimator.accepted:
             raise NodeError(f"the clock of node {self.name} is not known yet: the node is {self.state.value}")
-        return self._clock
+        return self._keeper.estimator
 
     @property
     def best_clock(self) -> EstimatedClock:
@@ -210,9 +206,9 @@ class Node:
             self._enter(NodeEvent.CONNECTED)
             await self._identify()
             self._enter(NodeEvent.IDENTIFIED)
-            self._start_clock()
+            keeper = self._start_clock()
             if await self._configure(self._build_config(self.dictionary)):
-                await self._wait_for_clock()
+                await self._wait_for_clock(keeper)
                 self._enter(NodeEvent.CONFIGURED)
                 return
             await self._disconnect()
@@ -258,10 +254,8 @@ class Node:
     async def _disconnect(self) -> None:
         self._generation += 1
         self._talk.fail(self.failure or NodeLost(f"the connection to node {self.name} was closed"))
-        task, self._clock_task = self._clock_task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
+        if self._keeper is not None:
+            await self._keeper.close()
         link = self._talk.detach()
         if link is not None:
             link.close()
@@ -337,81 +331,27 @@ class Node:
 
     # ------------------------------------------------------------------------------------------------ clock
 
-    def _start_clock(self) -> None:
-        self._clock = ClockEstimator(self.dictionary.clock_freq_hz)
-        self._clock_ready.clear()
-        self._clock_task = asyncio.get_running_loop().create_task(self._keep_clock(self._clock))
-        self._clock_task.add_done_callback(self._clock_ended)
+    def _start_clock(self) -> ClockKeeper:
+        self._keeper = ClockKeeper(
+            self._talk,
+            self._connector,
+            on_estimate=lambda estimate: self._on_clock(self, estimate),
+            on_sample=self._look,
+            on_lost=self.lose,
+        )
+        return self._keeper
 
-    def _clock_ended(self, task: asyncio.Task[None]) -> None:
-        """Bring a bug in keeping the clock to light, and stop using the node: its time is not known."""
-        bug = None if task.cancelled() else task.exception()
-        if bug is not None:
-            self.lose("its clock is no longer kept; this is a bug, please report it")
-            task.get_loop().call_exception_handler({"message": "keeping a clock failed", "exception": bug})
-
-    async def _keep_clock(self, clock: ClockEstimator) -> None:
-        """Ask for the clock for as long as the node can be talked to."""
-        while True:
-            try:
-                self._sampled(clock, await self._ask_clock(clock))
-                if self.state is NodeState.READY:
-                    self._note(await self._vigil.look())
-            except QueryTimeout:
-                self._connector.suspect()  # the link decides when a silent node is lost
-            except CanductorError as error:
-                self.lose(str(error))
-                return
-            await self._wait_watching(clock.next_sample_ns(0) * 1e-9)
-
-    def _note(self, trouble: NodeError | None) -> None:
+    async def _look(self) -> None:
+        """Notice what the node said only once, should that have been lost."""
+        trouble = await self._vigil.look() if self.state is NodeState.READY else None
         if trouble is not None:
             shutdown = isinstance(trouble, NodeShutdown)
             self._fail(NodeEvent.SHUTDOWN if shutdown else NodeEvent.RESTARTED, trouble)
 
-    async def _wait_watching(self, wait_s: float) -> None:
-        """Wait, and suspect the node when it owes answers and gives none."""
-        while wait_s > 0:
-            heard = self._talk.heard
-            await asyncio.sleep(min(wait_s, SILENCE_S))
-            wait_s -= SILENCE_S
-            if wait_s > 0 and heard == self._talk.heard and self._owes():
-                self._connector.suspect()
-
-    def _owes(self) -> bool:
-        return self._talk.connected and self._talk.link.pending() > 0
-
-    def _sampled(self, clock: ClockEstimator, answer: Answer) -> None:
-        if not self._take_sample(clock, answer):
-            return
-        estimate = clock.estimate()
-        self._talk.link.set_clock(estimate.freq_hz, estimate.at_ns, estimate.at_ticks)
-        self._on_clock(self, estimate)
-        if clock.ready:
-            self._clock_ready.set()
-
-    async def _ask_clock(self, clock: ClockEstimator) -> Answer:
-        if clock.accepted:
-            return await self._talk.ask("get_clock", "clock", tries=1, survives_shutdown=True)
-        return await self._talk.ask("get_uptime", "uptime", tries=1, survives_shutdown=True)
-
-    def _take_sample(self, clock: ClockEstimator, answer: Answer) -> bool:
-        message = answer.message
-        bitrate = self.dictionary.int_constant("CANBUS_FREQUENCY", 0)
-        sent_ns, received_ns = narrow(
-            answer.sent_ns,
-            answer.received_ns,
-            self._connector.wire_ns(answer.asked_bytes, bitrate),
-            self._connector.wire_ns(answer.answered_bytes, bitrate),
-        )
-        if message.name == "clock":
-            return clock.add(sent_ns, received_ns, message.integer("clock"))
-        return clock.begin(sent_ns, received_ns, message.integer("high"), message.integer("clock"))
-
-    async def _wait_for_clock(self) -> None:
+    async def _wait_for_clock(self, keeper: ClockKeeper) -> None:
         try:
             async with asyncio.timeout(CLOCK_TIMEOUT_S):
-                await self._clock_ready.wait()
+                await keeper.ready.wait()
         except TimeoutError:
             raise self.failure or NodeError(
                 f"node {self.name} answers too seldom to learn its clock; check the bus for errors and load"
@@ -433,7 +373,8 @@ class Node:
         self.failure = failure
         self._enter(event)
         self._talk.fail(failure, shutdown=event is NodeEvent.SHUTDOWN)
-        self._clock_ready.set()  # nobody needs to wait for it any more
+        if self._keeper is not None:
+            self._keeper.ready.set()  # nobody needs to wait for it any more
 
     def _link_lost(self, generation: int) -> Callable[[str], None]:
         def lost(cause: str) -> None:
