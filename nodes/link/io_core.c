@@ -91,6 +91,8 @@ void io_handle_time(struct io_bus *bus, uint64_t now) {
         link_handle_timer(&node->link, now);
         node->changed |= node->link.stats.timeouts + node->link.state != before;
     }
+    if (bus->hold_ns <= now) // io_next() follows, or the driver waits for something else
+        bus->hold_ns = UINT64_MAX;
     io_publish(bus);
     io_note_states(bus);
 }

@@ -173,8 +173,9 @@ size_t io_next(struct io_bus *bus, uint64_t now, uint64_t queued, uint8_t *out, 
         uint64_t waiting = bus->schedule.queue_frames - outlet.left;
         bus->stats.queued_max = waiting > bus->stats.queued_max ? waiting : bus->stats.queued_max;
     }
-    note_holds(bus, &outlet, now);
-    if (outlet.size == 0)
-        io_publish(bus); // the end of a round
+    if (outlet.size == 0) { // the end of a round
+        note_holds(bus, &outlet, now);
+        io_publish(bus);
+    }
     return outlet.size;
 }

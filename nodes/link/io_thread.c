@@ -94,9 +94,9 @@ static int flush(struct io_thread *thread, uint64_t now) {
 }
 
 // How many frames the kernel still has, as far as it tells; a serial line: bytes. It counts buffers,
-// SKB_BYTES for a write of up to some ten frames (measured: AF_UNIX on x86-64; a CAN frame has one of its
-// own). Whether frames wait behind the kernel, in an adapter or in the virtual bus, nobody tells: the core
-// estimates that from the bit rate, so the greater of the two counts.
+// SKB_BYTES for a write of up to some ten frames (measured on x86-64: AF_UNIX, and vcan, where a frame has
+// one of its own). Whether frames wait behind the kernel, in an adapter or in the virtual bus, nobody tells:
+// the core estimates that from the bit rate, so the greater of the two counts.
 static uint64_t queued(const struct io_thread *thread) {
     if (!io_bounds_queue(thread->bus))
         return 0;

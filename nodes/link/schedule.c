@@ -19,10 +19,9 @@ enum {
     QUEUE_FRAMES_MIN = 3,      // one on the wire, one behind it, one while the thread wakes up
 };
 
-#define OVERDRAFT_NS (20 * NS_PER_MS) // of control: a dozen full blocks at 500 kbit/s
+#define OVERDRAFT_NS (20 * NS_PER_MS) // of control and motion sent ahead: a dozen full blocks at 500 kbit/s
 #define DEBT_MAX_NS (50 * NS_PER_MS)  // older debt is forgiven: the bus was busy then, it is not now
-#define CREDIT_MIN_NS                                                                                        \
-    (2 * NS_PER_MS) // a thread that sleeps for so long need not lose what it could have sent
+#define CREDIT_MIN_NS (2 * NS_PER_MS) // a thread that slept for so long loses nothing
 #define SLOT_NS (100 * NS_PER_MS)
 // An acknowledgement that is awaited for so long may be waiting for the line; a third of the least timeout. A
 // pause of a frame each time costs a line that is never idle 4 % at 500 kbit/s.

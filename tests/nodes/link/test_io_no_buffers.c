@@ -52,7 +52,7 @@ int main(void) {
     struct acker acker = {.fd = fds[1], .can = 1};
     pthread_t server;
     CHECK_EQUAL(pthread_create(&server, NULL, serve, &acker), 0);
-    struct io_settings line = {0};
+    struct io_settings line = {.bitrate = 1000000};
     struct io_thread *thread = io_start(fds[0], IO_CAN_STREAM, &line);
     struct io_bus *bus = io_thread_bus(thread);
     struct link_settings settings = {.receive_window = 192, .lost_after_ns = 20000000000};
