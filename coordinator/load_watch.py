@@ -49,6 +49,6 @@ class LoadWatch:
             )
         raise BusOverload(
             f"bus {self.name} cannot carry what is planned: its motion needs {forecast.worst_ratio:.0%} of "
-            f"the {forecast.motion_bits_per_s / 1000:.0f} kbit/s there are for it, and {late}; lower the speed or "
-            "the microsteps, take other traffic off the bus, or raise its bit rate"
+            f"the {forecast.motion_bits_per_s / 1000:.0f} kbit/s there are for it, and {late}; lower the "
+            "speed or the microsteps, take other traffic off the bus, or raise its bit rate"
         )
