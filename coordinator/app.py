@@ -123,8 +123,8 @@ class Machine:
         self.stopped = MachineStopped(cause)
         self._stopped_at_ns = self.host.now()
         self._care.halt()
-        for node in self.nodes.values():
-            node.emergency_stop()
+        for opened in self._open:
+            opened.bus.emergency_stop()
         self._failed.set()
 
     async def sleep(self, name: str) -> None:
@@ -220,7 +220,7 @@ class Machine:
         """Raise BusOverload when a bus will not carry the motion queued on it in time."""
         for opened in self._open:
             if opened.bus.closed_because is None:
-                opened.watch.look(opened.bus.io.forecast(), self.host.now())
+                opened.watch.look(opened.bus.io.forecast(), self.host.now(), _repeated(opened.bus))
 
     async def stepper_positions(self) -> dict[str, int]:
         """Ask every node where its steppers stand: steps from where they began, positive as motion counts."""
@@ -299,6 +299,12 @@ class Machine:
 
 
 _NOT_RUNNING = (NodeState.LOST, NodeState.SHUTDOWN, NodeState.SLEEPING)
+
+
+def _repeated(bus: CanBus | UartBus) -> float:
+    """Return the share of the blocks sent on BUS that were repeats."""
+    stats = [link_of(node).stats() for node in bus.nodes if node.talks]
+    return sum(s.blocks_repeated for s in stats) / max(1, sum(s.blocks_sent for s in stats))
 
 
 def _first_cause(group: BaseExceptionGroup[BaseException]) -> BaseException:

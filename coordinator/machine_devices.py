@@ -1,10 +1,19 @@
 """The configured machine's devices: what each node is configured as, and what motion has to know of it."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
-from coordinator.machine.description import MachineDescription, StepperDescription
+from coordinator.machine.description import (
+    CanConnection,
+    MachineDescription,
+    NodePolicy,
+    RailDescription,
+    StepperDescription,
+)
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
+from nodes.bus import KNOWS_BUS_STOP
+from nodes.devices.endstop import Endstop
 from nodes.devices.stepper import Stepper
+from nodes.devices.trsync import Trsync
 from nodes.dictionary import Dictionary
 from nodes.node_config import NodeConfig
 
@@ -18,6 +27,14 @@ class MachineDevices:
     def __init__(self, description: MachineDescription) -> None:
         self.description = description
         self.steppers: dict[str, Stepper] = {s.name: _stepper(s) for s in description.steppers}
+        self.endstops: dict[str, Endstop] = {
+            rail.axis: _endstop(rail) for rail in description.rails if rail.homing.endstop_pin is not None
+        }
+        """By axis, of the rails whose endstop is on a pin."""
+        self.trsyncs: dict[str, Trsync] = {
+            node: Trsync(f"homing on node {node}") for node in self._homing_nodes()
+        }
+        """By node, of all that take part in homing."""
 
     def build_config(self, node: str, dictionary: Dictionary) -> NodeConfig:
         """Return what NODE is to be configured as; raises CanductorError when it cannot be that."""
@@ -29,7 +46,38 @@ class MachineDevices:
                 stepper.step_pin.number(numbers)  # tells file and line when the node has no such pin
                 stepper.dir_pin.number(numbers)
                 self.steppers[stepper.name].configure(config)
+        self._add_homing(config, numbers)
+        self._spread_shutdown(config)
         return config
+
+    def _homing_nodes(self) -> Iterator[str]:
+        if self.endstops:
+            yield from self.moving_nodes
+        for rail in self.description.rails:
+            if rail.homing.endstop_pin is not None:
+                yield rail.homing.endstop_pin.node
+
+    def _add_homing(self, config: NodeConfig, pins: Mapping[str, int]) -> None:
+        for rail in self.description.rails:
+            pin = rail.homing.endstop_pin
+            if pin is not None and pin.node == config.name:
+                pin.number(pins)
+                self.endstops[rail.axis].configure(config)
+        if config.name in self.trsyncs:
+            self.trsyncs[config.name].configure(config)
+
+    def endstop_node(self, rail: RailDescription) -> str:
+        """Return the node of a rail's endstop, which is on a pin."""
+        assert rail.homing.endstop_pin is not None
+        return rail.homing.endstop_pin.node
+
+    def _spread_shutdown(self, config: NodeConfig) -> None:
+        """Have a node that must not fail stop its whole bus when it shuts down, past the host."""
+        described = next(n for n in self.description.nodes if n.name == config.name)
+        knows = config.dictionary.int_constant(KNOWS_BUS_STOP, 0)
+        on_can = isinstance(described.connection, CanConnection)
+        if knows and on_can and described.policy is NodePolicy.FATAL:
+            config.add_init("the bus-wide stop", "set_bus_stop enable=1")
 
     @property
     def moving_nodes(self) -> list[str]:
@@ -54,6 +102,12 @@ class MachineDevices:
             invert_dir=described.dir_pin.invert,
             step_pulse_s=described.step_pulse_s,
         )
+
+
+def _endstop(rail: RailDescription) -> Endstop:
+    pin = rail.homing.endstop_pin
+    assert pin is not None
+    return Endstop(f"axis {rail.axis}", pin=pin.name, pull=pin.pull, invert=pin.invert)
 
 
 def _stepper(described: StepperDescription) -> Stepper:

@@ -139,7 +139,7 @@ async def _outcome(machine: Machine, streamer: Streamer, began_at: dict[str, int
         issued={s.name: s.issued for s in stats.steppers},
         maps={node.name: m for node, m in zip(machine.moving, streamer.maps, strict=True)},
         nodes=tuple(
-            NodeOutcome(node.name, link_of(node).stats(), node.clock.estimate().error_s)
+            NodeOutcome(node.name, link_of(node).stats(), node.clock_error_s or 0.0)
             for node in machine.nodes.values()
             if node.state is NodeState.READY  # an optional one may be away
         ),
@@ -158,5 +158,5 @@ def _figures(machine: Machine, name: str) -> NodeFigures:
         retransmitted_bytes=stats.bytes_repeated,
         queue_depth=stats.motion_commands,
         lead_ms=None if stats.min_lead_s is None else stats.min_lead_s * 1e3,
-        clock_error_us=node.clock.estimate().error_s * 1e6,
+        clock_error_us=None if node.clock_error_s is None else node.clock_error_s * 1e6,
     )

@@ -37,6 +37,12 @@ from nodes.wire_time import can_wire_ns
 LOST_AFTER_S: Final = 1.0
 SUSPECT_INTERVAL_S: Final = 0.1
 """The bus is asked at most that often who waits for an id."""
+BUS_STOP_ID: Final = 0x010
+"""Frame ``<reason> <node id of the origin>``: every node of this project's firmware shuts down at once."""
+KNOWS_BUS_STOP: Final = "CAN_BUS_STOP"
+"""Of the dictionary: the firmware does so."""
+BUS_STOP_FRAMES: Final = 3
+"""Nobody acknowledges it, and a bus that has to be stopped may be one that loses frames."""
 BUS_OFF: Final = 0x2000_0040
 """Id of the kernel's error frame (CAN_ERR_FLAG | CAN_ERR_BUSOFF): the controller took itself off the bus."""
 
@@ -273,6 +279,14 @@ class CanBus(_Base):
                 raise result  # a bug of those tasks, which expect all that may happen
         await super().close()
 
+    def emergency_stop(self) -> None:
+        """Stop every node that can be reached: by frames that our firmware obeys at once, and one by one."""
+        if any(node.dictionary.int_constant(KNOWS_BUS_STOP, 0) for node in self.nodes):
+            with contextlib.suppress(CanductorError):  # the bus may be what failed
+                for _ in range(BUS_STOP_FRAMES):
+                    self.io.send_frame(BUS_STOP_ID, bytes((0, 0)))
+        super().emergency_stop()
+
     async def assign(self, uuids: Iterable[Uuid]) -> Assignment:
         """Give UUIDS their ids; whether one can be had for certain is for ``Assignment.check_node``."""
         async with self._assigning:
@@ -340,10 +354,18 @@ class CanBus(_Base):
     def _frame_came(self, frame: FrameLike) -> None:
         if self._assignment is not None:
             self._assignment.frame(frame.can_id, frame.data, _ns(asyncio.get_running_loop().time()))
-        if frame.can_id == ADMIN_RESPONSE_ID:
+        if frame.can_id == BUS_STOP_ID and len(frame.data) == 2:
+            self._bus_stopped(reason=frame.data[0], nodeid=frame.data[1])
+        elif frame.can_id == ADMIN_RESPONSE_ID:
             self._doubt(waiting_uuid(frame.data))
         elif frame.can_id == BUS_OFF:
             self._went_bus_off()
+
+    def _bus_stopped(self, reason: int, nodeid: int) -> None:
+        """Take note that a node stopped the bus: what the others report from now on follows from that."""
+        for uuid, node in self._by_uuid.items():
+            if self._nodeids[uuid] == nodeid:
+                node.shut_down_for(reason)
 
     def _went_bus_off(self) -> None:
         cause = (
@@ -421,8 +443,7 @@ class _CanConnector:
 
 
 def _knows_pulses(node: Node) -> bool:
-    talks = node.state in (NodeState.CONFIGURING, NodeState.READY)
-    return talks and bool(node.dictionary.int_constant(CONSTANT, 0))
+    return node.talks and bool(node.dictionary.int_constant(CONSTANT, 0))
 
 
 def _twins(uuid: Uuid, bus: str) -> str:

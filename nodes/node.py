@@ -104,9 +104,22 @@ class Node:
         return self._keeper.estimator
 
     @property
+    def talks(self) -> bool:
+        """Whether commands can be sent to it now."""
+        return self.failure is None and self.state in (NodeState.CONFIGURING, NodeState.READY)
+
+    @property
     def best_clock(self) -> EstimatedClock:
         """The node's clock as well as it is known: by sync pulses, else by exchanges; NodeError before."""
         return self.pulse_clock or self.clock
+
+    @property
+    def clock_error_s(self) -> float | None:
+        """Bound of the error of ``best_clock``; None while that is not known."""
+        if self.pulse_clock is not None:
+            return self.pulse_clock.error_s
+        known = self._keeper is not None and self._keeper.estimator.accepted
+        return self.clock.estimate().error_s if known else None
 
     @property
     def clock_freq_hz(self) -> int:
@@ -388,10 +401,13 @@ class Node:
         self.load = load_of(stats, self.dictionary.clock_freq_hz, base)
 
     def _shutdown_came(self, message: Message) -> None:
+        self.shut_down_for(message.integer("static_string_id"))
+
+    def shut_down_for(self, static_string_id: int) -> None:
+        """Take note that the node shut down, and which text it gives as reason."""
         if self._starting_over or self.failure is not None or self.state not in _SHUTDOWN_MEANS:
             return
-        value = message.integer("static_string_id")
-        text = self.dictionary.enum_name("static_string_id", value)
+        text = self.dictionary.enum_name("static_string_id", static_string_id)
         self._fail(NodeEvent.SHUTDOWN, NodeShutdown(shutdown_sentence(self.name, text)))
 
     def _starting_came(self, _: Message) -> None:

@@ -169,9 +169,9 @@ class PulseKeeper:
                 self._publish(())
                 await asyncio.sleep(IDLE_S)
                 continue
-            with contextlib.suppress(CanductorError):
+            with contextlib.suppress(CanductorError):  # a reference without a clock yet, a bus that closes
                 await self._round(nodes)
-            self._publish(nodes)
+                self._publish(nodes)
             settling = self.rounds.rounds < SETTLE_ROUNDS
             await asyncio.sleep(SETTLE_INTERVAL_S if settling else INTERVAL_S)
 

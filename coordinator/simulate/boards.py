@@ -19,6 +19,14 @@ from nodes.virtual.world import CanWire, Latency, NodeSettings, Uart, WorldNode
 PIECE: Final = 40
 PS_PER_NS: Final = 1000
 
+EXTENSIONS: Final = frozenset(
+    (
+        *("CAN_SYNC_PULSE", "CAN_TRIGGER_GROUPS", "CAN_BUS_STOP", "CAN_WHO_IS_HERE"),
+        *("get_sync_pulse", "sync_pulse", "trsync_set_group", "set_bus_stop"),
+    )
+)
+"""What the dictionary of firmware without this project's extensions does not have."""
+
 
 class Board:
     """One simulated board: NAME as SETTING and DICE make it, at WIRE of WORLD."""
@@ -40,7 +48,7 @@ class Board:
         def draw(option: str) -> float:
             return dice.draw(getattr(setting, option), f"nodes.{name}.{option}")
 
-        blob = _dictionary(setting.clock_hz)
+        blob = _dictionary(setting.clock_hz, setting.legacy)
         self.dictionary = _parsed(blob)
         self.clock_hz = round(self.dictionary.clock_freq_hz)
         self._ppm = draw("ppm")
@@ -52,7 +60,7 @@ class Board:
             start_clock=2**32 - round(draw("rollover_after_s") * self.clock_hz) % 2**32,
             clock_freq=self.clock_hz if setting.clock_hz else 0,
             move_count=setting.move_slots,
-            dictionary=blob if setting.clock_hz else None,
+            dictionary=blob if setting.clock_hz or setting.legacy else None,
             legacy=setting.legacy,
         )
         self._begin(draw("power_on_s"), draw("ramp_ppm_per_s"), draw("ramp_s"))
@@ -96,12 +104,19 @@ class Board:
 
 
 @lru_cache
-def _dictionary(clock_hz: int) -> bytes:
-    """Return the compressed dictionary of the simulated board, for a clock of CLOCK_HZ (0: as built)."""
-    if not clock_hz:
+def _dictionary(clock_hz: int, legacy: bool) -> bytes:
+    """Return the compressed dictionary of the simulated board, for a clock of CLOCK_HZ (0: as built).
+
+    LEGACY: as of firmware that does not have this project's extensions.
+    """
+    if not clock_hz and not legacy:
         return _download()
-    words = json.loads(zlib.decompress(_dictionary(0)))
-    words["config"]["CLOCK_FREQ"] = clock_hz
+    words = json.loads(zlib.decompress(_dictionary(0, legacy=False)))
+    if clock_hz:
+        words["config"]["CLOCK_FREQ"] = clock_hz
+    if legacy:
+        for table in ("config", "commands", "responses"):
+            words[table] = {k: v for k, v in words[table].items() if k.split()[0] not in EXTENSIONS}
     return zlib.compress(json.dumps(words, separators=(",", ":")).encode(), 9)
 
 

@@ -51,26 +51,29 @@ void command_config_endstop(struct node *node, const struct wire_arg *args) {
 }
 DECL_COMMAND(command_config_endstop, "config_endstop oid=%c pin=%c pull_up=%c", 0);
 
-void command_endstop_home(struct node *node, const struct wire_arg *args) {
-    struct endstop *endstop = oid_find(node, args[0].value, &endstop_type);
-    if (!endstop)
+static void start(struct node *node, struct endstop *endstop, const struct wire_arg *args) {
+    endstop->trsync = trsync_find(node, args[6].value);
+    if (!endstop->trsync)
         return;
-    uint32_t irq = board_irq_save(node);
-    sched_delete_timer(node, &endstop->timer);
     endstop->timer.waketime = endstop->next_clock = args[1].value;
     endstop->sample_ticks = args[2].value;
     endstop->sample_count = endstop->samples_left = (uint8_t)args[3].value;
     endstop->rest_ticks = args[4].value;
     endstop->wanted = args[5].value != 0;
     endstop->reason = (uint8_t)args[7].value;
+    endstop->homing = 1;
+    sched_add_timer(node, &endstop->timer);
+}
+
+void command_endstop_home(struct node *node, const struct wire_arg *args) {
+    struct endstop *endstop = oid_find(node, args[0].value, &endstop_type);
+    if (!endstop)
+        return;
+    uint32_t irq = board_irq_save(node);
+    sched_delete_timer(node, &endstop->timer);
     endstop->homing = 0;
-    if (endstop->sample_count) {
-        endstop->trsync = trsync_find(node, args[6].value);
-        if (endstop->trsync) {
-            endstop->homing = 1;
-            sched_add_timer(node, &endstop->timer);
-        }
-    }
+    if (args[3].value) // else it ends here, and a host may still ask when the last look was
+        start(node, endstop, args);
     board_irq_restore(node, irq);
 }
 DECL_COMMAND(command_endstop_home,

@@ -182,28 +182,31 @@ class LinkIO:
 
     def _hand_over(self, taken: int) -> None:
         responses: dict[int, list[Response]] = {}
-        others: list[tuple[int, int, int, Frame]] = []
+        frames: list[Frame] = []
+        notices: list[tuple[int, int, int]] = []
         for i in range(taken):
             event = self._events[i]
             content = bytes(self._ffi.buffer(event.content)[: event.size])
             if event.notice == self._lib.IO_RESPONSE:
                 response = Response(content, event.sent_ns, event.received_ns)
                 responses.setdefault(event.link, []).append(response)
+            elif event.notice == self._lib.IO_FRAME:
+                frames.append(Frame(event.can_id, content, event.received_ns))
             else:
-                frame = Frame(event.can_id, content, event.received_ns)
-                others.append((event.notice, event.link, event.value, frame))
+                notices.append((event.notice, event.link, event.value))
+        # Frames first: one with which a node stops its bus tells why, what the others then report does not.
+        for frame in frames:
+            if self._bus.open and self._on_frame:
+                self._on_frame(frame)
         for number, batch in responses.items():
             if link := self._links.get(number):
                 link.handle_responses(batch)
-        for notice, number, value, frame in others:
+        for notice in notices:
             if self._bus.open:
-                self._hand_over_other(notice, number, value, frame)
+                self._handle_notice(*notice)
 
-    def _hand_over_other(self, notice: int, number: int, value: int, frame: Frame) -> None:
-        if notice == self._lib.IO_FRAME:
-            if self._on_frame:
-                self._on_frame(frame)
-        elif notice == self._lib.IO_ENDED:
+    def _handle_notice(self, notice: int, number: int, value: int) -> None:
+        if notice == self._lib.IO_ENDED:
             self._handle_ended(value)
         elif link := self._links.get(number):
             if notice == self._lib.IO_DRAINED:
@@ -236,6 +239,7 @@ def _convert(raw: Any, lib: Any) -> IOStats:
         "bulk": lib.LINK_BULK,
         "acks": lib.SCHEDULE_ACKS,
         "data": lib.SCHEDULE_DATA,
+        "weak": lib.SCHEDULE_WEAK,
     }
     return IOStats(
         **{name: getattr(raw, name) for name in _COUNTERS},

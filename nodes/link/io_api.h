@@ -88,8 +88,8 @@ enum io_status io_set_receive_window(struct io_bus *bus, uint32_t number, uint64
 enum io_status io_set_clock(struct io_bus *bus, uint32_t number, double freq_hz, uint64_t at_ns,
                             uint64_t at_ticks);
 
-// The bit rate of a bus that io_settings did not know, or knew wrongly: budget and forecast begin anew with it.
-// 0: nothing is budgeted.
+// The bit rate of a bus that io_settings did not know, or knew wrongly: budget and forecast begin anew with
+// it. 0: nothing is budgeted.
 void io_set_bitrate(struct io_bus *bus, uint32_t bitrate);
 
 // Asks for one IO_DRAINED when nothing is pending (at once, if so).

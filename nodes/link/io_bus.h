@@ -14,7 +14,8 @@
 enum {
     IO_FRAME_SIZE = sizeof(struct can_frame),
     IO_DATA_MAX = 8,
-    IO_DATA_ID = 0x100, // + 2 * node id: to the node
+    IO_DATA_ID = 0x100,       // + 2 * node id: to the node
+    IO_ADMIN_LAST_ID = 0x3F1, // ids above it are nobody's whom we know
     IO_CUT_MAX = IO_DATA_MAX - 1 + LINK_WIRE_MAX,
     IO_SEGMENTS = 512, // of queued motion, per link
 };

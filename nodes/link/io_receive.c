@@ -42,7 +42,7 @@ static void receive_frame(struct io_bus *bus, const struct can_frame *frame, uin
         return;
     }
     bus->stats.frames_unclaimed++;
-    schedule_received(&bus->schedule, SCHEDULE_DATA, bits);
+    schedule_received(&bus->schedule, frame->can_id > IO_ADMIN_LAST_ID ? SCHEDULE_WEAK : SCHEDULE_DATA, bits);
     struct io_event event = {.notice = IO_FRAME, .size = frame->can_dlc, .can_id = frame->can_id};
     event.received_ns = now;
     memcpy(event.content, frame->data, frame->can_dlc);

@@ -228,8 +228,8 @@ uint64_t schedule_recent(const struct schedule *schedule, unsigned flow) {
     return bits * (NS_PER_S / 1000) / (span_ns / 1000);
 }
 
-// Received data and control take what they take; bulk gives way. Acknowledgements are part of what motion
-// costs.
+// Received data and control take what they take; bulk gives way, and so do frames of higher ids.
+// Acknowledgements are part of what motion costs.
 double schedule_left_for_motion(const struct schedule *schedule) {
     uint64_t others = schedule_recent(schedule, LINK_CONTROL);
     others += schedule->serial ? 0 : schedule_recent(schedule, SCHEDULE_DATA);

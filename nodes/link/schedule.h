@@ -22,9 +22,10 @@
 // cffi: begin
 enum {
     SCHEDULE_SLOTS = 11, // of 100 ms: ten whole ones and the one that is being filled
-    SCHEDULE_FLOWS = 5,  // what was sent, by enum link_class; then:
+    SCHEDULE_FLOWS = 6,  // what was sent, by enum link_class; then:
     SCHEDULE_ACKS = 3,   // received: acknowledgements without content
     SCHEDULE_DATA = 4,   // received: everything else
+    SCHEDULE_WEAK = 5,   // received: of ids so high that it gives way to all of ours
 };
 
 // All fields are the scheduler's own, but for reading.
@@ -61,7 +62,7 @@ unsigned schedule_allowed(const struct schedule *schedule);
 // When a class that may not send now may again, if nothing else is sent or received.
 uint64_t schedule_opens_at(const struct schedule *schedule, enum link_class kind);
 
-// Something of BITS was handed over, or was received, now. FLOW: SCHEDULE_ACKS or SCHEDULE_DATA.
+// Something of BITS was handed over, or was received, now. FLOW: SCHEDULE_ACKS, _DATA or _WEAK.
 void schedule_sent(struct schedule *schedule, enum link_class kind, uint32_t bits);
 void schedule_received(struct schedule *schedule, unsigned flow, uint32_t bits);
 

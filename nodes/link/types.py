@@ -206,11 +206,13 @@ class BusLoad:
     """Received acknowledgements."""
     data: float = 0.0
     """Received otherwise; a serial line: all that was received."""
+    weak: float = 0.0
+    """Received with ids above those of nodes and host: frames that give way to all of these."""
 
     @property
     def total(self) -> float:
         """All of it together."""
-        return self.motion + self.control + self.bulk + self.acks + self.data
+        return self.motion + self.control + self.bulk + self.acks + self.data + self.weak
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,233 @@
+"""Homing on simulated boards: steppers here, the endstop there; what the host believes against the truth."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coordinator.app import Machine
+from coordinator.homing import TIMEOUT_S, HomingError, HomingMove, HomingResult
+from coordinator.simulate import scenario as scenarios
+from coordinator.simulate.stage import Stage
+from nodes.errors import CanductorError
+
+MACHINE = """
+[mcu]
+canbus_uuid: 90a4ae022dfc
+canbus_interface: can0
+
+[mcu toolhead]
+{toolhead}
+
+[printer]
+kinematics: {kinematics}
+max_velocity: 250
+max_accel: 3000
+max_z_velocity: 20
+max_z_accel: 500
+
+[stepper_x]
+step_pin: PB0
+dir_pin: PB1
+microsteps: 16
+rotation_distance: 40
+endstop_pin: {endstop}
+position_endstop: 0
+position_max: 250
+homing_speed: 50
+
+[stepper_y]
+step_pin: {y_node}PB3
+dir_pin: !{y_node}PB4
+microsteps: 16
+rotation_distance: 40
+position_endstop: 0
+position_max: 250
+
+[stepper_z]
+step_pin: PB6
+dir_pin: PB7
+microsteps: 16
+rotation_distance: 8
+position_endstop: 0
+position_max: 250
+"""
+ON_CAN = "canbus_uuid: 5e1ec7ab1e02\ncanbus_interface: can0"
+ON_UART = "serial: /dev/ttyTool\nbaud: 250000"
+PS_PER_US = 1_000_000
+SWITCH_AT = -1600
+"""Steps from where the axis begins to where the switch is: 20 mm."""
+STEPS_PER_MM = 80
+
+
+@dataclass
+class Home:
+    """One homing move of X on a simulated machine."""
+
+    folder: Path
+    toolhead: str = ON_CAN
+    kinematics: str = "cartesian"
+    endstop: str = "^toolhead:PC5"
+    y_node: str = ""
+    settings: str = ""
+    switch_at: int | None = SWITCH_AT
+    way_mm: float = 40.0
+    speed: float = 50.0
+    seed: int = 0
+    during: Callable[[Stage], None] | None = None
+    """What happens half a second after the move began."""
+    told: list[str] = field(default_factory=list)
+
+    def run(self) -> HomingResult:
+        machine = MACHINE.format(
+            toolhead=self.toolhead, kinematics=self.kinematics, endstop=self.endstop, y_node=self.y_node
+        )
+        (self.folder / "home.cfg").write_text(machine)
+        text = f'about = "Homing."\nmachine = "home.cfg"\n{self.settings}'
+        (self.folder / "home.toml").write_text(text)
+        self.stage = Stage(scenarios.find(str(self.folder / "home.toml")), self.seed)
+        mcu, toolhead = (self.stage._boards[name].node for name in ("mcu", "toolhead"))
+        pins = self.stage.pins("mcu")
+        self.axis = mcu.add_axis(
+            pins["PB0"],
+            pins["PB1"],
+            target=toolhead if "toolhead" in self.endstop else mcu,
+            target_pin=pins["PC5"],
+            at=self.switch_at if self.switch_at is not None else -(10**6),
+            direction=-1,
+        )
+        with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
+            return runner.run(self._main())
+
+    async def _main(self) -> HomingResult:
+        machine = Machine(self.stage.description, self.stage.host, on_notice=self.told.append)
+        await machine.start()
+        try:
+            rail = self.stage.description.rails[0]
+            move = HomingMove(machine, rail, direction=-1, way_mm=self.way_mm, speed=self.speed, accel=3000.0)
+            if self.during is not None:
+                asyncio.get_running_loop().call_later(0.5, self.during, self.stage)
+            return await move.run()
+        finally:
+            await machine.close()
+
+    def steps(self, node: str = "mcu", pin: str = "PB0") -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        """Return the true times (µs) of a stepper's steps."""
+        edges = self.stage._boards[node].node.edges()
+        chosen = (edges["pin"] == self.stage.pins(node)[pin]) & (edges["level"] == 1)
+        return np.asarray(edges["true_ps"][chosen] // PS_PER_US, np.int64)
+
+    def position(self) -> int:
+        return self.stage._boards["mcu"].node.axis_position(self.axis)
+
+    def microseconds_to_stop(self) -> int:
+        """Return the true time from the switch to the last step behind it."""
+        steps = self.steps()
+        return int(steps[-1] - steps[abs(SWITCH_AT) - 1])
+
+
+def check_position(home: Home, result: HomingResult) -> None:
+    """Compare what the host believes with the truth."""
+    assert result.moved["stepper_x"] == home.position()
+    beyond = abs(home.position()) - abs(SWITCH_AT)
+    assert result.way_mm == pytest.approx(abs(home.position()) / STEPS_PER_MM, abs=1e-9)
+    # The switch closes with a step; a look is taken every 50 µs, 2.5 µm of way, and clocks differ by less.
+    assert result.way_to_trigger_mm == pytest.approx(abs(SWITCH_AT) / STEPS_PER_MM, abs=1.5 / STEPS_PER_MM)
+    (overshoot,) = [o for o in result.overshoots if o.stepper == "stepper_x"]
+    assert abs(overshoot.steps - beyond) <= 1
+    assert result.beyond_trigger_mm == pytest.approx(overshoot.distance_mm, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_trigger_group_stops_another_node_within_300_us_on_a_busy_bus(tmp_path: Path, seed: int) -> None:
+    home = Home(tmp_path, settings="[buses.can0]\nload = 0.7\n", seed=seed)
+    result = home.run()
+    assert result.through_group
+    assert home.microseconds_to_stop() < 300
+    check_position(home, result)
+
+
+def test_frames_that_get_lost_cost_overshoot_but_no_position(tmp_path: Path) -> None:
+    found = []
+    for seed in range(8):
+        home = Home(tmp_path, settings="[buses.can0]\nloss = 0.02\n", seed=seed)
+        check_position(home, home.run())
+        found.append(home.microseconds_to_stop())
+    assert sorted(found)[len(found) // 2] < 300
+    assert max(found) < TIMEOUT_S * 1e6
+
+
+def test_the_host_relays_for_a_board_without_groups(tmp_path: Path) -> None:
+    home = Home(tmp_path, settings="[nodes.toolhead]\nlegacy = true\n")
+    result = home.run()
+    assert not result.through_group
+    assert home.microseconds_to_stop() < 20_000
+    check_position(home, result)
+
+
+def test_the_host_relays_from_a_uart_to_a_bus(tmp_path: Path) -> None:
+    home = Home(tmp_path, toolhead=ON_UART)
+    result = home.run()
+    assert not result.through_group
+    assert home.microseconds_to_stop() < 20_000
+    check_position(home, result)
+
+
+def test_an_endstop_on_the_node_of_its_stepper_needs_nobody(tmp_path: Path) -> None:
+    home = Home(tmp_path, endstop="^PC5")
+    result = home.run()
+    assert not result.through_group
+    assert home.microseconds_to_stop() < 150
+    check_position(home, result)
+
+
+def test_all_motors_of_a_corexy_stop(tmp_path: Path) -> None:
+    home = Home(tmp_path, kinematics="corexy", y_node="toolhead:")
+    result = home.run()
+    assert {o.stepper for o in result.overshoots} == {"stepper_x", "stepper_y"}
+    assert result.moved["stepper_x"] == home.position()
+    assert result.moved["stepper_y"] == pytest.approx(home.position(), abs=25)
+    assert home.steps("toolhead", "PB3")[-1] - home.steps()[abs(SWITCH_AT) - 1] < 300
+    assert result.way_to_trigger_mm == pytest.approx(20.0, abs=0.02)
+
+
+def test_a_switch_that_never_closes_is_told(tmp_path: Path) -> None:
+    home = Home(tmp_path, switch_at=None)
+    with pytest.raises(HomingError, match="axis x moved 40 mm and its endstop did not switch; check"):
+        home.run()
+    assert home.position() == -40 * STEPS_PER_MM
+
+
+def test_a_switch_that_is_pressed_already_is_told_before_anything_moves(tmp_path: Path) -> None:
+    home = Home(tmp_path, switch_at=0)
+    with pytest.raises(HomingError, match="the endstop of axis x is pressed before the move"):
+        home.run()
+    assert len(home.steps()) == 0
+
+
+def cut(stage: Stage) -> None:
+    controller = stage._boards["toolhead"].node.controller
+    assert controller is not None
+    controller.cut(1)
+
+
+def stall(stage: Stage) -> None:
+    stage._world.stall(0.6)
+
+
+@pytest.mark.parametrize("settings", ["", "[nodes.toolhead]\nlegacy = true\n"])
+@pytest.mark.parametrize(
+    ("during", "cause"),
+    [(cut, "lost node toolhead"), (stall, r"did not hear from the host for 0\.25 s and stopped by itself")],
+)
+def test_whoever_is_left_alone_while_homing_stops_in_time(
+    tmp_path: Path, settings: str, during: Callable[[Stage], None], cause: str
+) -> None:
+    home = Home(tmp_path, settings=settings, way_mm=200.0, switch_at=-(10**6), during=during)
+    with pytest.raises(CanductorError, match=cause):
+        home.run()
+    # It began 0.25 s after the call, was left alone 0.25 s later, and has a quarter of a second's patience.
+    assert home.steps()[-1] - home.steps()[0] < (0.25 + TIMEOUT_S + 0.1) * 1e6
