@@ -10,18 +10,17 @@ error bound, "held" how often the estimate was within it.
 """
 
 import asyncio
-import json
 import math
 import random
 import sys
 import time
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
+from coordinator.simulate.boards import dictionary_blob
 from coordinator.streamer import CYCLE_S, SEND_AHEAD_S
 from coordinator.timebase import ClockMap, TimeBase
 from nodes.assign import Uuid
@@ -57,7 +56,9 @@ class Setting:
     loss: float = 0.0
     """Probability for each receiver to lose a frame."""
     late_share: float = 0.0
-    """Share of seconds in which a node's receive interrupt may come LATE_S late."""
+    """Share of time in which a node's receive interrupt may come up to LATE_S late."""
+    late_for_s: float = CYCLE_S
+    """For how long at a time."""
     load: float = 0.0
     """Share of the bus that other traffic takes."""
 
@@ -66,6 +67,7 @@ SETTINGS: Final = (
     Setting("quiet"),
     Setting("1 % of frames lost", loss=0.01),
     Setting("2 % late by up to 30 µs", late_share=0.02),
+    Setting("… for 2 s at a time", late_share=0.02, late_for_s=2.0),
     Setting("70 % other traffic", load=0.7),
 )
 
@@ -87,7 +89,7 @@ class Errors:
             1e6 * sorted(self.bound)[len(self.bound) // 2],
         ]
         held = sum(abs(e) <= b for e, b in zip(self.estimate, self.bound, strict=True)) / len(self.bound)
-        return "".join(f"{x:9.2f}" for x in figures) + f"{held:9.2%}"
+        return "".join(f"{x:9.2f}" for x in figures) + f"{held:10.3%}"
 
 
 def rms_us(values: Sequence[float]) -> float:
@@ -113,7 +115,7 @@ class Machine:
                 f"00000000000{n}",
                 start_clock=START_CLOCKS[n],
                 clock_freq=CLOCK_FREQS[n],
-                dictionary=dictionary_of(CLOCK_FREQS[n]),
+                dictionary=dictionary_blob(CLOCK_FREQS[n], legacy=False),
             )
             for n in range(len(PPM))
         ]
@@ -135,20 +137,14 @@ class Machine:
             board.set_rate(ppm if begins else ppm + change, change / RAMP_S if begins else 0.0)
 
     def disturb(self) -> None:
-        """Be called every CYCLE_S: other traffic, and interrupts that are held off for a second."""
+        """Be called every CYCLE_S: other traffic, and interrupts that are held off."""
         if self.sender is not None:
             for n in range(round(self.setting.load * CYCLE_S * 1e6 / FRAME_BITS)):
                 self.sender.send(LOAD_ID + n % 16, bytes(8))
-        if self.setting.late_share and self.random.random() < CYCLE_S:
+        if self.setting.late_share and self.random.random() < CYCLE_S / self.setting.late_for_s:
             for board in self.boards:
                 late = self.random.random() < self.setting.late_share
                 board.set_pace(irq_jitter_s=LATE_S if late else JITTER_S)
-
-
-def dictionary_of(clock_freq: int) -> bytes:
-    words = json.loads(zlib.decompress(default_dictionary()))
-    words["config"]["CLOCK_FREQ"] = clock_freq
-    return zlib.compress(json.dumps(words).encode())
 
 
 def config(dictionary: Dictionary) -> NodeConfig:
