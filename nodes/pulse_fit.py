@@ -9,6 +9,7 @@ older they are.
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -107,6 +108,20 @@ class PulseFit:
             self.restarts += 1
         self._pairs.append((reference, ticks))
         self.line = self._fit()
+
+    def fill(self, pairs: Iterable[tuple[Ticks, Ticks]]) -> None:
+        """Begin anew with PAIRS, in order; what lies before a jump of either clock does not count."""
+        self._pairs.clear()
+        for pair in pairs:
+            if self._pairs and self._parted(self._pairs[-1], pair):
+                self._pairs.clear()
+            self._pairs.append(pair)
+        self.line = self._fit() if self._pairs else None
+
+    def _parted(self, earlier: tuple[Ticks, Ticks], later: tuple[Ticks, Ticks]) -> bool:
+        passed_s = (later[0] - earlier[0]) / self._reference_hz
+        off_s = abs((later[1] - earlier[1]) / self._freq_hz - passed_s)
+        return passed_s <= 0 or off_s > JUMP_S + RATE_PRIOR * passed_s
 
     def _jumped(self, line: PulseLine, reference: Ticks, ticks: Ticks) -> bool:
         passed_s = (reference - line.reference) / self._reference_hz

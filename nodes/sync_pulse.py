@@ -8,6 +8,7 @@ extension keep their own estimate. `PulseRounds` is sans-IO; `PulseKeeper` sends
 
 import asyncio
 import contextlib
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
@@ -17,7 +18,7 @@ from nodes.clock import HostTime, Ticks, extend32
 from nodes.errors import CanductorError
 from nodes.estimated_clock import EstimatedClock
 from nodes.message_format import Message
-from nodes.pulse_fit import PulseFit, PulseLine
+from nodes.pulse_fit import PAIRS_MAX, PulseFit, PulseLine
 
 SYNC_PULSE: Final = 0x40
 CONSTANT: Final = "CAN_SYNC_PULSE"
@@ -62,6 +63,9 @@ class PulseClock:
 class _Follower:
     fit: PulseFit
     missed: int = 0
+    """Rounds in a row without a pair."""
+    settling: int = 0
+    """Rounds for which it may still hasten the pulses."""
 
 
 class PulseRounds:
@@ -70,27 +74,40 @@ class PulseRounds:
     def __init__(self) -> None:
         self.seq = 0
         """Of the last pulse, 1..255; 0 before the first."""
-        self.rounds = 0
-        """Since the reference became it."""
         self.late = 0
         """Answers that told of another pulse than the last, or of none."""
         self.reference: str | None = None
         self._followers: dict[str, _Follower] = {}
-        self._latched: dict[str, Ticks] = {}
+        self._history: deque[dict[str, Ticks]] = deque(maxlen=PAIRS_MAX)
+        """What was latched, by round; the last entry is that of the present one."""
+
+    @property
+    def settling(self) -> bool:
+        """Whether a node has come up so recently that pulses should follow each other fast."""
+        return any(follower.settling > 0 for follower in self._followers.values())
+
+    def forget(self) -> None:
+        """Forget all: there will be no pulses for a time of unknown length."""
+        self.reference = None
+        self._followers.clear()
+        self._history.clear()
 
     def next_pulse(self, members: Mapping[str, int]) -> int:
-        """Begin a round with these nodes (nominal Hz by name; the first may become reference): its seq."""
-        if self.reference not in members:
-            self.reference = next(iter(members), None)
-            self._followers.clear()
-            self.rounds = 0
+        """Begin a round with these nodes (nominal Hz by name, at least one, the preferred one first): its seq.
+
+        The preferred node is the reference, once it was seen often enough for all others to follow at once.
+        """
         self._followers = {name: f for name, f in self._followers.items() if name in members}
+        preferred = next(iter(members))
+        if self.reference not in members or self.line(preferred) is not None:
+            self._refer_to(preferred, members)
         for name, freq_hz in members.items():
-            if name != self.reference and self.reference is not None:
-                fit = PulseFit(members[self.reference], freq_hz)
-                self._followers.setdefault(name, _Follower(fit)).missed += 1
-        self._latched.clear()
-        self.rounds += 1
+            if name not in (self.reference, *self._followers):
+                self._followers[name] = self._follower(name, freq_hz, members[self.reference or preferred])
+        for follower in self._followers.values():
+            follower.missed += 1
+            follower.settling -= follower.settling > 0
+        self._history.append({})
         self.seq = self.seq % 255 + 1
         return self.seq
 
@@ -99,9 +116,10 @@ class PulseRounds:
         if seq != self.seq:
             self.late += 1
             return
-        if name not in self._latched:
-            self._latched[name] = extend32(clock32, near)
-            for other in tuple(self._latched) if name == self.reference else (name,):
+        latched = self._history[-1]
+        if name not in latched:
+            latched[name] = extend32(clock32, near)
+            for other in tuple(latched) if name == self.reference else (name,):
                 self._pair(other)
 
     def line(self, name: str) -> PulseLine | None:
@@ -111,12 +129,33 @@ class PulseRounds:
             return None
         return follower.fit.line
 
+    def _refer_to(self, reference: str, members: Mapping[str, int]) -> None:
+        """Let REFERENCE be it; nodes that were known against another node are known against this one at once."""
+        self.reference = reference
+        self._followers = {
+            name: self._follower(name, freq_hz, members[reference])
+            for name, freq_hz in members.items()
+            if name != reference
+        }
+
+    def _follower(self, name: str, freq_hz: int, reference_hz: int) -> _Follower:
+        fit = PulseFit(reference_hz, freq_hz)
+        reference = self.reference or ""
+        both = [reference in latched and name in latched for latched in self._history]
+        fit.fill((r[reference], r[name]) for r, paired in zip(self._history, both, strict=True) if paired)
+        missed = next((n for n, paired in enumerate(reversed(both)) if paired), len(both))
+        return _Follower(fit, missed, settling=0 if fit.settled else SETTLE_ROUNDS)
+
     def _pair(self, name: str) -> None:
-        reference = self._latched.get(self.reference or "")
+        latched = self._history[-1]
         follower = self._followers.get(name)
-        if reference is not None and follower is not None:
-            follower.fit.add(reference, self._latched[name])
-            follower.missed = 0
+        if self.reference not in latched or follower is None:
+            return
+        was_settled = follower.fit.settled
+        follower.fit.add(latched[self.reference], latched[name])
+        follower.missed = 0
+        if was_settled and not follower.fit.settled:  # it restarted
+            follower.settling = SETTLE_ROUNDS
 
 
 class PulseNode(Protocol):
@@ -166,14 +205,14 @@ class PulseKeeper:
         while True:
             nodes = self._capable()
             if len(nodes) < 2:
+                self.rounds.forget()
                 self._publish(())
                 await asyncio.sleep(IDLE_S)
                 continue
-            with contextlib.suppress(CanductorError):  # a reference without a clock yet, a bus that closes
+            with contextlib.suppress(CanductorError):  # the bus closes: that is told elsewhere
                 await self._round(nodes)
-                self._publish(nodes)
-            settling = self.rounds.rounds < SETTLE_ROUNDS
-            await asyncio.sleep(SETTLE_INTERVAL_S if settling else INTERVAL_S)
+            self._publish(nodes)
+            await asyncio.sleep(SETTLE_INTERVAL_S if self.rounds.settling else INTERVAL_S)
 
     async def _round(self, nodes: Sequence[PulseNode]) -> None:
         seq = self.rounds.next_pulse({node.name: node.clock_freq_hz for node in nodes})
@@ -193,7 +232,14 @@ class PulseKeeper:
             if name not in present:
                 node.pulse_clock = None
         self._asked = present
-        reference = present.get(self.rounds.reference or "")
+        reference = _clock_of(present.get(self.rounds.reference or ""))
         for node in nodes:
             line = self.rounds.line(node.name)
-            node.pulse_clock = PulseClock(reference.clock, line) if line and reference else None
+            node.pulse_clock = PulseClock(reference, line) if line and reference else None
+
+
+def _clock_of(node: PulseNode | None) -> EstimatedClock | None:
+    """Return the host's own estimate, if there is any yet."""
+    with contextlib.suppress(CanductorError):
+        return node.clock if node is not None else None
+    return None

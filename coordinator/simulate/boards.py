@@ -48,7 +48,7 @@ class Board:
         def draw(option: str) -> float:
             return dice.draw(getattr(setting, option), f"nodes.{name}.{option}")
 
-        blob = _dictionary(setting.clock_hz, setting.legacy)
+        blob = dictionary_blob(setting.clock_hz, setting.legacy)
         self.dictionary = _parsed(blob)
         self.clock_hz = round(self.dictionary.clock_freq_hz)
         self._ppm = draw("ppm")
@@ -104,14 +104,14 @@ class Board:
 
 
 @lru_cache
-def _dictionary(clock_hz: int, legacy: bool) -> bytes:
+def dictionary_blob(clock_hz: int, legacy: bool) -> bytes:
     """Return the compressed dictionary of the simulated board, for a clock of CLOCK_HZ (0: as built).
 
     LEGACY: as of firmware that does not have this project's extensions.
     """
     if not clock_hz and not legacy:
         return _download()
-    words = json.loads(zlib.decompress(_dictionary(0, legacy=False)))
+    words = json.loads(zlib.decompress(dictionary_blob(0, legacy=False)))
     if clock_hz:
         words["config"]["CLOCK_FREQ"] = clock_hz
     if legacy:
