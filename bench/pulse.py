@@ -24,7 +24,7 @@ from coordinator.simulate.boards import dictionary_blob
 from coordinator.streamer import CYCLE_S, SEND_AHEAD_S
 from coordinator.timebase import ClockMap, TimeBase
 from nodes.assign import Uuid
-from nodes.bus import CanBus
+from nodes.can_bus import CanBus
 from nodes.clock import HostTime, Ticks
 from nodes.dictionary import Dictionary
 from nodes.link import LinkIO
@@ -81,6 +81,7 @@ class Errors:
     bound: list[float] = field(default_factory=list)
 
     def row(self) -> str:
+        """Return a line of the table."""
         figures = [
             rms_us(self.estimate),
             worst_us(self.estimate),
@@ -120,7 +121,9 @@ class Machine:
             for n in range(len(PPM))
         ]
         self.bus = CanBus("can0", self._start_io)
-        self.nodes = [self.bus.add_node(f"n{n}", Uuid.parse(b.uuid), config) for n, b in enumerate(self.boards)]
+        self.nodes = [
+            self.bus.add_node(f"n{n}", Uuid.parse(b.uuid), config) for n, b in enumerate(self.boards)
+        ]
         self.port.controller.set_faults(loss=setting.loss)
         for board, ppm in zip(self.boards, PPM, strict=True):
             board.set_rate(ppm)
@@ -133,6 +136,7 @@ class Machine:
         return LinkIO.driven_by(port.open(), on_frame=on_frame, on_closed=on_closed)
 
     def ramp(self, *, begins: bool) -> None:
+        """Let the boards begin to warm up, or end it."""
         for board, ppm, change in zip(self.boards, PPM, RAMP_PPM, strict=True):
             board.set_rate(ppm if begins else ppm + change, change / RAMP_S if begins else 0.0)
 
