@@ -129,7 +129,7 @@ struct node_config {
     size_t arena_size;
     const uint8_t *dictionary; // what identify gives, zlib-compressed; null: that of node_tables
     uint32_t dictionary_size;
-    uint8_t legacy; // 1: behave as firmware without this project's CAN extensions (net/bus_signals.h)
+    uint8_t legacy; // 1: behave as firmware without this project's CAN extensions (core/bus_signals.h)
 };
 
 struct oid_slot {
@@ -189,7 +189,7 @@ struct node {
         uint32_t crc;
         uint16_t move_count;
         uint8_t oid_count, oids_allocated, finalized;
-        uint8_t stops_bus; // a shutdown is told to the whole bus (net/bus_signals.h)
+        uint8_t stops_bus; // a shutdown is told to the whole bus (core/bus_signals.h)
     } objects;
     struct {
         uint32_t clock;

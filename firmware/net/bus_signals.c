@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Signals from node to node: see bus_signals.h.
-#include "net/bus_signals.h"
+#include "core/bus_signals.h"
 
 #include "boards/board.h"
 #include "net/can_stream.h"

@@ -3,8 +3,8 @@
 #ifndef NET_CAN_STREAM_H
 #define NET_CAN_STREAM_H
 
+#include "core/bus_signals.h"
 #include "core/node.h"
-#include "net/bus_signals.h"
 #include "net/discovery.h"
 
 enum { CAN_ID_ADMIN_REQUEST = 0x3F0, CAN_ID_ADMIN_RESPONSE = 0x3F1, CAN_FRAME_MAX = 8 };

@@ -4,7 +4,7 @@
 #include "objects/trsync.h"
 
 #include "boards/board.h"
-#include "net/bus_signals.h"
+#include "core/bus_signals.h"
 
 DECL_STATIC_STRING(invalid_group, "Not a valid trigger group");
 DECL_STATIC_STRING(already_joined, "Can't add signal that is already active");

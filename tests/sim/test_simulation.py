@@ -13,8 +13,9 @@ from coordinator.simulate import scenario
 from coordinator.simulate.play import play
 from coordinator.simulate.result import Result
 from coordinator.timebase import ClockMap, ClockPiece, TimeBase
+from nodes.bus import BusBase
+from nodes.can_bus import CanBus
 from nodes.link import Link
-from nodes.node import Node
 
 USUAL = [entry for entry in map(scenario.find, scenario.names()) if entry.weight > 0]
 
@@ -105,7 +106,8 @@ def test_a_stepper_that_turns_the_wrong_way_is_caught(monkeypatch: pytest.Monkey
 
 
 def test_a_stop_that_is_not_sent_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Node, "emergency_stop", lambda _node: None)
+    monkeypatch.setattr(BusBase, "emergency_stop", lambda _bus: None)
+    monkeypatch.setattr(CanBus, "emergency_stop", lambda _bus: None)
     assert "after-stop" in rules(play(scenario.find("m112"), 1))
 
 

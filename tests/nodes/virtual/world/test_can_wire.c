@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: nodes/virtual/world/agenda.c nodes/virtual/world/can_wire.c nodes/virtual/world/controller.c
-// nodes/can_bits.c The wire under the sanitizers: everything that can happen to it, at random, and what must
-// hold whatever it was.
+// sources: nodes/can_bits.c nodes/virtual/world/agenda.c nodes/virtual/world/c*.c
+// The wire under the sanitizers: everything that can happen
+// to it, at random, and what must hold whatever it was.
 #include "tests/check.h"
 
 #include <string.h>

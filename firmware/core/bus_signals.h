@@ -9,8 +9,8 @@
 //
 // Nothing is sent unless the host asked for it (set_bus_stop, trsync_set_group); a node with config.legacy
 // neither sends nor hears any of it. On a UART there is nobody to signal to.
-#ifndef NET_BUS_SIGNALS_H
-#define NET_BUS_SIGNALS_H
+#ifndef CORE_BUS_SIGNALS_H
+#define CORE_BUS_SIGNALS_H
 
 #include <stddef.h>
 #include <stdint.h>
