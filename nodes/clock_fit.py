@@ -1,101 +1,129 @@
-"""The filter behind a clock's estimate: a node's lead over host time, from bounds on either side."""
+"""The filter behind a settled clock: a node's lead over host time, cut by one-sided bounds.
+
+State: lead of the node's clock over host time (s), its rate, the rate's change (1/s), the fastest way one
+way (s) and half the difference of the two ways (s). An exchange bounds lead + way out from above and
+way back - lead likewise; the distance to the bound is exponential. Each bound updates the Gaussian belief
+with the exact mean and variance of the product, so tight bounds cut and loose ones hardly count.
+"""
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 SIZE: Final = 5
-LEAD, RATE, CURVATURE, DELAY, SKEW = range(SIZE)
-P = dict(rate0=2e-4, curv=1.2e-8, tau=150.0, qr=1e-10, qb=0.1, floor=0.1, soft=7.0, late=16, askew=1.0, sdecay=1000.0)
+RATE_SD: Final = 1.5e-4
+"""Standard deviation of a clock's rate against its nominal one, before anything is measured."""
+CURVATURE_SD: Final = 1.2e-8
+"""Standard deviation of a rate's change per second: a crystal in a warming board."""
+CURVATURE_FADE_S: Final = 150.0
+SKEW_FADE_S: Final = 1000.0
+DELAY_WANDER: Final = 0.01
+"""How far the fastest way wanders in a second (square root of), against the mean delay on top of it."""
+NOISE: Final = 0.02
+"""Reading noise against the mean delay on top of the fastest way."""
+LOOSE: Final = 7.0
+"""Further from its bound than so many mean delays, an exchange says nothing about them."""
+MEMORY: Final = 256.0
+"""Delays over which their mean is taken."""
+LATE: Final = 16
+"""So many exchanges later than believable, in one direction, mean that the way has become slower."""
+LEAST_SPREAD_S: Final = 1e-7
 
 
 def hazard(k: float) -> float:
     """Return φ(k)/Φ(k) of the normal distribution, for any K without underflow."""
     if k < -25.0:
         return -k - 1 / k
+    if k > 37.0:
+        return 0.0
     return math.exp(-k * k / 2) * 0.3989422804014327 / (0.5 * math.erfc(-k * 0.7071067811865476))
 
 
 class Filter:
-    def __init__(self, lead_s: float, round_trip_s: float) -> None:
-        base = round_trip_s / 4
-        self.x = [lead_s, 0.0, 0.0, base, 0.0]
-        self.p = [[0.0] * SIZE for _ in range(SIZE)]
-        self.p[0][0] = base**2 * 4 / 3
-        self.p[1][1] = P["rate0"] ** 2
-        self.p[2][2] = P["curv"] ** 2
-        self.p[3][3] = base**2 / 3
+    """Goes on from STATE and COVARIANCE (lead, rate, curvature, delay) at AT_S."""
 
-    def predict(self, dt: float, spread: float) -> None:
-        x, p = self.x, self.p
-        phi = math.exp(-dt / P["tau"])
-        half = dt * dt / 2
-        x[0] += x[1] * dt + x[2] * half
-        x[1] += x[2] * dt
-        x[2] *= phi
-        relax = math.exp(-dt / P["sdecay"])
-        x[4] *= relax
-        for row in p:
+    def __init__(
+        self, state: Sequence[float], covariance: Sequence[Sequence[float]], at_s: float, spread_s: float
+    ) -> None:
+        self.state = [*state, 0.0]
+        self.covariance = [[*row, 0.0] for row in covariance] + [[0.0] * SIZE]
+        self._at_s = at_s
+        self._spread_s = spread_s
+        self._nearest: dict[int, tuple[int, float]] = {1: (0, math.inf), -1: (0, math.inf)}
+
+    def add(self, at_s: float, lead_s: float, round_trip_s: float) -> None:
+        """Take an exchange in whose middle, AT_S, the clock would have been ahead by LEAD_S."""
+        self._predict(at_s - self._at_s)
+        self._at_s = at_s
+        for sign in (1, -1):
+            bound_s = sign * lead_s + round_trip_s / 2
+            self._watch(sign, bound_s)
+            self._bound(sign, bound_s)
+            gap_s = min(max(self._gap(sign, bound_s), 0.0), 5 * self._spread_s)
+            # 1.03: what the limit of 5 takes off the mean
+            self._spread_s += (1.03 * gap_s - self._spread_s) / MEMORY
+            self._spread_s = max(self._spread_s, LEAST_SPREAD_S)
+
+    def _gap(self, sign: int, bound_s: float) -> float:
+        x = self.state
+        return bound_s - sign * (x[0] + x[4]) - x[3]
+
+    def _predict(self, dt: float) -> None:
+        x, p = self.state, self.covariance
+        keep, relax, half = math.exp(-dt / CURVATURE_FADE_S), math.exp(-dt / SKEW_FADE_S), dt * dt / 2
+        for row in (x, *p):
             row[0] += row[1] * dt + row[2] * half
             row[1] += row[2] * dt
-            row[2] *= phi
+            row[2] *= keep
             row[4] *= relax
         p0, p1, p2, p4 = p[0], p[1], p[2], p[4]
         for i in range(SIZE):
             p0[i] += p1[i] * dt + p2[i] * half
             p1[i] += p2[i] * dt
-            p2[i] *= phi
+            p2[i] *= keep
             p4[i] *= relax
-        q = P["qr"] ** 2 * dt
-        p0[0] += q * dt * dt / 3
-        p0[1] += q * dt / 2
-        p1[0] += q * dt / 2
-        p1[1] += q
-        p2[2] += P["curv"] ** 2 * (1 - phi * phi)
-        # process noise of base: fraction of the spread per sqrt(100 s)
-        p[3][3] += (P["qb"] * spread) ** 2 * dt / 100
+        p2[2] += CURVATURE_SD**2 * (1 - keep * keep)
+        p[3][3] += (DELAY_WANDER * self._spread_s) ** 2 * dt
 
-    def slack(self, sign: int, bound: float) -> float:
-        x = self.x
-        return bound - (sign * (x[0] + x[4]) + x[3])
+    def _doubt(self, sign: int, by_s: float) -> None:
+        """Allow the fastest way in one direction to be another by about BY_S."""
+        p, variance = self.covariance, by_s * by_s / 4
+        p[3][3] += variance
+        p[4][4] += variance
+        p[3][4] += sign * variance
+        p[4][3] += sign * variance
 
-    def bound(self, sign: int, bound: float, spread: float) -> float:
-        """sign*(lead+skew)+delay <= bound, exponential with mean SPREAD below it."""
-        p, x = self.p, self.x
-        ph = [sign * (row[0] + row[4]) + row[3] for row in p]
-        v = sign * (ph[0] + ph[4]) + ph[3]
-        gap = bound - (sign * (x[0] + x[4]) + x[3])
-        noise = (P["floor"] * spread) ** 2
-        s = math.sqrt(v + noise)
-        if gap < -4 * s:
-            # faster than believed possible: the line's fastest has changed in this direction
-            d = gap * gap / 4
-            p[3][3] += d
-            p[4][4] += d
-            p[3][4] += sign * d
-            p[4][3] += sign * d
-            ph = [sign * (row[0] + row[4]) + row[3] for row in p]
-            v = sign * (ph[0] + ph[4]) + ph[3]
-            s = math.sqrt(v + noise)
-        pull = 1 / spread if gap < P["soft"] * spread else 0.0
-        k = gap / s - pull * s
+    def _watch(self, sign: int, bound_s: float) -> None:
+        """Notice when one direction has become slower: none of LATE exchanges comes near its bound."""
+        count, nearest_s = self._nearest[sign]
+        count, nearest_s = count + 1, min(nearest_s, self._gap(sign, bound_s))
+        if nearest_s < self._spread_s:
+            count, nearest_s = 0, math.inf
+        elif count >= LATE:
+            self.state[3] += nearest_s / 2
+            self.state[4] += sign * nearest_s / 2
+            self._doubt(sign, nearest_s)
+            count, nearest_s = 0, math.inf
+        self._nearest[sign] = count, nearest_s
+
+    def _bound(self, sign: int, bound_s: float) -> None:
+        """Cut by: sign·(lead + skew) + delay <= BOUND_S, with an exponential distance."""
+        x, p = self.state, self.covariance
+        column = [sign * (row[0] + row[4]) + row[3] for row in p]
+        variance = sign * (column[0] + column[4]) + column[3]
+        gap_s = self._gap(sign, bound_s)
+        noise = (NOISE * self._spread_s) ** 2
+        if gap_s < 0 and gap_s * gap_s > 16 * (variance + noise):
+            self._doubt(sign, gap_s)
+            column = [sign * (row[0] + row[4]) + row[3] for row in p]
+            variance = sign * (column[0] + column[4]) + column[3]
+        s = math.sqrt(max(variance, 0.0) + noise)
+        pull = 1 / self._spread_s if gap_s < LOOSE * self._spread_s else 0.0
+        k = gap_s / s - pull * s
         r = hazard(k)
-        push = pull - r / s
-        cut = max(r * (k + r), 0.0) / (s * s)
-        cut = min(cut, 1 / (s * s))
-        for i in range(SIZE):
-            x[i] += ph[i] * push
-            g = ph[i] * cut
+        push, cut = pull - r / s, min(max(r * (k + r), 0.0), 1.0) / (s * s)
+        for i, own in enumerate(column):
+            x[i] += own * push
             row = p[i]
-            for j in range(SIZE):
-                row[j] -= g * ph[j]
-
-    def later(self, sign: int, by: float) -> None:
-        """The line has become slower in one direction."""
-        x, p = self.x, self.p
-        x[3] += by / 2
-        x[4] += sign * by / 2
-        d = by * by / 4 * P["askew"]**2
-        p[3][3] += d
-        p[4][4] += d
-        p[3][4] += sign * d
-        p[4][3] += sign * d
+            for j, other in enumerate(column):
+                row[j] -= own * cut * other
