@@ -63,7 +63,7 @@ class ClockEstimate:
     at_ns: HostTime
     at_ticks: Ticks
     error_s: float
-    """Bound of the error, from AT_NS to a second later, if the fastest ways out and back take equally long."""
+    """Bound of the error, from AT_NS to a second later, if the fastest ways out and back take as long."""
     asymmetry_s: float = 0.0
     """What they may add when not: half the fastest exchange, were all of it spent in one direction."""
 
@@ -148,7 +148,11 @@ class ClockEstimator:
             self.unusable += 1
             return False
         round_trip_s = (received_ns - sent_ns) * 1e-9
-        if self._last_ns < 0 or middle_ns - self._last_ns > GAP_NS or self._impossible(middle_ns, ticks, round_trip_s):
+        if (
+            self._last_ns < 0
+            or middle_ns - self._last_ns > GAP_NS
+            or self._impossible(middle_ns, ticks, round_trip_s)
+        ):
             self._restart(middle_ns, ticks)
         self._last_ns = middle_ns
         self._round_trips_s.append(round_trip_s)

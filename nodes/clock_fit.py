@@ -13,13 +13,13 @@ from typing import Final
 SIZE: Final = 5
 RATE_SD: Final = 1.5e-4
 """Standard deviation of a clock's rate against its nominal one, before anything is measured."""
-CURVATURE_SD: Final = 1.2e-8
+CURVATURE_SD: Final = 1e-8
 """Standard deviation of a rate's change per second: a crystal in a warming board."""
-CURVATURE_FADE_S: Final = 150.0
+CURVATURE_FADE_S: Final = 250.0
 SKEW_FADE_S: Final = 1000.0
 DELAY_WANDER: Final = 0.01
 """How far the fastest way wanders in a second (square root of), against the mean delay on top of it."""
-NOISE: Final = 0.02
+NOISE: Final = 0.005
 """Reading noise against the mean delay on top of the fastest way."""
 LOOSE: Final = 7.0
 """Further from its bound than so many mean delays, an exchange says nothing about them."""

@@ -71,7 +71,7 @@ class Start:
 
     def _solve(self, rows: Array, prior: Array, pull: Array) -> tuple[Array, Array]:
         information = np.diag(prior) + (rows * self._precision[:, None]).T @ rows
-        covariance: Array = np.linalg.inv(information)
+        covariance: Array = np.asarray(np.linalg.inv(information), dtype=np.float64)
         return covariance @ (pull + rows.T @ self._shift), covariance
 
     def _sweep(self, rows: Array, bounds: Array, mean: Array, covariance: Array, guess: float) -> None:
