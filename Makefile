@@ -8,7 +8,7 @@ NATIVE_INPUTS := $(C_SOURCES) $(wildcard firmware/Makefile firmware/tools/*.py) 
 
 C_WARNINGS := -std=gnu11 -Wall -Wextra -Wconversion -Werror -I. -Ifirmware
 
-.PHONY: demo test check pytest ctest vcan bench clean setup format
+.PHONY: demo test check pytest ctest sim mutants vcan bench clean setup format
 .DEFAULT_GOAL := test
 
 setup: $(VENV)/.installed
@@ -43,6 +43,15 @@ pytest: setup
 	$(BIN)/pytest
 
 test: check ctest pytest
+
+# Whole machines in virtual time, each seed with other faults (docs/simulation.md).
+SIM_SEEDS ?= 2000
+sim: setup
+	$(BIN)/canductor simulate --seeds 0:$(SIM_SEEDS)
+
+# Does the simulation find anything? Plants bugs and looks.
+mutants: setup
+	$(BIN)/python tests/sim/mutants.py
 
 # SocketCAN in a Linux kernel booted as a process: one boot for all, since a boot costs 5 s. Builds nothing inside.
 vcan: setup

@@ -2,22 +2,27 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from coordinator.host import Host, Port
+from coordinator.host import Host
+from coordinator.load_watch import LoadWatch
 from coordinator.machine.description import (
     CanConnection,
     MachineDescription,
     NodeDescription,
+    NodePolicy,
     UartConnection,
 )
 from coordinator.machine_devices import MachineDevices, stream_specs
 from coordinator.motion.specs import NodeStreamSpec
+from coordinator.node_care import JobGate, NodeCare
 from coordinator.timebase import ClockMap, TimeBase
+from coordinator.wire import Wire
 from nodes.assign import Uuid
 from nodes.bus import CanBus, UartBus
 from nodes.dictionary import Dictionary
+from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 from nodes.link import Link
 from nodes.node import Node
@@ -36,23 +41,45 @@ CONFIRM_STOP_S = 0.5
 @dataclass(frozen=True, slots=True)
 class _OpenBus:
     bus: CanBus | UartBus
-    port: Port
+    wire: Wire
+    watch: LoadWatch
+
+
+def _ignore(_: str) -> None:
+    pass
 
 
 class Machine:
     """All nodes of DESCRIPTION as one machine, on the ports and in the time of HOST; lives on one loop.
 
-    ``start``, then ``close`` whatever happened. When any node is lost or shuts down, all others are
-    stopped at once and ``stopped`` tells why.
+    ``start``, then ``close`` whatever happened. When a node is lost or shuts down whose policy is fatal, all
+    others are stopped at once and ``stopped`` tells why; others are brought back (NodeCare). ON_NOTICE gets
+    sentences for the user; dictionaries are kept in CACHE.
     """
 
-    def __init__(self, description: MachineDescription, host: Host) -> None:
+    def __init__(
+        self,
+        description: MachineDescription,
+        host: Host,
+        *,
+        on_notice: Callable[[str], None] = _ignore,
+        cache: DictionaryCache | None = None,
+    ) -> None:
         self.description = description
         self.host = host
+        self.policies = {node.name: node.policy for node in description.nodes}
         self.devices = MachineDevices(description)
         self.nodes: dict[str, Node] = {}
         self.stopped: MachineStopped | None = None
+        self._on_notice = on_notice
+        self._cache = cache if cache is not None else DictionaryCache()
         self._open: list[_OpenBus] = []
+        self._bus_of: dict[Node, CanBus | UartBus] = {}
+        self._care = NodeCare(
+            self.policies, bring_back=self._bring_back, on_notice=on_notice, now_s=lambda: host.now() * 1e-9
+        )
+        self._job: JobGate | None = None
+        self._waking: set[Node] = set()
         self._failed = asyncio.Event()
         self._stopped_at_ns = 0
         self._all_down = asyncio.Event()
@@ -83,9 +110,10 @@ class Machine:
     async def close(self) -> None:
         """Leave the nodes as they are and release everything."""
         self._ready = False
+        await self._care.close()
         for opened in self._open:
             await opened.bus.close()
-            opened.port.close()
+            opened.wire.close()
         self._open.clear()
 
     def stop(self, cause: str) -> None:
@@ -94,9 +122,57 @@ class Machine:
             return
         self.stopped = MachineStopped(cause)
         self._stopped_at_ns = self.host.now()
-        for node in self.nodes.values():
-            node.emergency_stop()
+        self._care.halt()
+        for opened in self._open:
+            opened.bus.emergency_stop()
         self._failed.set()
+
+    async def sleep(self, name: str) -> None:
+        """Let go of node NAME, so that its power can be switched off: it is not missed until ``wake``.
+
+        Raises CanductorError when it is needed.
+        """
+        node = self._node(name)
+        if self._job is not None and self.policies[name] is NodePolicy.FATAL:
+            if node is self.primary:
+                raise CanductorError(
+                    f"node {name} cannot sleep while a job runs: its clock is the job's time"
+                )
+            if node in self.moving:
+                raise CanductorError(f"node {name} cannot sleep while a job runs: it carries steppers")
+        await self._care.dismiss(name)
+        await node.sleep()
+
+    async def wake(self, name: str) -> None:
+        """Take a node that sleeps back, with its power on again; raises CanductorError, leaving it asleep."""
+        node = self._node(name)
+        self._waking.add(node)
+        try:
+            if node.state is NodeState.SLEEPING:
+                self._bus_of[node].ensure_open()
+            await node.wake()
+        except CanductorError:
+            if node.state in (NodeState.LOST, NodeState.SHUTDOWN):
+                await node.sleep()
+            raise
+        finally:
+            self._waking.discard(node)
+
+    def _node(self, name: str) -> Node:
+        if name not in self.nodes:
+            raise CanductorError(f"there is no node {name!r}; there are {', '.join(self.nodes)}")
+        return self.nodes[name]
+
+    @contextlib.contextmanager
+    def job(self, gate: JobGate) -> Iterator[None]:
+        """Run a job inside: GATE is held while a node is out whose policy is pause."""
+        self._job = gate
+        self._care.begin_job(gate)
+        try:
+            yield
+        finally:
+            self._job = None
+            self._care.end_job()
 
     async def wait_stopped(self) -> MachineStopped:
         """Wait until the machine is stopped; return why."""
@@ -138,7 +214,13 @@ class Machine:
         """Return the map from print time to NODE's ticks, beginning at PRINT_TIME."""
         if node is self.primary:
             return time_base.primary_map(print_time)
-        return time_base.secondary_map(node.clock, node.dictionary.clock_freq_hz, print_time)
+        return time_base.secondary_map(node.best_clock, node.dictionary.clock_freq_hz, print_time)
+
+    def check_load(self) -> None:
+        """Raise BusOverload when a bus will not carry the motion queued on it in time."""
+        for opened in self._open:
+            if opened.bus.closed_because is None:
+                opened.watch.look(opened.bus.io.forecast(), self.host.now(), _repeated(opened.bus))
 
     async def stepper_positions(self) -> dict[str, int]:
         """Ask every node where its steppers stand: steps from where they began, positive as motion counts."""
@@ -158,37 +240,71 @@ class Machine:
                 self._add_uart(node, connection)
                 continue
             if connection.interface not in can:
-                can[connection.interface] = self._open_can(connection)
-            self.nodes[node.name] = can[connection.interface].add_node(
-                node.name,
-                Uuid.parse(connection.uuid),
-                self._build_config(node),
-                on_state=self._node_changed,
+                can[connection.interface] = self._add_can(connection)
+            bus = can[connection.interface]
+            self._add(
+                bus,
+                bus.add_node(
+                    node.name,
+                    Uuid.parse(connection.uuid),
+                    self._build_config(node),
+                    may_be_absent=node.policy is NodePolicy.OPTIONAL,
+                    on_state=self._node_changed,
+                ),
             )
 
-    def _open_can(self, connection: CanConnection) -> CanBus:
-        port = self.host.open_can(connection)
-        bus = CanBus(port.name, port.start_io)
-        self._open.append(_OpenBus(bus, port))
+    def _add_can(self, connection: CanConnection) -> CanBus:
+        wire = Wire(lambda: self.host.open_can(connection))
+        bus = CanBus(connection.interface, wire.start_io, cache=self._cache, on_notice=self._on_notice)
+        self._open.append(_OpenBus(bus, wire, LoadWatch(bus.name)))
         return bus
 
     def _add_uart(self, node: NodeDescription, connection: UartConnection) -> None:
-        port = self.host.open_uart(connection)
-        bus = UartBus(port.name, port.start_io)
-        self._open.append(_OpenBus(bus, port))
-        self.nodes[node.name] = bus.add_node(node.name, self._build_config(node), on_state=self._node_changed)
+        wire = Wire(lambda: self.host.open_uart(connection))
+        bus = UartBus(connection.path, wire.start_io, cache=self._cache, on_notice=self._on_notice)
+        self._open.append(_OpenBus(bus, wire, LoadWatch(bus.name)))
+        self._add(
+            bus,
+            bus.add_node(
+                node.name,
+                self._build_config(node),
+                may_be_absent=node.policy is NodePolicy.OPTIONAL,
+                on_state=self._node_changed,
+            ),
+        )
+
+    def _add(self, bus: CanBus | UartBus, node: Node) -> None:
+        self.nodes[node.name] = node
+        self._bus_of[node] = bus
 
     def _build_config(self, node: NodeDescription) -> Callable[[Dictionary], NodeConfig]:
         return lambda dictionary: self.devices.build_config(node.name, dictionary)
 
+    async def _bring_back(self, node: Node) -> None:
+        self._bus_of[node].ensure_open()
+        await node.restart()
+
     def _node_changed(self, node: Node) -> None:
-        if not self._ready or node.state not in (NodeState.LOST, NodeState.SHUTDOWN):
+        gone = node.state in (NodeState.LOST, NodeState.SHUTDOWN)
+        if not self._ready or not gone or node in self._waking:
+            return
+        if self.policies[node.name] is not NodePolicy.FATAL and self.stopped is None:
+            self._care.take_on(node)
             return
         self.stop(f"{node.failure}; all other nodes were stopped")
         if node.state is NodeState.SHUTDOWN:
             self._confirmed_s[node.name] = (self.host.now() - self._stopped_at_ns) * 1e-9
-        if all(other.state in (NodeState.LOST, NodeState.SHUTDOWN) for other in self.nodes.values()):
+        if all(other.state in _NOT_RUNNING for other in self.nodes.values()):
             self._all_down.set()
+
+
+_NOT_RUNNING = (NodeState.LOST, NodeState.SHUTDOWN, NodeState.SLEEPING)
+
+
+def _repeated(bus: CanBus | UartBus) -> float:
+    """Return the share of the blocks sent on BUS that were repeats."""
+    stats = [link_of(node).stats() for node in bus.nodes if node.talks]
+    return sum(s.blocks_repeated for s in stats) / max(1, sum(s.blocks_sent for s in stats))
 
 
 def _first_cause(group: BaseExceptionGroup[BaseException]) -> BaseException:

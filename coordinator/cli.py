@@ -15,7 +15,15 @@ from typing import Annotated, TypeVar, cast
 
 import typer
 
-from coordinator.commands import DemoOptions, PlanOptions, Report, RunOptions, Terminated, find_machine
+from coordinator.commands import (
+    DemoOptions,
+    PlanOptions,
+    Report,
+    RunOptions,
+    SimulateOptions,
+    Terminated,
+    find_machine,
+)
 from nodes.errors import CanductorError
 
 Job = Callable[[], Report]
@@ -28,6 +36,9 @@ EXIT_BUG = 70
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 EXIT_TERMINATED = 143
+
+SEED_MAX = 2**32
+SEEDS_AT_ONCE_MAX = 10_000_000
 
 # rich_markup_mode=None: plain help, and rich is not imported before something is to be drawn.
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -251,6 +262,54 @@ def plan(
         _existing_file(path)
     options = PlanOptions(config=config, gcode=gcode, output=output, json=json_, dictionaries=dictionaries)
     return lambda: _runner("coordinator.plan", "plan_file")(options)
+
+
+@app.command()
+def simulate(
+    *,
+    scenario: Annotated[
+        list[str] | None, typer.Argument(help="Names or files; all if none is named.")
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=0, max=SEED_MAX, help="The one seed to run; 1 if none is given."),
+    ] = None,
+    seeds: Annotated[
+        str | None, typer.Option("--seeds", metavar="A:B", help="Seeds from A up to but not including B.")
+    ] = None,
+    jobs: Annotated[
+        int, typer.Option("--jobs", min=0, max=256, help="Processes; 0: one for every processor.")
+    ] = 0,
+    list_: Annotated[bool, typer.Option("--list", help="Only list the scenarios.")] = False,
+    json_: JsonFlag = False,
+) -> Job:
+    """Run whole machines in virtual time, with faults, and check every step."""
+    if seed is not None and seeds is not None:
+        raise typer.BadParameter("--seed and --seeds exclude each other; give one of them")
+    options = SimulateOptions(
+        scenarios=tuple(dict.fromkeys(scenario or ())),
+        seeds=_one_seed(1 if seed is None else seed) if seeds is None else _seeds(seeds),
+        jobs=jobs,
+        list=list_,
+        json=json_,
+    )
+    return lambda: _runner("coordinator.simulate", "run_simulation")(options)
+
+
+def _one_seed(seed: int) -> range:
+    return range(seed, seed + 1)
+
+
+def _seeds(text: str) -> range:
+    first, colon, end = text.partition(":")
+    if not (colon and all(word.isascii() and word.isdecimal() and len(word) <= 10 for word in (first, end))):
+        raise typer.BadParameter(f"--seeds is '{text}', must be A:B, two whole numbers such as 0:100")
+    seeds = range(int(first), int(end))
+    if not 0 < len(seeds) <= SEEDS_AT_ONCE_MAX:
+        raise typer.BadParameter(
+            f"--seeds is '{text}', must be A:B with B above A, at most {SEEDS_AT_ONCE_MAX:,} seeds"
+        )
+    return seeds
 
 
 def _existing_file(path: Path | None) -> Path | None:

@@ -81,6 +81,20 @@ class PlanOptions:
     """By node: its data dictionary as JSON; other nodes take the project's own firmware."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulateOptions:
+    """``canductor simulate``."""
+
+    scenarios: tuple[str, ...] = ()
+    """Names or files, each run with every seed; none: all, and several seeds are spread over them."""
+    seeds: range = range(1, 2)
+    jobs: int = 0
+    """Processes; 0: as many as there are processors."""
+    list: bool = False
+    """Only name the scenarios."""
+    json: bool = False
+
+
 def find_machine(name: str) -> Path:
     """Return the configuration file of a path or of an example's name; raises CanductorError."""
     path = Path(name)

@@ -2,8 +2,14 @@
 
 from collections.abc import Iterable, Mapping
 
-from coordinator.machine.description import MachineDescription, StepperDescription
+from coordinator.machine.description import (
+    CanConnection,
+    MachineDescription,
+    NodePolicy,
+    StepperDescription,
+)
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
+from nodes.bus import KNOWS_BUS_STOP
 from nodes.devices.stepper import Stepper
 from nodes.dictionary import Dictionary
 from nodes.node_config import NodeConfig
@@ -29,7 +35,16 @@ class MachineDevices:
                 stepper.step_pin.number(numbers)  # tells file and line when the node has no such pin
                 stepper.dir_pin.number(numbers)
                 self.steppers[stepper.name].configure(config)
+        self._spread_shutdown(config)
         return config
+
+    def _spread_shutdown(self, config: NodeConfig) -> None:
+        """Have a node that must not fail stop its whole bus when it shuts down, past the host."""
+        described = next(n for n in self.description.nodes if n.name == config.name)
+        knows = config.dictionary.int_constant(KNOWS_BUS_STOP, 0)
+        on_can = isinstance(described.connection, CanConnection)
+        if knows and on_can and described.policy is NodePolicy.FATAL:
+            config.add_init("the bus-wide stop", "set_bus_stop enable=1")
 
     @property
     def moving_nodes(self) -> list[str]:

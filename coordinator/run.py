@@ -11,6 +11,7 @@ from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, load_machine
 from coordinator.progress import Progress, ProgressDisplay
 from coordinator.session import NodeOutcome, Outcome, run_job
+from nodes.dictionary_cache import DictionaryCache
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +100,13 @@ def run_machine(options: RunOptions) -> RunReport:
         _announce(description)
         show = stack.enter_context(_progress(options, program))
         outcome = run_to_end(
-            lambda: run_job(description, program, show, on_told=lambda told: _say(told.text))
+            lambda: run_job(
+                description,
+                program,
+                show,
+                on_told=lambda told: _say(told.text),
+                cache=DictionaryCache.of_user(),
+            )
         )
         return RunReport(program.name, outcome)
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from coordinator.app import Machine, MachineStopped, link_of
 from coordinator.gcode.errors import GCodeError
+from coordinator.gcode.events import Notice
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.host import Host, LinuxHost
@@ -14,8 +15,10 @@ from coordinator.pipeline import PlanRecord
 from coordinator.progress import NodeFigures, Progress
 from coordinator.streamer import JobState, Streamer, Told
 from coordinator.timebase import ClockMap
+from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 from nodes.link import LinkStats
+from nodes.node_states import NodeState
 
 OnProgress = Callable[[Progress], None]
 
@@ -58,13 +61,21 @@ async def run_job(
     on_told: Callable[[Told], None],
     on_ready: Callable[[Machine], None] | None = None,
     host: Host | None = None,
+    cache: DictionaryCache | None = None,
 ) -> Outcome:
     """Connect to the machine, run PROGRAM on it and return what became of it.
+
+    ON_TOLD gets what the program and the machine have to say; dictionaries are kept in CACHE.
 
     Raises CanductorError. Whatever ends the job before its end stops all nodes, but for a bad line of the
     program: what came before it is carried out, and the machine stands.
     """
-    machine = Machine(description, host or LinuxHost())
+    machine = Machine(
+        description,
+        host or LinuxHost(),
+        on_notice=lambda text: on_told(Notice(0, text)),
+        cache=cache,
+    )
     await machine.start()
     if on_ready is not None:
         on_ready(machine)
@@ -128,8 +139,9 @@ async def _outcome(machine: Machine, streamer: Streamer, began_at: dict[str, int
         issued={s.name: s.issued for s in stats.steppers},
         maps={node.name: m for node, m in zip(machine.moving, streamer.maps, strict=True)},
         nodes=tuple(
-            NodeOutcome(node.name, link_of(node).stats(), node.clock.estimate().error_s)
+            NodeOutcome(node.name, link_of(node).stats(), node.clock_error_s or 0.0)
             for node in machine.nodes.values()
+            if node.state is NodeState.READY  # an optional one may be away
         ),
     )
 
@@ -146,5 +158,5 @@ def _figures(machine: Machine, name: str) -> NodeFigures:
         retransmitted_bytes=stats.bytes_repeated,
         queue_depth=stats.motion_commands,
         lead_ms=None if stats.min_lead_s is None else stats.min_lead_s * 1e3,
-        clock_error_us=node.clock.estimate().error_s * 1e6,
+        clock_error_us=None if node.clock_error_s is None else node.clock_error_s * 1e6,
     )

@@ -101,6 +101,7 @@ class Streamer:
         self.ended_s = 0.0
         self._done = Progress(0, 0, None)
         self._failure: GCodeError | None = None
+        self._held: str | None = None
 
     @property
     def _planner(self) -> Planner:
@@ -110,6 +111,22 @@ class Streamer:
         """Return the present print time."""
         return self._time_base.print_time_at(self._machine.host.now())
 
+    def hold(self, cause: str) -> None:
+        """Let the g-code wait, from the control loop: what is planned is carried out, to a standstill.
+
+        CAUSE is a sentence. The end of a job that has been read to its end is not held up.
+        """
+        self._held = cause
+
+    def release(self) -> None:
+        """Let the g-code go on after ``hold``."""
+        self._held = None
+
+    @property
+    def held(self) -> str | None:
+        """Why the g-code waits, or None."""
+        return self._held
+
     async def run(self) -> None:
         """Run the job to its end: until the last step is executed.
 
@@ -117,6 +134,10 @@ class Streamer:
         the machine is stopped then.
         """
         self._begin()
+        with self._machine.job(self):
+            await self._run()
+
+    async def _run(self) -> None:
         work = asyncio.ensure_future(self._stream())
         watch = asyncio.ensure_future(self._machine.wait_stopped())
         try:
@@ -162,7 +183,7 @@ class Streamer:
                 if isinstance(event, Emergency):
                     self._machine.stop(f"{self._job.program.name}:{event.line}: M112 stopped the machine")
                     return
-                if event is not None:
+                if event is not None or self._held is not None:
                     await asyncio.sleep(CYCLE_S)
             self.ended_s = self._planner.print_time_end_s
             await self._settle(worker)
@@ -172,6 +193,8 @@ class Streamer:
     def _hand_over(self, cycle: _Cycle) -> None:
         for node, batch in cycle.batches:
             link_of(self._nodes[node]).send_batch(batch)
+        if cycle.batches:
+            self._machine.check_load()
         for told in cycle.told:
             self._on_told(told)
         self._report()
@@ -203,7 +226,8 @@ class Streamer:
         now = self.print_time_now()
         told: list[Told] = []
         event = waiting_for
-        if self._failure is None and not self._still_waiting(waiting_for, now):
+        held = self._held is not None and self._failure is None
+        if self._failure is None and not held and not self._still_waiting(waiting_for, now):
             self._planner.plan_until_s = now + PLAN_AHEAD_S
             self._begin_anew(now)
             try:
@@ -213,7 +237,7 @@ class Streamer:
                 self._failure = error
         if self._failure is not None:
             event = self._end_early()
-        if self._runs_dry(now):
+        if held or self._runs_dry(now):
             self._planner.flush()
         self._generate(now)
         return self._cycle(told, event)
@@ -290,7 +314,7 @@ class Streamer:
         border = self.steps.generated_until
         for index, (node, clock_map) in enumerate(zip(self._nodes, self.maps, strict=True)):
             if node is not self._machine.primary and border > clock_map.last.print_time:
-                piece = self._time_base.steer(node.name, clock_map, node.clock, border)
+                piece = self._time_base.steer(node.name, clock_map, node.best_clock, border)
                 self.steps.set_clock(index, piece.ticks_per_s)
                 if not self._keeps_maps:
                     clock_map.forget()

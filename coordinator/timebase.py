@@ -6,13 +6,13 @@ without a jump, each aimed at where the two clock estimators say the node's cloc
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nodes.clock import HostTime, Ticks
 from nodes.errors import CanductorError
+from nodes.estimated_clock import EstimatedClock
 
 STEER_HORIZON_S = 1.0
 """A difference to the estimate is worked off over this long: shorter follows faster, longer is smoother."""
@@ -22,18 +22,6 @@ SLEW_LIMIT = 500e-6
 
 JUMP_LIMIT_S = 0.005
 """A node whose clock is further off than this cannot be steered without late or early steps."""
-
-
-class EstimatedClock(Protocol):
-    """A node's clock as far as the host knows it."""
-
-    def ticks_at(self, at_ns: HostTime, /) -> Ticks:
-        """Return the node's 64-bit ticks at a moment of host time."""
-        ...
-
-    def ns_at(self, ticks: Ticks, /) -> HostTime:
-        """Return the host time at which the node's clock stands at TICKS."""
-        ...
 
 
 class ClockJumpError(CanductorError):

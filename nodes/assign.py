@@ -2,10 +2,15 @@
 
 A round asks who waits (QUERY_UNASSIGNED) and, of firmware that knows the question, who is there already
 (WHO_IS_HERE); the answers of a round are merged with those before, since frames get lost and answers
-collide. Setting an id is not acknowledged. It counts as done when the node says so (WHO_IS_HERE), or when
-it no longer answers SILENT_ROUNDS queries in a row; each further answer means that it did not hear, and
-it is told again. A node that has an id from before answers no query, so one that never answers is told
-its id all the same, and remains *unheard*: only talking to it (identify) shows whether it is there.
+collide: older firmware answers at once, all nodes with the same CAN id, and two that begin in the same bit
+destroy each other's frame. A host's own frame right behind the question would make them wait for its end
+and so begin together: nothing follows QUERY_UNASSIGNED, and some rounds ask it alone. Nodes that still
+collide are told their ids unheard, and then collide no more.
+
+Setting an id is not acknowledged. It counts as done when the node says so (WHO_IS_HERE), or when it no
+longer answers SILENT_ROUNDS queries in a row; until then it is told again in every round, as its silence may
+be lost frames. A node that has an id from before answers no query, so one that never answers is told its id
+all the same, and remains *unheard*: only talking to it (identify) shows whether it is there.
 """
 
 import re
@@ -29,12 +34,20 @@ LAST_NODEID: Final = 255
 
 ROUND_NS: Final = 20_000_000
 """Time for the answers of one round; nodes answer within a few milliseconds."""
+ALL_ASKED_ROUNDS: Final = 3
+"""Rounds after which only every other one asks WHO_IS_HERE."""
 SLOW_ROUND_NS: Final = 100_000_000
 QUICK_ROUNDS: Final = 10
+ANSWER_NS: Final = 540_000
+"""One answer on the wire at 250 kbit/s: a round lasts longer, the more nodes may answer."""
 PATIENCE_NS: Final = 1_200_000_000
-"""How long a node that does not answer is asked: it may still be booting."""
+"""How long a node that does not answer is asked, since a new one appeared last: it may still be booting."""
+MAX_NS: Final = 5_000_000_000
+"""After which it ends even if new ones appear for ever."""
 SILENT_ROUNDS: Final = 3
 """With 1 % of frames lost, an unassigned node stays silent that long once in 10^5 rounds."""
+UNHEARD_ROUNDS: Final = 4
+"""After which one that never answered is told its id."""
 MAX_STRANGERS: Final = 512
 """Uuids remembered that nobody asked for."""
 _UUID: Final = re.compile(r"[0-9a-fA-F]{12}\Z")
@@ -73,6 +86,13 @@ class AdminFrame:
     data: bytes
 
 
+def waiting_uuid(data: bytes) -> Uuid | None:
+    """Return who waits for an id, from an admin response; None when it says something else."""
+    if len(data) == UUID_SIZE + 2 and data[0] == NEED_NODEID:
+        return Uuid(data[1 : 1 + UUID_SIZE])
+    return None
+
+
 def number_nodes(uuids: Iterable[Uuid]) -> dict[Uuid, int]:
     """Give out node ids 4, 5, 6, … in the order of UUIDS; raises AssignError."""
     found: dict[Uuid, int] = {}
@@ -91,7 +111,11 @@ class _Seen:
 
     nodeid: int | None = None
     answers: int = 0
+    here: int = 0
+    """Answers to WHO_IS_HERE."""
     answered_round: bool = False
+    needs_id: bool = False
+    """It said in this round that it has none or another, or somebody else said to have the same."""
     silent_rounds: int = 0
     bootloader: bool = False
     settled: bool = False
@@ -108,20 +132,25 @@ class Assignment:
     """Uuids that more than one board answered with."""
     strangers: Mapping[Uuid, str] = field(default_factory=dict)
     """Uuids that wait for an id and are not wanted, and what they are."""
+    displaced: Mapping[Uuid, int] = field(default_factory=dict)
+    """Uuids that are not wanted and had an id that a wanted one gets."""
 
     def check(self, bus: str) -> None:
         """Raise AssignError when a wanted node cannot be used for certain."""
-        for uuid in self.duplicates:
-            if uuid in self.nodeids:
-                raise AssignError(
-                    f"two boards on bus {bus} have the uuid {uuid} (cloned chips?); take one of them off"
-                )
-        for uuid in self.in_bootloader:
-            if uuid in self.nodeids:
-                raise AssignError(
-                    f"node {uuid} on bus {bus} is in its bootloader (Katapult) and has no firmware running; "
-                    "flash it or reset it"
-                )
+        for uuid in self.nodeids:
+            self.check_node(uuid, bus)
+
+    def check_node(self, uuid: Uuid, bus: str) -> None:
+        """Raise AssignError when this node cannot be used for certain."""
+        if uuid in self.duplicates:
+            raise AssignError(
+                f"two boards on bus {bus} have the uuid {uuid} (cloned chips?); take one of them off"
+            )
+        if uuid in self.in_bootloader:
+            raise AssignError(
+                f"node {uuid} on bus {bus} is in its bootloader (Katapult) and has no firmware running; "
+                "flash it or reset it"
+            )
 
     def not_found(self, uuid: Uuid, bus: str) -> AssignError:
         """Return the error for a node that neither answered a query nor identifies."""
@@ -136,7 +165,8 @@ class IdAssignment:
     """Gives the uuids of WANTED their node ids. Times are nanoseconds of any one clock.
 
     Call ``start``, then ``frame`` for what arrives and ``timer`` when ``deadline_ns`` has come; send what
-    ``frames_to_send`` returns after each; it is over when ``result`` is not None.
+    ``frames_to_send`` returns after each; it is over when ``result`` is not None. With nothing
+    WANTED it finds out who waits for an id (``strangers``), until SILENT_ROUNDS rounds brought nobody new.
     """
 
     def __init__(self, wanted: Mapping[Uuid, int]) -> None:
@@ -144,14 +174,18 @@ class IdAssignment:
         self._seen: dict[Uuid, _Seen] = {uuid: _Seen(nodeid) for uuid, nodeid in wanted.items()}
         self._outbox: list[AdminFrame] = []
         self._started_ns = 0
+        self._news_ns = 0
         self._rounds = 0
+        self._rounds_asking_here = 0
+        self._rounds_without_news = 0
+        self._displaced: dict[Uuid, int] = {}
         self.deadline_ns: int | None = None
         self.result: Assignment | None = None
         self.ignored_frames = 0
 
     def start(self, now_ns: int) -> None:
         """Begin the first round."""
-        self._started_ns = now_ns
+        self._started_ns = self._news_ns = now_ns
         self._next_round(now_ns)
 
     def frames_to_send(self) -> list[AdminFrame]:
@@ -161,19 +195,17 @@ class IdAssignment:
 
     def frame(self, can_id: int, data: bytes, now_ns: int) -> None:
         """Take a received frame; anything but an answer of a node is ignored."""
-        del now_ns  # answers count for the round they arrive in
         if can_id != ADMIN_RESPONSE_ID or len(data) != UUID_SIZE + 2 or self.result is not None:
             self.ignored_frames += can_id == ADMIN_RESPONSE_ID
             return
-        seen = self._remember(Uuid(data[1 : 1 + UUID_SIZE]))
+        uuid = Uuid(data[1 : 1 + UUID_SIZE])
+        seen = self._remember(uuid, now_ns) if data[0] in (NEED_NODEID, NODE_IS_HERE) else None
         if seen is None:
-            return
-        if data[0] == NEED_NODEID:
-            self._node_waits(seen, data[-1])
-        elif data[0] == NODE_IS_HERE:
-            seen.settled = seen.nodeid == data[-1]
-        else:
             self.ignored_frames += 1
+        elif data[0] == NEED_NODEID:
+            self._node_waits(seen, data[-1])
+        else:
+            self._node_is_here(uuid, seen, data[-1])
 
     def timer(self, now_ns: int) -> None:
         """Take the time; closes a round whose deadline has come."""
@@ -182,28 +214,48 @@ class IdAssignment:
         for uuid, seen in self._seen.items():
             if seen.nodeid is not None:
                 self._close_round(uuid, seen)
-        impatient = now_ns - self._started_ns >= PATIENCE_NS
-        if impatient or all(seen.settled for seen in self._seen.values() if seen.nodeid is not None):
+        impatient = now_ns - self._news_ns >= PATIENCE_NS or now_ns - self._started_ns >= MAX_NS
+        if impatient or self._all_settled():
             self._finish()
         else:
             self._next_round(now_ns)
 
     # ------------------------------------------------------------------------------------------------ rounds
 
-    def _remember(self, uuid: Uuid) -> _Seen | None:
+    def _all_settled(self) -> bool:
+        if not self._wanted:
+            return self._rounds_without_news >= SILENT_ROUNDS
+        return all(seen.settled for seen in self._seen.values() if seen.nodeid is not None)
+
+    def _remember(self, uuid: Uuid, now_ns: int) -> _Seen | None:
         if uuid not in self._seen:
             if len(self._seen) >= len(self._wanted) + MAX_STRANGERS:
-                self.ignored_frames += 1
                 return None
             self._seen[uuid] = _Seen()
-        return self._seen[uuid]
+        seen = self._seen[uuid]
+        if not seen.answers and not seen.here:
+            self._news_ns = now_ns
+            self._rounds_without_news = -1  # this round does not count
+        return seen
 
     @staticmethod
     def _node_waits(seen: _Seen, set_command: int) -> None:
         seen.answers += 1
-        seen.answered_round = True
+        seen.answered_round = seen.needs_id = True
         seen.settled = False
         seen.bootloader = set_command == SET_NODEID_BOOTLOADER
+
+    def _node_is_here(self, uuid: Uuid, seen: _Seen, nodeid: int) -> None:
+        seen.here += 1
+        if seen.nodeid is not None:
+            seen.settled = seen.nodeid == nodeid
+            seen.needs_id |= not seen.settled
+            return
+        for other in self._seen.values():
+            if other.nodeid == nodeid:
+                # Told its id once more, the wanted node keeps it, and this one drops it and shuts down.
+                self._displaced[uuid] = nodeid
+                other.needs_id = True
 
     def _close_round(self, uuid: Uuid, seen: _Seen) -> None:
         """Judge a wanted node by the round that ends, and tell it its id when it does not seem to know it."""
@@ -213,18 +265,23 @@ class IdAssignment:
             seen.silent_rounds += 1
             if seen.answers and not seen.bootloader and seen.silent_rounds >= SILENT_ROUNDS:
                 seen.settled = True
-        unheard = not seen.answers and not seen.settled and seen.silent_rounds >= SILENT_ROUNDS
-        if seen.nodeid is not None and not seen.bootloader and (seen.answered_round or unheard):
+        unheard = not seen.answers and not seen.settled and seen.silent_rounds >= UNHEARD_ROUNDS
+        silent = seen.answers and not seen.settled  # it knows its id, or the queries got lost
+        if seen.nodeid is not None and not seen.bootloader and (seen.needs_id or silent or unheard):
             data = bytes((SET_NODEID, *uuid.raw, seen.nodeid))
             self._outbox.append(AdminFrame(ADMIN_ID, data))
 
     def _next_round(self, now_ns: int) -> None:
         for seen in self._seen.values():
-            seen.answered_round = False
+            seen.answered_round = seen.needs_id = False
         self._rounds += 1
+        self._rounds_without_news += 1
+        if self._rounds <= ALL_ASKED_ROUNDS or self._rounds % 2:
+            self._rounds_asking_here += 1
+            self._outbox.append(AdminFrame(ADMIN_ID, bytes((WHO_IS_HERE,))))
         self._outbox.append(AdminFrame(ADMIN_ID, bytes((QUERY_UNASSIGNED,))))
-        self._outbox.append(AdminFrame(ADMIN_ID, bytes((WHO_IS_HERE,))))
-        self.deadline_ns = now_ns + (ROUND_NS if self._rounds <= QUICK_ROUNDS else SLOW_ROUND_NS)
+        quiet_ns = ROUND_NS if self._rounds <= QUICK_ROUNDS else SLOW_ROUND_NS
+        self.deadline_ns = now_ns + quiet_ns + len(self._seen) * ANSWER_NS
 
     def _finish(self) -> None:
         wanted = [(uuid, self._seen[uuid]) for uuid in self._wanted]
@@ -235,13 +292,16 @@ class IdAssignment:
             in_bootloader=tuple(uuid for uuid, seen in wanted if seen.bootloader),
             # A node answers a query at most once, so more answers than queries come from more than one.
             duplicates=tuple(
-                uuid for uuid, seen in self._seen.items() if seen.answers > self._queries_for(seen)
+                uuid
+                for uuid, seen in self._seen.items()
+                if seen.answers > self._queries_for(seen) or seen.here > self._rounds_asking_here
             ),
             strangers={
                 uuid: "in its bootloader" if seen.bootloader else "ready for an id"
                 for uuid, seen in self._seen.items()
                 if seen.nodeid is None and seen.answers
             },
+            displaced=self._displaced,
         )
 
     def _queries_for(self, seen: _Seen) -> int:

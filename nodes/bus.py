@@ -1,14 +1,27 @@
 """One bus or UART with its nodes: node ids, links, starting and closing, each unwinding cleanly."""
 
 import asyncio
+import contextlib
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from nodes.assign import Assignment, IdAssignment, Uuid, number_nodes
+from nodes.assign import (
+    ADMIN_ID,
+    ADMIN_RESPONSE_ID,
+    QUERY_UNASSIGNED,
+    Assignment,
+    IdAssignment,
+    Uuid,
+    number_nodes,
+    waiting_uuid,
+)
+from nodes.clock import HostTime
+from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 from nodes.link import LinkSettings
 from nodes.node import Node, OnClock, OnState
-from nodes.node_errors import NodeLost
+from nodes.node_errors import NodeError, NodeLost
+from nodes.node_states import NodeState
 from nodes.seams import (
     BuildConfig,
     FrameLike,
@@ -18,9 +31,20 @@ from nodes.seams import (
     OnLost,
     OnResponses,
 )
+from nodes.sync_pulse import CONSTANT, PulseKeeper
 from nodes.wire_time import can_wire_ns
 
 LOST_AFTER_S: Final = 1.0
+SUSPECT_INTERVAL_S: Final = 0.1
+"""The bus is asked at most that often who waits for an id."""
+BUS_STOP_ID: Final = 0x010
+"""Frame ``<reason> <node id of the origin>``: every node of this project's firmware shuts down at once."""
+KNOWS_BUS_STOP: Final = "CAN_BUS_STOP"
+"""Of the dictionary: the firmware does so."""
+BUS_STOP_FRAMES: Final = 3
+"""Nobody acknowledges it, and a bus that has to be stopped may be one that loses frames."""
+BUS_OFF: Final = 0x2000_0040
+"""Id of the kernel's error frame (CAN_ERR_FLAG | CAN_ERR_BUSOFF): the controller took itself off the bus."""
 
 
 def _ignore(*_: object) -> None:
@@ -28,13 +52,27 @@ def _ignore(*_: object) -> None:
 
 
 class _Base:
-    """What a CAN bus and a UART have in common: the I/O, and nodes that live and die with it."""
+    """What a CAN bus and a UART have in common: the I/O, and nodes that live and die with it.
 
-    def __init__(self, name: str, start_io: IoFactory) -> None:
+    START_IO opens the transport; it is called again when a bus that closed is to come back. Nodes share
+    CACHE, their dictionaries. ON_NOTICE gets sentences about what the user should put right.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        start_io: IoFactory,
+        *,
+        cache: DictionaryCache | None = None,
+        on_notice: Callable[[str], None] = _ignore,
+    ) -> None:
         self.name = name
         self.nodes: list[Node] = []
         self.closed_because: str | None = None
         self._start_io = start_io
+        self._cache = cache if cache is not None else DictionaryCache()
+        self._on_notice = on_notice
+        self._may_be_absent: set[Node] = set()
         self._io: LinkIOLike | None = None
 
     @property
@@ -46,19 +84,51 @@ class _Base:
         return self._io
 
     async def start(self) -> None:
-        """Open the bus and bring all its nodes to READY, together. What fails is raised with all closed."""
+        """Open the bus and bring its nodes to READY, together. What fails is raised with all closed.
+
+        Nodes that may be absent are LOST when they are, and so are all when the bus has only such.
+        """
         try:
-            self._io = self._start_io(on_frame=self._frame_handler(), on_closed=self._io_closed)
-            await self._prepare()
-            async with asyncio.TaskGroup() as group:
-                for node in self.nodes:
-                    group.create_task(node.start())
+            await self._start()
         except BaseException as error:
             await self.close()
             cause = _cause(error)
             if cause is None:
                 raise
             raise cause from None
+
+    async def _start(self) -> None:
+        try:
+            self._open()
+        except CanductorError as error:
+            if len(self._may_be_absent) < len(self.nodes):
+                raise
+            self._io_closed(str(error))
+            return
+        await self._prepare()
+        async with asyncio.TaskGroup() as group:
+            for node in self.nodes:
+                group.create_task(self._start_node(node))
+
+    async def _start_node(self, node: Node) -> None:
+        try:
+            await node.start()
+            self._node_started(node)
+        except CanductorError:
+            if node not in self._may_be_absent:
+                raise
+
+    def ensure_open(self) -> None:
+        """Open the bus again when it closed, for its nodes to be restarted; raises CanductorError."""
+        if self.closed_because is not None:
+            io, self._io = self._io, None
+            if io is not None:
+                io.close()
+            self._open()
+            self.closed_because = None
+
+    def _open(self) -> None:
+        self._io = self._start_io(on_frame=self._frame_handler(), on_closed=self._io_closed)
 
     async def close(self) -> None:
         """Close all nodes and the bus; nothing is left running."""
@@ -73,7 +143,16 @@ class _Base:
         for node in self.nodes:
             node.emergency_stop()
 
+    def _add(self, node: Node, *, may_be_absent: bool) -> Node:
+        self.nodes.append(node)
+        if may_be_absent:
+            self._may_be_absent.add(node)
+        return node
+
     async def _prepare(self) -> None:
+        pass
+
+    def _node_started(self, node: Node) -> None:
         pass
 
     def _frame_handler(self) -> Callable[[FrameLike], None] | None:
@@ -109,15 +188,16 @@ class UartBus(_Base):
         name: str,
         build_config: BuildConfig,
         *,
+        may_be_absent: bool = False,
         on_state: OnState = _ignore,
         on_clock: OnClock = _ignore,
     ) -> Node:
         """Add the node, before ``start``."""
         assert not self.nodes
-        self.nodes.append(
-            Node(name, _UartConnector(self), build_config, on_state=on_state, on_clock=on_clock)
+        node = Node(
+            name, _UartConnector(self), build_config, on_state=on_state, on_clock=on_clock, cache=self._cache
         )
-        return self.nodes[0]
+        return self._add(node, may_be_absent=may_be_absent)
 
 
 class _UartConnector:
@@ -141,16 +221,34 @@ class _UartConnector:
             "and that the firmware is built for this port"
         )
 
+    def check_identity(self, found: bytes) -> None:
+        pass  # whatever board is at the other end of the cable, it is the node
+
+    def suspect(self) -> None:
+        pass  # a node that restarts on a UART says so itself
+
 
 class CanBus(_Base):
     """A CAN bus; its nodes get their ids 4, 5, 6, … in the order in which they are added."""
 
-    def __init__(self, name: str, start_io: IoFactory) -> None:
-        super().__init__(name, start_io)
+    def __init__(
+        self,
+        name: str,
+        start_io: IoFactory,
+        *,
+        cache: DictionaryCache | None = None,
+        on_notice: Callable[[str], None] = _ignore,
+    ) -> None:
+        super().__init__(name, start_io, cache=cache, on_notice=on_notice)
         self._nodeids: dict[Uuid, int] = {}
+        self._by_uuid: dict[Uuid, Node] = {}
         self._connectors: list[_CanConnector] = []
         self._assigning = asyncio.Lock()
         self._assignment: IdAssignment | None = None
+        self._asked_s = float("-inf")
+        self._doubts: dict[Uuid, asyncio.Task[None]] = {}
+        self._pulses: asyncio.Task[None] | None = None
+        self._said: set[Uuid] = set()
 
     def add_node(
         self,
@@ -158,6 +256,7 @@ class CanBus(_Base):
         uuid: Uuid,
         build_config: BuildConfig,
         *,
+        may_be_absent: bool = False,
         on_state: OnState = _ignore,
         on_clock: OnClock = _ignore,
     ) -> Node:
@@ -165,19 +264,59 @@ class CanBus(_Base):
         self._nodeids = number_nodes([*self._nodeids, uuid])
         connector = _CanConnector(self, uuid)
         self._connectors.append(connector)
-        self.nodes.append(Node(name, connector, build_config, on_state=on_state, on_clock=on_clock))
-        return self.nodes[-1]
+        node = Node(name, connector, build_config, on_state=on_state, on_clock=on_clock, cache=self._cache)
+        self._by_uuid[uuid] = node
+        return self._add(node, may_be_absent=may_be_absent)
+
+    async def close(self) -> None:
+        """Close all nodes and the bus; nothing is left running."""
+        tasks = [*self._doubts.values(), *([self._pulses] if self._pulses is not None else [])]
+        self._pulses = None
+        for task in tasks:
+            task.cancel()
+        for result in await asyncio.gather(*tasks, return_exceptions=True):
+            if isinstance(result, Exception):
+                raise result  # a bug of those tasks, which expect all that may happen
+        await super().close()
+
+    def emergency_stop(self) -> None:
+        """Stop every node that can be reached: by frames that our firmware obeys at once, and one by one."""
+        if any(node.dictionary.int_constant(KNOWS_BUS_STOP, 0) for node in self.nodes):
+            with contextlib.suppress(CanductorError):  # the bus may be what failed
+                for _ in range(BUS_STOP_FRAMES):
+                    self.io.send_frame(BUS_STOP_ID, bytes((0, 0)))
+        super().emergency_stop()
 
     async def assign(self, uuids: Iterable[Uuid]) -> Assignment:
-        """Give UUIDS their ids; raises AssignError when one cannot be had for certain."""
+        """Give UUIDS their ids; whether one can be had for certain is for ``Assignment.check_node``."""
         async with self._assigning:
             self._assignment = IdAssignment({uuid: self._nodeids[uuid] for uuid in uuids})
             try:
                 result = await self._run(self._assignment)
             finally:
                 self._assignment = None
-        result.check(self.name)
+        for stranger, nodeid in result.displaced.items():
+            self._say(
+                stranger,
+                f"board {stranger} on bus {self.name} is not configured here and had node id {nodeid}, which "
+                "was taken from it; it has shut down: let only one host assign ids on a bus",
+            )
         return result
+
+    def suspect(self) -> None:
+        """Ask who waits for an id: a node that restarted does. The answers come as frames."""
+        now_s = asyncio.get_running_loop().time()
+        if now_s - self._asked_s >= SUSPECT_INTERVAL_S:
+            self._asked_s = now_s
+            with contextlib.suppress(CanductorError):  # the bus may be gone: that is told elsewhere
+                self.io.send_frame(ADMIN_ID, bytes((QUERY_UNASSIGNED,)))
+
+    def _node_started(self, node: Node) -> None:
+        # Boards are built for one bit rate, and this one has just been heard at it.
+        self.io.learn_bitrate(node.dictionary.int_constant("CANBUS_FREQUENCY", 0))
+
+    def _send_frame(self, can_id: int, data: bytes) -> None:
+        self.io.send_frame(can_id, data)
 
     def nodeid(self, uuid: Uuid) -> int:
         """Return the id UUID has, or gets."""
@@ -200,13 +339,64 @@ class CanBus(_Base):
         assignment = await self.assign(self._nodeids)
         for connector in self._connectors:
             connector.assignment = assignment
+        loop = asyncio.get_running_loop()
+        keeper = PulseKeeper(
+            lambda: [node for node in self.nodes if _knows_pulses(node)],
+            self._send_frame,
+            lambda: HostTime(_ns(loop.time())),
+        )
+        # From the start, so that the clocks agree when the nodes are ready.
+        self._pulses = loop.create_task(keeper.run())
 
     def _frame_handler(self) -> Callable[[FrameLike], None]:
-        def received(frame: FrameLike) -> None:
-            if self._assignment is not None:
-                self._assignment.frame(frame.can_id, frame.data, _ns(asyncio.get_running_loop().time()))
+        return self._frame_came
 
-        return received
+    def _frame_came(self, frame: FrameLike) -> None:
+        if self._assignment is not None:
+            self._assignment.frame(frame.can_id, frame.data, _ns(asyncio.get_running_loop().time()))
+        if frame.can_id == BUS_STOP_ID and len(frame.data) == 2:
+            self._bus_stopped(reason=frame.data[0], nodeid=frame.data[1])
+        elif frame.can_id == ADMIN_RESPONSE_ID:
+            self._doubt(waiting_uuid(frame.data))
+        elif frame.can_id == BUS_OFF:
+            self._went_bus_off()
+
+    def _bus_stopped(self, reason: int, nodeid: int) -> None:
+        """Take note that a node stopped the bus: what the others report from now on follows from that."""
+        for uuid, node in self._by_uuid.items():
+            if self._nodeids[uuid] == nodeid:
+                node.shut_down_for(reason)
+
+    def _went_bus_off(self) -> None:
+        cause = (
+            f"the controller of {self.name} met too many errors and went off the bus (bus-off); check "
+            "cables, termination and bit rates, and have it return by itself: while the interface is down, "
+            f"'ip link set {self.name} type can restart-ms 100'"
+        )
+        for node in self.nodes:
+            node.lose(cause)
+
+    def _doubt(self, uuid: Uuid | None) -> None:
+        """Find out why a board asks for an id whose node has one: it restarted, or there are two."""
+        node = self._by_uuid.get(uuid) if uuid is not None else None
+        if uuid is None or node is None or uuid in self._doubts:
+            return
+        if node.state in (NodeState.READY, NodeState.SHUTDOWN):
+            task = asyncio.get_running_loop().create_task(self._resolve(uuid, node))
+            self._doubts[uuid] = task
+            task.add_done_callback(lambda _: self._doubts.pop(uuid, None))
+
+    async def _resolve(self, uuid: Uuid, node: Node) -> None:
+        if await node.lives():
+            self._say(uuid, f"{_twins(uuid, self.name)}; the second one waits for an id and is not used")
+        else:
+            node.restarted("its uuid asks for an id again")
+
+    def _say(self, uuid: Uuid, sentence: str) -> None:
+        """Tell the user, once for each board."""
+        if uuid not in self._said:
+            self._said.add(uuid)
+            self._on_notice(sentence)
 
 
 class _CanConnector:
@@ -220,6 +410,7 @@ class _CanConnector:
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
         if self.assignment is None:
             self.assignment = await self._bus.assign([self._uuid])
+        self.assignment.check_node(self._uuid, self._bus.name)
         settings = LinkSettings(self._bus.nodeid(self._uuid), lost_after_s=LOST_AFTER_S)
         return self._bus.io.open_link(settings, on_responses=on_responses, on_lost=on_lost)
 
@@ -238,6 +429,25 @@ class _CanConnector:
             f"node {self._uuid} on bus {self._bus.name} took id {self._bus.nodeid(self._uuid)} but does not "
             "answer on it; check the bus for errors and for another host"
         )
+
+    def check_identity(self, found: bytes) -> None:
+        if found != self._uuid.raw:
+            raise NodeError(
+                f"two boards answer on node id {self._bus.nodeid(self._uuid)} of bus {self._bus.name}: "
+                f"{self._uuid}, and one that says it is {found.hex()}; switch both off and on again, and let "
+                "only one host assign ids on this bus"
+            )
+
+    def suspect(self) -> None:
+        self._bus.suspect()
+
+
+def _knows_pulses(node: Node) -> bool:
+    return node.talks and bool(node.dictionary.int_constant(CONSTANT, 0))
+
+
+def _twins(uuid: Uuid, bus: str) -> str:
+    return f"two boards on bus {bus} have the uuid {uuid} (cloned chips?); take one of them off"
 
 
 def _ns(loop_time_s: float) -> int:

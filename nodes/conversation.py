@@ -60,6 +60,8 @@ class Conversation:
         self.dictionary: Dictionary = BOOTSTRAP
         self.undecodable = 0
         """Responses that no format of the dictionary fits: damaged, or from other firmware."""
+        self.heard = 0
+        """Responses received, whatever they were."""
         self._link: LinkLike | None = None
         self._waiters: list[_Waiter] = []
         self._listeners: dict[tuple[str, int | None], list[Callback]] = {}
@@ -162,6 +164,7 @@ class Conversation:
 
     def receive(self, responses: Sequence[ResponseLike]) -> None:
         """Take what the link received."""
+        self.heard += len(responses)
         for response in responses:
             message = self.dictionary.decode(response.content)
             if message is None:

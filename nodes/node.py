@@ -3,30 +3,36 @@
 import asyncio
 import contextlib
 from collections.abc import Callable
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from nodes.clock import ClockEstimate, ClockEstimator
-from nodes.conversation import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, Callback, Conversation, QueryTimeout
-from nodes.dictionary import MAX_COMPRESSED_BYTES, Dictionary
+from nodes.clock_keeper import ClockKeeper
+from nodes.conversation import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, Conversation
+from nodes.dictionary import Dictionary
+from nodes.dictionary_cache import DictionaryCache
 from nodes.dictionary_parts import DictionaryError
 from nodes.errors import CanductorError
+from nodes.estimated_clock import EstimatedClock
+from nodes.identify import identify
 from nodes.load import NodeLoad, load_of
 from nodes.message_format import Message, Value
 from nodes.node_config import NodeConfig
-from nodes.node_errors import NodeError, NodeLost, NodeShutdown
+from nodes.node_errors import NodeError, NodeLost, NodeShutdown, shutdown_sentence
 from nodes.node_states import NodeEvent, NodeState, following
 from nodes.seams import BuildConfig, Connector, LinkLike
-from nodes.vocabulary import check_vocabulary
-from nodes.wire_time import narrow
+from nodes.vigil import Vigil, get_config, restarted
+from nodes.vocabulary import carries_identity, check_vocabulary
 
-IDENTIFY_PIECE: Final = 40
+if TYPE_CHECKING:
+    from nodes.sync_pulse import PulseClock
+
 MAX_STARTS: Final = 3
 """How often a node is connected anew in one start because only a reset rids it of an old configuration."""
 CONFIG_RESET_TRIES: Final = 4
 RESET_SETTLE_S: Final = 0.3
 """For the reset command to arrive, repeated if need be, and the node to come up again."""
-SHUTDOWN_GRACE_S: Final = 0.05
-"""For a node that is seen to be shut down to say why."""
+ALIVE_TIMEOUT_S: Final = 0.1
+"""For a node of which another board claims to be it to show that it lives."""
 CLOCK_TIMEOUT_S: Final = 15.0
 """On a bus that loses one frame in twenty every fourth sample is lost or of no use."""
 
@@ -43,7 +49,8 @@ class Node:
     """Node NAME, reached through CONNECTOR and configured as BUILD_CONFIG says.
 
     ON_STATE is called after every change of ``state``, ON_CLOCK with every new estimate of its clock, both on
-    the control loop. ``failure`` says why it is lost or shut down.
+    the control loop. ``failure`` says why it is lost or shut down. Without a CACHE every start downloads the
+    dictionary.
     """
 
     def __init__(
@@ -54,6 +61,7 @@ class Node:
         *,
         on_state: OnState = _ignore,
         on_clock: OnClock = _ignore,
+        cache: DictionaryCache | None = None,
     ) -> None:
         self.name = name
         self.state = NodeState.CONNECTING
@@ -61,14 +69,16 @@ class Node:
         self.move_count = 0
         """Queue slots shared by all steppers and timed outputs; known when READY."""
         self.load: NodeLoad | None = None
+        self.pulse_clock: PulseClock | None = None
+        """The node's clock by sync pulses, while its bus has such; kept by the bus."""
         self._connector = connector
         self._build_config = build_config
         self._on_state = on_state
         self._on_clock = on_clock
+        self._cache = cache
         self._talk = Conversation(name)
-        self._clock: ClockEstimator | None = None
-        self._clock_ready = asyncio.Event()
-        self._clock_task: asyncio.Task[None] | None = None
+        self._keeper: ClockKeeper | None = None
+        self._vigil = Vigil(self._talk, 0)
         self._starting_over = True  # until an old configuration is judged, old news mean nothing
         self._generation = 0
         for response, handler in (
@@ -89,9 +99,32 @@ class Node:
     @property
     def clock(self) -> ClockEstimator:
         """The node's clock; NodeError before its first sample."""
-        if self._clock is None or not self._clock.accepted:
+        if self._keeper is None or not self._keeper.estimator.accepted:
             raise NodeError(f"the clock of node {self.name} is not known yet: the node is {self.state.value}")
-        return self._clock
+        return self._keeper.estimator
+
+    @property
+    def talks(self) -> bool:
+        """Whether commands can be sent to it now."""
+        return self.failure is None and self.state in (NodeState.CONFIGURING, NodeState.READY)
+
+    @property
+    def best_clock(self) -> EstimatedClock:
+        """The node's clock as well as it is known: by sync pulses, else by exchanges; NodeError before."""
+        return self.pulse_clock or self.clock
+
+    @property
+    def clock_error_s(self) -> float | None:
+        """Bound of the error of ``best_clock``; None while that is not known."""
+        if self.pulse_clock is not None:
+            return self.pulse_clock.error_s
+        known = self._keeper is not None and self._keeper.estimator.accepted
+        return self.clock.estimate().error_s if known else None
+
+    @property
+    def clock_freq_hz(self) -> int:
+        """Nominal ticks per second."""
+        return self.dictionary.clock_freq_hz
 
     @property
     def link(self) -> LinkLike:
@@ -144,6 +177,20 @@ class Node:
         """Take note that the node can no longer be reached."""
         self._fail(NodeEvent.LOST, NodeLost(f"lost node {self.name}: {cause}"))
 
+    def restarted(self, how: str) -> None:
+        """Take note that the node restarted by itself; HOW that is known."""
+        self._fail(NodeEvent.RESTARTED, restarted(self.name, how))
+
+    async def lives(self) -> bool:
+        """Tell whether the node answers at once, and has its configuration."""
+        try:
+            answer = await self._talk.ask(
+                "get_config", "config", tries=1, timeout_s=ALIVE_TIMEOUT_S, survives_shutdown=True
+            )
+        except CanductorError:
+            return False
+        return bool(answer.message.integer("is_config"))
+
     def _check_usable(self) -> None:
         if self.failure is not None:
             raise self.failure
@@ -157,8 +204,11 @@ class Node:
         try:
             await self._start()
         except CanductorError as error:
+            failure = error if isinstance(error, NodeError) else NodeError(str(error))
             if self.failure is None:
-                self._fail(NodeEvent.LOST, error if isinstance(error, NodeError) else NodeError(str(error)))
+                self._fail(NodeEvent.LOST, failure)
+            elif self.state is NodeState.LOST:
+                self.failure = failure  # says more than its link, which only found it silent
             raise
 
     async def _start(self) -> None:
@@ -169,9 +219,9 @@ class Node:
             self._enter(NodeEvent.CONNECTED)
             await self._identify()
             self._enter(NodeEvent.IDENTIFIED)
-            self._start_clock()
+            keeper = self._start_clock()
             if await self._configure(self._build_config(self.dictionary)):
-                await self._wait_for_clock()
+                await self._wait_for_clock(keeper)
                 self._enter(NodeEvent.CONFIGURED)
                 return
             await self._disconnect()
@@ -190,6 +240,25 @@ class Node:
         self._enter(NodeEvent.RESET)
         await self.start()
 
+    async def sleep(self) -> None:
+        """Let go of the node, so that its power can be switched off: it is neither talked to nor missed.
+
+        A start that was under way must have been cancelled. Raises NodeError when it sleeps or is closed.
+        """
+        if following(self.state, NodeEvent.SLEEP) is None:
+            raise NodeError(f"node {self.name} is {self.state.value} and cannot be put to sleep")
+        await self._disconnect()
+        self._connector.forget()
+        self.failure = None
+        self._enter(NodeEvent.SLEEP)
+
+    async def wake(self) -> None:
+        """Start the node again, from SLEEPING; raises like ``start``."""
+        if following(self.state, NodeEvent.WAKE) is None:
+            raise NodeError(f"node {self.name} is {self.state.value} and cannot be woken")
+        self._enter(NodeEvent.WAKE)
+        await self.start()
+
     async def close(self) -> None:
         """End the conversation; the node itself is left as it is."""
         await self._disconnect()
@@ -198,47 +267,34 @@ class Node:
     async def _disconnect(self) -> None:
         self._generation += 1
         self._talk.fail(self.failure or NodeLost(f"the connection to node {self.name} was closed"))
-        task, self._clock_task = self._clock_task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
+        if self._keeper is not None:
+            await self._keeper.close()
         link = self._talk.detach()
         if link is not None:
             link.close()
 
     async def _identify(self) -> None:
-        data = bytearray()
-        while True:
-            try:
-                answer = await self._talk.ask(
-                    "identify",
-                    "identify_response",
-                    {"offset": len(data), "count": IDENTIFY_PIECE},
-                    matching={"offset": len(data)},
-                )
-            except (QueryTimeout, NodeLost):
-                better = None if data else self._connector.why_silent()
-                if better is not None:
-                    raise better from None
-                raise
-            piece = answer.message.data("data")
-            if not piece:
-                break
-            data += piece
-            if len(data) > MAX_COMPRESSED_BYTES:
-                raise DictionaryError(f"node {self.name}: its dictionary does not end; other firmware?")
+        cache = self._cache or DictionaryCache()
+        dictionary = await identify(self._talk, cache, self._connector.why_silent)
         try:
-            self._talk.dictionary = Dictionary.parse(bytes(data))
-            check_vocabulary(self.dictionary)
-            self._talk.link.set_receive_window(self.dictionary.receive_window)
+            check_vocabulary(dictionary)
+            self._talk.dictionary = dictionary
+            self._talk.link.set_receive_window(dictionary.receive_window)
         except DictionaryError as error:
             raise DictionaryError(f"node {self.name}: {error}") from None
+        await self._check_identity()
+
+    async def _check_identity(self) -> None:
+        """Make sure that the board that answers is the one that was given the node's id."""
+        if carries_identity(self.dictionary):
+            answer = await self._talk.ask("get_canbus_id", "canbus_id", survives_shutdown=True)
+            self._connector.check_identity(answer.message.data("canbus_uuid"))
 
     # ------------------------------------------------------------------------------------------ configuring
 
     async def _configure(self, wanted: NodeConfig) -> bool:
         """Make the node what WANTED says; False when it had to be reset and must be connected anew."""
-        found = await self._get_config()
+        found = await get_config(self._talk)
         other = bool(found.integer("is_config")) and found.integer("crc") != wanted.crc
         if other or found.integer("is_shutdown"):
             if "config_reset" not in self.dictionary.commands:
@@ -250,9 +306,10 @@ class Node:
             for command in wanted.config_commands:
                 self._talk.send_text(command)
             self._talk.send("finalize_config", crc=wanted.crc)
-            found = await self._get_config()
+            found = await get_config(self._talk)
         self._check_configured(found, wanted)
         self.move_count = found.integer("move_count")
+        self._vigil = Vigil(self._talk, wanted.crc)
         for command in wanted.init_commands:
             self._talk.send_text(command)
         return True
@@ -264,19 +321,6 @@ class Node:
             raise NodeShutdown(f"node {self.name} shut down while being configured; see its pins and limits")
         if not found.integer("is_config") or found.integer("crc") != wanted.crc:
             raise NodeError(f"node {self.name} did not take its configuration; restart it and try again")
-
-    async def _get_config(self, tries: int = QUERY_TRIES) -> Message:
-        answer = await self._talk.ask("get_config", "config", tries=tries, survives_shutdown=True)
-        return answer.message
-
-    async def _judge(self, found: Message) -> None:
-        """Notice what the node said only once, when that message got lost."""
-        if not found.integer("is_config"):
-            self.lose("it restarted by itself; check its power supply")
-        elif found.integer("is_shutdown"):
-            await asyncio.sleep(SHUTDOWN_GRACE_S)
-            reason = "the message with the reason got lost"
-            self._fail(NodeEvent.SHUTDOWN, NodeShutdown(f"node {self.name} shut down: {reason}"))
 
     async def _reset(self) -> None:
         if "reset" not in self.dictionary.commands:
@@ -290,74 +334,37 @@ class Node:
         for _ in range(CONFIG_RESET_TRIES):
             self._talk.send("emergency_stop")
             self._talk.send("config_reset")
-            found = await self._get_config()
+            found = await get_config(self._talk)
             if found.integer("is_shutdown") and "clear_shutdown" in self.dictionary.commands:
                 self._talk.send("clear_shutdown")
-                found = await self._get_config()
+                found = await get_config(self._talk)
             if not found.integer("is_config") and not found.integer("is_shutdown"):
                 return found
         raise NodeError(f"node {self.name} does not let go of its old configuration; power-cycle it")
 
     # ------------------------------------------------------------------------------------------------ clock
 
-    def _start_clock(self) -> None:
-        self._clock = ClockEstimator(self.dictionary.clock_freq_hz)
-        self._clock_ready.clear()
-        self._clock_task = asyncio.get_running_loop().create_task(self._keep_clock(self._clock))
-        self._clock_task.add_done_callback(self._clock_ended)
-
-    def _clock_ended(self, task: asyncio.Task[None]) -> None:
-        """Bring a bug in keeping the clock to light, and stop using the node: its time is not known."""
-        bug = None if task.cancelled() else task.exception()
-        if bug is not None:
-            self.lose("its clock is no longer kept; this is a bug, please report it")
-            task.get_loop().call_exception_handler({"message": "keeping a clock failed", "exception": bug})
-
-    async def _keep_clock(self, clock: ClockEstimator) -> None:
-        """Ask for the clock for as long as the node can be talked to."""
-        while True:
-            try:
-                self._sampled(clock, await self._ask_clock(clock))
-                if self.state is NodeState.READY:
-                    await self._judge(await self._get_config(tries=1))
-            except QueryTimeout:
-                pass  # the link decides when a silent node is lost
-            except CanductorError as error:
-                self.lose(str(error))
-                return
-            await asyncio.sleep(clock.next_sample_ns(0) * 1e-9)
-
-    def _sampled(self, clock: ClockEstimator, answer: Answer) -> None:
-        if not self._take_sample(clock, answer):
-            return
-        estimate = clock.estimate()
-        self._talk.link.set_clock(estimate.freq_hz, estimate.at_ns, estimate.at_ticks)
-        self._on_clock(self, estimate)
-        if clock.ready:
-            self._clock_ready.set()
-
-    async def _ask_clock(self, clock: ClockEstimator) -> Answer:
-        if clock.accepted:
-            return await self._talk.ask("get_clock", "clock", tries=1, survives_shutdown=True)
-        return await self._talk.ask("get_uptime", "uptime", tries=1, survives_shutdown=True)
-
-    def _take_sample(self, clock: ClockEstimator, answer: Answer) -> bool:
-        message = answer.message
-        bitrate = self.dictionary.int_constant("CANBUS_FREQUENCY", 0)
-        sent_ns, received_ns = narrow(
-            answer.sent_ns,
-            answer.received_ns,
-            self._connector.wire_ns(answer.asked_bytes, bitrate),
-            self._connector.wire_ns(answer.answered_bytes, bitrate),
+    def _start_clock(self) -> ClockKeeper:
+        self._keeper = ClockKeeper(
+            self._talk,
+            self._connector,
+            on_estimate=lambda estimate: self._on_clock(self, estimate),
+            on_sample=self._look,
+            on_lost=self.lose,
         )
-        if message.name == "clock":
-            return clock.add(sent_ns, received_ns, message.integer("clock"))
-        return clock.begin(sent_ns, received_ns, message.integer("high"), message.integer("clock"))
+        return self._keeper
 
-    async def _wait_for_clock(self) -> None:
+    async def _look(self) -> None:
+        """Notice what the node said only once, should that have been lost."""
+        trouble = await self._vigil.look() if self.state is NodeState.READY else None
+        if trouble is not None:
+            shutdown = isinstance(trouble, NodeShutdown)
+            self._fail(NodeEvent.SHUTDOWN if shutdown else NodeEvent.RESTARTED, trouble)
+
+    async def _wait_for_clock(self, keeper: ClockKeeper) -> None:
         try:
             async with asyncio.timeout(CLOCK_TIMEOUT_S):
-                await self._clock_ready.wait()
+                await keeper.ready.wait()
         except TimeoutError:
             raise self.failure or NodeError(
                 f"node {self.name} answers too seldom to learn its clock; check the bus for errors and load"
@@ -379,7 +386,8 @@ class Node:
         self.failure = failure
         self._enter(event)
         self._talk.fail(failure, shutdown=event is NodeEvent.SHUTDOWN)
-        self._clock_ready.set()  # nobody needs to wait for it any more
+        if self._keeper is not None:
+            self._keeper.ready.set()  # nobody needs to wait for it any more
 
     def _link_lost(self, generation: int) -> Callable[[str], None]:
         def lost(cause: str) -> None:
@@ -393,15 +401,18 @@ class Node:
         self.load = load_of(stats, self.dictionary.clock_freq_hz, base)
 
     def _shutdown_came(self, message: Message) -> None:
+        self.shut_down_for(message.integer("static_string_id"))
+
+    def shut_down_for(self, static_string_id: int) -> None:
+        """Take note that the node shut down, and which text it gives as reason."""
         if self._starting_over or self.failure is not None or self.state not in _SHUTDOWN_MEANS:
             return
-        value = message.integer("static_string_id")
-        text = self.dictionary.enum_name("static_string_id", value)
-        self._fail(NodeEvent.SHUTDOWN, NodeShutdown(f"node {self.name} shut down: {text}"))
+        text = self.dictionary.enum_name("static_string_id", static_string_id)
+        self._fail(NodeEvent.SHUTDOWN, NodeShutdown(shutdown_sentence(self.name, text)))
 
     def _starting_came(self, _: Message) -> None:
         if not self._starting_over:
-            self.lose("it restarted by itself; check its power supply")
+            self.restarted("it said so")
 
 
 _SHUTDOWN_MEANS: Final = (NodeState.CONFIGURING, NodeState.READY)

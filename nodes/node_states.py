@@ -17,6 +17,7 @@ class NodeState(Enum):
     READY = "ready"
     SHUTDOWN = "shut down"
     LOST = "lost"
+    SLEEPING = "asleep"
     CLOSED = "closed"
 
 
@@ -28,7 +29,10 @@ class NodeEvent(Enum):
     CONFIGURED = "configuration finalized, clock known"
     RESET = "reset, to start again"
     SHUTDOWN = "shutdown reported"
-    LOST = "no answer, or it restarted"
+    LOST = "no answer"
+    RESTARTED = "it restarted by itself"
+    SLEEP = "put to sleep by the host"
+    WAKE = "woken by the host"
     CLOSE = "closed by the host"
 
 
@@ -36,24 +40,36 @@ _S, _E = NodeState, NodeEvent
 TRANSITIONS: Final = {
     (_S.CONNECTING, _E.CONNECTED): _S.IDENTIFYING,
     (_S.CONNECTING, _E.LOST): _S.LOST,
+    (_S.CONNECTING, _E.SLEEP): _S.SLEEPING,
     (_S.CONNECTING, _E.CLOSE): _S.CLOSED,
     (_S.IDENTIFYING, _E.IDENTIFIED): _S.CONFIGURING,
     (_S.IDENTIFYING, _E.LOST): _S.LOST,
+    (_S.IDENTIFYING, _E.RESTARTED): _S.LOST,
+    (_S.IDENTIFYING, _E.SLEEP): _S.SLEEPING,
     (_S.IDENTIFYING, _E.CLOSE): _S.CLOSED,
     (_S.CONFIGURING, _E.CONFIGURED): _S.READY,
     (_S.CONFIGURING, _E.RESET): _S.CONNECTING,
     (_S.CONFIGURING, _E.SHUTDOWN): _S.SHUTDOWN,
     (_S.CONFIGURING, _E.LOST): _S.LOST,
+    (_S.CONFIGURING, _E.RESTARTED): _S.LOST,
+    (_S.CONFIGURING, _E.SLEEP): _S.SLEEPING,
     (_S.CONFIGURING, _E.CLOSE): _S.CLOSED,
     (_S.READY, _E.RESET): _S.CONNECTING,
     (_S.READY, _E.SHUTDOWN): _S.SHUTDOWN,
     (_S.READY, _E.LOST): _S.LOST,
+    (_S.READY, _E.RESTARTED): _S.LOST,
+    (_S.READY, _E.SLEEP): _S.SLEEPING,
     (_S.READY, _E.CLOSE): _S.CLOSED,
     (_S.SHUTDOWN, _E.RESET): _S.CONNECTING,
     (_S.SHUTDOWN, _E.LOST): _S.LOST,
+    (_S.SHUTDOWN, _E.RESTARTED): _S.LOST,
+    (_S.SHUTDOWN, _E.SLEEP): _S.SLEEPING,
     (_S.SHUTDOWN, _E.CLOSE): _S.CLOSED,
     (_S.LOST, _E.RESET): _S.CONNECTING,
+    (_S.LOST, _E.SLEEP): _S.SLEEPING,
     (_S.LOST, _E.CLOSE): _S.CLOSED,
+    (_S.SLEEPING, _E.WAKE): _S.CONNECTING,
+    (_S.SLEEPING, _E.CLOSE): _S.CLOSED,
 }
 
 

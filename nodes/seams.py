@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from nodes.dictionary import Dictionary
-from nodes.link import LinkSettings
+from nodes.link import Forecast, LinkSettings
 from nodes.node_config import NodeConfig
 
 
@@ -57,6 +57,8 @@ class LinkIOLike(Protocol):
         self, settings: LinkSettings, *, on_responses: OnResponses, on_lost: OnLost
     ) -> LinkLike: ...
     def send_frame(self, can_id: int, data: bytes) -> None: ...  # noqa: D102
+    def learn_bitrate(self, bitrate: int) -> None: ...  # noqa: D102
+    def forecast(self) -> Forecast: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
 
 
@@ -80,6 +82,12 @@ class Connector(Protocol):
 
     def why_silent(self) -> Exception | None:
         """Return a better explanation than "no answer" when a node never answered at all."""
+
+    def check_identity(self, found: bytes) -> None:
+        """Raise when a board that answers get_canbus_id with FOUND is not the node."""
+
+    def suspect(self) -> None:
+        """Find out whether a node that is silent restarted; the bus tells the node when it did."""
 
 
 BuildConfig = Callable[[Dictionary], NodeConfig]

@@ -43,6 +43,16 @@ def check_vocabulary(dictionary: Dictionary) -> None:
     _ = dictionary.clock_freq_hz, dictionary.receive_window, dictionary.int_constant("STATS_SUMSQ_BASE", 256)
 
 
+def carries_identity(dictionary: Dictionary) -> bool:
+    """Tell whether the node can be asked which board it is (get_canbus_id), with the answer as bytes."""
+    format_ = dictionary.responses.get("canbus_id")
+    asked = dictionary.commands.get("get_canbus_id")
+    if format_ is None or asked is None or asked.names:
+        return False
+    codes = dict(zip(format_.names, format_.code_texts, strict=True))
+    return codes.get("canbus_uuid", "").endswith("s")
+
+
 def _carries(dictionary: Dictionary, name: str, params: tuple[str, ...]) -> bool:
     found = dictionary.responses[name]
     codes = dict(zip(found.names, found.code_texts, strict=True))

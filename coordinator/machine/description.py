@@ -7,6 +7,7 @@ from coordinator.machine.model import (
     HomingDescription,
     MachineDescription,
     NodeDescription,
+    NodePolicy,
     NotYetActing,
     RailDescription,
     StepperDescription,
@@ -15,7 +16,7 @@ from coordinator.machine.model import (
 from coordinator.machine.pins import PinDescription, PinRegistry
 from coordinator.machine.problem import ConfigError, Place, nearest
 from coordinator.machine.read_extruder import limits_without_extruder, read_extruder
-from coordinator.machine.read_nodes import make_pin_registry, read_nodes
+from coordinator.machine.read_nodes import check_policies, make_pin_registry, read_nodes
 from coordinator.machine.read_printer import read_printer
 from coordinator.machine.read_steppers import Weights, is_extra_stepper, read_rail
 from coordinator.machine.well_known import LATER_SECTIONS
@@ -27,6 +28,7 @@ __all__ = [
     "HomingDescription",
     "MachineDescription",
     "NodeDescription",
+    "NodePolicy",
     "NotYetActing",
     "PinDescription",
     "Place",
@@ -65,7 +67,7 @@ def load_machine(path: str) -> MachineDescription:
     limits = limits_without_extruder(printer, rails)
     if "extruder" in config.sections:
         extruder, limits = read_extruder(config.sections["extruder"], printer, rails, pins, later)
-    return MachineDescription(
+    description = MachineDescription(
         path=config.path,
         nodes=nodes,
         kinematics=printer.kinematics,
@@ -75,6 +77,8 @@ def load_machine(path: str) -> MachineDescription:
         not_yet_acting=(*later, *_later_sections(config, pins, later)),
         notes=tuple(config.notes),
     )
+    check_policies(description.nodes, description.steppers)
+    return description
 
 
 def _required(config: ConfigFile, name: str) -> RawSection:

@@ -1,6 +1,7 @@
 """The machine as the configuration describes it: frozen, checked, ready to be built."""
 
 from dataclasses import dataclass
+from enum import Enum
 
 from coordinator.machine.pins import PinDescription
 from coordinator.machine.problem import Place
@@ -29,6 +30,17 @@ class UartConnection:
     place: Place
 
 
+class NodePolicy(Enum):
+    """What becomes of the machine when a node is lost, shuts down or restarts; the value is its word."""
+
+    FATAL = "fatal"
+    """All nodes are stopped."""
+    PAUSE = "pause"
+    """The job waits at standstill until the node is back."""
+    OPTIONAL = "optional"
+    """The node's features are off until it is back; it may even be absent at start."""
+
+
 @dataclass(frozen=True, slots=True)
 class NodeDescription:
     """One micro-controller; ``mcu`` is the primary whose clock is print time."""
@@ -36,6 +48,9 @@ class NodeDescription:
     name: str
     connection: CanConnection | UartConnection
     place: Place
+    policy: NodePolicy
+    policy_place: Place
+    """Where the policy is given; the section where it is not."""
 
 
 @dataclass(frozen=True, slots=True)

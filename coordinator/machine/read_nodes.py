@@ -1,9 +1,17 @@
 """The sections [mcu] and [mcu NAME], [board_pins] and [duplicate_pin_override]."""
 
 import re
+from collections.abc import Iterable
 
 from coordinator.machine.config_file import ConfigFile, RawSection
-from coordinator.machine.model import CanConnection, NodeDescription, NotYetActing, UartConnection
+from coordinator.machine.model import (
+    CanConnection,
+    NodeDescription,
+    NodePolicy,
+    NotYetActing,
+    StepperDescription,
+    UartConnection,
+)
 from coordinator.machine.options import (
     BadValue,
     ChoiceOption,
@@ -48,9 +56,16 @@ RESTART_METHOD = ChoiceOption(
     help="how the host resets the node; by default arduino on a serial line, command on CAN",
     choices=("arduino", "cheetah", "rpi_usb", "command"),
 )
+POLICY = ChoiceOption(
+    name="policy",
+    help="what happens when the node is lost, shuts down or restarts: fatal stops the machine, pause lets the"
+    " job wait until the node is back, optional goes on without it; a node with steppers is fatal",
+    default=NodePolicy.FATAL.value,
+    choices=tuple(policy.value for policy in NodePolicy),
+)
 MCU = SectionSpec(
     help="One micro-controller. [mcu] is the primary, [mcu NAME] another; each has 'serial' or 'canbus_uuid'",
-    options=(SERIAL, BAUD, CANBUS_UUID, CANBUS_INTERFACE, RESTART_METHOD),
+    options=(SERIAL, BAUD, CANBUS_UUID, CANBUS_INTERFACE, RESTART_METHOD, POLICY),
     later=LATER_MCU_OPTIONS,
 )
 BOARD_MCU = ListOption(name="mcu", help="the nodes that have these pins", default=(PRIMARY_NODE,))
@@ -95,12 +110,32 @@ def _read_node(section: RawSection, later: list[NotYetActing]) -> NodeDescriptio
             section.place,
             f"[{section.name}] does not say how to reach the node; add 'canbus_uuid' or 'serial'",
         )
+    policy = _read_policy(reader)
     waiting = [option.name for option in reader.finish()]
     if isinstance(connection, UartConnection) and reader.find(RESTART_METHOD) not in (None, "command"):
         waiting.append(RESTART_METHOD.name)  # so far a node is only reset by its own commands
     if waiting:
         later.append(NotYetActing(section.name, section.place, tuple(waiting)))
-    return NodeDescription(name, connection, section.place)
+    return NodeDescription(name, connection, section.place, policy, reader.place_of(POLICY))
+
+
+def _read_policy(reader: SectionReader) -> NodePolicy:
+    policy = NodePolicy(reader.get(POLICY))
+    if policy is not NodePolicy.FATAL and not reader.section.instance:
+        raise reader.bad(POLICY, "but the primary node's clock is the time of all others; make it 'fatal'")
+    return policy
+
+
+def check_policies(nodes: Iterable[NodeDescription], steppers: Iterable[StepperDescription]) -> None:
+    """Refuse a node that carries a stepper and may come and go; raises ConfigError."""
+    carried = {stepper.node: stepper for stepper in reversed(tuple(steppers))}
+    for node in nodes:
+        if node.policy is not NodePolicy.FATAL and node.name in carried:
+            raise ConfigError(
+                node.policy_place,
+                f"option '{POLICY.name}' of [{PRIMARY_NODE} {node.name}] is '{node.policy.value}', but the"
+                f" node carries [{carried[node.name].name}], whose position would be lost; make it 'fatal'",
+            )
 
 
 def _read_uart(reader: SectionReader) -> CanConnection | UartConnection:

@@ -33,7 +33,9 @@ struct board_can_status {
 void board_can_status(struct node *node, struct board_can_status *out);
 
 // Both links offer their bytes whenever tasks run; a board that refuses calls node_wake_tasks() when there is
-// room again.
+// room again. Frames are also sent in interrupt context (net/bus_signals.h), perhaps while a task is in
+// board_can_send(); those with ids below CAN_ID_URGENT_END leave before all data that still waits. A board
+// does not give a node its own frames back.
 int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t size); // 0, or -1: busy
 size_t board_uart_send(struct node *node, const uint8_t *data, size_t size);          // bytes taken
 

@@ -21,13 +21,19 @@ enum { IDENTIFY_MAX = WIRE_CONTENT_MAX - 1 - WIRE_VLQ_MAX - 1 }; // what fits be
 
 void command_identify(struct node *node, const struct wire_arg *args) {
     uint32_t offset = args[0].value, count = args[1].value;
-    uint32_t left = offset < node_tables.dictionary_size ? node_tables.dictionary_size - offset : 0;
+    const uint8_t *text = node->config.dictionary;
+    uint32_t size = node->config.dictionary_size;
+    if (!text) {
+        text = node_tables.dictionary;
+        size = node_tables.dictionary_size;
+    }
+    uint32_t left = offset < size ? size - offset : 0;
     // More than fits into a block is cut: the host asks on from where the answer ended.
     if (count > IDENTIFY_MAX)
         count = IDENTIFY_MAX;
     if (count > left)
         count = left;
-    RESPOND(node, identify_response, INT(offset), BYTES(node_tables.dictionary + (left ? offset : 0), count));
+    RESPOND(node, identify_response, INT(offset), BYTES(text + (left ? offset : 0), count));
 }
 DECL_COMMAND(command_identify, "identify offset=%u count=%c", ALLOWED_IN_SHUTDOWN);
 

@@ -127,6 +127,9 @@ struct node_config {
     uint8_t uuid[NODE_UUID_SIZE];
     void *arena; // memory for configured objects and the move queue, aligned for any type
     size_t arena_size;
+    const uint8_t *dictionary; // what identify gives, zlib-compressed; null: that of node_tables
+    uint32_t dictionary_size;
+    uint8_t legacy; // 1: behave as firmware without this project's CAN extensions (net/bus_signals.h)
 };
 
 struct oid_slot {
@@ -186,7 +189,12 @@ struct node {
         uint32_t crc;
         uint16_t move_count;
         uint8_t oid_count, oids_allocated, finalized;
+        uint8_t stops_bus; // a shutdown is told to the whole bus (net/bus_signals.h)
     } objects;
+    struct {
+        uint32_t clock;
+        uint8_t set;
+    } alarm;
     struct {
         uint32_t last_clock, clock_high; // 64-bit uptime
         uint32_t report_clock, count, sum, sumsq;
@@ -204,6 +212,12 @@ void node_run_tasks(struct node *node);
 // From any context: node_run_tasks() has something to do.
 static inline void node_wake_tasks(struct node *node) {
     node->tasks_pending = 1;
+}
+// Tasks are to run at CLOCK, which may be now. There is one such alarm, the link's. Unlike a timer it
+// outlives a shutdown and a config_reset, since a node that is shut down still has to be found on its bus.
+static inline void node_set_alarm(struct node *node, uint32_t clock) {
+    node->alarm.clock = clock;
+    node->alarm.set = 1;
 }
 // The clock at which the node next wants to be called without input.
 uint32_t node_next_deadline(const struct node *node);

@@ -54,8 +54,11 @@ void *oid_create(struct node *node, uint32_t oid, const struct oid_type *type, s
         return NULL;
     }
     void *object = node_alloc(node, size);
-    if (object)
+    if (object) {
+        uint32_t irq = board_irq_save(node); // interrupts look through all objects of a type
         node->objects.oids[oid] = (struct oid_slot){.type = type, .object = object};
+        board_irq_restore(node, irq);
+    }
     return object;
 }
 

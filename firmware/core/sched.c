@@ -108,6 +108,8 @@ void node_run_tasks(struct node *node) {
 uint32_t node_next_deadline(const struct node *node) {
     uint32_t deadline = node->base.report_clock + NODE_STATS_SECONDS * node->config.clock_freq;
     const struct timer *first = node->sched.first;
+    if (node->alarm.set && clock_before(node->alarm.clock, deadline))
+        deadline = node->alarm.clock;
     return first && clock_before(first->waketime, deadline) ? first->waketime : deadline;
 }
 

@@ -19,8 +19,6 @@ DECL_ENUMERATION("canbus_bus_state", "warn", 1);
 DECL_ENUMERATION("canbus_bus_state", "passive", 2);
 DECL_ENUMERATION("canbus_bus_state", "off", 3);
 
-enum { QUERY_UNASSIGNED = 0x00, SET_NODEID = 0x01, NEED_NODEID = 0x20 };
-
 static uint32_t receive_id(const struct can_stream *stream) {
     return stream->node_id * 2u + 0x100;
 }
@@ -37,8 +35,8 @@ void can_stream_attach(struct node *node, struct can_stream *stream) {
 // ------------------------------------------------------------------------------------------------- receiving
 
 static void lose_id(struct node *node) {
+    node_shutdown(node, STRING(id_conflict)); // under the id whose loss it may have to tell the bus
     node->can->node_id = 0;
-    node_shutdown(node, STRING(id_conflict));
 }
 
 static void set_node_id(struct node *node, const uint8_t *data) {
@@ -53,19 +51,23 @@ static void set_node_id(struct node *node, const uint8_t *data) {
 }
 
 static void receive_admin(struct node *node, const uint8_t *data, size_t size) {
-    if (size >= 1 && data[0] == QUERY_UNASSIGNED && !node->can->node_id) {
-        node->can->must_announce = 1;
-        node_wake_tasks(node);
-    } else if (size >= 2 + NODE_UUID_SIZE && data[0] == SET_NODEID) {
+    if (!size)
+        return;
+    if (data[0] == SYNC_PULSE)
+        bus_signals_pulse(node, data, size);
+    else if (data[0] == QUERY_UNASSIGNED || data[0] == WHO_IS_HERE)
+        discovery_query(node, data[0]);
+    else if (data[0] == SET_NODEID && size >= 2 + NODE_UUID_SIZE)
         set_node_id(node, data);
-    }
 }
 
 void can_stream_receive(struct node *node, uint32_t id, const uint8_t *data, size_t size) {
     struct can_stream *stream = node->can;
     if (size > CAN_FRAME_MAX)
         return;
-    if (id == CAN_ID_ADMIN_REQUEST) {
+    if (id < CAN_ID_URGENT_END) {
+        bus_signals_receive(node, id, data, size);
+    } else if (id == CAN_ID_ADMIN_REQUEST) {
         receive_admin(node, data, size);
     } else if (stream->node_id && id == receive_id(stream)) {
         stream->frames_in++;
@@ -77,20 +79,13 @@ void can_stream_receive(struct node *node, uint32_t id, const uint8_t *data, siz
 
 // ---------------------------------------------------------------------------------------------- transmitting
 
-static void announce(struct node *node) {
-    uint8_t data[CAN_FRAME_MAX] = {NEED_NODEID};
-    memcpy(data + 1, node->config.uuid, NODE_UUID_SIZE);
-    data[1 + NODE_UUID_SIZE] = SET_NODEID;
-    if (board_can_send(node, CAN_ID_ADMIN_RESPONSE, data, sizeof(data)) == 0)
-        node->can->must_announce = 0;
-}
-
 void can_stream_task(struct node *node) {
     struct can_stream *stream = node->can;
     if (!stream)
         return;
-    if (stream->must_announce)
-        announce(node);
+    if (bus_signals_flush(node))
+        return; // nothing goes before a signal; the board wakes the tasks
+    discovery_run(node);
     uint8_t data[CAN_FRAME_MAX];
     size_t size;
     while ((size = node_transmit_peek(node, data, sizeof(data)))) {

@@ -4,14 +4,22 @@
 #define NET_CAN_STREAM_H
 
 #include "core/node.h"
+#include "net/bus_signals.h"
+#include "net/discovery.h"
 
 enum { CAN_ID_ADMIN_REQUEST = 0x3F0, CAN_ID_ADMIN_RESPONSE = 0x3F1, CAN_FRAME_MAX = 8 };
 
+enum { SET_NODEID = 0x01, SYNC_PULSE = 0x40 }; // admin commands; those of questions are in discovery.h
+
+// Ids below this one win against all data; a board sends them before whatever else waits in it.
+enum { CAN_ID_URGENT_END = 0x100 };
+
 // One per node, owned by the board; zeroed by can_stream_attach().
 struct can_stream {
-    uint8_t node_id;       // 0: none assigned
-    uint8_t must_announce; // a query for unassigned nodes is still to be answered
+    uint8_t node_id; // 0: none assigned
     uint32_t frames_in, frames_out;
+    struct discovery discovery;
+    struct bus_signals signals;
 };
 
 // Connects STREAM to NODE, before node_start() and again at every restart: the id is dropped.

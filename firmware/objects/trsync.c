@@ -4,7 +4,9 @@
 #include "objects/trsync.h"
 
 #include "boards/board.h"
+#include "net/bus_signals.h"
 
+DECL_STATIC_STRING(invalid_group, "Not a valid trigger group");
 DECL_STATIC_STRING(already_joined, "Can't add signal that is already active");
 
 DECL_RESPONSE(trsync_state, "trsync_state oid=%c can_trigger=%c trigger_reason=%c clock=%u");
@@ -14,6 +16,7 @@ struct trsync {
     struct trsync_member *members;
     uint32_t report_ticks, report_clock;
     uint8_t can_trigger, reason, expire_reason, must_report;
+    uint8_t group; // on the bus, or TRIGGER_GROUP_NONE
 };
 
 static const struct oid_type trsync_type = {"trsync"};
@@ -34,15 +37,30 @@ static void stop_members(struct node *node, struct trsync *trsync) {
     }
 }
 
-void trsync_trigger(struct node *node, struct trsync *trsync, uint8_t reason) {
-    if (!trsync->can_trigger)
-        return;
+static void trigger_alone(struct node *node, struct trsync *trsync, uint8_t reason) {
     trsync->can_trigger = 0;
     trsync->reason = reason;
     trsync->report_clock = board_clock(node);
     stop_members(node, trsync);
     trsync->must_report = 1;
     node_wake_tasks(node);
+}
+
+void trsync_trigger(struct node *node, struct trsync *trsync, uint8_t reason) {
+    if (!trsync->can_trigger)
+        return;
+    trigger_alone(node, trsync, reason);
+    if (trsync->group == TRIGGER_GROUP_NONE)
+        return;
+    bus_signals_trigger(node, trsync->group, reason, trsync->report_clock);
+    trsync_trigger_group(node, trsync->group, reason); // a node does not hear its own frames
+}
+
+void trsync_trigger_group(struct node *node, uint8_t group, uint8_t reason) {
+    struct trsync *trsync;
+    for (unsigned oid = 0; (trsync = oid_next(node, &oid, &trsync_type));)
+        if (trsync->can_trigger && trsync->group == group)
+            trigger_alone(node, trsync, reason);
 }
 
 void trsync_join(struct node *node, struct trsync *trsync, struct trsync_member *member) {
@@ -84,6 +102,7 @@ void command_config_trsync(struct node *node, const struct wire_arg *args) {
         return;
     trsync->report_timer.function = report_event;
     trsync->expire_timer.function = expire_event;
+    trsync->group = TRIGGER_GROUP_NONE;
 }
 DECL_COMMAND(command_config_trsync, "config_trsync oid=%c", 0);
 
@@ -95,6 +114,8 @@ void command_trsync_start(struct node *node, const struct wire_arg *args) {
     sched_delete_timer(node, &trsync->report_timer);
     sched_delete_timer(node, &trsync->expire_timer);
     stop_members(node, trsync); // of an earlier round that nobody ended
+    if (trsync->group != TRIGGER_GROUP_NONE)
+        bus_signals_forget_trigger(node, trsync->group);
     trsync->can_trigger = 1;
     trsync->reason = trsync->must_report = 0;
     trsync->report_timer.waketime = args[1].value;
@@ -118,6 +139,18 @@ void command_trsync_set_timeout(struct node *node, const struct wire_arg *args) 
     board_irq_restore(node, irq);
 }
 DECL_COMMAND(command_trsync_set_timeout, "trsync_set_timeout oid=%c clock=%u", 0);
+
+void command_trsync_set_group(struct node *node, const struct wire_arg *args) {
+    struct trsync *trsync = trsync_find(node, args[0].value);
+    if (!trsync)
+        return;
+    if (args[1].value >= TRIGGER_GROUPS && args[1].value != TRIGGER_GROUP_NONE) {
+        node_shutdown(node, STRING(invalid_group));
+        return;
+    }
+    trsync->group = (uint8_t)args[1].value;
+}
+DECL_COMMAND(command_trsync_set_group, "trsync_set_group oid=%c group=%c", 0);
 
 static void report(struct node *node, uint32_t oid, struct trsync *trsync) {
     trsync->must_report = 0;

@@ -18,7 +18,11 @@ struct trsync *trsync_find(struct node *node, uint32_t oid);
 // Interrupts must be off. Joining twice is a shutdown; a trsync that already triggered stops the member at
 // once.
 void trsync_join(struct node *node, struct trsync *trsync, struct trsync_member *member);
-// Stops all members if nothing did before. Interrupt context.
+// Stops all members if nothing did before, and tells the trsync's group, here and on the bus. Interrupts must
+// be off.
 void trsync_trigger(struct node *node, struct trsync *trsync, uint8_t reason);
+// Another node triggered GROUP: triggers every trsync of it that is armed, which tells nobody else. Interrupt
+// context.
+void trsync_trigger_group(struct node *node, uint8_t group, uint8_t reason);
 
 #endif

@@ -3,6 +3,11 @@
 from nodes.link.bus_io import LinkIO
 from nodes.link.link import Link
 from nodes.link.types import (
+    BusDriver,
+    BusLoad,
+    BusSettings,
+    Flow,
+    Forecast,
     Frame,
     IOStats,
     LinkError,
@@ -14,6 +19,11 @@ from nodes.link.types import (
 )
 
 __all__ = [
+    "BusDriver",
+    "BusLoad",
+    "BusSettings",
+    "Flow",
+    "Forecast",
     "Frame",
     "IOStats",
     "Link",

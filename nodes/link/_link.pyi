@@ -1,4 +1,4 @@
-"""cffi module; the functions are documented in nodes/link/link.h and nodes/link/io_thread.h."""
+"""cffi module; the functions are documented in link.h, io_core.h, io_api.h and io_thread.h."""
 
 from typing import Any
 

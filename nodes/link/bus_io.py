@@ -3,11 +3,16 @@
 import asyncio
 import errno
 import os
+from typing import Any, Self
 
-from nodes.link._link import ffi, lib
 from nodes.link.handle import BusHandle
 from nodes.link.link import Link, ResponsesHandler, TextHandler
+from nodes.link.thread_driver import ThreadDriver
 from nodes.link.types import (
+    BusDriver,
+    BusLoad,
+    BusSettings,
+    Forecast,
     Frame,
     FrameHandler,
     IOStats,
@@ -28,11 +33,13 @@ _ENDED_ADVICE = {
 
 
 class LinkIO:
-    """One bus or serial line: starts its I/O thread and hands over what arrives in LOOP's thread.
+    """One bus or serial line: its links, and what arrives on it, handed over in the event loop's thread.
 
-    ON_FRAME gets CAN frames that belong to no link, ON_CLOSED one sentence when the transport ends by itself.
-    The transport stays the caller's: close() here first, then the transport. Not thread-safe: use from the
-    loop's thread.
+    LinkIO(transport, loop) starts an I/O thread for the transport, which stays the caller's: close() here
+    first, then the transport. LinkIO.driven_by() takes a bus that something else drives, for example a
+    simulation. ON_FRAME gets CAN frames that belong to no link, ON_CLOSED one sentence when the transport
+    ends by itself. SETTINGS say what the bus can carry; without them a CAN transport's bit rate counts, where
+    it knows it. Not thread-safe: use from the loop's thread.
     """
 
     def __init__(
@@ -42,23 +49,44 @@ class LinkIO:
         *,
         on_frame: FrameHandler | None = None,
         on_closed: TextHandler | None = None,
+        settings: BusSettings | None = None,
     ) -> None:
-        self._transport = transport
-        self._loop = loop
+        if settings is None:
+            # A serial line's rate may be a mere word, as on USB: nothing is budgeted unless asked for.
+            serial = transport.kind == TransportKind.BYTES
+            settings = BusSettings(bitrate=0 if serial else getattr(transport, "bitrate", None) or 0)
+        self._attach(ThreadDriver(transport, loop, settings), on_frame, on_closed)
+
+    @classmethod
+    def driven_by(
+        cls,
+        driver: BusDriver,
+        *,
+        on_frame: FrameHandler | None = None,
+        on_closed: TextHandler | None = None,
+    ) -> Self:
+        """Use the bus of DRIVER, and close it with this object."""
+        io = cls.__new__(cls)
+        io._attach(driver, on_frame, on_closed)  # noqa: SLF001
+        return io
+
+    def _attach(
+        self, driver: BusDriver, on_frame: FrameHandler | None, on_closed: TextHandler | None
+    ) -> None:
+        self._serial = driver.serial
         self._on_frame = on_frame
         self._on_closed = on_closed
         self._links: dict[int, Link] = {}
-        self._final = ffi.new("struct io_stats *")
-        self._events = ffi.new("struct io_event[]", _BATCH)
-        os.set_blocking(transport.fileno(), False)
-        self._bus = BusHandle(transport.name, transport.fileno(), int(transport.kind))
-        self._notice_fd = lib.io_notice_fd(self._bus.live())
-        loop.add_reader(self._notice_fd, self._handle_events)
+        self._bus = BusHandle(driver)
+        self._lib, self._ffi = driver.lib, driver.ffi
+        self._final = self._ffi.new("struct io_stats *")
+        self._events = self._ffi.new("struct io_event[]", _BATCH)
+        driver.listen(self._handle_events)
 
     @property
     def name(self) -> str:
         """The transport's name."""
-        return self._transport.name
+        return self._bus.name
 
     def open_link(
         self, settings: LinkSettings, *, on_responses: ResponsesHandler, on_lost: TextHandler
@@ -69,23 +97,24 @@ class LinkIO:
         the link takes no more commands. Raises LinkError on bad settings, a taken node id, or
         a transport that has ended.
         """
-        serial = self._transport.kind == TransportKind.BYTES
         where = f"{self.name}: node {settings.nodeid}"
-        if serial != (settings.nodeid is None) or not 1 <= (settings.nodeid or 1) <= 255:
+        if self._serial != (settings.nodeid is None) or not 1 <= (settings.nodeid or 1) <= 255:
             raise LinkError(f"{where}: a link needs a node id of 1..255 on CAN and none on a serial line")
-        if settings.receive_window < lib.LINK_WINDOW_MIN:
+        if settings.receive_window < self._lib.LINK_WINDOW_MIN:
             raise LinkError(
                 f"{where}: a receive window of {settings.receive_window} bytes cannot hold a block; "
-                f"{lib.LINK_WINDOW_MIN} is the least"
+                f"{self._lib.LINK_WINDOW_MIN} is the least"
             )
         if not 1e-3 <= settings.lost_after_s <= 3600:
             raise LinkError(f"{where}: lost_after_s={settings.lost_after_s} is not within 0.001..3600 s")
         lost_after_ns = round(settings.lost_after_s * 1e9)
-        c_settings = ffi.new("struct link_settings *", (settings.receive_window, lost_after_ns))
-        number = ffi.new("uint32_t *")
-        status = lib.io_open_link(self._bus.live(), settings.nodeid or 0, c_settings, number)
-        if status == lib.IO_TAKEN:
-            raise LinkError(f"{where}: there is a link with this id already, or {lib.IO_LINKS_MAX} links")
+        c_settings = self._ffi.new("struct link_settings *", (settings.receive_window, lost_after_ns))
+        number = self._ffi.new("uint32_t *")
+        status = self._lib.io_open_link(self._bus.live(), settings.nodeid or 0, c_settings, number)
+        if status == self._lib.IO_TAKEN:
+            raise LinkError(
+                f"{where}: there is a link with this id already, or {self._lib.IO_LINKS_MAX} links"
+            )
         self._bus.check(status, where)
         link = Link(
             self._bus,
@@ -98,24 +127,42 @@ class LinkIO:
         self._links[number[0]] = link
         return link
 
+    def learn_bitrate(self, bitrate: int) -> None:
+        """Take BITRATE (bit/s) for what the bus carries, unless that is known already."""
+        if self.stats().bitrate == 0 < bitrate:
+            self._lib.io_set_bitrate(self._bus.live(), bitrate)
+
     def send_frame(self, can_id: int, data: bytes) -> None:
         """Send one CAN frame that belongs to no link, before all data. Raises LinkError when it cannot."""
-        status = lib.io_send_frame(self._bus.live(), can_id, ffi.from_buffer(data), len(data))
-        if status == lib.IO_INVALID:
+        status = self._lib.io_send_frame(self._bus.live(), can_id, self._ffi.from_buffer(data), len(data))
+        if status == self._lib.IO_INVALID:
             raise LinkError(
                 f"{self.name}: a frame of {len(data)} bytes; CAN frames have 0..8, serial lines none"
             )
-        if status == lib.IO_FULL:
+        if status == self._lib.IO_FULL:
             raise LinkError(
-                f"{self.name}: {lib.IO_ADMIN_MAX} admin frames wait already; the bus does not take them"
+                f"{self.name}: {self._lib.IO_ADMIN_MAX} admin frames wait already; the bus does not take them"
             )
         self._bus.check(status, self.name)
 
     def stats(self) -> IOStats:
         """Return the counters so far; after close(), the last ones."""
         if self._bus.open:
-            lib.io_get_stats(self._bus.live(), self._final)
-        return IOStats(**{name: getattr(self._final, name) for name in IOStats.__slots__})
+            self._lib.io_get_stats(self._bus.live(), self._final)
+        return _convert(self._final, self._lib)
+
+    def forecast(self) -> Forecast:
+        """Return whether the queued motion will be in time; raises LinkError after close()."""
+        out = self._ffi.new("struct io_forecast *")
+        self._lib.io_forecast(self._bus.live(), out)
+        return Forecast(
+            now_ns=out.now_ns,
+            worst_ratio=out.worst_ratio,
+            at_ns=out.at_ns,
+            late_ns=out.late_ns or None,
+            motion_bits_per_s=out.motion_bits_per_s,
+            queued_bits=out.queued_bits,
+        )
 
     def close(self) -> None:
         """Close the links and join the thread. Further calls do nothing."""
@@ -124,43 +171,45 @@ class LinkIO:
         for link in list(self._links.values()):
             link.close()
         self.stats()
-        self._loop.remove_reader(self._notice_fd)
         self._bus.close()
 
     def _handle_events(self) -> None:
         # A callback may close this bus or any link: every step looks again.
         taken = _BATCH
         while taken == _BATCH and self._bus.open:
-            taken = lib.io_take(self._bus.live(), self._events, _BATCH)
+            taken = self._lib.io_take(self._bus.live(), self._events, _BATCH)
             self._hand_over(taken)
 
     def _hand_over(self, taken: int) -> None:
         responses: dict[int, list[Response]] = {}
-        others: list[tuple[int, int, int, Frame]] = []
+        frames: list[Frame] = []
+        notices: list[tuple[int, int, int]] = []
         for i in range(taken):
             event = self._events[i]
-            content = bytes(ffi.buffer(event.content)[: event.size])
-            if event.notice == lib.IO_RESPONSE:
+            content = bytes(self._ffi.buffer(event.content)[: event.size])
+            if event.notice == self._lib.IO_RESPONSE:
                 response = Response(content, event.sent_ns, event.received_ns)
                 responses.setdefault(event.link, []).append(response)
+            elif event.notice == self._lib.IO_FRAME:
+                frames.append(Frame(event.can_id, content, event.received_ns))
             else:
-                frame = Frame(event.can_id, content, event.received_ns)
-                others.append((event.notice, event.link, event.value, frame))
+                notices.append((event.notice, event.link, event.value))
+        # Frames first: one with which a node stops its bus tells why, what the others then report does not.
+        for frame in frames:
+            if self._bus.open and self._on_frame:
+                self._on_frame(frame)
         for number, batch in responses.items():
             if link := self._links.get(number):
                 link.handle_responses(batch)
-        for notice, number, value, frame in others:
+        for notice in notices:
             if self._bus.open:
-                self._hand_over_other(notice, number, value, frame)
+                self._handle_notice(*notice)
 
-    def _hand_over_other(self, notice: int, number: int, value: int, frame: Frame) -> None:
-        if notice == lib.IO_FRAME:
-            if self._on_frame:
-                self._on_frame(frame)
-        elif notice == lib.IO_ENDED:
+    def _handle_notice(self, notice: int, number: int, value: int) -> None:
+        if notice == self._lib.IO_ENDED:
             self._handle_ended(value)
         elif link := self._links.get(number):
-            if notice == lib.IO_DRAINED:
+            if notice == self._lib.IO_DRAINED:
                 link.handle_drained()
             else:
                 link.handle_lost(value)
@@ -173,3 +222,30 @@ class LinkIO:
             link.handle_ended(self._bus.ended)
         if self._on_closed:
             self._on_closed(self._bus.ended)
+
+
+_COUNTERS = (
+    *("frames_sent", "frames_received", "frames_unclaimed", "frames_dropped", "frames_malformed"),
+    *("responses_dropped", "responses_max", "unclaimed_max", "admin_max", "bytes_sent", "bytes_received"),
+    *("waits", "wakeups", "bitrate", "received_bits", "queue_frames", "queued_max", "queue_waits"),
+)
+
+
+def _convert(raw: Any, lib: Any) -> IOStats:
+    rate = raw.bitrate or 1
+    flows = {
+        "motion": lib.LINK_MOTION,
+        "control": lib.LINK_CONTROL,
+        "bulk": lib.LINK_BULK,
+        "acks": lib.SCHEDULE_ACKS,
+        "data": lib.SCHEDULE_DATA,
+        "weak": lib.SCHEDULE_WEAK,
+    }
+    return IOStats(
+        **{name: getattr(raw, name) for name in _COUNTERS},
+        motion_bits=raw.sent_bits[lib.LINK_MOTION],
+        control_bits=raw.sent_bits[lib.LINK_CONTROL],
+        bulk_bits=raw.sent_bits[lib.LINK_BULK],
+        load=BusLoad(**{name: raw.recent_bits[number] / rate for name, number in flows.items()}),
+        held_s=raw.held_ns * 1e-9,
+    )

@@ -1,21 +1,22 @@
-"""What a bus and its links share: the C thread's handle, and the words for its refusals."""
+"""What a bus and its links share: the driver's C side, and the words for its refusals."""
 
 from typing import Any
 
-from nodes.link._link import ffi, lib
-from nodes.link.types import LinkError
+from nodes.link.types import BusDriver, LinkError
 
 
 class BusHandle:
-    """Owns the C side of one bus. NAME is the transport's, for messages."""
+    """Owns the driver of one bus."""
 
-    def __init__(self, name: str, fd: int, kind: int) -> None:
-        self.name = name
+    def __init__(self, driver: BusDriver) -> None:
+        self._driver = driver
+        self.name = driver.name
+        """The transport's name, for messages."""
+        self.ffi = driver.ffi
+        self.lib = driver.lib
         self.ended: str | None = None
         """One sentence, once the transport has ended by itself."""
-        self._bus: Any = lib.io_start(fd, kind)
-        if self._bus == ffi.NULL:
-            raise LinkError(f"{name}: cannot start the I/O thread; out of memory or threads")
+        self._bus: Any = driver.bus
 
     @property
     def open(self) -> bool:
@@ -29,17 +30,17 @@ class BusHandle:
         return self._bus
 
     def close(self) -> None:
-        """Join the thread and free the bus."""
-        bus, self._bus = self._bus, None
-        lib.io_stop(bus)
+        """End the driver, which frees the bus."""
+        self._bus = None
+        self._driver.close()
 
     def check(self, status: int, where: str) -> None:
         """Raise LinkError for what can happen to any call."""
-        if status == lib.IO_OK:
+        if status == self.lib.IO_OK:
             return
-        if status == lib.IO_CLOSED:
-            # The thread may know before the notice has come through the loop.
+        if status == self.lib.IO_CLOSED:
+            # The driver may know before the notice has come through the loop.
             raise LinkError(self.ended or f"{self.name}: the transport has just failed; open it again")
-        if status == lib.IO_NO_MEMORY:
+        if status == self.lib.IO_NO_MEMORY:
             raise LinkError(f"{where}: no memory for a further link")
-        raise LinkError(f"{where}: refused by the I/O thread (status {status}); an argument is out of range")
+        raise LinkError(f"{where}: refused by the bus (status {status}); an argument is out of range")

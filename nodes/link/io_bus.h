@@ -1,15 +1,38 @@
 // SPDX-License-Identifier: Apache-2.0
-// The inside of an I/O thread, shared by io_thread.c (thread, events), io_links.c (what is asked of links),
-// io_transfer.c (bytes and frames) and io_schedule.c (whose turn it is); not for others. Every function here
-// wants the mutex held.
+// The inside of a bus's core, shared by io_core.c (life, notices), io_links.c (what is asked of links),
+// io_receive.c, io_send.c (bytes and frames), io_schedule.c (whose turn it is), io_forecast.c (whether motion
+// will be in time) and io_stats.c (counters); not for others. Every function here wants the driver's lock
+// held.
 #ifndef LINK_IO_BUS_H
 #define LINK_IO_BUS_H
 
 #include <linux/can.h>
-#include <pthread.h>
 
-#include "nodes/link/io_thread.h"
+#include "nodes/link/io_api.h"
 #include "nodes/link/link.h"
+
+enum {
+    IO_FRAME_SIZE = sizeof(struct can_frame),
+    IO_DATA_MAX = 8,
+    IO_DATA_ID = 0x100,       // + 2 * node id: to the node
+    IO_ADMIN_LAST_ID = 0x3F1, // ids above it are nobody's whom we know
+    IO_CUT_MAX = IO_DATA_MAX - 1 + LINK_WIRE_MAX,
+    IO_SEGMENTS = 512, // of queued motion, per link
+};
+
+// Motion commands that are due within a few ms of each other, for the forecast.
+struct io_segment {
+    uint64_t start, end;           // positions in the motion queue
+    uint64_t min_clock, req_clock; // the earliest of them, node ticks
+    uint32_t content;              // bytes
+};
+
+// Counters as last published, read without a lock: SEQUENCE is odd while they are written.
+struct io_snapshot {
+    uint64_t sequence;
+    uint64_t number; // of the link; 0: none
+    struct io_link_stats stats;
+};
 
 struct io_link {
     struct link link;
@@ -19,8 +42,17 @@ struct io_link {
     uint8_t lost_told;     // and was given
     uint8_t watch_drained; // an IO_DRAINED was asked for
     uint8_t drained_pending;
+    uint8_t cut[IO_CUT_MAX]; // bytes of blocks that are being cut into frames
+    size_t cut_at, cut_size;
+    struct link_offer cut_offer; // of the newest block in there
+    uint8_t changed;             // since its counters were published
+    struct io_snapshot *snapshot;
+    struct io_flow flows[LINK_CLASSES], received;
+    struct io_segment segments[IO_SEGMENTS];
+    size_t segment_first, segment_count;
     uint8_t control_memory[IO_CONTROL_BYTES];
     uint8_t motion_memory[IO_MOTION_BYTES];
+    uint8_t bulk_memory[IO_BULK_BYTES];
 };
 
 // A bounded ring that drops its oldest entry when full.
@@ -30,47 +62,61 @@ struct io_ring {
 };
 
 struct io_bus {
-    int fd, wake_fd, notice_fd;
+    struct io_driver driver;
+    void *context;
+    struct io_settings settings;
+    struct schedule schedule;
     enum io_kind kind;
-    pthread_t thread;
-    pthread_mutex_t mutex;
-    uint8_t stopping;
-    uint8_t sleeping;      // the thread sleeps, or is about to
-    uint8_t noticed;       // notice_fd is readable
-    uint8_t ended;         // the transport is of no more use
-    uint8_t ended_pending; // an IO_ENDED is due
+    unsigned allowed;                   // classes that may send, at the last io_next()
+    uint64_t hold_ns;                   // what may not go now may then; UINT64_MAX: there is nothing
+    double motion_bits, motion_content; // what motion has cost, for the forecast: bits for so many bytes
+    uint8_t noticed;                    // the driver was told that io_take() has something
+    uint8_t ended;                      // the transport is of no more use
+    uint8_t ended_pending;              // an IO_ENDED is due
     int32_t ended_errno;
     uint32_t last_number;
-    uint64_t sleep_until_ns; // when the sleeping thread wakes by itself
-    size_t turn;             // link after the one that was served last
+    size_t turn; // link after the one that was served last
     size_t link_count;
     struct io_link *links[IO_LINKS_MAX];
     struct io_link *by_nodeid[256];
     struct io_ring responses, unclaimed;
     struct can_frame admin[IO_ADMIN_MAX]; // to be sent
     size_t admin_first, admin_count;
-    uint8_t out[IO_OUT_FRAMES * sizeof(struct can_frame)]; // bytes for the kernel: frames, or a serial line's
-    size_t out_at, out_size;
-    uint8_t in[64 * sizeof(struct can_frame)];
-    size_t in_used;      // IO_CAN_STREAM: bytes of a frame that is not complete
-    uint64_t retry_ns;   // the kernel has no buffers; try again then. 0: it has
-    uint8_t kernel_full; // wait until the descriptor is writable
+    uint8_t rest[IO_FRAME_SIZE]; // IO_CAN_STREAM: bytes of a received frame that is not complete
+    size_t rest_size;
     struct io_stats stats;
+    uint64_t published_sequence;
+    struct io_stats published;
+    struct io_snapshot snapshots[IO_LINKS_MAX];
 };
 
-// io_transfer.c: read all there is; write all that may go.
-void io_read_all(struct io_bus *bus, uint64_t now);
-void io_write_all(struct io_bus *bus, uint64_t now);
-void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, size_t size, uint64_t now);
-void io_end(struct io_bus *bus, int cause);
+// io_core.c
+void io_lock(struct io_bus *bus);
+void io_unlock(struct io_bus *bus);
 void io_notify(struct io_bus *bus);
+void io_push(struct io_bus *bus, struct io_ring *ring, const struct io_event *event, uint64_t *dropped,
+             uint64_t *most);
+void io_note_states(struct io_bus *bus); // notes what Python has to hear of
 
-// io_thread.c: notes what Python has to hear of; sends from the caller's thread what was queued.
-void io_note_states(struct io_bus *bus);
-void io_send_now(struct io_bus *bus);
+// io_receive.c: bytes of one node; none: time may have given up a cut-off block.
+void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, size_t size, uint64_t now);
 
-// io_schedule.c: the link that shall send its next block now, or NULL; and that it did.
-struct io_link *io_next_link(const struct io_bus *bus, uint64_t now);
+// io_schedule.c: the link that shall send next of the classes in ALLOWED, or NULL. What is left to cut of a
+// block counts as an offer, but not that of ENDING, which has come to a block's end. *best: its offer. And
+// that it did.
+struct io_link *io_next_link(const struct io_bus *bus, uint64_t now, unsigned allowed,
+                             const struct io_link *ending, struct link_offer *best);
 void io_served(struct io_bus *bus, const struct io_link *node);
+
+// Bits of a frame for the budget; 0 while the bit rate is unknown.
+uint32_t io_frame_bits(const struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size);
+uint32_t io_serial_bits(const struct io_bus *bus, size_t size);
+
+// io_forecast.c: notes a batch that was put into the motion queue; forgets all that was queued.
+void io_note_batch(struct io_link *node, const uint8_t *batch, size_t size);
+void io_note_motion_dropped(struct io_link *node);
+
+// io_stats.c: makes what changed readable.
+void io_publish(struct io_bus *bus);
 
 #endif

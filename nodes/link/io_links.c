@@ -7,6 +7,17 @@
 
 // --------------------------------------------------------------------------------------------------- links
 
+// There are as many places as links.
+static void open_snapshot(struct io_bus *bus, struct io_link *node) {
+    struct io_snapshot *place = bus->snapshots;
+    while (place->number)
+        place++;
+    node->snapshot = place;
+    node->changed = 1;
+    io_publish(bus);
+    __atomic_store_n(&place->number, node->number, __ATOMIC_RELEASE);
+}
+
 static enum io_status add_link(struct io_bus *bus, unsigned nodeid, const struct link_settings *settings,
                                uint32_t *number) {
     int taken = bus->kind == IO_BYTES ? bus->link_count > 0 : bus->by_nodeid[nodeid] != NULL;
@@ -15,11 +26,16 @@ static enum io_status add_link(struct io_bus *bus, unsigned nodeid, const struct
     struct io_link *node = calloc(1, sizeof *node);
     if (!node)
         return IO_NO_MEMORY;
-    link_init(&node->link, settings, node->control_memory, IO_CONTROL_BYTES, node->motion_memory,
-              IO_MOTION_BYTES);
+    const struct link_memory memories[LINK_CLASSES] = {
+        [LINK_MOTION] = {node->motion_memory, IO_MOTION_BYTES},
+        [LINK_CONTROL] = {node->control_memory, IO_CONTROL_BYTES},
+        [LINK_BULK] = {node->bulk_memory, IO_BULK_BYTES},
+    };
+    link_init(&node->link, settings, memories);
     node->nodeid = (uint8_t)nodeid;
     node->number = *number = ++bus->last_number;
     bus->links[bus->link_count++] = node;
+    open_snapshot(bus, node);
     if (bus->kind != IO_BYTES)
         bus->by_nodeid[nodeid] = node;
     return IO_OK;
@@ -30,9 +46,9 @@ enum io_status io_open_link(struct io_bus *bus, unsigned nodeid, const struct li
     if (nodeid > 255 || (bus->kind == IO_BYTES) != (nodeid == 0) || !settings->lost_after_ns ||
         settings->receive_window < LINK_WINDOW_MIN)
         return IO_INVALID;
-    pthread_mutex_lock(&bus->mutex);
+    io_lock(bus);
     enum io_status status = bus->ended ? IO_CLOSED : add_link(bus, nodeid, settings, number);
-    pthread_mutex_unlock(&bus->mutex);
+    io_unlock(bus);
     return status;
 }
 
@@ -44,30 +60,35 @@ static size_t index_of(const struct io_bus *bus, uint32_t number) {
 }
 
 void io_close_link(struct io_bus *bus, uint32_t number) {
-    pthread_mutex_lock(&bus->mutex);
+    io_lock(bus);
     size_t at = index_of(bus, number);
     if (at < bus->link_count) {
         struct io_link *node = bus->links[at];
         bus->by_nodeid[node->nodeid] = NULL;
         bus->link_count--;
+        __atomic_store_n(&node->snapshot->number, 0, __ATOMIC_RELEASE);
         memmove(bus->links + at, bus->links + at + 1, (bus->link_count - at) * sizeof *bus->links);
         free(node);
     }
-    pthread_mutex_unlock(&bus->mutex);
+    io_unlock(bus);
 }
 
 // Locks the bus and finds the link; NULL (and *status): it cannot be used.
 static struct io_link *enter(struct io_bus *bus, uint32_t number, enum io_status *status) {
-    pthread_mutex_lock(&bus->mutex);
+    io_lock(bus);
     size_t at = index_of(bus, number);
     *status = bus->ended ? IO_CLOSED : at == bus->link_count ? IO_GONE : IO_OK;
-    return *status == IO_OK ? bus->links[at] : NULL;
+    if (*status != IO_OK)
+        return NULL;
+    bus->links[at]->changed = 1;
+    return bus->links[at];
 }
 
 static enum io_status leave(struct io_bus *bus, enum io_status status) {
     if (status == IO_OK)
-        io_send_now(bus);
-    pthread_mutex_unlock(&bus->mutex);
+        bus->driver.kick(bus->context);
+    io_publish(bus);
+    io_unlock(bus);
     return status;
 }
 
@@ -77,12 +98,13 @@ static enum io_status from_link(enum link_status status) {
     return same[status];
 }
 
-enum io_status io_send(struct io_bus *bus, uint32_t number, const uint8_t *content, size_t size,
-                       uint64_t min_clock, uint64_t req_clock) {
+enum io_status io_send(struct io_bus *bus, uint32_t number, enum link_class kind, const uint8_t *content,
+                       size_t size, uint64_t min_clock, uint64_t req_clock) {
     enum io_status status;
     struct io_link *node = enter(bus, number, &status);
     if (node)
-        status = from_link(link_send(&node->link, content, size, min_clock, req_clock));
+        status = from_link(
+            link_send(&node->link, kind, content, size, min_clock, req_clock, bus->driver.now(bus->context)));
     return leave(bus, status);
 }
 
@@ -91,6 +113,8 @@ enum io_status io_send_batch(struct io_bus *bus, uint32_t number, const uint8_t 
     struct io_link *node = enter(bus, number, &status);
     if (node)
         status = from_link(link_send_batch(&node->link, batch, size));
+    if (status == IO_OK)
+        io_note_batch(node, batch, size);
     return leave(bus, status);
 }
 
@@ -98,7 +122,9 @@ enum io_status io_send_urgent(struct io_bus *bus, uint32_t number, const uint8_t
     enum io_status status;
     struct io_link *node = enter(bus, number, &status);
     if (node)
-        status = from_link(link_send_urgent(&node->link, content, size));
+        status = from_link(link_send_urgent(&node->link, content, size, bus->driver.now(bus->context)));
+    if (status == IO_OK)
+        io_note_motion_dropped(node);
     return leave(bus, status);
 }
 
@@ -130,9 +156,9 @@ enum io_status io_watch_drained(struct io_bus *bus, uint32_t number) {
 }
 
 enum io_status io_send_frame(struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size) {
-    if (size > CAN_MAX_DLEN || bus->kind == IO_BYTES)
+    if (size > IO_DATA_MAX || bus->kind == IO_BYTES)
         return IO_INVALID;
-    pthread_mutex_lock(&bus->mutex);
+    io_lock(bus);
     if (bus->ended || bus->admin_count == IO_ADMIN_MAX)
         return leave(bus, bus->ended ? IO_CLOSED : IO_FULL);
     struct can_frame *frame = &bus->admin[(bus->admin_first + bus->admin_count++) % IO_ADMIN_MAX];
@@ -141,41 +167,4 @@ enum io_status io_send_frame(struct io_bus *bus, uint32_t can_id, const uint8_t 
     if (bus->admin_count > bus->stats.admin_max)
         bus->stats.admin_max = bus->admin_count;
     return leave(bus, IO_OK);
-}
-
-// ------------------------------------------------------------------------------------------------ counters
-
-enum io_status io_get_link_stats(struct io_bus *bus, uint32_t number, struct io_link_stats *out) {
-    enum io_status status;
-    struct io_link *node = enter(bus, number, &status);
-    if (!node) {
-        size_t at = index_of(bus, number);
-        node = at < bus->link_count ? bus->links[at] : NULL; // the counters of an ended bus stay readable
-    }
-    if (node) {
-        const struct link *link = &node->link;
-        const struct link_queue *control = &link->control, *motion = &link->motion;
-        *out = (struct io_link_stats){
-            .pending = link_pending(link),
-            .control_commands = control->commands,
-            .control_bytes = link_queue_bytes(control),
-            .control_commands_max = control->commands_max,
-            .control_bytes_max = control->bytes_max,
-            .motion_commands = motion->commands,
-            .motion_bytes = link_queue_bytes(motion),
-            .motion_commands_max = motion->commands_max,
-            .motion_bytes_max = motion->bytes_max,
-            .flying_bytes = link->flying_bytes,
-            .flying_blocks = link->next - link->first,
-        };
-        link_get_stats(link, &out->link);
-    }
-    pthread_mutex_unlock(&bus->mutex);
-    return node ? IO_OK : status;
-}
-
-void io_get_stats(struct io_bus *bus, struct io_stats *out) {
-    pthread_mutex_lock(&bus->mutex);
-    *out = bus->stats;
-    pthread_mutex_unlock(&bus->mutex);
 }

@@ -1,17 +1,24 @@
 // SPDX-License-Identifier: Apache-2.0
-// Whose turn it is on a bus. The seam for a scheduler that budgets bits: it decides here and nowhere else.
+// Whose turn it is on a bus, and what a frame costs.
+#include "nodes/can_bits.h"
 #include "nodes/link/io_bus.h"
 
-// Earliest deadline first; repeats and control are due at once. Among equals the turn goes round.
-struct io_link *io_next_link(const struct io_bus *bus, uint64_t now) {
-    uint64_t earliest_ns = UINT64_MAX;
+enum { BITS_PER_BYTE = 10 }; // of a serial line: start, eight, stop
+
+// Earliest deadline first over all nodes; among equals the turn goes round.
+struct io_link *io_next_link(const struct io_bus *bus, uint64_t now, unsigned allowed,
+                             const struct io_link *ending, struct link_offer *best) {
     struct io_link *chosen = NULL;
     for (size_t i = 0; i < bus->link_count; i++) {
         struct io_link *node = bus->links[(bus->turn + i) % bus->link_count];
-        uint64_t due_ns = link_next_due(&node->link, now);
-        if (due_ns < earliest_ns) {
-            earliest_ns = due_ns;
+        struct link_offer offer;
+        if (node->cut_at < node->cut_size && node != ending)
+            offer = node->cut_offer;
+        else if (!link_next_offer(&node->link, now, allowed, &offer))
+            continue;
+        if (!chosen || schedule_before(&offer, best, now)) {
             chosen = node;
+            *best = offer;
         }
     }
     return chosen;
@@ -21,4 +28,12 @@ void io_served(struct io_bus *bus, const struct io_link *node) {
     for (size_t i = 0; i < bus->link_count; i++)
         if (bus->links[i] == node)
             bus->turn = i + 1;
+}
+
+uint32_t io_frame_bits(const struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size) {
+    return bus->schedule.bitrate ? can_frame_bits(can_id & CAN_SFF_MASK, (uint32_t)size, data) : 0;
+}
+
+uint32_t io_serial_bits(const struct io_bus *bus, size_t size) {
+    return bus->schedule.bitrate ? (uint32_t)size * BITS_PER_BYTE : 0;
 }

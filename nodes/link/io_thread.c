@@ -1,23 +1,45 @@
 // SPDX-License-Identifier: Apache-2.0
-// The thread of a bus and the functions Python calls.
+// The thread that drives a bus over a file descriptor.
 #define _GNU_SOURCE
 #include "nodes/link/io_thread.h"
 
 #include <errno.h>
+#include <linux/can.h>
+#include <linux/sock_diag.h>
 #include <poll.h>
+#include <pthread.h>
 #include <stdlib.h>
-#include <string.h>
 #include <sys/eventfd.h>
+#include <sys/ioctl.h>
 #include <sys/prctl.h>
 #include <sys/socket.h>
 #include <time.h>
 #include <unistd.h>
 
-#include "nodes/link/io_bus.h"
-
 #define NS_PER_S 1000000000ULL
+// SocketCAN answers ENOBUFS while the interface's queue is full, but calls the socket writable: only time
+// helps. A full frame lasts 111 µs and more.
+#define NO_BUFFERS_NS 300000ULL
 
-enum { KERNEL_FRAMES = 16 };
+enum { KERNEL_FRAMES = 16, FRAME = sizeof(struct can_frame), SKB_BYTES = 768, WRITES = 32 };
+
+struct io_thread {
+    int fd, wake_fd, notice_fd;
+    enum io_kind kind;
+    struct io_bus *bus;
+    pthread_t thread;
+    pthread_mutex_t mutex;
+    uint8_t stopping;
+    uint8_t sleeping;        // the thread sleeps, or is about to
+    uint8_t kernel_full;     // wait until the descriptor is writable
+    uint64_t retry_ns;       // the kernel has no buffers; try again then. 0: it has
+    uint64_t sleep_until_ns; // when the sleeping thread wakes by itself
+    uint8_t out[IO_OUT_FRAMES * FRAME];
+    size_t out_at, out_size;
+    uint8_t in[64 * FRAME];
+    uint8_t write_frames[WRITES]; // of the last writes, to tell frames from the kernel's buffers
+    unsigned writes;
+};
 
 static uint64_t monotonic_ns(void) {
     struct timespec now;
@@ -25,118 +47,189 @@ static uint64_t monotonic_ns(void) {
     return (uint64_t)now.tv_sec * NS_PER_S + (uint64_t)now.tv_nsec;
 }
 
+// ------------------------------------------------------------------------------------------------ transfer
+
+static void read_all(struct io_thread *thread, uint64_t now) {
+    // Bounded, so that a flood cannot keep the thread from sending; what is left wakes it again at once.
+    // Enough for all that waits after a stall of the host, lest an acknowledgement in there count as late.
+    for (int rounds = 0; rounds < 1024 && !io_ended(thread->bus); rounds++) {
+        size_t room = thread->kind == IO_CAN_PACKET ? FRAME : sizeof thread->in;
+        ssize_t size = read(thread->fd, thread->in, room);
+        if (size > 0) {
+            io_received(thread->bus, thread->in, (size_t)size, now);
+            if (thread->kind != IO_CAN_PACKET && (size_t)size < room)
+                return; // a stream gave less than there was room for: it is empty
+        } else if (size == 0) {
+            io_end(thread->bus, 0);
+        } else if (errno == EAGAIN || errno == EWOULDBLOCK) {
+            return;
+        } else if (errno != EINTR) {
+            io_end(thread->bus, errno);
+        }
+    }
+}
+
+// Hands bytes to the kernel; returns 0 when it takes no more.
+static int flush(struct io_thread *thread, uint64_t now) {
+    while (thread->out_at < thread->out_size) {
+        size_t size = thread->kind == IO_CAN_PACKET ? FRAME : thread->out_size - thread->out_at;
+        ssize_t done = write(thread->fd, thread->out + thread->out_at, size);
+        if (done > 0) {
+            thread->out_at += (size_t)done;
+            thread->write_frames[thread->writes++ % WRITES] = (uint8_t)((size_t)done / FRAME);
+            continue;
+        }
+        if (done < 0 && errno == EINTR)
+            continue;
+        if (done < 0 && errno == ENOBUFS)
+            thread->retry_ns = now + NO_BUFFERS_NS;
+        else if (done == 0 || errno == EAGAIN || errno == EWOULDBLOCK)
+            thread->kernel_full = 1;
+        else
+            io_end(thread->bus, errno);
+        io_count_wait(thread->bus);
+        return 0;
+    }
+    return 1;
+}
+
+// How many frames the kernel still has, as far as it tells; a serial line: bytes. It counts buffers,
+// SKB_BYTES for a write of up to some ten frames (measured on x86-64: AF_UNIX, and vcan, where a frame has
+// one of its own). Whether frames wait behind the kernel, in an adapter or in the virtual bus, nobody tells:
+// the core estimates that from the bit rate, so the greater of the two counts.
+static uint64_t queued(const struct io_thread *thread) {
+    if (!io_bounds_queue(thread->bus))
+        return 0;
+    int bytes = 0;
+    if (thread->kind == IO_BYTES)
+        return ioctl(thread->fd, TIOCOUTQ, &bytes) == 0 ? (uint64_t)bytes : IO_QUEUED_UNKNOWN;
+    uint32_t memory[SK_MEMINFO_VARS];
+    socklen_t size = sizeof memory;
+    if (getsockopt(thread->fd, SOL_SOCKET, SO_MEMINFO, memory, &size) != 0)
+        return IO_QUEUED_UNKNOWN;
+    uint64_t frames = 0;
+    unsigned buffers = memory[SK_MEMINFO_WMEM_ALLOC] / SKB_BYTES;
+    for (unsigned i = 1; i <= buffers && i <= WRITES && i <= thread->writes; i++)
+        frames += thread->write_frames[(thread->writes - i) % WRITES];
+    return frames;
+}
+
+static void write_all(struct io_thread *thread, uint64_t now) {
+    if (io_ended(thread->bus) || thread->kernel_full || now < thread->retry_ns)
+        return;
+    thread->retry_ns = 0;
+    while (flush(thread, now)) {
+        thread->out_at = 0;
+        thread->out_size = io_next(thread->bus, now, queued(thread), thread->out, sizeof thread->out);
+        if (thread->out_size == 0)
+            return;
+    }
+}
+
 // -------------------------------------------------------------------------------------------------- thread
 
-void io_note_states(struct io_bus *bus) {
-    for (size_t i = 0; i < bus->link_count; i++) {
-        struct io_link *node = bus->links[i];
-        if (node->link.state == LINK_LOST && !node->lost_told) {
-            node->lost_told = node->lost_pending = 1;
-            io_notify(bus);
-        }
-        if (node->watch_drained && link_pending(&node->link) == 0) {
-            node->watch_drained = 0;
-            node->drained_pending = 1;
-            io_notify(bus);
-        }
-    }
-}
-
-static void handle_timers(struct io_bus *bus, uint64_t now) {
-    for (size_t i = 0; i < bus->link_count && !bus->ended; i++) {
-        io_deliver(bus, bus->links[i], NULL, 0, now);
-        link_handle_timer(&bus->links[i]->link, now);
-    }
-}
-
-static uint64_t next_deadline(const struct io_bus *bus, uint64_t now) {
-    if (bus->ended)
-        return UINT64_MAX;
-    uint64_t at_ns = bus->retry_ns ? bus->retry_ns : UINT64_MAX;
-    for (size_t i = 0; i < bus->link_count; i++) {
-        uint64_t link_ns = link_deadline(&bus->links[i]->link, now);
-        at_ns = link_ns < at_ns ? link_ns : at_ns;
-    }
-    return at_ns;
+static uint64_t next_deadline(const struct io_thread *thread, uint64_t now) {
+    uint64_t at_ns = io_deadline(thread->bus, now);
+    return thread->retry_ns && !io_ended(thread->bus) && thread->retry_ns < at_ns ? thread->retry_ns : at_ns;
 }
 
 // Sleeps until the descriptor, a caller or time asks for work; returns what poll saw on the descriptor.
-static short sleep_unlocked(struct io_bus *bus, uint64_t now) {
-    struct pollfd fds[2] = {{.fd = bus->ended ? -1 : bus->fd, .events = POLLIN},
-                            {.fd = bus->wake_fd, .events = POLLIN}};
-    if (bus->kernel_full)
+static short sleep_unlocked(struct io_thread *thread, uint64_t now) {
+    struct pollfd fds[2] = {{.fd = io_ended(thread->bus) ? -1 : thread->fd, .events = POLLIN},
+                            {.fd = thread->wake_fd, .events = POLLIN}};
+    if (thread->kernel_full)
         fds[0].events |= POLLOUT;
-    bus->sleep_until_ns = next_deadline(bus, now);
-    uint64_t wait_ns = bus->sleep_until_ns > now ? bus->sleep_until_ns - now : 0;
+    thread->sleep_until_ns = next_deadline(thread, now);
+    uint64_t wait_ns = thread->sleep_until_ns > now ? thread->sleep_until_ns - now : 0;
     struct timespec wait = {.tv_sec = (time_t)(wait_ns / NS_PER_S), .tv_nsec = (long)(wait_ns % NS_PER_S)};
-    bus->sleeping = 1;
-    pthread_mutex_unlock(&bus->mutex);
-    int ready = ppoll(fds, 2, bus->sleep_until_ns == UINT64_MAX ? NULL : &wait, NULL);
+    thread->sleeping = 1;
+    pthread_mutex_unlock(&thread->mutex);
+    int ready = ppoll(fds, 2, thread->sleep_until_ns == UINT64_MAX ? NULL : &wait, NULL);
     uint64_t count;
-    if (ready > 0 && (fds[1].revents & POLLIN) && read(bus->wake_fd, &count, sizeof count) < 0)
+    if (ready > 0 && (fds[1].revents & POLLIN) && read(thread->wake_fd, &count, sizeof count) < 0)
         ready = 0; // cannot happen: the eventfd was readable and this thread alone reads it
-    pthread_mutex_lock(&bus->mutex);
-    bus->sleeping = 0;
-    bus->stats.wakeups++;
+    pthread_mutex_lock(&thread->mutex);
+    thread->sleeping = 0;
+    io_count_wakeup(thread->bus);
     return ready > 0 ? fds[0].revents : 0;
 }
 
 static void *run(void *argument) {
-    struct io_bus *bus = argument;
+    struct io_thread *thread = argument;
     prctl(PR_SET_TIMERSLACK, 1000UL); // the default of 50 µs would show in every timed send
-    pthread_mutex_lock(&bus->mutex);
+    pthread_mutex_lock(&thread->mutex);
     short seen = POLLIN;
-    while (!bus->stopping) {
+    while (!thread->stopping) {
         uint64_t now = monotonic_ns();
         if (seen & POLLOUT)
-            bus->kernel_full = 0;
+            thread->kernel_full = 0;
         if (seen & ~POLLOUT)
-            io_read_all(bus, now);
-        handle_timers(bus, now);
-        io_write_all(bus, now);
-        io_note_states(bus);
-        seen = sleep_unlocked(bus, now);
+            read_all(thread, now);
+        io_handle_time(thread->bus, now);
+        write_all(thread, now);
+        seen = sleep_unlocked(thread, now);
     }
-    pthread_mutex_unlock(&bus->mutex);
+    pthread_mutex_unlock(&thread->mutex);
     return NULL;
 }
 
-static void wake(struct io_bus *bus) {
+static void wake(struct io_thread *thread) {
     uint64_t one = 1;
-    if (bus->sleeping && write(bus->wake_fd, &one, sizeof one) == sizeof one)
-        bus->sleeping = 0;
+    if (thread->sleeping && write(thread->wake_fd, &one, sizeof one) == sizeof one)
+        thread->sleeping = 0;
+}
+
+// -------------------------------------------------------------------------------------- what the core calls
+
+static uint64_t now_of(void *context) {
+    (void)context;
+    return monotonic_ns();
+}
+
+static void lock(void *context) {
+    pthread_mutex_lock(&((struct io_thread *)context)->mutex);
+}
+
+static void unlock(void *context) {
+    pthread_mutex_unlock(&((struct io_thread *)context)->mutex);
 }
 
 // The caller sends what it queued by itself, which saves a query the thread's wake-up on its way out; the
 // thread is woken only when it has to wait for something that it does not yet know of.
-void io_send_now(struct io_bus *bus) {
-    if (!bus->sleeping)
+static void kick(void *context) {
+    struct io_thread *thread = context;
+    if (!thread->sleeping)
         return; // the thread is at work, or on its way to it, and will find what was queued
     uint64_t now = monotonic_ns();
-    io_write_all(bus, now);
-    if (bus->ended || bus->kernel_full || next_deadline(bus, now) < bus->sleep_until_ns)
-        wake(bus);
+    write_all(thread, now);
+    if (io_ended(thread->bus) || thread->kernel_full || next_deadline(thread, now) < thread->sleep_until_ns)
+        wake(thread);
+}
+
+// An eventfd holds 2^64-2 such ones, and nobody else reads it: neither call can fail.
+static void notify(void *context) {
+    uint64_t one = 1;
+    ssize_t done = write(((struct io_thread *)context)->notice_fd, &one, sizeof one);
+    (void)done;
+}
+
+static void quiet(void *context) {
+    uint64_t count;
+    ssize_t done = read(((struct io_thread *)context)->notice_fd, &count, sizeof count);
+    (void)done;
 }
 
 // ------------------------------------------------------------------------------------------- start and end
 
-static int make_ring(struct io_ring *ring, size_t size) {
-    ring->events = calloc(size, sizeof *ring->events);
-    ring->size = size;
-    return ring->events != NULL;
-}
-
-static void forget(struct io_bus *bus) {
-    for (size_t i = 0; i < bus->link_count; i++)
-        free(bus->links[i]);
-    free(bus->responses.events);
-    free(bus->unclaimed.events);
-    if (bus->wake_fd >= 0)
-        close(bus->wake_fd);
-    if (bus->notice_fd >= 0)
-        close(bus->notice_fd);
-    pthread_mutex_destroy(&bus->mutex);
-    free(bus);
+static void forget(struct io_thread *thread) {
+    if (thread->bus)
+        io_free(thread->bus);
+    if (thread->wake_fd >= 0)
+        close(thread->wake_fd);
+    if (thread->notice_fd >= 0)
+        close(thread->notice_fd);
+    pthread_mutex_destroy(&thread->mutex);
+    free(thread);
 }
 
 // What sits in the kernel cannot be overtaken by something more urgent. A small send buffer bounds it, and
@@ -148,82 +241,40 @@ static void bound_kernel_queue(int fd) {
     setsockopt(fd, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes);
 }
 
-struct io_bus *io_start(int fd, enum io_kind kind) {
-    struct io_bus *bus = calloc(1, sizeof *bus);
-    if (!bus)
+struct io_thread *io_start(int fd, enum io_kind kind, const struct io_settings *settings) {
+    static const struct io_driver driver = {now_of, lock, unlock, kick, notify, quiet};
+    struct io_thread *thread = calloc(1, sizeof *thread);
+    if (!thread)
         return NULL;
-    bus->fd = fd;
-    bus->kind = kind;
-    bus->wake_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
-    bus->notice_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
-    pthread_mutex_init(&bus->mutex, NULL);
-    int good = bus->wake_fd >= 0 && bus->notice_fd >= 0 && make_ring(&bus->responses, IO_RESPONSES_MAX) &&
-               make_ring(&bus->unclaimed, IO_FRAMES_MAX);
+    thread->fd = fd;
+    thread->kind = kind;
+    thread->wake_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
+    thread->notice_fd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
+    thread->bus = io_new(kind, settings, &driver, thread);
+    pthread_mutex_init(&thread->mutex, NULL);
     if (kind != IO_BYTES)
         bound_kernel_queue(fd);
-    if (!good || pthread_create(&bus->thread, NULL, run, bus)) {
-        forget(bus);
+    if (thread->wake_fd < 0 || thread->notice_fd < 0 || !thread->bus ||
+        pthread_create(&thread->thread, NULL, run, thread)) {
+        forget(thread);
         return NULL;
     }
-    return bus;
+    return thread;
 }
 
-void io_stop(struct io_bus *bus) {
-    pthread_mutex_lock(&bus->mutex);
-    bus->stopping = 1;
-    wake(bus);
-    pthread_mutex_unlock(&bus->mutex);
-    pthread_join(bus->thread, NULL);
-    forget(bus);
+void io_stop(struct io_thread *thread) {
+    pthread_mutex_lock(&thread->mutex);
+    thread->stopping = 1;
+    wake(thread);
+    pthread_mutex_unlock(&thread->mutex);
+    pthread_join(thread->thread, NULL);
+    forget(thread);
 }
 
-int io_notice_fd(struct io_bus *bus) {
-    return bus->notice_fd;
+struct io_bus *io_thread_bus(struct io_thread *thread) {
+    return thread->bus;
 }
 
-// -------------------------------------------------------------------------------------------------- taking
-
-static size_t take_ring(struct io_ring *ring, struct io_event *out, size_t room) {
-    size_t taken = 0;
-    for (; taken < room && ring->count; taken++, ring->count--) {
-        out[taken] = ring->events[ring->first];
-        ring->first = (ring->first + 1) % ring->size;
-    }
-    return taken;
-}
-
-// Moves one flag out as an event; returns whether it did.
-static int take_flag(uint8_t *flag, struct io_event *out, struct io_event event) {
-    if (!*flag)
-        return 0;
-    *flag = 0;
-    *out = event;
-    return 1;
-}
-
-static size_t take_notices(struct io_bus *bus, struct io_event *out, size_t room) {
-    size_t taken = 0;
-    for (size_t i = 0; i < bus->link_count && room - taken >= 2; i++) {
-        struct io_link *node = bus->links[i];
-        struct io_event drained = {.notice = IO_DRAINED, .link = node->number};
-        struct io_event lost = {.notice = IO_LOST, .link = node->number, .value = (int32_t)node->link.cause};
-        taken += (size_t)take_flag(&node->drained_pending, out + taken, drained);
-        taken += (size_t)take_flag(&node->lost_pending, out + taken, lost);
-    }
-    struct io_event ended = {.notice = IO_ENDED, .value = bus->ended_errno};
-    if (taken < room)
-        taken += (size_t)take_flag(&bus->ended_pending, out + taken, ended);
-    return taken;
-}
-
-size_t io_take(struct io_bus *bus, struct io_event *out, size_t room) {
-    pthread_mutex_lock(&bus->mutex);
-    size_t taken = take_ring(&bus->responses, out, room);
-    taken += take_ring(&bus->unclaimed, out + taken, room - taken);
-    taken += take_notices(bus, out + taken, room - taken);
-    uint64_t count;
-    if (taken < room && bus->noticed && read(bus->notice_fd, &count, sizeof count) == sizeof count)
-        bus->noticed = 0;
-    pthread_mutex_unlock(&bus->mutex);
-    return taken;
+int io_notice_fd(struct io_thread *thread) {
+    return thread->notice_fd;
 }

@@ -1,115 +1,25 @@
 // SPDX-License-Identifier: Apache-2.0
-// The one I/O thread of a bus: moves bytes between a transport's file descriptor and the links of its nodes.
+// The I/O thread of a bus: drives its core (io_core.h) over a transport's file descriptor.
 //
 // One mutex guards everything of one bus; the thread holds it while it works and never while it sleeps, and
-// nothing blocks under it. What is for Python (responses, raw frames, notices) waits in bounded rings; the
-// file descriptor io_notice_fd() becomes readable when there is something, and io_take() hands it over in
-// batches. Functions may be called from any thread.
-//
-// When Python is slow: reading goes on, because the acknowledgements in the stream carry the motion, and a
-// full ring drops its oldest entry and counts it. Answers may get lost on the wire too; who asked asks again.
-// Notices (link lost, drained, transport closed) are flags and never dropped.
+// nothing blocks under it. The file descriptor io_notice_fd() becomes readable when io_take() has something.
 #ifndef LINK_IO_THREAD_H
 #define LINK_IO_THREAD_H
 
-#include "nodes/link/link.h"
+#include "nodes/link/io_api.h"
 
 // cffi: begin
-enum io_kind {
-    IO_CAN_STREAM, // a stream of 16-byte struct can_frame
-    IO_CAN_PACKET, // one struct can_frame per read and write
-    IO_BYTES,      // a serial line: the bytes of one link
-};
-
-enum {
-    IO_LINKS_MAX = 128,
-    IO_CONTROL_BYTES = 1 << 15, // queue of control commands, per link
-    IO_MOTION_BYTES = 1 << 20,  // queue of motion commands, per link
-    IO_RESPONSES_MAX = 4096,    // ring of responses, per bus
-    IO_FRAMES_MAX = 1024,       // ring of received frames that belong to no link, per bus
-    IO_ADMIN_MAX = 256,         // queue of frames to send that belong to no link, per bus
-    IO_OUT_FRAMES = 25, // frames cut and not yet taken by the kernel: a block with its longest lead-in
-                        // (17) and a further block
-};
-
-enum io_status { IO_OK, IO_FULL, IO_INVALID, IO_GONE, IO_CLOSED, IO_TAKEN, IO_NO_MEMORY };
-
-enum io_notice {
-    IO_RESPONSE, // a link's response
-    IO_FRAME,    // a CAN frame that belongs to no link
-    IO_DRAINED,  // nothing is pending on a link, as io_watch_drained asked
-    IO_LOST,     // a link is lost; value: enum link_cause
-    IO_ENDED,    // the transport failed or was closed by its peer; value: errno, 0 for an end of file
-};
-
-struct io_event {
-    uint8_t notice; // enum io_notice
-    uint8_t size;   // of content
-    int32_t value;
-    uint32_t link;   // number of the link, as io_open_link gave it
-    uint32_t can_id; // of a frame, with its flag bits
-    uint64_t sent_ns, received_ns;
-    uint8_t content[WIRE_CONTENT_MAX];
-};
-
-struct io_stats {
-    uint64_t frames_sent, frames_received;
-    uint64_t frames_unclaimed;             // received, of no link: handed to Python or dropped
-    uint64_t frames_dropped;               // of those: ring full, oldest dropped
-    uint64_t frames_malformed;             // longer than 8 bytes, or cut short
-    uint64_t responses_dropped;            // ring full, oldest dropped
-    uint64_t responses_max, unclaimed_max; // most that ever waited
-    uint64_t admin_max;                    // most admin frames that ever waited
-    uint64_t bytes_sent, bytes_received;   // through the file descriptor
-    uint64_t waits;                        // times the kernel took no more and sending paused
-    uint64_t wakeups;                      // rounds of the thread
-};
+struct io_thread;
 
 // Opens no file: FD stays the caller's, is non-blocking, and outlives the bus. Starts the thread. NULL: no
 // memory, or no thread.
-struct io_bus *io_start(int fd, enum io_kind kind);
+struct io_thread *io_start(int fd, enum io_kind kind, const struct io_settings *settings);
 
 // Ends and joins the thread, and forgets the bus with its links.
-void io_stop(struct io_bus *bus);
+void io_stop(struct io_thread *thread);
 
-int io_notice_fd(struct io_bus *bus);
-
-// Moves up to ROOM events to OUT, notices after the responses that came before them; returns their number.
-// Fewer than ROOM: io_notice_fd is quiet until there is more.
-size_t io_take(struct io_bus *bus, struct io_event *out, size_t room);
-
-// Adds the link of NODEID (1..255; on a serial line 0, and only one); *number names it from now on.
-// IO_TAKEN: there is one with this id, or no place is left.
-enum io_status io_open_link(struct io_bus *bus, unsigned nodeid, const struct link_settings *settings,
-                            uint32_t *number);
-void io_close_link(struct io_bus *bus, uint32_t number);
-
-// As the functions of link.h; IO_CLOSED when the transport has ended, IO_GONE when the link is lost or
-// closed.
-enum io_status io_send(struct io_bus *bus, uint32_t number, const uint8_t *content, size_t size,
-                       uint64_t min_clock, uint64_t req_clock);
-enum io_status io_send_batch(struct io_bus *bus, uint32_t number, const uint8_t *batch, size_t size);
-enum io_status io_send_urgent(struct io_bus *bus, uint32_t number, const uint8_t *content, size_t size);
-enum io_status io_set_receive_window(struct io_bus *bus, uint32_t number, uint64_t size);
-enum io_status io_set_clock(struct io_bus *bus, uint32_t number, double freq_hz, uint64_t at_ns,
-                            uint64_t at_ticks);
-
-// Asks for one IO_DRAINED when nothing is pending (at once, if so).
-enum io_status io_watch_drained(struct io_bus *bus, uint32_t number);
-
-// Queues one frame ahead of all data. IO_FULL, IO_INVALID (longer than 8 bytes, or a serial line), IO_CLOSED.
-enum io_status io_send_frame(struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size);
-
-// What one link has counted, what waits in its queues, and how much ever did.
-struct io_link_stats {
-    struct link_stats link;
-    uint64_t pending;
-    uint64_t control_commands, control_bytes, control_commands_max, control_bytes_max;
-    uint64_t motion_commands, motion_bytes, motion_commands_max, motion_bytes_max;
-    uint64_t flying_bytes, flying_blocks;
-};
-enum io_status io_get_link_stats(struct io_bus *bus, uint32_t number, struct io_link_stats *out);
-void io_get_stats(struct io_bus *bus, struct io_stats *out);
+struct io_bus *io_thread_bus(struct io_thread *thread);
+int io_notice_fd(struct io_thread *thread);
 // cffi: end
 
 #endif

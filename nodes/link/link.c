@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The sending half of a link: queues, packing, window, repeats, timers.
+// The sending half of a link: queues, blocks, window, repeats, timers.
 #include "nodes/link/link_core.h"
 
 #include <math.h>
@@ -7,24 +7,17 @@
 
 #include "nodes/link/batch.h"
 
-// No command whose req_clock lies further ahead is sent: its 32-bit clocks would be ambiguous from 2^31 ticks
-// on, and the other half of that range is left to times inside the command that lie behind req_clock.
-#define CLOCK_REACH ((uint64_t)1 << 30)
-// A block that could still be filled by commands whose min_clock comes soon waits for them, but not when its
-// first command is due within this time: fewer, fuller blocks cost less of the bus.
-#define PACK_LEAD_NS (100 * NS_PER_MS)
 #define RTO_MIN_NS (20 * NS_PER_MS)    // below, a busy host or node would cause needless repeats
 #define RTO_FIRST_NS (100 * NS_PER_MS) // until a round trip was measured
 #define FIRST_SEQUENCE 16              // room below for the adoption of the node's
 
 // -------------------------------------------------------------------------------------------------- set-up
 
-void link_init(struct link *link, const struct link_settings *settings, uint8_t *control, size_t control_size,
-               uint8_t *motion, size_t motion_size) {
+void link_init(struct link *link, const struct link_settings *settings, const struct link_memory *memories) {
     memset(link, 0, sizeof *link);
     link->settings = *settings;
-    link_queue_init(&link->control, control, control_size);
-    link_queue_init(&link->motion, motion, motion_size);
+    for (int kind = 0; kind < LINK_CLASSES; kind++)
+        link_queue_init(&link->queues[kind], memories[kind].at, memories[kind].size, kind != LINK_MOTION);
     link->first = link->cursor = link->next = FIRST_SEQUENCE;
     link->last_ack = LINK_NEVER;
     link->lead_in = LEAD_FLUSH; // an earlier host may have left half a block in the node's buffer
@@ -55,17 +48,22 @@ uint64_t link_clock_to_ns(const struct link *link, uint64_t ticks) {
     return away_ns < (double)link->clock_at_ns ? link->clock_at_ns - (uint64_t)away_ns : 0;
 }
 
+uint64_t link_first_rto(const struct link *link) {
+    const struct link_stats *stats = &link->stats;
+    uint64_t rto_ns = stats->srtt_ns ? stats->srtt_ns + 4 * stats->rttvar_ns : RTO_FIRST_NS;
+    return rto_ns < RTO_MIN_NS ? RTO_MIN_NS : rto_ns;
+}
+
 // ------------------------------------------------------------------------------------------------ queueing
 
-enum link_status link_send(struct link *link, const uint8_t *content, size_t size, uint64_t min_clock,
-                           uint64_t req_clock) {
+enum link_status link_send(struct link *link, enum link_class kind, const uint8_t *content, size_t size,
+                           uint64_t min_clock, uint64_t req_clock, uint64_t now) {
     if (link->state == LINK_LOST)
         return LINK_GONE;
-    if (size == 0 || size > WIRE_CONTENT_MAX)
+    if (size == 0 || size > WIRE_CONTENT_MAX || (kind != LINK_CONTROL && kind != LINK_BULK))
         return LINK_INVALID;
-    uint8_t record[BATCH_HEADER + WIRE_CONTENT_MAX];
-    size_t length = batch_write(record, min_clock, req_clock, content, (uint8_t)size);
-    return link_queue_put(&link->control, record, length, 1) ? LINK_OK : LINK_FULL;
+    struct link_command command = {min_clock, req_clock, now, (uint8_t)size};
+    return link_queue_put_stamped(&link->queues[kind], &command, content) ? LINK_OK : LINK_FULL;
 }
 
 enum link_status link_send_batch(struct link *link, const uint8_t *batch, size_t size) {
@@ -79,146 +77,48 @@ enum link_status link_send_batch(struct link *link, const uint8_t *batch, size_t
             return LINK_INVALID;
         at += length;
     }
-    return link_queue_put(&link->motion, batch, size, count) ? LINK_OK : LINK_FULL;
+    return link_queue_put(&link->queues[LINK_MOTION], batch, size, count) ? LINK_OK : LINK_FULL;
 }
 
-enum link_status link_send_urgent(struct link *link, const uint8_t *content, size_t size) {
+enum link_status link_send_urgent(struct link *link, const uint8_t *content, size_t size, uint64_t now) {
     if (link->state == LINK_LOST)
         return LINK_GONE;
     if (size == 0 || size > WIRE_CONTENT_MAX)
         return LINK_INVALID;
-    link->stats.commands_dropped += link->control.commands + link->motion.commands;
-    link_queue_drop(&link->control, link->control.tail, link->control.commands);
-    link_queue_drop(&link->motion, link->motion.tail, link->motion.commands);
-    return link_send(link, content, size, 0, 0);
+    for (int kind = 0; kind < LINK_CLASSES; kind++) {
+        struct link_queue *queue = &link->queues[kind];
+        link->stats.commands_dropped += queue->commands;
+        link_queue_drop(queue, queue->tail, queue->commands);
+    }
+    link->urgent = 1;
+    return link_send(link, LINK_CONTROL, content, size, 0, 0, now);
+}
+
+static uint64_t queued_commands(const struct link *link) {
+    return link->queues[LINK_MOTION].commands + link->queues[LINK_CONTROL].commands +
+           link->queues[LINK_BULK].commands;
 }
 
 uint64_t link_pending(const struct link *link) {
-    return link->control.commands + link->motion.commands + link->flying_commands;
-}
-
-// ------------------------------------------------------------------------------------------------- packing
-
-// The records at the front of a queue that may go now and fit together.
-struct front {
-    uint64_t end; // position behind them
-    uint64_t commands;
-    size_t size;      // of their payloads
-    uint64_t gate_ns; // when the next one may follow; LINK_NEVER: there is none, or it does not fit
-    uint64_t due_ns;  // of the first; 0: at once or unknown
-};
-
-static uint64_t gate_of(const struct link *link, const struct link_command *command) {
-    uint64_t reach = command->req_clock > CLOCK_REACH ? command->req_clock - CLOCK_REACH : 0;
-    uint64_t ticks = command->min_clock > reach ? command->min_clock : reach;
-    if (link->clock_hz > 0)
-        return ticks ? link_clock_to_ns(link, ticks) : 0;
-    return command->min_clock ? LINK_NEVER : 0;
-}
-
-static struct front ready(const struct link *link, const struct link_queue *queue, uint64_t now,
-                          size_t room) {
-    struct front front = {.end = queue->head, .gate_ns = LINK_NEVER};
-    while (front.end < queue->tail) {
-        struct link_command command;
-        uint64_t behind = link_queue_peek(queue, front.end, &command);
-        if (command.size > room - front.size)
-            break;
-        uint64_t gate_ns = gate_of(link, &command);
-        if (gate_ns > now) {
-            front.gate_ns = gate_ns;
-            break;
-        }
-        if (!front.commands && command.req_clock && link->clock_hz > 0)
-            front.due_ns = link_clock_to_ns(link, command.req_clock);
-        front.end = behind;
-        front.size += command.size;
-        front.commands++;
-    }
-    return front;
-}
-
-// When the last of the records that fit into the block may go.
-static uint64_t filled_at(const struct link *link, const struct front *front, size_t room) {
-    uint64_t latest = 0;
-    size_t size = front->size;
-    for (uint64_t at = front->end; at < link->motion.tail;) {
-        struct link_command command;
-        at = link_queue_peek(&link->motion, at, &command);
-        if (command.size > room - size)
-            break;
-        uint64_t gate_ns = gate_of(link, &command);
-        if (gate_ns > latest)
-            latest = gate_ns;
-        size += command.size;
-    }
-    return latest;
-}
-
-struct plan {
-    uint64_t at_ns;  // when the next new block may go; <= NOW: it may, as far as clocks are concerned
-    uint64_t due_ns; // host time at which it is due, 0: at once
-    struct front control, motion;
-};
-
-static struct plan plan_block(const struct link *link, uint64_t now) {
-    struct plan plan = {.control = ready(link, &link->control, now, WIRE_CONTENT_MAX)};
-    size_t room = WIRE_CONTENT_MAX - plan.control.size;
-    plan.motion = ready(link, &link->motion, now, room);
-    plan.at_ns = plan.control.gate_ns;
-    if (plan.control.commands || (plan.motion.commands && plan.motion.gate_ns == LINK_NEVER)) {
-        plan.at_ns = 0;
-    } else if (plan.motion.commands) {
-        uint64_t due_ns = plan.motion.due_ns;
-        uint64_t pressing_ns = due_ns > PACK_LEAD_NS ? due_ns - PACK_LEAD_NS : 0;
-        uint64_t full_ns = filled_at(link, &plan.motion, room);
-        uint64_t hold_ns = full_ns < pressing_ns ? full_ns : pressing_ns;
-        plan.at_ns = hold_ns < plan.at_ns ? hold_ns : plan.at_ns;
-    } else if (plan.motion.gate_ns < plan.at_ns) {
-        plan.at_ns = plan.motion.gate_ns;
-    }
-    plan.due_ns = plan.control.commands ? 0 : plan.motion.due_ns;
-    return plan;
-}
-
-static void take(struct link_queue *queue, const struct front *front, struct link_block *block, int motion) {
-    while (queue->head < front->end) {
-        struct link_command command;
-        uint64_t behind = link_queue_peek(queue, queue->head, &command);
-        link_queue_payload(queue, queue->head, &command, block->bytes + WIRE_HEADER + block->length);
-        block->length = (uint8_t)(block->length + command.size);
-        block->commands++;
-        if (motion && command.req_clock)
-            block->req_clock[block->leads++] = command.req_clock;
-        link_queue_drop(queue, behind, 1);
-    }
+    return queued_commands(link) + link->flying_commands;
 }
 
 // -------------------------------------------------------------------------------------------- transmission
 
-static int fits(const struct link *link, size_t bytes) {
-    return link->flying_bytes == 0 || link->flying_bytes + bytes <= link->settings.receive_window;
-}
-
 static int may_probe(const struct link *link) {
-    return link->first == link->next && link->control.commands + link->motion.commands > 0;
-}
-
-static int may_go(const struct link *link, const struct plan *plan, uint64_t now) {
-    size_t length = WIRE_BLOCK_MIN + plan->control.size + plan->motion.size;
-    return plan->at_ns <= now && link->next - link->first < LINK_BLOCKS_MAX && fits(link, length);
+    return link->first == link->next && queued_commands(link) > 0;
 }
 
 // Makes the next new block, if there is one to send. While the node's expected sequence is unknown it is
 // empty: an answer that names the next sequence cannot tell whether the block was taken or was out of order,
 // and of an empty one nothing can be lost.
-static int make_block(struct link *link, uint64_t now) {
-    struct plan plan = {.control = {.end = link->control.head}, .motion = {.end = link->motion.head}};
+static int make_block(struct link *link, uint64_t now, unsigned allowed) {
+    struct link_plan plan = {.offer = {.kind = LINK_CONTROL}};
     if (link->state == LINK_RUNNING) {
-        if (link->flying_bytes && !fits(link, WIRE_BLOCK_MIN + 1))
+        if (link->flying_bytes && !link_fits(link, WIRE_BLOCK_MIN + 1))
             return 0;
-        plan = plan_block(link, now);
-        if (!may_go(link, &plan, now))
+        plan = link_plan_block(link, now, allowed);
+        if (!link_may_go(link, &plan, now))
             return 0;
     } else if (!may_probe(link)) {
         return 0;
@@ -226,8 +126,10 @@ static int make_block(struct link *link, uint64_t now) {
     struct link_block *block = block_of(link, link->next);
     block->sent_ns = 0;
     block->repeated = block->length = block->commands = block->leads = 0;
-    take(&link->control, &plan.control, block, 0);
-    take(&link->motion, &plan.motion, block, 1);
+    block->kind = plan.offer.kind;
+    for (size_t i = 0; i < plan.classes; i++)
+        link_take(link, plan.order[i], &plan.fronts[plan.order[i]], block);
+    link->urgent = link->urgent && link->queues[LINK_CONTROL].commands;
     block->length =
         (uint8_t)wire_block_finish(block->bytes, block->length, (unsigned)(link->next % LINK_SLOTS));
     link->stats.commands_sent += block->commands;
@@ -247,12 +149,12 @@ static size_t lead_in_bytes(const struct link *link) {
     return bytes < WIRE_BLOCK_MAX ? WIRE_BLOCK_MAX - bytes : 1;
 }
 
-size_t link_next_block(struct link *link, uint64_t now, uint8_t *out) {
-    if (link->state == LINK_LOST || (link->cursor == link->next && !make_block(link, now)))
+size_t link_next_block(struct link *link, uint64_t now, unsigned allowed, uint8_t *out) {
+    if (link->state == LINK_LOST || (link->cursor == link->next && !make_block(link, now, allowed)))
         return 0;
     struct link_block *block = block_of(link, link->cursor);
     size_t lead_in = lead_in_bytes(link), size = lead_in + block->length;
-    if (!fits(link, size))
+    if (!link_fits(link, size))
         return 0;
     memset(out, WIRE_SYNC, lead_in);
     memcpy(out + lead_in, block->bytes, block->length);
@@ -271,24 +173,37 @@ size_t link_next_block(struct link *link, uint64_t now, uint8_t *out) {
     return size;
 }
 
-uint64_t link_next_due(const struct link *link, uint64_t now) {
+// A repeat goes at once, and before everything where motion is in it or waits behind it.
+static int offer_repeat(const struct link *link, struct link_offer *out) {
+    const struct link_block *block = const_block_of(link, link->cursor);
+    *out = (struct link_offer){.kind = block->kind};
+    struct link_command head = {0};
+    const struct link_queue *motion = &link->queues[LINK_MOTION];
+    if (motion->commands)
+        link_queue_peek(motion, motion->head, &head);
+    out->pressing = block->leads > 0 || head.req_clock || link->urgent;
+    return link_fits(link, lead_in_bytes(link) + block->length);
+}
+
+int link_next_offer(const struct link *link, uint64_t now, unsigned allowed, struct link_offer *out) {
     if (link->state == LINK_LOST)
-        return LINK_NEVER;
+        return 0;
     if (link->cursor < link->next)
-        return fits(link, lead_in_bytes(link) + const_block_of(link, link->cursor)->length) ? 0 : LINK_NEVER;
-    if (link->state == LINK_PROBING)
-        return may_probe(link) ? 0 : LINK_NEVER;
-    struct plan plan = plan_block(link, now);
-    return may_go(link, &plan, now) ? plan.due_ns : LINK_NEVER;
+        return offer_repeat(link, out);
+    if (link->state == LINK_PROBING) {
+        *out = (struct link_offer){.kind = LINK_CONTROL};
+        return may_probe(link);
+    }
+    struct link_plan plan = link_plan_block(link, now, allowed);
+    *out = plan.offer;
+    return link_may_go(link, &plan, now);
 }
 
 // ---------------------------------------------------------------------------------------------------- time
 
 uint64_t link_rto(const struct link *link) {
-    const struct link_stats *stats = &link->stats;
-    uint64_t rto_ns = stats->srtt_ns ? stats->srtt_ns + 4 * stats->rttvar_ns : RTO_FIRST_NS;
+    uint64_t rto_ns = link_first_rto(link);
     uint64_t most_ns = link->settings.lost_after_ns / 4; // several tries before the link counts as lost
-    rto_ns = rto_ns < RTO_MIN_NS ? RTO_MIN_NS : rto_ns;
     for (uint64_t i = 0; i < link->backoff && rto_ns < most_ns; i++)
         rto_ns *= 2;
     return rto_ns < most_ns ? rto_ns : most_ns;
@@ -308,11 +223,16 @@ void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in) {
         link->lead_in = (uint8_t)lead_in;
 }
 
-static uint64_t repeat_deadline(const struct link *link) {
+uint64_t link_unanswered_since(const struct link *link) {
     if (link->cursor == link->first)
         return LINK_NEVER;
     uint64_t sent_ns = const_block_of(link, link->first)->sent_ns;
-    return (sent_ns > link->progress_ns ? sent_ns : link->progress_ns) + link_rto(link);
+    return sent_ns > link->progress_ns ? sent_ns : link->progress_ns;
+}
+
+static uint64_t repeat_deadline(const struct link *link) {
+    uint64_t since_ns = link_unanswered_since(link);
+    return since_ns == LINK_NEVER ? LINK_NEVER : since_ns + link_rto(link);
 }
 
 static uint64_t lost_deadline(const struct link *link) {
@@ -335,7 +255,7 @@ void link_handle_timer(struct link *link, uint64_t now) {
     }
 }
 
-uint64_t link_deadline(const struct link *link, uint64_t now) {
+uint64_t link_deadline(const struct link *link, uint64_t now, unsigned allowed) {
     if (link->state == LINK_LOST)
         return LINK_NEVER;
     uint64_t at_ns = lost_deadline(link);
@@ -344,7 +264,7 @@ uint64_t link_deadline(const struct link *link, uint64_t now) {
         at_ns = others[i] < at_ns ? others[i] : at_ns;
     if (link->state != LINK_RUNNING || link->cursor < link->next)
         return at_ns;
-    uint64_t gate_ns = plan_block(link, now).at_ns;
+    uint64_t gate_ns = link_plan_block(link, now, allowed).at_ns;
     return gate_ns > now && gate_ns < at_ns ? gate_ns : at_ns;
 }
 

@@ -32,6 +32,15 @@ enum link_status {
     LINK_GONE,    // the link is lost
 };
 
+// What a command is for; the order in which a scheduler thinks of them.
+enum link_class {
+    LINK_MOTION,  // batches: due at their req_clock
+    LINK_CONTROL, // questions, configuration: soon
+    LINK_BULK,    // data for later: what is left of the bus
+    LINK_CLASSES,
+    LINK_ALL = (1 << LINK_CLASSES) - 1, // a set of classes has bit 1 << class for each
+};
+
 enum link_state { LINK_PROBING, LINK_RUNNING, LINK_LOST };
 
 enum link_cause {
@@ -67,6 +76,7 @@ struct link_block {
     uint8_t length;      // of the block
     uint8_t wire_length; // of the last transmission: with the sync bytes in front
     uint8_t commands;
+    uint8_t kind;  // enum link_class of its first command
     uint8_t leads; // how many req_clocks follow
     uint64_t req_clock[WIRE_CONTENT_MAX];
     uint8_t bytes[WIRE_BLOCK_MAX];
@@ -78,11 +88,13 @@ struct link {
     enum link_state state;
     enum link_cause cause;
     uint8_t probe_answered; // LINK_PROBING: the first answer is in
-    struct link_queue control, motion;
+    uint8_t urgent;         // link_send_urgent's command is still queued
+    struct link_queue queues[LINK_CLASSES];
     struct link_block blocks[LINK_SLOTS];
     uint64_t first, cursor, next; // first unacknowledged <= next to transmit (again) <= next new block
     uint64_t flying_bytes;        // transmitted since the last rewind and not acknowledged
     uint64_t flying_commands;     // in blocks [first, next)
+    uint64_t motion_content;      // content bytes of motion commands sent so far, once each
     uint64_t progress_ns;         // last acknowledgement, or when the line began to be busy
     uint64_t heard_ns;            // last sound block
     uint64_t last_ack;            // sequence of the last empty block
@@ -105,23 +117,28 @@ struct link_response {
     uint8_t content[WIRE_CONTENT_MAX];
 };
 
-// Prepares a link over the two memories (sizes are powers of two, at least 256), which it uses until it is
-// forgotten. SETTINGS are in their ranges.
-void link_init(struct link *link, const struct link_settings *settings, uint8_t *control, size_t control_size,
-               uint8_t *motion, size_t motion_size);
+// Memory for the queue of a class; size is a power of two, at least 256.
+struct link_memory {
+    uint8_t *at;
+    size_t size;
+};
+
+// Prepares a link over the memories, one for each class, which it uses until it is forgotten. SETTINGS are in
+// their ranges.
+void link_init(struct link *link, const struct link_settings *settings, const struct link_memory *memories);
 
 // ------------------------------------------------------------------------------------------------ commands
 
-// Queues one encoded command. Control commands go in order, before motion, as soon as the window allows, but
-// not before min_clock (0: at once).
-enum link_status link_send(struct link *link, const uint8_t *content, size_t size, uint64_t min_clock,
-                           uint64_t req_clock);
+// Queues one encoded command of KIND, LINK_CONTROL or LINK_BULK, at NOW. Order is kept within a class; it
+// does not go before min_clock (0: at once).
+enum link_status link_send(struct link *link, enum link_class kind, const uint8_t *content, size_t size,
+                           uint64_t min_clock, uint64_t req_clock, uint64_t now);
 
 // Queues the motion commands of a batch (batch.h), all or none.
 enum link_status link_send_batch(struct link *link, const uint8_t *batch, size_t size);
 
-// Drops all that is queued and not yet sent, and sends CONTENT next.
-enum link_status link_send_urgent(struct link *link, const uint8_t *content, size_t size);
+// Drops all that is queued and not yet sent, and sends CONTENT next, before everything else on the bus.
+enum link_status link_send_urgent(struct link *link, const uint8_t *content, size_t size, uint64_t now);
 
 // Commands that are queued or not yet acknowledged.
 uint64_t link_pending(const struct link *link);
@@ -143,16 +160,31 @@ int link_receive(struct link *link, const uint8_t **data, size_t *size, uint64_t
 // Acts on what time brings: repeats and the loss of the link (once: state becomes LINK_LOST, with a cause).
 void link_handle_timer(struct link *link, uint64_t now);
 
-// Writes the next transmission (at most LINK_WIRE_MAX bytes) and returns its size; 0: nothing to send now.
-size_t link_next_block(struct link *link, uint64_t now, uint8_t *out);
+// What a link would send next. Smaller due_ns first, pressing ones before all others.
+struct link_offer {
+    uint64_t due_ns;  // host time by which it should go, what a repeat may take already deducted
+    uint8_t kind;     // enum link_class of its first command
+    uint8_t pressing; // motion whose due_ns has come, its repeat, or an urgent command
+};
 
-// When the thing to be sent now is due, in host time: 0 for repeats and control, the req_clock of motion.
-// UINT64_MAX: nothing to send now.
-uint64_t link_next_due(const struct link *link, uint64_t now);
+// What the link would send now of the classes in the set ALLOWED (repeats and pressing motion always may go);
+// returns 0: nothing.
+int link_next_offer(const struct link *link, uint64_t now, unsigned allowed, struct link_offer *out);
 
-// When link_handle_timer, link_receive or link_next_block has something to do that it has not now.
-// UINT64_MAX: nothing but an event changes anything.
-uint64_t link_deadline(const struct link *link, uint64_t now);
+// Writes that transmission (at most LINK_WIRE_MAX bytes) and returns its size; 0: nothing to send now. The
+// block is filled from the class that is due first, then from the others as far as they fit.
+size_t link_next_block(struct link *link, uint64_t now, unsigned allowed, uint8_t *out);
+
+// When link_handle_timer, link_receive or link_next_block with ALLOWED has something to do that it has not
+// now. UINT64_MAX: nothing but an event changes anything.
+uint64_t link_deadline(const struct link *link, uint64_t now, unsigned allowed);
+
+// Since when the oldest transmission waits for its acknowledgement; UINT64_MAX: none does.
+uint64_t link_unanswered_since(const struct link *link);
+
+// Host time by which a motion command of REQ_CLOCK should go: a loss on the way can be noticed and repaired
+// before it is due. 0: the clock is unknown.
+uint64_t link_motion_due(const struct link *link, uint64_t req_clock);
 
 // The counters, with those that are computed on demand.
 void link_get_stats(const struct link *link, struct link_stats *out);

@@ -5,9 +5,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from nodes.link._link import ffi, lib
 from nodes.link.handle import BusHandle
-from nodes.link.types import LinkError, LinkSettings, LinkStats, Response
+from nodes.link.types import Flow, LinkError, LinkSettings, LinkStats, Response
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -33,6 +32,7 @@ class Link:
     ) -> None:
         self._on_close = on_close
         self._bus = bus
+        self._lib, self._ffi = bus.lib, bus.ffi
         self._number = number
         self._settings = settings
         self._on_responses = on_responses
@@ -48,27 +48,29 @@ class Link:
         """How messages to the user call it: transport and node id."""
         return self._name
 
-    def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0) -> None:
-        """Queue one encoded control command: in order, before motion, not before MIN_CLOCK (node ticks).
+    def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False) -> None:
+        """Queue one encoded command: in order within its class, not before MIN_CLOCK (node ticks).
 
+        A control command goes within milliseconds, BULK data with what motion and control leave of the bus.
         Raises LinkError when the queue is full, the command is too long, or the link is closed or lost.
         """
-        data = ffi.from_buffer(content)
-        status = lib.io_send(self._live(), self._number, data, len(content), min_clock, req_clock)
-        self._check_command(status, len(content))
+        data = self._ffi.from_buffer(content)
+        kind = self._lib.LINK_BULK if bulk else self._lib.LINK_CONTROL
+        status = self._lib.io_send(self._live(), self._number, kind, data, len(content), min_clock, req_clock)
+        self._check_command(status, len(content), "bulk" if bulk else "control")
 
     def send_batch(self, batch: "Buffer") -> None:
         """Queue the motion commands of a batch (format: batch.h), all or none; raises LinkError as send()."""
         with memoryview(batch) as view:
             size = view.nbytes
-            status = lib.io_send_batch(self._live(), self._number, ffi.from_buffer(view), size)
-        if status == lib.IO_FULL:
-            free = lib.IO_MOTION_BYTES - self.stats().motion_bytes
+            status = self._lib.io_send_batch(self._live(), self._number, self._ffi.from_buffer(view), size)
+        if status == self._lib.IO_FULL:
+            free = self._lib.IO_MOTION_BYTES - self.stats().motion_bytes
             raise LinkError(
                 f"{self._name}: a batch of {size} bytes does not fit into the motion queue "
-                f"({free} of {lib.IO_MOTION_BYTES} free); send less ahead, or wait for drained()"
+                f"({free} of {self._lib.IO_MOTION_BYTES} free); send less ahead, or wait for drained()"
             )
-        if status == lib.IO_INVALID:
+        if status == self._lib.IO_INVALID:
             raise LinkError(
                 f"{self._name}: a batch of {size} bytes ends within a record, or has a bad command"
             )
@@ -76,14 +78,16 @@ class Link:
 
     def send_urgent(self, content: bytes) -> None:
         """Drop everything that is queued and unsent and send CONTENT next; raises LinkError as send()."""
-        status = lib.io_send_urgent(self._live(), self._number, ffi.from_buffer(content), len(content))
+        status = self._lib.io_send_urgent(
+            self._live(), self._number, self._ffi.from_buffer(content), len(content)
+        )
         self._check_command(status, len(content))
 
     def set_receive_window(self, size: int) -> None:
         """Bound the unacknowledged bytes to SIZE, at least 64; LinkError below."""
-        if size < lib.LINK_WINDOW_MIN:
+        if size < self._lib.LINK_WINDOW_MIN:
             raise LinkError(f"{self._name}: a receive window of {size} bytes cannot hold a block (64)")
-        self._check(lib.io_set_receive_window(self._live(), self._number, size))
+        self._check(self._lib.io_set_receive_window(self._live(), self._number, size))
 
     def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> None:
         """Tell the node's clock: it reads AT_TICKS (64 bits) at host time AT_NS and runs at FREQ_HZ (> 0)."""
@@ -91,7 +95,7 @@ class Link:
             raise LinkError(
                 f"{self._name}: not a clock: {freq_hz} Hz at {at_ns} ns, {at_ticks} ticks; estimate it again"
             )
-        self._check(lib.io_set_clock(self._live(), self._number, freq_hz, at_ns, at_ticks))
+        self._check(self._lib.io_set_clock(self._live(), self._number, freq_hz, at_ns, at_ticks))
 
     def pending(self) -> int:
         """Return how many commands are not yet acknowledged, queued ones included."""
@@ -100,16 +104,16 @@ class Link:
     async def drained(self) -> None:
         """Wait until nothing is pending; raises LinkError when the link is lost or closed meanwhile."""
         if self._drained is None:
-            self._check(lib.io_watch_drained(self._live(), self._number))
+            self._check(self._lib.io_watch_drained(self._live(), self._number))
             self._drained = asyncio.get_running_loop().create_future()
         await asyncio.shield(self._drained)
 
     def stats(self) -> LinkStats:
         """Return the counters so far; after close(), the last ones."""
         if not self._closed:
-            raw = ffi.new("struct io_link_stats *")
-            if lib.io_get_link_stats(self._bus.live(), self._number, raw) == lib.IO_OK:
-                self._final = _convert(raw)
+            raw = self._ffi.new("struct io_link_stats *")
+            if self._lib.io_get_link_stats(self._bus.live(), self._number, raw) == self._lib.IO_OK:
+                self._final = _convert(raw, self._lib)
         return self._final
 
     def close(self) -> None:
@@ -119,7 +123,7 @@ class Link:
         self.stats()
         self._fail(f"{self._name}: the link was closed by this program")
         self._closed = True
-        lib.io_close_link(self._bus.live(), self._number)
+        self._lib.io_close_link(self._bus.live(), self._number)
         self._on_close(self._number)
 
     # ------------------------------------------------------------------------- called by LinkIO
@@ -137,7 +141,11 @@ class Link:
 
     def handle_lost(self, cause: int) -> None:
         """Tell the user, once, that the node does not acknowledge any more."""
-        heard = "answers, but accepts nothing" if cause == lib.LINK_CAUSE_STUCK else "does not answer at all"
+        heard = (
+            "answers, but accepts nothing"
+            if cause == self._lib.LINK_CAUSE_STUCK
+            else "does not answer at all"
+        )
         silence_s = self._settings.lost_after_s
         text = (
             f"{self._name}: lost, no acknowledgement for {silence_s:g} s, the node {heard}; "
@@ -166,19 +174,21 @@ class Link:
             self._drained = None
 
     def _check(self, status: int) -> None:
-        if status == lib.IO_GONE:
+        if status == self._lib.IO_GONE:
             raise LinkError(f"{self._name}: the link is lost; open it again when the node is back")
         self._bus.check(status, self._name)
 
-    def _check_command(self, status: int, size: int) -> None:
-        if status == lib.IO_FULL:
+    def _check_command(self, status: int, size: int, queue: str = "control") -> None:
+        if status == self._lib.IO_FULL:
+            limit = self._lib.IO_BULK_BYTES if queue == "bulk" else self._lib.IO_CONTROL_BYTES
             raise LinkError(
-                f"{self._name}: the control queue ({lib.IO_CONTROL_BYTES} bytes) is full; "
+                f"{self._name}: the {queue} queue ({limit} bytes) is full; "
                 "wait until drained() before sending more"
             )
-        if status == lib.IO_INVALID:
+        if status == self._lib.IO_INVALID:
             raise LinkError(
-                f"{self._name}: a command of {size} bytes; a block holds 1..{lib.WIRE_CONTENT_MAX} bytes"
+                f"{self._name}: a command of {size} bytes; "
+                f"a block holds 1..{self._lib.WIRE_CONTENT_MAX} bytes"
             )
         self._check(status)
 
@@ -188,21 +198,35 @@ _COUNTERS = (
     *("naks", "timeouts", "blocks_received", "bytes_received", "bytes_invalid", "acks_duplicate"),
     *("acks_never_sent", "lead_count"),
 )
-_DEPTHS = (
-    *("pending", "flying_bytes", "flying_blocks"),
-    *("control_commands", "control_commands_max", "control_bytes", "control_bytes_max"),
-    *("motion_commands", "motion_commands_max", "motion_bytes", "motion_bytes_max"),
-)
+_DEPTHS = ("pending", "flying_bytes", "flying_blocks")
 
 
-def _convert(raw: Any) -> LinkStats:
+def _flow(raw: Any) -> Flow:
+    return Flow(raw.frames, raw.bits, raw.blocks)
+
+
+def _convert(raw: Any, lib: Any) -> LinkStats:
     link = raw.link
+    depths: dict[str, int] = {}
+    for kind, number in (("control", lib.LINK_CONTROL), ("motion", lib.LINK_MOTION), ("bulk", lib.LINK_BULK)):
+        depth = raw.queues[number]
+        depths |= {
+            f"{kind}_commands": depth.commands,
+            f"{kind}_commands_max": depth.commands_max,
+            f"{kind}_bytes": depth.bytes,
+            f"{kind}_bytes_max": depth.bytes_max,
+        }
     return LinkStats(
         **{name: getattr(link, name) for name in _COUNTERS},
         **{name: getattr(raw, name) for name in _DEPTHS},
+        **depths,
         srtt_s=link.srtt_ns * _S_PER_NS,
         rttvar_s=link.rttvar_ns * _S_PER_NS,
         rto_s=link.rto_ns * _S_PER_NS,
         min_lead_s=link.lead_min_ns * _S_PER_NS if link.lead_count else None,
         lead_histogram=tuple(link.lead_histogram),
+        motion=_flow(raw.flows[lib.LINK_MOTION]),
+        control=_flow(raw.flows[lib.LINK_CONTROL]),
+        bulk=_flow(raw.flows[lib.LINK_BULK]),
+        received=Flow(raw.received.frames, raw.received.bits, link.blocks_received),
     )

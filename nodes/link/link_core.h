@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Shared by the two halves of the link (link.c sends, link_receive.c listens); not for others.
+// Shared by the parts of the link (link.c sends, link_pack.c fills blocks, link_receive.c listens); not for
+// others.
 #ifndef LINK_CORE_H
 #define LINK_CORE_H
 
@@ -30,10 +31,45 @@ uint64_t link_clock_to_ns(const struct link *link, uint64_t ticks);
 // Everything from the first unacknowledged block on will be transmitted again.
 void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in);
 
+// The timeout without doublings.
+uint64_t link_first_rto(const struct link *link);
+
 // The timeout in use: from the round trip, doubled for each timeout since the last measurement.
 uint64_t link_rto(const struct link *link);
 
 // When a partial block in the receive buffer is given up; LINK_NEVER without one.
 uint64_t link_partial_deadline(const struct link *link);
+
+// Whether BYTES more fit into the node's receive window.
+static inline int link_fits(const struct link *link, size_t bytes) {
+    return link->flying_bytes == 0 || link->flying_bytes + bytes <= link->settings.receive_window;
+}
+
+// The records at the front of a queue that may go now and fit together.
+struct link_front {
+    uint64_t end; // position behind them
+    uint64_t commands;
+    size_t size;      // of their payloads
+    uint64_t gate_ns; // when the next one may follow; LINK_NEVER: there is none, or it does not fit
+};
+
+// The next new block.
+struct link_plan {
+    uint64_t at_ns;          // when the next new block may go; <= NOW: it may, as far as clocks are concerned
+    struct link_offer offer; // of its first command
+    struct link_front fronts[LINK_CLASSES];
+    enum link_class order[LINK_CLASSES];
+    size_t classes; // how many of them have something to go
+    size_t size;    // of all fronts
+};
+
+struct link_plan link_plan_block(const struct link *link, uint64_t now, unsigned allowed);
+
+// Whether clocks, sequence and window let it go.
+int link_may_go(const struct link *link, const struct link_plan *plan, uint64_t now);
+
+// Moves what a plan found of a class into BLOCK.
+void link_take(struct link *link, enum link_class kind, const struct link_front *front,
+               struct link_block *block);
 
 #endif

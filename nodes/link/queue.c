@@ -4,8 +4,14 @@
 
 #include "nodes/link/batch.h"
 
-void link_queue_init(struct link_queue *queue, uint8_t *memory, size_t size) {
-    *queue = (struct link_queue){.memory = memory, .size = size};
+enum { STAMP = sizeof(uint64_t) };
+
+void link_queue_init(struct link_queue *queue, uint8_t *memory, size_t size, int stamped) {
+    *queue = (struct link_queue){.memory = memory, .size = size, .stamped = stamped ? 1 : 0};
+}
+
+static size_t header_of(const struct link_queue *queue) {
+    return queue->stamped ? BATCH_HEADER + STAMP : BATCH_HEADER;
 }
 
 static void copy_in(struct link_queue *queue, uint64_t at, const uint8_t *from, size_t size) {
@@ -35,18 +41,36 @@ int link_queue_put(struct link_queue *queue, const uint8_t *batch, size_t size, 
     return 1;
 }
 
+int link_queue_put_stamped(struct link_queue *queue, const struct link_command *command,
+                           const uint8_t *payload) {
+    uint8_t record[BATCH_HEADER + STAMP + UINT8_MAX];
+    memcpy(record, &command->min_clock, 8);
+    memcpy(record + 8, &command->req_clock, 8);
+    record[16] = command->size;
+    memcpy(record + BATCH_HEADER, &command->queued_ns, STAMP);
+    memcpy(record + BATCH_HEADER + STAMP, payload, command->size);
+    return link_queue_put(queue, record, header_of(queue) + command->size, 1);
+}
+
 uint64_t link_queue_peek(const struct link_queue *queue, uint64_t at, struct link_command *out) {
-    uint8_t header[BATCH_HEADER];
-    copy_out(queue, at, header, sizeof header);
+    uint8_t header[BATCH_HEADER + STAMP]; // a fixed size, since this is the hottest line of sending
+    size_t start = at & (queue->size - 1);
+    if (queue->size - start >= sizeof header)
+        memcpy(header, queue->memory + start, sizeof header);
+    else
+        copy_out(queue, at, header, sizeof header);
     memcpy(&out->min_clock, header, 8);
     memcpy(&out->req_clock, header + 8, 8);
     out->size = header[16];
-    return at + BATCH_HEADER + out->size;
+    out->queued_ns = 0;
+    if (queue->stamped)
+        memcpy(&out->queued_ns, header + BATCH_HEADER, STAMP);
+    return at + header_of(queue) + out->size;
 }
 
 void link_queue_payload(const struct link_queue *queue, uint64_t at, const struct link_command *command,
                         uint8_t *out) {
-    copy_out(queue, at + BATCH_HEADER, out, command->size);
+    copy_out(queue, at + header_of(queue), out, command->size);
 }
 
 void link_queue_drop(struct link_queue *queue, uint64_t at, uint64_t count) {

@@ -13,6 +13,7 @@
 struct link_queue {
     uint8_t *memory;
     uint64_t size, head, tail;
+    uint64_t stamped;                 // records carry, behind the header, when they were queued
     uint64_t commands;                // records inside now
     uint64_t bytes_max, commands_max; // most that ever were inside
 };
@@ -21,13 +22,18 @@ struct link_queue {
 // One record at the front of a queue; PAYLOAD is read separately.
 struct link_command {
     uint64_t min_clock, req_clock;
+    uint64_t queued_ns; // of a stamped queue, else 0
     uint8_t size;
 };
 
-void link_queue_init(struct link_queue *queue, uint8_t *memory, size_t size);
+void link_queue_init(struct link_queue *queue, uint8_t *memory, size_t size, int stamped);
 
 // Appends COUNT whole records of SIZE bytes in all; returns 0 and changes nothing when they do not fit.
 int link_queue_put(struct link_queue *queue, const uint8_t *batch, size_t size, uint64_t count);
+
+// Appends one command to a stamped queue; returns as link_queue_put.
+int link_queue_put_stamped(struct link_queue *queue, const struct link_command *command,
+                           const uint8_t *payload);
 
 // Reads the record at position AT (head <= AT < tail) and returns the position behind it.
 uint64_t link_queue_peek(const struct link_queue *queue, uint64_t at, struct link_command *out);

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import Any, Protocol
 
 from nodes.errors import CanductorError
 
@@ -42,6 +42,63 @@ class LinkTransport(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class BusSettings:
+    """What is known of a bus or serial line (``struct io_settings`` of io_core.h)."""
+
+    bitrate: int = 0
+    """Bits per second; 0: unlimited or unknown, nothing is budgeted."""
+    ceiling: float = 0.9
+    """Share of the bit rate that is given out, 0.1..1."""
+    queue_frames: int = 0
+    """Most frames (a serial line: bytes) that may sit in the kernel or adapter; 0: from the bit rate."""
+
+    def __post_init__(self) -> None:
+        """Raise LinkError when a value is out of its range."""
+        if not 0 <= self.bitrate <= 100_000_000:
+            raise LinkError(f"a bus of {self.bitrate} bit/s; give 1..100000000, or 0 when it is unknown")
+        if not 0.1 <= self.ceiling <= 1.0:
+            raise LinkError(f"a ceiling of {self.ceiling} of the bit rate; give 0.1..1")
+        if not 0 <= self.queue_frames <= 1000:
+            raise LinkError(
+                f"a kernel queue of {self.queue_frames} frames; give 1..1000, or 0 for the default"
+            )
+
+    def as_dict(self) -> dict[str, float]:
+        """Return the fields for cffi."""
+        return {"bitrate": self.bitrate, "ceiling": self.ceiling, "queue_frames": self.queue_frames}
+
+
+class BusDriver(Protocol):
+    """What moves the bytes of a bus: its I/O thread, or a simulation (io_core.h)."""
+
+    @property
+    def name(self) -> str:
+        """How messages to the user call the bus."""
+
+    @property
+    def serial(self) -> bool:
+        """Whether it is a serial line: one link, without a node id."""
+
+    @property
+    def ffi(self) -> Any:
+        """The cffi module that the bus was made with, and its lib."""
+
+    @property
+    def lib(self) -> Any:
+        """With the functions of io_api.h."""
+
+    @property
+    def bus(self) -> Any:
+        """The ``struct io_bus *``."""
+
+    def listen(self, handler: Callable[[], None]) -> None:
+        """Call HANDLER in the event loop's thread whenever io_take() has something."""
+
+    def close(self) -> None:
+        """End the driver and free the bus; nothing is called any more."""
+
+
+@dataclass(frozen=True, slots=True)
 class Response:
     """One response of a node: the checked content of a block."""
 
@@ -72,6 +129,15 @@ class LinkSettings:
     """Bytes the node can buffer, at least 64: RECEIVE_WINDOW of its dictionary."""
     lost_after_s: float = 1.0
     """Without an acknowledgement for so long, the link is lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """What passed on the wire. Bits are the true lengths of frames, 0 while the bit rate is unknown."""
+
+    frames: int = 0
+    bits: int = 0
+    blocks: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +184,35 @@ class LinkStats:
     """The smallest lead of all; negative: a command came too late. None: no lead is known."""
     lead_histogram: tuple[int, ...] = ()
     """Commands by lead: late, < 1 ms, < 2 ms, < 4 ms, …, and the last: 2^13 ms or more."""
+    bulk_commands: int = 0
+    bulk_commands_max: int = 0
+    bulk_bytes: int = 0
+    bulk_bytes_max: int = 0
+    motion: Flow = Flow()
+    """What was sent, by the class of each block's first command; repeats included."""
+    control: Flow = Flow()
+    bulk: Flow = Flow()
+    received: Flow = Flow()
+
+
+@dataclass(frozen=True, slots=True)
+class BusLoad:
+    """Shares of the bit rate within the last second; all 0 while it is unknown."""
+
+    motion: float = 0.0
+    control: float = 0.0
+    bulk: float = 0.0
+    acks: float = 0.0
+    """Received acknowledgements."""
+    data: float = 0.0
+    """Received otherwise; a serial line: all that was received."""
+    weak: float = 0.0
+    """Received with ids above those of nodes and host: frames that give way to all of these."""
+
+    @property
+    def total(self) -> float:
+        """All of it together."""
+        return self.motion + self.control + self.bulk + self.acks + self.data + self.weak
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +236,45 @@ class IOStats:
     waits: int
     """Times the kernel took no more and sending paused."""
     wakeups: int
+    bitrate: int
+    """The line's, 0: unknown; all that follows is 0 then, too."""
+    motion_bits: int
+    """Sent so far, true frame lengths."""
+    control_bits: int
+    """With admin frames."""
+    bulk_bits: int
+    received_bits: int
+    load: BusLoad
+    queue_frames: int
+    """Most frames that may sit in the kernel (a serial line: bytes; 0: not bounded)."""
+    queued_max: int
+    """Most that ever did."""
+    queue_waits: int
+    held_s: float
+    """Time for which the budget held something back."""
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """Whether the queued motion of a bus will be in time, if the bus goes on as in the last second."""
+
+    now_ns: int
+    """Host time of this forecast."""
+    worst_ratio: float
+    """Highest demand of any stretch of time, relative to what the bus can carry in it; above 1: too much."""
+    at_ns: int
+    """Host time at which that stretch ends; 0 without demand, or while the bit rate is unknown."""
+    late_ns: int | None
+    """Host time at which the first command is due that would be late; None: none would."""
+    motion_bits_per_s: float
+    """What the bus can carry of motion, beside the other traffic and below the ceiling; 0: unknown."""
+    queued_bits: int
+    """What the queued motion needs, acknowledgements included."""
+
+    @property
+    def warning_s(self) -> float | None:
+        """How early that is known; None: nothing would be late."""
+        return None if self.late_ns is None else (self.late_ns - self.now_ns) * 1e-9
 
 
 FrameHandler = Callable[[Frame], None]

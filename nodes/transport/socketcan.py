@@ -25,6 +25,8 @@ _SO_RCVBUFFORCE = 33
 _SO_MEMINFO = 55
 _MEMINFO = struct.Struct("=9I")
 _MEMINFO_DROPS = 8
+_CAN_RAW_ERR_FILTER = 2
+_CAN_ERR_BUSOFF = 0x40
 
 _ERRORS = {
     errno.ENODEV: "there is no such interface; list those there are with 'ip link show'",
@@ -135,7 +137,9 @@ def _configure(sock: socket.socket) -> None:
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER // 2)
     with contextlib.suppress(PermissionError):
         sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER // 2)
-    # Only what a node can send: no extended and no remote frames. Error frames are off unless asked for.
+    # Of error frames only that the controller went off the bus: who reads the descriptor hears of it.
+    sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", _CAN_ERR_BUSOFF))
+    # Only what a node can send: no extended and no remote frames.
     filters = struct.pack("=II", 0, socket.CAN_EFF_FLAG | socket.CAN_RTR_FLAG)
     sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
 

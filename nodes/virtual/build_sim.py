@@ -1,4 +1,8 @@
-"""Builds ``nodes.virtual._sim``: the node firmware on the simulated board, with its generated dictionary."""
+"""Builds ``nodes.virtual._sim``: the simulated world.
+
+That is the node firmware on the simulated board, with its generated dictionary, the host's core of a bus, and
+the wires between them.
+"""
 
 import subprocess
 import sys
@@ -6,6 +10,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent.parent))
 
+from nodes.link_sources import CORE_HEADERS, CORE_SOURCES
 from nodes.native_build import ROOT, builder
 
 TABLES = Path("build/sim/tables.c")
@@ -30,8 +35,18 @@ def generate() -> None:
 
 
 generate()
+WORLD = [
+    *("nodes/can_bits.c", "nodes/virtual/world/agenda.c", "nodes/virtual/world/clock.c"),
+    *(f"nodes/virtual/world/{name}.c" for name in ("can_wire", "controller", "uart", "nodes", "node_world")),
+    *(f"nodes/virtual/world/{name}.c" for name in ("host", "world")),
+]
+
 ffibuilder = builder(
     "nodes.virtual._sim",
-    headers=["firmware/boards/sim/sim.h"],
-    sources=[*map(str, SOURCES), str(TABLES)],
+    headers=[
+        *CORE_HEADERS,
+        *("firmware/boards/sim/sim.h", "nodes/virtual/world/can_wire.h", "nodes/virtual/world/world.h"),
+    ],
+    # The wire codec is in both, and linked once.
+    sources=list(dict.fromkeys([*map(str, SOURCES), str(TABLES), *CORE_SOURCES, *WORLD])),
 )

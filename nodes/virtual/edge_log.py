@@ -4,7 +4,7 @@ Layout: a header of 64 bytes, then 8-byte records ``clock << 16 | pin << 1 | lev
 """
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -99,19 +99,31 @@ class EdgeLog:
         Pins are at their idle level (the direction pin: low) before the log mentions them; a record that
         repeats a level is none.
         """
-        step_level, dir_level = step_idle_level, 0
-        for clock, pin, level in self.edges(step_pin, dir_pin, chunk_records=chunk_records):
-            is_step_pin = pin == step_pin
-            levels = level[is_step_pin]
-            before = np.concatenate(([np.uint8(step_level)], levels[:-1]))
-            stepped = levels != before
-            if not both_edges:
-                stepped &= levels != step_idle_level
-            # The direction pin's level after each record, carried on from one record to the next.
-            last_dir = np.maximum.accumulate(np.where(is_step_pin, -1, np.arange(len(pin))))
-            directions = np.where(last_dir < 0, dir_level, level[last_dir])[is_step_pin][stepped]
-            if len(levels):
-                step_level = int(levels[-1])
-            if len(pin) and last_dir[-1] >= 0:
-                dir_level = int(level[last_dir[-1]])
-            yield clock[is_step_pin][stepped], (directions.astype(np.int8) * 2 - 1).astype(np.int8)
+        chunks = self.edges(step_pin, dir_pin, chunk_records=chunk_records)
+        yield from steps_of(chunks, step_pin, both_edges=both_edges, step_idle_level=step_idle_level)
+
+
+def steps_of(
+    chunks: Iterable[tuple[Clocks, npt.NDArray[np.uint16], npt.NDArray[np.uint8]]],
+    step_pin: int,
+    *,
+    both_edges: bool,
+    step_idle_level: int = 0,
+) -> Iterator[tuple[Clocks, Directions]]:
+    """Yield the steps in CHUNKS of clock, pin and level of a step and a direction pin; see EdgeLog.steps."""
+    step_level, dir_level = step_idle_level, 0
+    for clock, pin, level in chunks:
+        is_step_pin = pin == step_pin
+        levels = level[is_step_pin]
+        before = np.concatenate(([np.uint8(step_level)], levels[:-1]))
+        stepped = levels != before
+        if not both_edges:
+            stepped &= levels != step_idle_level
+        # The direction pin's level after each record, carried on from one record to the next.
+        last_dir = np.maximum.accumulate(np.where(is_step_pin, -1, np.arange(len(pin))))
+        directions = np.where(last_dir < 0, dir_level, level[last_dir])[is_step_pin][stepped]
+        if len(levels):
+            step_level = int(levels[-1])
+        if len(pin) and last_dir[-1] >= 0:
+            dir_level = int(level[last_dir[-1]])
+        yield clock[is_step_pin][stepped], (directions.astype(np.int8) * 2 - 1).astype(np.int8)

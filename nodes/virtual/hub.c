@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // See hub.h.
 #include "nodes/virtual/hub.h"
-#include "nodes/virtual/frame_bits.h"
+#include "nodes/can_bits.h"
 
 #include <string.h>
 

@@ -9,6 +9,8 @@ from nodes.errors import CanductorError
 from nodes.virtual._sim import ffi, lib
 
 _CLOCK_LIMIT = 1 << 47
+_MOVE_COUNT_MAX = 0xFFFF
+_CLOCK_FREQ_LIMIT = (1 << 31) // 5  # five seconds between statistics have to fit into 2^31 ticks
 _EDGE_LEVEL_BITS, _EDGE_CLOCK_SHIFT, _EDGE_PIN_MASK = 1, 16, 0x7FFF
 
 
@@ -18,18 +20,50 @@ class SimNode:
     UUID: 12 hex digits. START_CLOCK: its 64-bit clock at the beginning, in ticks below 2^47. TRANSPORT
     decides which of the receive and take methods act. Not thread-safe: one thread at a time.
 
+    CLOCK_FREQ (ticks per second) and MOVE_COUNT (slots of the move queue) are those of the build's variant
+    unless given; DICTIONARY (zlib-compressed) is what `identify` gives instead of the build's own, with the
+    same numbers for the same commands. LEGACY: behave as firmware without this project's CAN extensions.
+
     Time moves only in `run_until`. Inputs act at the clock reached so far, and what they cause at once has
-    happened when the call returns. Raises CanductorError for a uuid, clock, pin or value that cannot be.
+    happened when the call returns. Raises CanductorError for a uuid, clock, frequency, count, pin or value
+    that cannot be.
     """
 
     def __init__(
-        self, uuid: str = "000000000001", start_clock: int = 0, transport: Literal["can", "uart"] = "can"
+        self,
+        uuid: str = "000000000001",
+        start_clock: int = 0,
+        transport: Literal["can", "uart"] = "can",
+        *,
+        clock_freq: int | None = None,
+        move_count: int | None = None,
+        dictionary: bytes | None = None,
+        legacy: bool = False,
     ) -> None:
         if len(uuid) != 12 or set(uuid) - set("0123456789abcdefABCDEF"):
             raise CanductorError(f"the uuid {uuid!r} of a simulated node must be 12 hex digits")
         if not 0 <= start_clock < _CLOCK_LIMIT:
             raise CanductorError(f"the start clock {start_clock} of a simulated node must lie in 0..2^47-1")
-        board = lib.sim_new(bytes.fromhex(uuid), start_clock, transport == "can")
+        if clock_freq is not None and not 0 < clock_freq < _CLOCK_FREQ_LIMIT:
+            raise CanductorError(f"the clock of a simulated node cannot run at {clock_freq} Hz")
+        if move_count is not None and not 0 < move_count <= _MOVE_COUNT_MAX:
+            raise CanductorError(f"a simulated node cannot have a move queue of {move_count} slots")
+        uuid_bytes = ffi.new("uint8_t[]", bytes.fromhex(uuid))
+        self._dictionary = ffi.NULL if dictionary is None else ffi.new("uint8_t[]", dictionary)
+        options = ffi.new(
+            "struct sim_options *",
+            {
+                "uuid": uuid_bytes,
+                "start_clock": start_clock,
+                "on_can": transport == "can",
+                "clock_freq": clock_freq or 0,
+                "move_count": move_count or 0,
+                "dictionary": self._dictionary,
+                "dictionary_size": len(dictionary or b""),
+                "legacy": legacy,
+            },
+        )
+        board = lib.sim_new_with(options)
         if not board:
             raise MemoryError
         self._board = ffi.gc(board, lib.sim_free)

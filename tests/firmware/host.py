@@ -1,6 +1,6 @@
 """A small, patient host for one simulated node, speaking through the twin of the wire protocol."""
 
-from typing import Literal
+from typing import Literal, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +13,18 @@ NODE_ID = 4
 TO_NODE, FROM_NODE = NODE_ID * 2 + 0x100, NODE_ID * 2 + 0x101
 
 
+class NodeOptions(TypedDict, total=False):
+    clock_freq: int
+    move_count: int
+    dictionary: bytes
+    legacy: bool
+
+
 class Host:
-    """Sends one block at a time; keeps what the node says of its own accord in `unasked`."""
+    """Sends one block at a time; keeps what the node says of its own accord in `unasked`.
+
+    Frames with ids below 0x100 which the node sent gather in `signals`.
+    """
 
     def __init__(
         self,
@@ -22,14 +32,17 @@ class Host:
         start_clock: int = 0,
         transport: Literal["can", "uart"] = "uart",
         uuid: str = "0123456789ab",
+        node_id: int = NODE_ID,
         learn: bool = True,
+        **options: Unpack[NodeOptions],
     ) -> None:
-        self.node = SimNode(uuid, start_clock, transport)
+        self.node = SimNode(uuid, start_clock, transport, **options)
+        self.uuid, self.node_id = bytes.fromhex(uuid), node_id
         self.transport = transport
         self.words = twin.Vocabulary()
         self.seq = 0
         self.unasked: list[twin.Answer] = []
-        self._buffer = b""
+        self.signals: list[tuple[int, bytes]] = []
         if transport == "can":
             self.assign()
         self.first_words = self.read()
@@ -42,22 +55,24 @@ class Host:
         return self.node.clock
 
     def assign(self) -> None:
-        uuid = bytes.fromhex("0123456789ab")
-        self.node.receive_frame(0x3F0, b"\x01" + uuid + bytes([NODE_ID]))
+        self.node.receive_frame(0x3F0, b"\x01" + self.uuid + bytes([self.node_id]))
 
     def write(self, data: bytes) -> None:
         if self.transport == "uart":
             self.node.receive_bytes(data)
             return
         for at in range(0, len(data), 8):
-            self.node.receive_frame(TO_NODE, data[at : at + 8])
+            self.node.receive_frame(self.node_id * 2 + 0x100, data[at : at + 8])
 
     def read(self) -> bytes:
         if self.transport == "uart":
             return self.node.take_bytes()
         frames = self.node.take_frames()
-        assert {can_id for can_id, _ in frames} <= {FROM_NODE}
-        return b"".join(data for _, data in frames)
+        from_node = self.node_id * 2 + 0x101
+        self.signals += [frame for frame in frames if frame[0] < 0x100]
+        data = [frame for frame in frames if frame[0] >= 0x100]
+        assert {can_id for can_id, _ in data} <= {from_node}
+        return b"".join(piece for _, piece in data)
 
     def receive(self) -> list[tuple[int, bytes]]:
         """Return all blocks waiting, as (seq, content), and keep the answers."""
@@ -76,6 +91,28 @@ class Host:
         answers = self.unasked[before:]
         del self.unasked[before:]
         return answers
+
+    def pour(self, command: str, count: int) -> None:
+        """Send a block of COUNT times COMMAND and take nothing of what comes back."""
+        self.write(wire_twin.block(self.seq, self.words.encode(command) * count))
+        self.seq = (self.seq + 1) & 15
+
+    def fill(self) -> None:
+        """Ask until the board takes no frames any more and the node stops executing."""
+        while self.node.counters()["rx_overflow_bytes"] == 0:
+            self.pour("get_uptime", 59)
+
+    def fill_board(self) -> None:
+        """Fill the board's room for frames, but not the node's own transmit buffer."""
+        for _ in range(4096 + 4):
+            self.pour("debug_nop", 1)
+
+    def restart(self) -> None:
+        """Power-cycle the node, and drop its first words."""
+        self.node.reset()
+        self.seq = 0
+        self.receive()
+        self.unasked.clear()
 
     def ask(self, command: str) -> twin.Answer:
         """Send a command with exactly one answer."""

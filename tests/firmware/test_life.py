@@ -1,6 +1,8 @@
 """A node's life: configuration, time, shutdown, reset; node ids; many nodes in one process."""
 
+import json
 import random
+import zlib
 
 import numpy as np
 import pytest
@@ -140,18 +142,6 @@ def fresh(uuid: str = "0123456789ab") -> SimNode:
     return SimNode(uuid, transport="can")
 
 
-def test_only_a_node_without_id_answers_the_query() -> None:
-    node = fresh()
-    assert node.take_frames() == []
-    for _ in range(2):
-        node.receive_frame(0x3F0, b"\x00")
-        assert node.take_frames() == [(0x3F1, b"\x20" + UUID + b"\x01")]
-    node.receive_frame(0x3F0, b"\x01" + UUID + b"\x05")
-    assert node.node_id == 5
-    node.receive_frame(0x3F0, b"\x00")
-    assert node.take_frames() == []
-
-
 @pytest.mark.parametrize(
     "frame",
     [
@@ -160,8 +150,6 @@ def test_only_a_node_without_id_answers_the_query() -> None:
         b"\x01" + UUID,
         b"\x02" + UUID,
         b"\x11" + UUID + b"\x05",
-        b"\x40\x01",
-        b"\x41",
         b"\xff" * 8,
         b"\x01" + UUID[::-1] + b"\x05",
     ],
@@ -200,7 +188,7 @@ def test_the_same_id_again_changes_nothing_and_other_ids_are_not_heard() -> None
     host = Host(transport="can")
     host.assign()
     block = wire_twin.block(host.seq, host.words.encode("get_config"))
-    for can_id in (TO_NODE + 2, TO_NODE - 2, 0x010, 0x020, 0x7FF):
+    for can_id in (TO_NODE + 2, TO_NODE - 2, 0x000, 0x00F, 0x011, 0x030, 0x0FF, 0x7FF):
         for at in range(0, len(block), 8):
             host.node.receive_frame(can_id, block[at : at + 8])
     assert host.node.take_frames() == []
@@ -252,10 +240,34 @@ def test_fifty_nodes_in_one_process_do_not_know_of_each_other() -> None:
         assert host.ask("get_config")["is_shutdown"] == 0
 
 
+def test_a_node_can_be_made_with_another_clock_queue_and_dictionary() -> None:
+    host = Host(clock_freq=64_000_000, move_count=7)
+    assert host.node.clock_freq == 64_000_000
+    host.configure("config_trsync oid=0")
+    assert host.ask("get_config")["move_count"] == 7
+    host.node.run_until(5 * 64_000_000)
+    host.receive()
+    assert [a.name for a in host.unasked] == ["stats"], "five seconds of the other clock"
+    words = host.words.raw | {"version": "another", "config": host.words.raw["config"] | {"MCU": "other"}}
+    blob = zlib.compress(json.dumps(words).encode())
+    other = Host(dictionary=blob)
+    assert (other.blob, other.words.raw["config"]["MCU"]) == (blob, "other")
+    for one in (host, other):
+        one.node.reset()
+        one.seq = 0
+        one.receive()
+    assert host.node.clock_freq == 64_000_000, "a restart changes none of it"
+    for offset in (len(blob) - 1, len(blob), len(blob) + 1):
+        assert other.ask(f"identify offset={offset} count=40").args["data"] == blob[offset:]
+
+
 def test_bad_arguments_are_told() -> None:
     for arguments in (("xyz", 0), ("0123456789a", 0), ("0123456789ab", -1), ("0123456789ab", 1 << 47)):
         with pytest.raises(CanductorError):
             SimNode(*arguments)
+    for clock_freq, move_count in ((0, 1), (-1, 1), (429_496_730, 1), (1, 0), (1, 65536)):
+        with pytest.raises(CanductorError):
+            SimNode(clock_freq=clock_freq, move_count=move_count)
     node = SimNode()
     with pytest.raises(CanductorError):
         node.set_input(144, 1)

@@ -114,6 +114,13 @@ class Process:
             if content:
                 answers.append(self.words.decode(seq, content))
 
+    def read_answer(self, name: str) -> twin.Answer:
+        """Wait for the answer NAME, past everything else."""
+        while True:
+            seq, content = self.read_block()
+            if content and (answer := self.words.decode(seq, content)).name == name:
+                return answer
+
     def end(self, *, close: bool = False) -> dict[str, float]:
         """End the process, by SIGTERM or by closing the bus; return its statistics."""
         if close and self.on_can:
@@ -322,3 +329,42 @@ def test_it_ends_on_ctrl_c(process: Process) -> None:
     out, _ = process.process.communicate(timeout=PATIENCE_S)
     assert json.loads(out)["blocks"] > 0
     assert process.process.returncode == 0
+
+
+CAN_ONLY = pytest.mark.parametrize("flavour", ["toolhead"], indirect=True)
+
+
+@CAN_ONLY
+def test_signals_reach_and_leave_the_process(process: Process) -> None:
+    process.start()
+    process.send("allocate_oids count=1", "config_trsync oid=0", "finalize_config crc=1")
+    process.send("trsync_set_group oid=0 group=7", "set_bus_stop enable=1")
+    start = "trsync_start oid=0 report_clock=0 report_ticks=0 expire_reason=2"
+    process.send(start)
+    process.frame(0x027, bytes([7, 5, 0, 0, 0, 0]))
+    assert process.read_answer("trsync_state")["trigger_reason"] == 5
+    before = process.send("get_clock")[0]["clock"]
+    process.frame(0x3F0, b"\x40\x09")
+    (latched,) = process.send("get_sync_pulse")
+    after = process.send("get_clock")[0]["clock"]
+    assert latched["seq"] == 9
+    assert (latched["clock"] - before) % ROLLOVER <= (after - before) % ROLLOVER
+    process.frame(0x3F0, b"\x41")
+    assert process.read_frame() == (0x3F1, b"\x21" + bytes.fromhex(UUID) + bytes([NODE_ID]))
+    process.send(start)
+    process.write(wire_twin.block(process.seq, process.words.encode("trsync_trigger oid=0 reason=6")))
+    process.seq = (process.seq + 1) & 15
+    can_id, data = process.read_frame()
+    assert (can_id, data[:2], len(data)) == (0x027, bytes([7, 6]), 6)
+    process.frame(0x010, b"\x00\x00")
+    assert process.read_answer("shutdown").name == "shutdown"
+
+
+@CAN_ONLY
+def test_a_legacy_process_takes_no_part_in_signals(tmp_path: Path, flavour: str) -> None:
+    process = Process(tmp_path, flavour, "--legacy", "1")
+    process.start()
+    process.frame(0x010, b"\x00\x00")
+    process.frame(0x3F0, b"\x41")
+    assert process.send("get_config")[0]["is_shutdown"] == 0
+    process.kill()

@@ -256,7 +256,9 @@ def test_a_node_that_restarts_by_itself_is_lost_for_that_reason() -> None:
     async def check() -> None:
         machine.io.links[0].say(machine.twin.response("starting"))
         await machine.changed_to(NodeState.LOST)
-        assert "it restarted by itself; check its power supply" in str(machine.node.failure)
+        assert str(machine.node.failure) == (
+            "node mainboard restarted by itself (it said so); check its power supply"
+        )
 
     machine.run(machine.bus.start, check)
 
@@ -269,7 +271,11 @@ def test_a_node_that_restarts_by_itself_is_lost_for_that_reason() -> None:
             NodeState.SHUTDOWN,
             "shut down: the message with the reason got lost",
         ),
-        (lambda twin: twin.reset(), NodeState.LOST, "it restarted by itself"),
+        (
+            lambda twin: twin.reset(),
+            NodeState.LOST,
+            "mainboard restarted by itself (its configuration is gone)",
+        ),
     ],
 )
 def test_what_a_node_said_only_once_is_noticed_when_that_was_lost(

@@ -15,7 +15,7 @@ from typing import Any
 
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, Uuid
 from nodes.dictionary import Dictionary
-from nodes.link import LinkSettings
+from nodes.link import Forecast, LinkSettings
 from nodes.message_format import Message, Value
 from nodes.seams import OnFrame, OnLost, OnResponses
 
@@ -26,6 +26,7 @@ SURVIVING = {
     "get_clock",
     "get_uptime",
     "get_config",
+    "get_canbus_id",
     "emergency_stop",
     "reset",
     "config_reset",
@@ -53,6 +54,14 @@ def source_of(**parts: Any) -> dict[str, Any]:
     return {key: value for key, value in source.items() if value is not None}
 
 
+def with_canbus_id() -> dict[str, Any]:
+    """The small dictionary of firmware that tells which board it runs on."""
+    source = source_of()
+    commands = source["commands"] | {"get_canbus_id": 101}
+    responses = source["responses"] | {"canbus_id canbus_uuid=%.*s canbus_nodeid=%u": 102}
+    return source_of(commands=commands, responses=responses)
+
+
 def without_commands(*names: str) -> dict[str, Any]:
     commands = source_of()["commands"]
     return source_of(commands={text: i for text, i in commands.items() if text.split()[0] not in names})
@@ -72,6 +81,10 @@ class TwinNode:
     configured: bool = False
     shut_down: bool = False
     alive: bool = True
+    strict_id: bool = False
+    """Without its node id it hears nothing on its link."""
+    says_uuid: Uuid | None = None
+    """What it answers get_canbus_id with, where its dictionary has that."""
     compressed: bytes = b""
     executed: list[str] = field(default_factory=list)
     refuse: Callable[[Message], int | None] = lambda _: None
@@ -102,6 +115,11 @@ class TwinNode:
 
     def reset(self) -> None:
         self.nodeid, self.crc, self.configured, self.shut_down = 0, 0, False, False
+
+    def reboot(self) -> None:
+        """Restart as a CAN node does: it forgets its id, and says nothing until it has one."""
+        self.reset()
+        self.strict_id = True
 
     def shutdown(self, now_s: float, text_id: int) -> bytes:
         self.shut_down = True
@@ -163,6 +181,11 @@ class TwinNode:
         oid = message.integer("oid")
         return self.response("stepper_position", oid=oid, pos=-100 * oid)
 
+    def _get_canbus_id(self, _: Message, __: float) -> bytes:
+        said = self.says_uuid or self.uuid
+        assert said is not None
+        return self.response("canbus_id", canbus_uuid=said.raw, canbus_nodeid=self.nodeid)
+
     def _debug_ping(self, message: Message, _: float) -> bytes:
         return self.response("pong", data=message.data("data"))
 
@@ -193,6 +216,8 @@ class TwinLink:
         content, sent_ns = self._to_node.popleft()
         loop = asyncio.get_running_loop()
         if self.node is None or not self.node.alive or self.closed:
+            return
+        if self.node.strict_id and not self.node.nodeid:
             return
         for answer in self.node.execute(content, loop.time()):
             self.say(answer, sent_ns)
@@ -248,7 +273,7 @@ class TwinIO:
         self.closed = False
 
     def __call__(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> "TwinIO":
-        self.on_frame, self.on_closed = on_frame, on_closed
+        self.on_frame, self.on_closed, self.closed = on_frame, on_closed, False
         return self
 
     @staticmethod
@@ -263,6 +288,12 @@ class TwinIO:
         self.links.append(link)
         self.settings.append(settings)
         return link
+
+    def learn_bitrate(self, bitrate: int) -> None:
+        self.bitrate = bitrate
+
+    def forecast(self) -> Forecast:
+        raise AssertionError("a twin bus has no budget")
 
     def send_frame(self, can_id: int, data: bytes) -> None:
         assert can_id == ADMIN_ID

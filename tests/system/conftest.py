@@ -6,6 +6,12 @@ import pytest
 from tests.system.stage import Hardware, hardware
 
 
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep what commands cache out of the user's home."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
 @pytest.fixture
 def machine(tmp_path: Path) -> Iterator[Hardware]:
     with hardware(tmp_path) as started:

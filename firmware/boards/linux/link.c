@@ -198,6 +198,19 @@ void link_flush(struct linux_board *board) {
     board->refused = 0;
 }
 
+// Where a frame with ID goes: urgent ones before the data, but not before what is already half written.
+static size_t place_for(const struct linux_board *board, uint32_t id) {
+    if (id >= CAN_ID_URGENT_END)
+        return board->out_size;
+    size_t at = board->out_size % sizeof(struct can_frame);
+    for (struct can_frame frame; at < board->out_size; at += sizeof(frame)) {
+        memcpy(&frame, board->out + at, sizeof(frame));
+        if (frame.can_id >= CAN_ID_URGENT_END)
+            break;
+    }
+    return at;
+}
+
 int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t size) {
     struct linux_board *board = (struct linux_board *)node;
     struct can_frame frame = {.can_id = id, .can_dlc = (uint8_t)size};
@@ -206,7 +219,9 @@ int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t s
         return -1;
     }
     memcpy(frame.data, data, size);
-    memcpy(board->out + board->out_size, &frame, sizeof(frame));
+    size_t at = place_for(board, id);
+    memmove(board->out + at + sizeof(frame), board->out + at, board->out_size - at);
+    memcpy(board->out + at, &frame, sizeof(frame));
     board->out_size += sizeof(frame);
     board->frames_out++;
     return 0;

@@ -20,7 +20,7 @@ struct options {
     const char *edge_log;
     uint8_t uuid[NODE_UUID_SIZE];
     double rate_ppm;
-    uint64_t start_clock, jitter_us, slice_us, seed;
+    uint64_t start_clock, jitter_us, slice_us, seed, legacy;
 };
 
 struct linux_board {

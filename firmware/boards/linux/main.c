@@ -23,6 +23,7 @@ static void start_node(struct linux_board *board) {
         .clock_high = (uint32_t)(virtual_clock(&board->virtual) >> 32),
         .arena = board->arena,
         .arena_size = sizeof(board->arena),
+        .legacy = board->options.legacy != 0,
     };
     memcpy(config.uuid, board->options.uuid, sizeof(config.uuid));
     virtual_pins_reset(&board->virtual);

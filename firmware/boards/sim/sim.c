@@ -15,8 +15,9 @@ struct sim_board {
     struct can_stream can;
     uint64_t clock;
     uint64_t edges_lost;
-    uint8_t uuid[NODE_UUID_SIZE];
+    struct node_config config; // but for clock_high, which every start sets anew
     uint8_t on_can, reset_wanted;
+    struct sim_owner owner; // all null: none
     uint8_t out[SIM_OUT_ROOM];
     size_t out_size;
     _Alignas(16) uint8_t arena[ARENA];
@@ -26,31 +27,40 @@ struct sim_board {
 // time
 
 static void start(struct sim_board *board) {
-    struct node_config config = {
-        .clock_freq = virtual_variant.clock_freq,
-        .move_count = virtual_variant.move_count,
-        .clock_high = (uint32_t)(board->clock >> 32),
-        .arena = board->arena,
-        .arena_size = sizeof(board->arena),
-    };
-    memcpy(config.uuid, board->uuid, sizeof(config.uuid));
+    board->config.clock_high = (uint32_t)(board->clock >> 32);
     board->reset_wanted = 0;
     virtual_pins_reset(&board->virtual);
     if (board->on_can)
         can_stream_attach(&board->virtual.node, &board->can);
-    node_start(&board->virtual.node, &config);
-    node_run_tasks(&board->virtual.node);
+    node_start(&board->virtual.node, &board->config);
+    if (!board->owner.context)
+        node_run_tasks(&board->virtual.node);
 }
 
 static void run_tasks(struct sim_board *board) {
     struct node *node = &board->virtual.node;
+    if (board->owner.context)
+        return; // it says when
     if (node->tasks_pending)
         node_run_tasks(node);
     if (board->reset_wanted)
         start(board);
 }
 
-struct sim_board *sim_new(const uint8_t *uuid, uint64_t start_clock, int on_can) {
+static void configure(struct sim_board *board, const struct sim_options *options) {
+    board->config = (struct node_config){
+        .clock_freq = options->clock_freq ? options->clock_freq : virtual_variant.clock_freq,
+        .move_count = options->move_count ? options->move_count : virtual_variant.move_count,
+        .arena = board->arena,
+        .arena_size = sizeof(board->arena),
+        .dictionary = options->dictionary,
+        .dictionary_size = options->dictionary_size,
+        .legacy = options->legacy != 0,
+    };
+    memcpy(board->config.uuid, options->uuid, sizeof(board->config.uuid));
+}
+
+struct sim_board *sim_new_with(const struct sim_options *options) {
     struct sim_board *board = calloc(1, sizeof(*board));
     if (!board)
         return NULL;
@@ -60,11 +70,16 @@ struct sim_board *sim_new(const uint8_t *uuid, uint64_t start_clock, int on_can)
         return NULL;
     }
     board->virtual.edge_room = EDGES_AT_FIRST;
-    board->clock = start_clock;
-    board->on_can = on_can != 0;
-    memcpy(board->uuid, uuid, sizeof(board->uuid));
+    board->clock = options->start_clock;
+    board->on_can = options->on_can != 0;
+    configure(board, options);
     start(board);
     return board;
+}
+
+struct sim_board *sim_new(const uint8_t *uuid, uint64_t start_clock, int on_can) {
+    const struct sim_options options = {.uuid = uuid, .start_clock = start_clock, .on_can = on_can};
+    return sim_new_with(&options);
 }
 
 void sim_free(struct sim_board *board) {
@@ -81,7 +96,11 @@ static uint64_t extend(const struct sim_board *board, uint32_t clock) {
 }
 
 uint64_t sim_next_deadline(const struct sim_board *board) {
-    return extend(board, node_next_deadline(&board->virtual.node));
+    const struct node *node = &board->virtual.node;
+    // With an owner, tasks that are wanted already run when it says so: only timers are due by themselves.
+    if (board->owner.context && node->tasks_pending)
+        return node->sched.first ? extend(board, node->sched.first->waketime) : UINT64_MAX;
+    return extend(board, node_next_deadline(node));
 }
 
 void sim_run_until(struct sim_board *board, uint64_t clock) {
@@ -103,6 +122,10 @@ void sim_run_until(struct sim_board *board, uint64_t clock) {
         board->clock = clock;
 }
 
+uint32_t sim_node_id(const struct sim_board *board) {
+    return board->can.node_id;
+}
+
 uint64_t sim_clock(const struct sim_board *board) {
     return board->clock;
 }
@@ -117,6 +140,54 @@ uint64_t virtual_clock(struct virtual_board *virtual) {
 
 void board_reset(struct node *node) {
     ((struct sim_board *)node)->reset_wanted = 1;
+}
+
+// ----------------------------------------------------------------------------------------------------- owner
+
+static void tell_edge(struct virtual_board *virtual, uint32_t pin, int level) {
+    struct sim_board *board = (struct sim_board *)virtual;
+    virtual->edge_count = 0; // the owner keeps it
+    board->owner.edge(board->owner.context, board->clock, pin, level);
+}
+
+static void ask_can_status(struct virtual_board *virtual, struct board_can_status *out) {
+    const struct sim_owner *owner = &((struct sim_board *)virtual)->owner;
+    owner->can_status(owner->context, out);
+}
+
+void sim_own(struct sim_board *board, const struct sim_owner *owner) {
+    board->owner = *owner;
+    board->out_size = 0;
+    board->virtual.on_edge = tell_edge;
+    if (board->on_can)
+        board->virtual.can_status = ask_can_status;
+}
+
+int sim_tasks_wanted(const struct sim_board *board) {
+    return board->virtual.node.tasks_pending;
+}
+
+int sim_reset_wanted(const struct sim_board *board) {
+    return board->reset_wanted;
+}
+
+void sim_run_tasks(struct sim_board *board) {
+    node_run_tasks(&board->virtual.node);
+}
+
+void sim_sent(struct sim_board *board) {
+    node_wake_tasks(&board->virtual.node);
+}
+
+void sim_power_off(struct sim_board *board) {
+    virtual_pins_reset(&board->virtual);
+    board->virtual.node.tasks_pending = 0;
+    board->virtual.node.sched.first = NULL;
+}
+
+void sim_power_on(struct sim_board *board, uint64_t start_clock) {
+    board->clock = start_clock;
+    start(board);
 }
 
 // ----------------------------------------------------------------------------------------------------- wires
@@ -135,12 +206,15 @@ void sim_receive_bytes(struct sim_board *board, const uint8_t *data, size_t size
     run_tasks(board);
 }
 
-static int put(struct sim_board *board, const void *data, size_t size) {
-    if (size > SIM_OUT_ROOM - board->out_size)
-        return -1;
-    memcpy(board->out + board->out_size, data, size);
-    board->out_size += size;
-    return 0;
+// Bytes of urgent frames at the front of what waits: data never goes before them.
+static size_t urgent_size(const struct sim_board *board) {
+    size_t at = 0;
+    for (uint32_t id; at < board->out_size; at += SIM_FRAME_SIZE) {
+        memcpy(&id, board->out + at, sizeof(id));
+        if (id >= CAN_ID_URGENT_END)
+            break;
+    }
+    return at;
 }
 
 int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t size) {
@@ -148,11 +222,27 @@ int board_can_send(struct node *node, uint32_t id, const uint8_t *data, size_t s
     memcpy(record, &id, sizeof(id));
     record[4] = (uint8_t)size;
     memcpy(record + 8, data, size);
-    return put((struct sim_board *)node, record, sizeof(record));
+    struct sim_board *board = (struct sim_board *)node;
+    if (board->owner.context)
+        return board->owner.send_frame(board->owner.context, id, data, size);
+    size_t at = id < CAN_ID_URGENT_END ? urgent_size(board) : board->out_size;
+    if (sizeof(record) > SIM_OUT_ROOM - board->out_size)
+        return -1;
+    memmove(board->out + at + sizeof(record), board->out + at, board->out_size - at);
+    memcpy(board->out + at, record, sizeof(record));
+    board->out_size += sizeof(record);
+    return 0;
 }
 
 size_t board_uart_send(struct node *node, const uint8_t *data, size_t size) {
-    return put((struct sim_board *)node, data, size) ? 0 : size;
+    struct sim_board *board = (struct sim_board *)node;
+    if (board->owner.context)
+        return board->owner.send_bytes(board->owner.context, data, size);
+    if (size > SIM_OUT_ROOM - board->out_size)
+        return 0;
+    memcpy(board->out + board->out_size, data, size);
+    board->out_size += size;
+    return size;
 }
 
 size_t sim_take(struct sim_board *board, uint8_t *out, size_t size) {

@@ -16,7 +16,19 @@ struct sim_board;
 
 enum { SIM_FRAME_SIZE = 16, SIM_OUT_ROOM = 65536 };
 
-// A node that starts at START_CLOCK (below 2^47), on CAN or on a UART. Null when memory is out.
+// What a node is made as; where 0 or null it is as the build's variant.
+struct sim_options {
+    const uint8_t *uuid;  // six bytes
+    uint64_t start_clock; // below 2^47
+    int on_can;           // else on a UART
+    uint32_t clock_freq;  // ticks per second, below 2^31 / NODE_STATS_SECONDS
+    uint16_t move_count;
+    const uint8_t *dictionary; // zlib-compressed; stays the caller's and must outlive the node
+    uint32_t dictionary_size;
+    int legacy; // 1: firmware without this project's CAN extensions
+};
+// Makes a node; everything but the dictionary's bytes is copied. Null when memory is out.
+struct sim_board *sim_new_with(const struct sim_options *options);
 struct sim_board *sim_new(const uint8_t *uuid, uint64_t start_clock, int on_can);
 void sim_free(struct sim_board *board);
 // As after a power cycle: unconfigured, without node id. The clock goes on.
@@ -28,11 +40,12 @@ void sim_receive_bytes(struct sim_board *board, const uint8_t *data, size_t size
 // nothing.
 void sim_run_until(struct sim_board *board, uint64_t clock);
 uint64_t sim_clock(const struct sim_board *board);
-// The clock of the next event without input.
+// The clock of the next event without input; UINT64_MAX: none.
 uint64_t sim_next_deadline(const struct sim_board *board);
 
 // Copies out up to SIZE bytes of what the node said, oldest first, and forgets them. On CAN they are records
-// of SIM_FRAME_SIZE bytes: u32 id, u8 length, three zeros, eight bytes of data; only whole records are taken.
+// of SIM_FRAME_SIZE bytes: u32 id, u8 length, three zeros, eight bytes of data; only whole records are taken,
+// urgent ones (ids below CAN_ID_URGENT_END) before all others.
 size_t sim_take(struct sim_board *board, uint8_t *out, size_t size);
 
 // Pins (0..143): level of an input, sample of a converter, value of a PWM. Return -1 for another pin.
@@ -53,5 +66,31 @@ struct sim_counters {
 };
 void sim_counters(const struct sim_board *board, struct sim_counters *out);
 // cffi: end
+
+// ------------------------------------------------------------------------------------ within a simulated
+// world
+//
+// A board with an owner leaves to it when tasks run and when a wanted reset happens, and gives it what it
+// sends at once. The owner calls sim_run_tasks() some time after sim_tasks_wanted(), and sim_restart() or
+// sim_power_on() after sim_reset_wanted().
+struct board_can_status;
+struct sim_owner {
+    void *context;
+    int (*send_frame)(void *context, uint32_t id, const uint8_t *data, size_t size); // 0, or -1: busy
+    size_t (*send_bytes)(void *context, const uint8_t *data, size_t size);           // bytes taken
+    void (*edge)(void *context, uint64_t clock, uint32_t pin, int level);
+    void (*can_status)(void *context, struct board_can_status *out);
+};
+// OWNER is copied.
+void sim_own(struct sim_board *board, const struct sim_owner *owner);
+uint32_t sim_node_id(const struct sim_board *board);
+int sim_tasks_wanted(const struct sim_board *board);
+int sim_reset_wanted(const struct sim_board *board);
+void sim_run_tasks(struct sim_board *board);
+// The wire has room again.
+void sim_sent(struct sim_board *board);
+// All outputs fall at once, nothing runs until sim_power_on(), whose clock is a new one.
+void sim_power_off(struct sim_board *board);
+void sim_power_on(struct sim_board *board, uint64_t start_clock);
 
 #endif

@@ -33,6 +33,8 @@ static void set_output(struct virtual_board *board, uint32_t pin, int level) {
         virtual_edges_full(board);
     board->edges[board->edge_count++] = virtual_clock(board) << 16 | pin << 1 | value;
     board->edges_total++;
+    if (board->on_edge)
+        board->on_edge(board, pin, value);
 }
 
 void virtual_pins_reset(struct virtual_board *board) {
@@ -98,6 +100,8 @@ void board_irq_restore(struct node *node, uint32_t state) {
 }
 
 void board_can_status(struct node *node, struct board_can_status *out) {
-    (void)node;
+    struct virtual_board *board = board_of(node);
     *out = (struct board_can_status){.state = BOARD_CAN_ACTIVE};
+    if (board->can_status)
+        board->can_status(board, out);
 }

@@ -16,6 +16,10 @@ struct virtual_board {
     uint64_t *edges;
     size_t edge_count, edge_room;
     uint64_t edges_total;
+    // Of a board's owner that simulates what is around it; null where there is none. on_edge: an output has
+    // changed and stands at the end of the edges.
+    void (*on_edge)(struct virtual_board *board, uint32_t pin, int level);
+    void (*can_status)(struct virtual_board *board, struct board_can_status *out);
 };
 
 // What one variant of the boards is built as (constants.c).

@@ -2,14 +2,19 @@
 // sources: firmware/wire/*.c firmware/core/*.c firmware/objects/*.c firmware/net/*.c
 // sources: firmware/boards/virtual/*.c firmware/boards/sim/sim.c build/sim/tables.c
 // Whatever a wire brings, a node survives: random commands with random arguments in sound blocks, and the
-// same with damage, under the sanitizers. Everything follows from the seed that a failure prints.
+// same with damage, under the sanitizers; on CAN also signals, admin commands and other nodes' frames.
+// Everything follows from the seed that a failure prints.
 #include "boards/sim/sim.h"
 #include "core/node.h"
+#include "net/can_stream.h"
 #include "tests/check.h"
 
 #include <string.h>
 
-enum { ROUNDS = 60, BLOCKS = 600, OIDS = 8 };
+enum { ROUNDS = 40, BLOCKS = 600, OIDS = 8, NODE_ID = 4, TO_NODE = 0x108, FROM_NODE = 0x109 };
+enum { DAMAGED = 1, ON_CAN = 2 };
+
+static const uint8_t uuid[NODE_UUID_SIZE] = {1, 2, 3, 4, 5, 6};
 
 DECL_COMMAND(command_config_reset, "", 0);
 DECL_COMMAND(command_allocate_oids, "", 0);
@@ -30,6 +35,8 @@ DECL_COMMAND(command_stepper_stop_on_trigger, "", 0);
 DECL_COMMAND(command_trsync_start, "", 0);
 DECL_COMMAND(command_trsync_set_timeout, "", 0);
 DECL_COMMAND(command_trsync_trigger, "", 0);
+DECL_COMMAND(command_trsync_set_group, "", 0);
+DECL_COMMAND(command_set_bus_stop, "", 0);
 DECL_COMMAND(command_endstop_home, "", 0);
 DECL_COMMAND(command_endstop_query_state, "", 0);
 DECL_COMMAND(command_set_digital_out_pwm_cycle, "", 0);
@@ -53,6 +60,7 @@ static const struct {
     {command_trsync_start, 2, 1},
     {command_trsync_set_timeout, 2, 1},
     {command_trsync_trigger, 2, 1},
+    {command_trsync_set_group, 2, 0},
     {command_endstop_home, 3, 1},
     {command_endstop_query_state, 3, 1},
     {command_set_digital_out_pwm_cycle, 4, 0},
@@ -73,7 +81,9 @@ struct fuzz {
     uint64_t state;
     struct sim_board *board;
     unsigned seq;
-    uint8_t out[SIM_OUT_ROOM];
+    int on_can;
+    unsigned signals, replies; // what the node said besides data
+    uint8_t out[SIM_OUT_ROOM], stream[SIM_OUT_ROOM];
 };
 
 static uint32_t below(struct fuzz *fuzz, uint32_t limit) {
@@ -82,6 +92,85 @@ static uint32_t below(struct fuzz *fuzz, uint32_t limit) {
     z = (z ^ (z >> 27)) * 0x94D049BB133111EBu;
     return (uint32_t)((z ^ (z >> 31)) % limit);
 }
+
+// ------------------------------------------------------------------------------------------------- the wire
+
+static void feed(struct fuzz *fuzz, const uint8_t *data, size_t size) {
+    if (!fuzz->on_can) {
+        sim_receive_bytes(fuzz->board, data, size);
+        return;
+    }
+    for (size_t at = 0; at < size; at += CAN_FRAME_MAX)
+        sim_receive_frame(fuzz->board, TO_NODE, data + at,
+                          size - at < CAN_FRAME_MAX ? size - at : CAN_FRAME_MAX);
+}
+
+static void assign(struct fuzz *fuzz) {
+    uint8_t data[CAN_FRAME_MAX] = {SET_NODEID};
+    memcpy(data + 1, uuid, sizeof(uuid));
+    data[7] = NODE_ID;
+    sim_receive_frame(fuzz->board, CAN_ID_ADMIN_REQUEST, data, sizeof(data));
+}
+
+// A frame that is not data for this node: any signal, any admin command, sometimes a trigger of its group or
+// a conflict about its id.
+static void send_other_frame(struct fuzz *fuzz) {
+    static const uint8_t commands[] = {QUERY_UNASSIGNED, SET_NODEID, SYNC_PULSE, WHO_IS_HERE};
+    uint8_t data[CAN_FRAME_MAX];
+    for (size_t i = 0; i < sizeof(data); i++)
+        data[i] = (uint8_t)below(fuzz, below(fuzz, 2) ? 8 : 256);
+    size_t size = below(fuzz, CAN_FRAME_MAX + 1);
+    uint32_t id = below(fuzz, 0x40);
+    if (id == 0x10 && below(fuzz, 4))
+        id++; // or it would hardly live
+    if (below(fuzz, 2)) {
+        id = 0x20 + below(fuzz, 16);
+        data[0] = (uint8_t)(below(fuzz, 4) ? id - 0x20 : data[0]);
+    } else if (!below(fuzz, 100)) {
+        id = below(fuzz, 2) ? FROM_NODE : below(fuzz, 0x800);
+    } else if (below(fuzz, 2)) {
+        id = CAN_ID_ADMIN_REQUEST;
+        data[0] = below(fuzz, 8) ? commands[below(fuzz, sizeof(commands))] : data[0];
+    }
+    sim_receive_frame(fuzz->board, id, data, size);
+}
+
+// Appends the data among SIZE bytes of frame records to the GATHERED bytes in fuzz->stream; returns how many
+// there are then. All that the node says must be of a kind it may say.
+static size_t gather(struct fuzz *fuzz, size_t size, size_t gathered) {
+    for (size_t at = 0; at < size; at += SIM_FRAME_SIZE) {
+        const uint8_t *record = fuzz->out + at;
+        uint32_t id;
+        memcpy(&id, record, sizeof(id));
+        if (id == FROM_NODE) {
+            memcpy(fuzz->stream + gathered, record + 8, record[4]);
+            gathered += record[4];
+        } else if (id == CAN_ID_ADMIN_RESPONSE) {
+            CHECK_EQUAL(record[8], record[15] == NODE_ID ? NODE_HERE : NEED_NODEID);
+            CHECK(memcmp(record + 9, uuid, sizeof(uuid)) == 0);
+            fuzz->replies++;
+        } else {
+            CHECK(id == 0x10 ? record[4] == 2 : id - 0x20 < TRIGGER_GROUPS && record[8] == id - 0x20);
+            fuzz->signals++;
+        }
+    }
+    return gathered;
+}
+
+// Takes the bytes the node said; returns how many they are. On CAN they may fill the board's room more than
+// once.
+static size_t take(struct fuzz *fuzz) {
+    size_t size = sim_take(fuzz->board, fuzz->out, sizeof(fuzz->out)), gathered = 0;
+    if (!fuzz->on_can)
+        return size;
+    for (; size; size = sim_take(fuzz->board, fuzz->out, sizeof(fuzz->out))) {
+        CHECK(gathered + size / 2 <= sizeof(fuzz->stream)); // half of a record is data
+        gathered = gather(fuzz, size, gathered);
+    }
+    return gathered;
+}
+
+// ------------------------------------------------------------------------------------------------- commands
 
 // Mostly what makes sense somewhere: small numbers, clocks soon, sometimes anything.
 static uint32_t argument(struct fuzz *fuzz, uint8_t type, unsigned index) {
@@ -147,12 +236,14 @@ static void configure(struct fuzz *fuzz) {
         {command_config_pwm_out, {INT(5), INT(7), INT(9), INT(0), INT(0), INT(below(fuzz, 9000))}},
         {command_config_analog_in, {INT(6), INT(8)}},
         {command_config_buttons, {INT(7), INT(8)}},
+        {command_trsync_set_group, {INT(2), INT(below(fuzz, 3))}},
+        {command_set_bus_stop, {INT(1)}},
         {command_finalize_config, {INT(1)}},
     };
     for (size_t i = 0; i < sizeof(setup) / sizeof(*setup); i++) {
         uint8_t block[WIRE_BLOCK_MAX];
         size_t size = command(block + WIRE_HEADER, setup[i].handler, setup[i].args);
-        sim_receive_bytes(fuzz->board, block, wire_block_finish(block, size, fuzz->seq++));
+        feed(fuzz, block, wire_block_finish(block, size, fuzz->seq++));
     }
 }
 
@@ -174,6 +265,8 @@ static size_t sensible_command(struct fuzz *fuzz, uint8_t *out) {
     } else if (uses[use].handler == command_endstop_home ||
                uses[use].handler == command_stepper_stop_on_trigger) {
         args[uses[use].oid ? 6 : 1] = INT(2);
+    } else if (uses[use].handler == command_trsync_set_group) {
+        args[1] = INT(below(fuzz, 3));
     }
     return command(out, uses[use].handler, args);
 }
@@ -190,61 +283,95 @@ static void send_block(struct fuzz *fuzz, int damage) {
     size = wire_block_finish(block, size, fuzz->seq++);
     if (damage && !below(fuzz, 3))
         block[below(fuzz, (uint32_t)size)] ^= (uint8_t)(1 + below(fuzz, 255));
-    sim_receive_bytes(fuzz->board, block, size);
+    feed(fuzz, block, size);
 }
 
 // Follows the node's numbers, and checks that all it says is sound.
 static void listen(struct fuzz *fuzz) {
     struct wire_scanner scanner = {0};
-    size_t size = sim_take(fuzz->board, fuzz->out, sizeof(fuzz->out)), at = 0;
+    size_t size = take(fuzz), at = 0;
+    const uint8_t *stream = fuzz->on_can ? fuzz->stream : fuzz->out;
     for (;;) {
         size_t skip, length;
-        enum wire_scan found = wire_scan(&scanner, fuzz->out + at, size - at, &skip, &length);
+        enum wire_scan found = wire_scan(&scanner, stream + at, size - at, &skip, &length);
         CHECK(found != WIRE_LOST && skip == 0);
         if (found == WIRE_MORE)
             break;
-        fuzz->seq = fuzz->out[at + 1] & WIRE_SEQ_MASK;
+        fuzz->seq = stream[at + 1] & WIRE_SEQ_MASK;
         at += length;
     }
     CHECK_EQUAL(at, size);
 }
 
-static void one_round(uint64_t seed, int damage) {
-    static const uint8_t uuid[NODE_UUID_SIZE] = {0};
+// A node that lost its id, or its configuration, gets a new one. Returns whether it had been shut down.
+static int revive(struct fuzz *fuzz) {
+    int was_shut_down = ((const struct node *)fuzz->board)->shutdown.active;
+    struct sim_counters counters;
+    sim_counters(fuzz->board, &counters);
+    if (fuzz->on_can && counters.node_id != NODE_ID) {
+        sim_restart(fuzz->board); // its half-sent block is gone with the id
+        fuzz->seq = 0;
+        assign(fuzz);
+        configure(fuzz);
+    } else if (was_shut_down) {
+        configure(fuzz);
+    }
+    return was_shut_down;
+}
+
+// It still is a node: after a restart it can be asked.
+static void check_alive(struct fuzz *fuzz) {
+    static const uint8_t identify[3] = {1, 0, 40};
+    sim_restart(fuzz->board);
+    if (fuzz->on_can)
+        assign(fuzz);
+    take(fuzz);
+    uint8_t block[WIRE_BLOCK_MAX];
+    memcpy(block + WIRE_HEADER, identify, sizeof(identify));
+    feed(fuzz, block, wire_block_finish(block, sizeof(identify), 0));
+    CHECK_EQUAL(take(fuzz), 43 + 2 * WIRE_BLOCK_MIN);
+}
+
+// Returns how many questions about who is there were answered.
+static unsigned one_round(uint64_t seed, int kind) {
     static struct fuzz fuzz;
-    fuzz = (struct fuzz){.state = seed, .board = sim_new(uuid, 0xFFFF0000u, 0)};
+    fuzz = (struct fuzz){.state = seed, .on_can = (kind & ON_CAN) != 0};
+    fuzz.board = sim_new(uuid, 0xFFFF0000u, fuzz.on_can);
     CHECK(fuzz.board);
+    if (fuzz.on_can)
+        assign(&fuzz);
     configure(&fuzz);
     unsigned lives = 0;
     for (unsigned i = 0; i < BLOCKS; i++) {
-        send_block(&fuzz, damage);
-        sim_run_until(fuzz.board, sim_clock(fuzz.board) + below(&fuzz, 3000));
+        send_block(&fuzz, kind & DAMAGED);
+        if (fuzz.on_can && below(&fuzz, 2))
+            send_other_frame(&fuzz);
+        uint32_t ticks = below(&fuzz, fuzz.on_can && !below(&fuzz, 16) ? 200000 : 3000);
+        sim_run_until(fuzz.board, sim_clock(fuzz.board) + ticks);
         sim_set_input(fuzz.board, below(&fuzz, 144), (int)below(&fuzz, 2));
         listen(&fuzz);
         if (!below(&fuzz, 100)) {
             sim_restart(fuzz.board);
             fuzz.seq = 0;
-            configure(&fuzz);
-        } else if (((const struct node *)fuzz.board)->shutdown.active) {
-            lives++;
+            if (fuzz.on_can)
+                assign(&fuzz);
             configure(&fuzz);
         }
+        lives += (unsigned)revive(&fuzz);
         sim_edges_forget(fuzz.board);
     }
     CHECK(lives > 5); // it did get into trouble
-    // It still is a node: after a restart it can be asked.
-    sim_restart(fuzz.board);
-    sim_take(fuzz.board, fuzz.out, sizeof(fuzz.out));
-    uint8_t block[WIRE_BLOCK_MAX] = {[WIRE_HEADER] = 1, [WIRE_HEADER + 1] = 0, [WIRE_HEADER + 2] = 40};
-    sim_receive_bytes(fuzz.board, block, wire_block_finish(block, 3, 0));
-    CHECK_EQUAL(sim_take(fuzz.board, fuzz.out, sizeof(fuzz.out)), 43 + 2 * WIRE_BLOCK_MIN);
+    CHECK(!fuzz.on_can || fuzz.signals > 50);
+    check_alive(&fuzz);
     sim_free(fuzz.board);
+    return fuzz.replies;
 }
 
 int main(void) {
-    for (uint64_t seed = 1; seed <= ROUNDS; seed++) {
-        one_round(seed, 0);
-        one_round(seed + 1000, 1);
-    }
+    unsigned replies = 0;
+    for (uint64_t seed = 1; seed <= ROUNDS; seed++)
+        for (int kind = 0; kind <= (DAMAGED | ON_CAN); kind++)
+            replies += one_round(seed + 1000 * (uint64_t)kind, kind);
+    CHECK(replies > ROUNDS);
     return 0;
 }

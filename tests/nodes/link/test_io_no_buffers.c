@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/io_*.c nodes/link/queue.c
+// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/can_bits.c
 // SocketCAN's ENOBUFS: a full interface queue costs time, no frame and no busy loop. The kernels of build
 // machines have no CAN, so the one call that tells it is replaced: this file's write() refuses first.
 #define _GNU_SOURCE
@@ -33,12 +33,12 @@ static void *serve(void *argument) {
     return NULL;
 }
 
-static void await_responses(struct io_bus *bus, int wanted) {
+static void await_responses(struct io_thread *thread, int wanted) {
     struct io_event events[16];
     while (wanted > 0) {
-        struct pollfd fd = {.fd = io_notice_fd(bus), .events = POLLIN};
+        struct pollfd fd = {.fd = io_notice_fd(thread), .events = POLLIN};
         CHECK(poll(&fd, 1, 20000) == 1);
-        size_t taken = io_take(bus, events, 16);
+        size_t taken = io_take(io_thread_bus(thread), events, 16);
         for (size_t i = 0; i < taken; i++)
             wanted -= events[i].notice == IO_RESPONSE;
     }
@@ -52,7 +52,9 @@ int main(void) {
     struct acker acker = {.fd = fds[1], .can = 1};
     pthread_t server;
     CHECK_EQUAL(pthread_create(&server, NULL, serve, &acker), 0);
-    struct io_bus *bus = io_start(fds[0], IO_CAN_STREAM);
+    struct io_settings line = {.bitrate = 1000000};
+    struct io_thread *thread = io_start(fds[0], IO_CAN_STREAM, &line);
+    struct io_bus *bus = io_thread_bus(thread);
     struct link_settings settings = {.receive_window = 192, .lost_after_ns = 20000000000};
     uint32_t link;
     CHECK_EQUAL(io_open_link(bus, 4, &settings, &link), IO_OK);
@@ -60,8 +62,8 @@ int main(void) {
     for (int round = 0; round < QUERIES; round++) {
         atomic_store(&refusals, round == 10 ? REFUSALS : round % 4);
         atomic_store(&refused_fd, fds[0]);
-        CHECK_EQUAL(io_send(bus, link, query, sizeof query, 0, 0), IO_OK);
-        await_responses(bus, 1);
+        CHECK_EQUAL(io_send(bus, link, LINK_CONTROL, query, sizeof query, 0, 0), IO_OK);
+        await_responses(thread, 1);
     }
     struct io_stats stats;
     struct io_link_stats link_stats;
@@ -73,7 +75,7 @@ int main(void) {
     CHECK(stats.waits >= REFUSALS);
     // Each refusal is one sleep, each answer a few wake-ups.
     CHECK(stats.wakeups < 2 * stats.waits + 20 * QUERIES);
-    io_stop(bus);
+    io_stop(thread);
     shutdown(fds[1], SHUT_RDWR);
     CHECK_EQUAL(pthread_join(server, NULL), 0);
     close(fds[0]);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/io_*.c nodes/link/queue.c
+// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/can_bits.c
 // The thread of a bus between several calling threads and a node that answers as fast as it can. Also built
 // by hand with -fsanitize=thread: what the mutex guards, it guards.
 #include "tests/check.h"
@@ -16,6 +16,7 @@
 enum { CALLERS = 3, COMMANDS = 3000, NODE = 4 };
 
 struct scene {
+    struct io_thread *thread;
     struct io_bus *bus;
     uint32_t link;
 };
@@ -36,7 +37,7 @@ static void *call(void *argument) {
             CHECK_EQUAL(io_send_batch(scene->bus, scene->link, batch, size), IO_OK);
         } else {
             CHECK_EQUAL(io_set_clock(scene->bus, scene->link, 1e6, 1000, 0), IO_OK);
-            while (io_send(scene->bus, scene->link, query, sizeof query, 0, 0) == IO_FULL)
+            while (io_send(scene->bus, scene->link, LINK_CONTROL, query, sizeof query, 0, 0) == IO_FULL)
                 ;
             CHECK_EQUAL(io_get_link_stats(scene->bus, scene->link, &stats), IO_OK);
             io_get_stats(scene->bus, &bus_stats);
@@ -46,13 +47,13 @@ static void *call(void *argument) {
 }
 
 // Takes events until the wanted notice comes; returns how many responses came before it.
-static size_t take_until(struct io_bus *bus, enum io_notice wanted) {
+static size_t take_until(struct io_thread *thread, enum io_notice wanted) {
     static struct io_event events[64];
     size_t responses = 0;
     for (;;) {
-        struct pollfd fd = {.fd = io_notice_fd(bus), .events = POLLIN};
+        struct pollfd fd = {.fd = io_notice_fd(thread), .events = POLLIN};
         CHECK(poll(&fd, 1, 20000) == 1);
-        size_t taken = io_take(bus, events, 64);
+        size_t taken = io_take(io_thread_bus(thread), events, 64);
         for (size_t i = 0; i < taken; i++) {
             responses += events[i].notice == IO_RESPONSE;
             if (events[i].notice == wanted)
@@ -68,7 +69,9 @@ static void converse(enum io_kind kind) {
     struct acker acker = {.fd = fds[1], .can = kind != IO_BYTES};
     pthread_t server, callers[CALLERS];
     CHECK_EQUAL(pthread_create(&server, NULL, serve, &acker), 0);
-    struct scene scene = {.bus = io_start(fds[0], kind)};
+    struct io_settings line = {0};
+    struct scene scene = {.thread = io_start(fds[0], kind, &line)};
+    scene.bus = io_thread_bus(scene.thread);
     struct link_settings settings = {.receive_window = 192, .lost_after_ns = 20000000000};
     CHECK_EQUAL(io_open_link(scene.bus, kind == IO_BYTES ? 0 : NODE, &settings, &scene.link), IO_OK);
     for (int i = 0; i < CALLERS; i++)
@@ -76,15 +79,15 @@ static void converse(enum io_kind kind) {
     for (int i = 0; i < CALLERS; i++)
         CHECK_EQUAL(pthread_join(callers[i], NULL), 0);
     CHECK_EQUAL(io_watch_drained(scene.bus, scene.link), IO_OK);
-    CHECK(take_until(scene.bus, IO_DRAINED) > 0);
+    CHECK(take_until(scene.thread, IO_DRAINED) > 0);
     struct io_link_stats stats;
     CHECK_EQUAL(io_get_link_stats(scene.bus, scene.link, &stats), IO_OK);
     CHECK_EQUAL(stats.link.commands_sent, CALLERS * COMMANDS);
     CHECK_EQUAL(stats.link.blocks_repeated, 0);
     shutdown(fds[1], SHUT_RDWR);
-    take_until(scene.bus, IO_ENDED);
-    CHECK_EQUAL(io_send(scene.bus, scene.link, (const uint8_t *)"\4", 1, 0, 0), IO_CLOSED);
-    io_stop(scene.bus);
+    take_until(scene.thread, IO_ENDED);
+    CHECK_EQUAL(io_send(scene.bus, scene.link, LINK_CONTROL, (const uint8_t *)"\4", 1, 0, 0), IO_CLOSED);
+    io_stop(scene.thread);
     CHECK_EQUAL(pthread_join(server, NULL), 0);
     close(fds[0]);
     close(fds[1]);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/link.c nodes/link/link_receive.c nodes/link/queue.c
+// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/queue.c
 // The link against bytes and calls that make no sense: nothing faults, nothing is unbounded, time goes on.
 #include "tests/check.h"
 
@@ -9,7 +9,7 @@
 #include "nodes/link/batch.h"
 #include "nodes/link/link.h"
 
-static uint8_t control_memory[512], motion_memory[2048];
+static uint8_t control_memory[512], motion_memory[2048], bulk_memory[1024];
 
 static uint32_t random_bits(uint32_t *state) {
     *state ^= *state << 13;
@@ -21,7 +21,12 @@ static uint32_t random_bits(uint32_t *state) {
 static struct link fresh(uint64_t window) {
     struct link link;
     struct link_settings settings = {.receive_window = window, .lost_after_ns = 1000000000};
-    link_init(&link, &settings, control_memory, sizeof control_memory, motion_memory, sizeof motion_memory);
+    const struct link_memory memories[LINK_CLASSES] = {
+        [LINK_MOTION] = {motion_memory, sizeof motion_memory},
+        [LINK_CONTROL] = {control_memory, sizeof control_memory},
+        [LINK_BULK] = {bulk_memory, sizeof bulk_memory},
+    };
+    link_init(&link, &settings, memories);
     return link;
 }
 
@@ -58,7 +63,7 @@ static void command(struct link *link, uint64_t now, uint32_t *state) {
     uint64_t clock = random_bits(state) % 4 ? now / 10 + random_bits(state) % 1000000 : random_bits(state);
     switch (random_bits(state) % 16) {
     case 0:
-        link_send_urgent(link, bytes, random_bits(state) % 64);
+        link_send_urgent(link, bytes, random_bits(state) % 64, now);
         break;
     case 1:
         link_send_batch(link, bytes, random_bits(state) % sizeof bytes);
@@ -70,7 +75,8 @@ static void command(struct link *link, uint64_t now, uint32_t *state) {
         link_set_receive_window(link, random_bits(state) % 1000);
         break;
     case 4:
-        link_send(link, bytes, random_bits(state) % 64, random_bits(state) % 3 ? 0 : clock, clock);
+        link_send(link, random_bits(state) % 3 ? LINK_CONTROL : LINK_BULK, bytes, random_bits(state) % 64,
+                  random_bits(state) % 3 ? 0 : clock, clock, now);
         break;
     default:
         for (int i = 0; i < 3; i++)
@@ -83,10 +89,12 @@ static void command(struct link *link, uint64_t now, uint32_t *state) {
 static void check_bounds(const struct link *link, uint64_t now) {
     CHECK(link->first <= link->cursor && link->cursor <= link->next);
     CHECK(link->next - link->first <= LINK_BLOCKS_MAX);
-    CHECK(link_queue_bytes(&link->control) <= sizeof control_memory);
-    CHECK(link_queue_bytes(&link->motion) <= sizeof motion_memory);
-    CHECK(link_pending(link) <= sizeof control_memory + sizeof motion_memory);
-    CHECK(link_deadline(link, now) > now);
+    CHECK(link_queue_bytes(&link->queues[LINK_CONTROL]) <= sizeof control_memory);
+    CHECK(link_queue_bytes(&link->queues[LINK_MOTION]) <= sizeof motion_memory);
+    CHECK(link_queue_bytes(&link->queues[LINK_BULK]) <= sizeof bulk_memory);
+    CHECK(link_pending(link) <= sizeof control_memory + sizeof motion_memory + sizeof bulk_memory);
+    for (unsigned allowed = 0; allowed <= LINK_ALL; allowed++)
+        CHECK(link_deadline(link, now, allowed) > now);
 }
 
 static void survives_garbage(void) {
@@ -106,7 +114,8 @@ static void survives_garbage(void) {
             link_handle_timer(&link, now);
             uint8_t out[LINK_WIRE_MAX];
             size_t size;
-            while ((size = link_next_block(&link, now, out)) != 0)
+            while ((size = link_next_block(
+                        &link, now, random_bits(&state) % 4 ? LINK_ALL : random_bits(&state) % 8, out)) != 0)
                 CHECK(size >= WIRE_BLOCK_MIN && size <= LINK_WIRE_MAX && out[size - 1] == WIRE_SYNC);
             check_bounds(&link, now);
         }
@@ -116,8 +125,9 @@ static void survives_garbage(void) {
 static void refuses_what_makes_no_sense(void) {
     struct link link = fresh(192);
     uint8_t bytes[64] = {1};
-    CHECK_EQUAL(link_send(&link, bytes, 0, 0, 0), LINK_INVALID);
-    CHECK_EQUAL(link_send(&link, bytes, 60, 0, 0), LINK_INVALID);
+    CHECK_EQUAL(link_send(&link, LINK_CONTROL, bytes, 0, 0, 0, 0), LINK_INVALID);
+    CHECK_EQUAL(link_send(&link, LINK_CONTROL, bytes, 60, 0, 0, 0), LINK_INVALID);
+    CHECK_EQUAL(link_send(&link, LINK_MOTION, bytes, 1, 0, 0, 0), LINK_INVALID);
     CHECK_EQUAL(link_send_batch(&link, bytes, 16), LINK_INVALID);
     CHECK_EQUAL(link_send_batch(&link, bytes, 17), LINK_INVALID); // a record without a command
     CHECK_EQUAL(link_set_receive_window(&link, 63), LINK_INVALID);
@@ -125,18 +135,18 @@ static void refuses_what_makes_no_sense(void) {
     CHECK_EQUAL(link_set_clock(&link, INFINITY, 0, 0), LINK_INVALID);
     CHECK_EQUAL(link_set_clock(&link, 0, 0, 0), LINK_INVALID);
     CHECK_EQUAL(link_pending(&link), 0);
-    CHECK(link_deadline(&link, 0) == UINT64_MAX);
+    CHECK(link_deadline(&link, 0, LINK_ALL) == UINT64_MAX);
 }
 
 static void a_full_queue_refuses_and_keeps_what_it_has(void) {
     struct link link = fresh(192);
     uint8_t bytes[59] = {1};
     unsigned taken = 0;
-    while (link_send(&link, bytes, sizeof bytes, 0, 0) == LINK_OK)
+    while (link_send(&link, LINK_CONTROL, bytes, sizeof bytes, 0, 0, 0) == LINK_OK)
         taken++;
-    CHECK_EQUAL(taken, sizeof control_memory / (BATCH_HEADER + sizeof bytes));
+    CHECK_EQUAL(taken, sizeof control_memory / (BATCH_HEADER + 8 + sizeof bytes));
     CHECK_EQUAL(link_pending(&link), taken);
-    CHECK_EQUAL(link_send_urgent(&link, bytes, 3), LINK_OK);
+    CHECK_EQUAL(link_send_urgent(&link, bytes, 3, 0), LINK_OK);
     CHECK_EQUAL(link_pending(&link), 1);
     CHECK_EQUAL(link.stats.commands_dropped, taken);
 }
@@ -147,10 +157,11 @@ static void extreme_clocks_wait(void) {
     link.state = LINK_RUNNING;
     uint8_t out[LINK_WIRE_MAX], bytes[] = {4};
     CHECK_EQUAL(link_set_clock(&link, 1e-3, 1000, 1000), LINK_OK);
-    CHECK_EQUAL(link_send(&link, bytes, 1, UINT64_MAX, UINT64_MAX), LINK_OK);
-    CHECK_EQUAL(link_next_block(&link, UINT64_MAX / 2, out), 0);
-    CHECK(link_deadline(&link, 5) == UINT64_MAX);
-    CHECK(link_next_due(&link, 5) == UINT64_MAX);
+    CHECK_EQUAL(link_send(&link, LINK_CONTROL, bytes, 1, UINT64_MAX, UINT64_MAX, 0), LINK_OK);
+    CHECK_EQUAL(link_next_block(&link, UINT64_MAX / 2, LINK_ALL, out), 0);
+    CHECK(link_deadline(&link, 5, LINK_ALL) == UINT64_MAX);
+    struct link_offer offer;
+    CHECK(!link_next_offer(&link, 5, LINK_ALL, &offer));
 }
 
 int main(void) {

@@ -348,11 +348,41 @@ def test_lead_histogram_buckets() -> None:
     assert line.link.stats.lead_min_ns == -4_500_000
 
 
-def test_next_due_orders_control_before_motion_by_its_clock() -> None:
+def test_an_offer_tells_class_and_deadline() -> None:
     line = connected()
-    assert line.link.next_due(line.now) == NEVER
-    line.link.set_clock(HZ, line.now, 0)
-    line.link.send_batch(record(store(1), 0, HZ))
-    assert line.link.next_due(line.now) == line.now + 1000 * MS
-    line.link.send(store(2))
-    assert line.link.next_due(line.now) == 0
+    link, now = line.link, line.now
+    assert link.offer(now) is None
+    link.set_clock(HZ, now, 0)
+    link.send_batch(record(store(1), 0, HZ))
+    # Due in 1 s, of which a round trip (2 ms) and the least timeout (20 ms) are kept for a repeat.
+    assert link.offer(now) == (lib.LINK_MOTION, now + 978 * MS, False)
+    link.send(ask(3), now=now, bulk=True)
+    assert link.offer(now) == (lib.LINK_MOTION, now + 978 * MS, False)
+    link.send(store(2), now=now)
+    assert link.offer(now) == (lib.LINK_CONTROL, now + 5 * MS, False)
+    assert link.offer(now + 977 * MS) == (lib.LINK_CONTROL, now + 5 * MS, False)
+    assert link.offer(now + 978 * MS) == (lib.LINK_MOTION, now + 978 * MS, True)
+    assert link.offer(now, 1 << lib.LINK_BULK) == (lib.LINK_BULK, now + 1000 * MS, False)
+    link.send_urgent(STOP)
+    assert link.offer(now) == (lib.LINK_CONTROL, 0, True)
+
+
+def test_a_block_is_filled_from_the_class_that_is_due_first() -> None:
+    line = connected()
+    link, now = line.link, line.now
+    link.set_clock(HZ, now, 0)
+    link.send(ask(3), now=now, bulk=True)
+    link.send_batch(record(store(1, 3), 0, HZ) + record(store(4, 3), 0, HZ))
+    link.send(store(2), now=now)
+    line.run()
+    assert line.node.executed == [store(2), store(1, 3), store(4, 3), ask(3)]
+
+
+def test_bulk_leaves_a_block_of_the_window_to_others() -> None:
+    line = connected()
+    link, now = line.link, line.now
+    for i in range(5):
+        link.send(store(i, 50), now=now, bulk=True)
+    assert [len(link.next_block(now)) for _ in range(3)] == [58, 58, 0]
+    link.send(store(9, 50), now=now)
+    assert len(link.next_block(now)) == 58

@@ -320,6 +320,8 @@ def test_full_queues_and_bad_arguments_are_refused_in_words() -> None:
                 link.send_urgent(b"")
             with pytest.raises(LinkError, match=r"control queue .* is full"):
                 repeat(lambda: link.send(ask(1), min_clock=1))  # no clock is known: it waits
+            with pytest.raises(LinkError, match=r"bulk queue .* is full"):
+                repeat(lambda: link.send(ask(1), min_clock=1, bulk=True))
             with pytest.raises(LinkError, match="cannot hold a block"):
                 link.set_receive_window(63)
             for freq_hz in (0.0, -1.0, float("nan"), float("inf")):

@@ -11,7 +11,7 @@ from tests.nodes.link.twin import NodeTwin, WindowObserver
 MS = 1_000_000
 NEVER = 2**64 - 1
 TO_NODE, TO_HOST = 0, 1
-QUEUE = 4096
+QUEUE = 8192
 MOTION_QUEUE = 65536
 
 Delivery = tuple[int, bytes]
@@ -31,14 +31,21 @@ class CoreLink:
         settings = ffi.new(
             "struct link_settings *", {"receive_window": window, "lost_after_ns": lost_after_ns}
         )
-        self._memory = ffi.new("uint8_t[]", QUEUE), ffi.new("uint8_t[]", MOTION_QUEUE)
+        sizes = {lib.LINK_MOTION: MOTION_QUEUE, lib.LINK_CONTROL: QUEUE, lib.LINK_BULK: QUEUE}
+        self._memory = {kind: ffi.new("uint8_t[]", size) for kind, size in sizes.items()}
+        memories = ffi.new("struct link_memory[]", lib.LINK_CLASSES)
+        for kind, size in sizes.items():
+            memories[kind].at, memories[kind].size = self._memory[kind], size
         self._out = ffi.new("uint8_t[]", lib.LINK_WIRE_MAX)
         self._response: Any = ffi.new("struct link_response *")
         self.c: Any = ffi.new("struct link *")
-        lib.link_init(self.c, settings, self._memory[0], QUEUE, self._memory[1], MOTION_QUEUE)
+        lib.link_init(self.c, settings, memories)
 
-    def send(self, content: bytes, min_clock: int = 0, req_clock: int = 0) -> int:
-        status: int = lib.link_send(self.c, content, len(content), min_clock, req_clock)
+    def send(
+        self, content: bytes, min_clock: int = 0, req_clock: int = 0, *, now: int = 0, bulk: bool = False
+    ) -> int:
+        kind = lib.LINK_BULK if bulk else lib.LINK_CONTROL
+        status: int = lib.link_send(self.c, kind, content, len(content), min_clock, req_clock, now)
         return status
 
     def send_batch(self, batch: bytes) -> int:
@@ -46,7 +53,7 @@ class CoreLink:
         return status
 
     def send_urgent(self, content: bytes) -> int:
-        status: int = lib.link_send_urgent(self.c, content, len(content))
+        status: int = lib.link_send_urgent(self.c, content, len(content), 0)
         return status
 
     def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> int:
@@ -66,19 +73,22 @@ class CoreLink:
         return found
 
     def next_block(self, now: int) -> bytes:
-        size = lib.link_next_block(self.c, now, self._out)
+        size = lib.link_next_block(self.c, now, lib.LINK_ALL, self._out)
         return bytes(ffi.buffer(self._out)[:size])
 
     def handle_timer(self, now: int) -> None:
         lib.link_handle_timer(self.c, now)
 
     def deadline(self, now: int) -> int:
-        at_ns: int = lib.link_deadline(self.c, now)
+        at_ns: int = lib.link_deadline(self.c, now, lib.LINK_ALL)
         return at_ns
 
-    def next_due(self, now: int) -> int:
-        due_ns: int = lib.link_next_due(self.c, now)
-        return due_ns
+    def offer(self, now: int, allowed: int = lib.LINK_ALL) -> tuple[int, int, bool] | None:
+        """(class, when it should go, pressing), or None."""
+        out: Any = ffi.new("struct link_offer *")
+        if not lib.link_next_offer(self.c, now, allowed, out):
+            return None
+        return out.kind, out.due_ns, bool(out.pressing)
 
     def pending(self) -> int:
         count: int = lib.link_pending(self.c)

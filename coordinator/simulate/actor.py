@@ -1,0 +1,129 @@
+"""Who makes the faults of a scenario happen, in the world's true time."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Final
+
+from coordinator.simulate.boards import Board
+from coordinator.simulate.faults import NS, Fault
+from coordinator.simulate.scenario import HOST
+from coordinator.simulate.script import ScriptedWorld
+from coordinator.simulate.values import ScenarioError
+from nodes.virtual.world import CanController, CanPort, CanWire, Uart, UartPort
+
+FRAME_BITS: Final = 110
+"""Of a usual frame: turns a share of frames into a share of bits."""
+BABBLE: Final = b"\xff" * 8
+
+
+def bit_errors(share: float) -> float:
+    """Return the probability of a disturbed bit that disturbs SHARE of the frames."""
+    return float(1.0 - (1.0 - share) ** (1.0 / FRAME_BITS))
+
+
+class SimActor:
+    """Acts on the parts of WORLD; NAME is the scenario's, for messages. The mappings may still grow."""
+
+    def __init__(
+        self,
+        name: str,
+        world: ScriptedWorld,
+        boards: Mapping[str, Board],
+        wires: Mapping[str, CanWire | Uart],
+        ports: Mapping[str, CanPort | UartPort],
+    ) -> None:
+        self._name = name
+        self._world = world
+        self._boards = boards
+        self._wires = wires
+        self._ports = ports
+        self._acts: dict[str, Callable[[Fault, bool], None]] = {
+            "cut": self._cut,
+            "reset": self._reset,
+            "power": self._power,
+            "stall": self._stall,
+            "babble": self._babble,
+            "loss": self._rate,
+            "corruption": self._rate,
+            "errors": self._disturb,
+        }
+
+    def now_ns(self) -> int:
+        """Return true time."""
+        return self._world.now_ns
+
+    def call(self, at_ns: int, what: Callable[[], object]) -> None:
+        """Call WHAT at AT_NS, and let the host go on."""
+        self._world.at(at_ns, what, wakes=True)
+
+    def act(self, fault: Fault) -> None:
+        """Plan FAULT: its begin, and its end."""
+        act = self._acts[fault.kind]
+        if fault.node and not (fault.node == HOST and fault.kind == "stall"):
+            self._board(fault)  # is told now, not in the middle
+        if fault.bus and fault.bus not in self._wires:
+            raise ScenarioError(
+                f"{self._name}: a fault names the bus '{fault.bus}', which the machine has not"
+            )
+        self._world.at(fault.begin_ns, partial(act, fault, True))
+        self._world.at(fault.end_ns, partial(act, fault, False))
+
+    def _board(self, fault: Fault) -> Board:
+        if fault.node not in self._boards:
+            known = ", ".join(self._boards)
+            raise ScenarioError(f"{self._name}: a fault names the node '{fault.node}'; there are {known}")
+        return self._boards[fault.node]
+
+    def _cut(self, fault: Fault, begins: bool) -> None:
+        board = self._board(fault)
+        if board.node.controller is not None:
+            board.node.controller.cut(int(begins))
+        elif isinstance(board.wire, Uart):
+            board.wire.set_faults(loss=float(begins))
+
+    def _reset(self, fault: Fault, begins: bool) -> None:
+        if begins:
+            self._board(fault).node.reset()
+
+    def _power(self, fault: Fault, begins: bool) -> None:
+        node = self._board(fault).node
+        if begins:
+            node.power_off()
+        else:
+            node.power_on()
+
+    def _stall(self, fault: Fault, begins: bool) -> None:
+        duration_s = (fault.end_ns - fault.begin_ns) / NS
+        if not begins:
+            return
+        if fault.node == HOST:
+            self._world.stall(duration_s)
+        else:
+            self._board(fault).stall(duration_s)
+
+    def _babble(self, fault: Fault, begins: bool) -> None:
+        controller = self._board(fault).node.controller
+        if controller is None:
+            raise ScenarioError(f"{self._name}: the node '{fault.node}' is on a UART and cannot babble")
+        if begins:
+            controller.babble(fault.can_id, BABBLE, (fault.end_ns - fault.begin_ns) / NS)
+
+    def _disturb(self, fault: Fault, begins: bool) -> None:
+        wire = self._wires[fault.bus]
+        if isinstance(wire, CanWire):
+            wire.set_bit_errors(bit_errors(fault.share) if begins else 0.0)
+
+    def _rate(self, fault: Fault, begins: bool) -> None:
+        share = fault.share if begins else 0.0
+        for part in self._listeners(fault.bus):
+            if fault.kind == "loss":
+                part.set_faults(loss=share)
+            else:
+                part.set_faults(corruption=share)
+
+    def _listeners(self, bus: str) -> list[CanController | Uart]:
+        wire, port = self._wires[bus], self._ports[bus]
+        if isinstance(wire, Uart) or isinstance(port, UartPort):
+            return [wire] if isinstance(wire, Uart) else []
+        boards = [board.node.controller for board in self._boards.values() if board.wire is wire]
+        return [port.controller, *(controller for controller in boards if controller is not None)]

@@ -1,0 +1,129 @@
+"""The boards of a scenario: simulated nodes as its settings and the seed make them, and what they did."""
+
+import json
+import zlib
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+
+from coordinator.simulate.scenario import NodeSetting
+from coordinator.simulate.script import ScriptedWorld
+from coordinator.simulate.truth import BoardTruth
+from coordinator.simulate.values import Dice
+from nodes._wire import ffi, lib
+from nodes.dictionary import BOOTSTRAP, Dictionary
+from nodes.virtual.sim import SimNode
+from nodes.virtual.world import CanWire, Latency, NodeSettings, Uart, WorldNode
+
+PIECE: Final = 40
+PS_PER_NS: Final = 1000
+
+
+class Board:
+    """One simulated board: NAME as SETTING and DICE make it, at WIRE of WORLD."""
+
+    def __init__(
+        self,
+        world: ScriptedWorld,
+        wire: CanWire | Uart,
+        name: str,
+        *,
+        uuid: str,
+        setting: NodeSetting,
+        dice: Dice,
+    ) -> None:
+        self.name = name
+        self.wire = wire
+        self._world = world
+
+        def draw(option: str) -> float:
+            return dice.draw(getattr(setting, option), f"nodes.{name}.{option}")
+
+        blob = _dictionary(setting.clock_hz)
+        self.dictionary = _parsed(blob)
+        self.clock_hz = round(self.dictionary.clock_freq_hz)
+        self._ppm = draw("ppm")
+        self._latency_s = draw("latency_us") * 1e-6
+        self.node: WorldNode = world.add_node(
+            wire,
+            uuid,
+            settings=NodeSettings(ppm=self._ppm, task=self._task(0.0)),
+            start_clock=2**32 - round(draw("rollover_after_s") * self.clock_hz) % 2**32,
+            clock_freq=self.clock_hz if setting.clock_hz else 0,
+            move_count=setting.move_slots,
+            dictionary=blob if setting.clock_hz else None,
+            legacy=setting.legacy,
+        )
+        self._begin(draw("power_on_s"), draw("ramp_ppm_per_s"), draw("ramp_s"))
+
+    def _begin(self, power_on_s: float, ramp_ppm_per_s: float, ramp_s: float) -> None:
+        now_ns = self._world.now_ns
+        if power_on_s > 0:
+            self.node.power_off()
+            self._world.at(now_ns + round(power_on_s * 1e9), self.node.power_on)
+        if ramp_ppm_per_s:
+            self.node.set_rate(self._ppm, ramp_ppm_per_s)
+            self._world.at(now_ns + round(ramp_s * 1e9), lambda: self.node.set_rate(self.node.ppm))
+
+    def _task(self, busy_s: float) -> Latency:
+        return Latency(busy_s + 5e-6, self._latency_s / 3, busy_s + max(self._latency_s, 5e-6))
+
+    def stall(self, duration_s: float) -> None:
+        """Let it not come to its tasks for DURATION_S; its timers and interrupts go on."""
+        self.node.set_pace(task=self._task(duration_s))
+        end_ns = self._world.now_ns + round(duration_s * 1e9)
+        self._world.at(end_ns, lambda: self.node.set_pace(task=self._task(0.0)))
+
+    def truth(self) -> BoardTruth:
+        """Return what its pins did."""
+        edges = self.node.edges()
+        return BoardTruth(
+            at_ns=edges["true_ps"] // PS_PER_NS,
+            pin=np.ascontiguousarray(edges["pin"]),
+            level=np.ascontiguousarray(edges["level"]),
+            life=np.ascontiguousarray(edges["life"]),
+        )
+
+    def overflow(self) -> int:
+        """Return how many bytes found its receive buffer full, since its last start."""
+        return self.node.counters()["rx_overflow_bytes"]
+
+    @property
+    def pins(self) -> dict[str, int]:
+        """Numbers of its pins by name."""
+        return dict(self.dictionary.enumerations["pin"].values)
+
+
+@lru_cache
+def _dictionary(clock_hz: int) -> bytes:
+    """Return the compressed dictionary of the simulated board, for a clock of CLOCK_HZ (0: as built)."""
+    if not clock_hz:
+        return _download()
+    words = json.loads(zlib.decompress(_dictionary(0)))
+    words["config"]["CLOCK_FREQ"] = clock_hz
+    return zlib.compress(json.dumps(words, separators=(",", ":")).encode(), 9)
+
+
+@lru_cache
+def _parsed(blob: bytes) -> Dictionary:
+    return Dictionary.parse(blob)
+
+
+def _download() -> bytes:
+    """Ask a board for its dictionary."""
+    node, data, sequence = SimNode(transport="uart"), b"", 0
+    node.take_bytes()
+    while True:
+        content = BOOTSTRAP.encode("identify", offset=len(data), count=PIECE)
+        block = ffi.new("uint8_t[]", lib.WIRE_BLOCK_MAX)
+        ffi.memmove(ffi.addressof(block, lib.WIRE_HEADER), content, len(content))
+        node.receive_bytes(bytes(ffi.buffer(block, lib.wire_block_finish(block, len(content), sequence))))
+        sequence += 1
+        answer = node.take_bytes()
+        content = answer[lib.WIRE_HEADER : answer[0] - lib.WIRE_TRAILER]
+        message = BOOTSTRAP.decode(content)
+        piece = b"" if message is None else message.data("data")
+        if not piece:
+            return data
+        data += piece

@@ -1,0 +1,216 @@
+"""One seed of one scenario: perform it on its stage, then let the checker judge."""
+
+import asyncio
+import contextlib
+import hashlib
+import time
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from coordinator.app import Machine, link_of
+from coordinator.gcode.program import Program
+from coordinator.machine.description import StepperDescription
+from coordinator.pipeline import PlanRecord
+from coordinator.session import Outcome, run_job
+from coordinator.simulate import checker, truth
+from coordinator.simulate.checker import Ending, QueueDepth, StepperTruth, Violation
+from coordinator.simulate.program import make_program
+from coordinator.simulate.result import Result
+from coordinator.simulate.scenario import Scenario
+from coordinator.simulate.stage import Stage
+from coordinator.simulate.values import ScenarioError
+from nodes.errors import CanductorError
+from nodes.link import Link
+
+LIMIT_S: Final = 90.0
+"""Simulated time after which a run hangs."""
+AFTERWARDS_S: Final = 2.0
+"""The boards go on for so long after the end: whoever still steps is found out."""
+LINK_CONTROL_BYTES: Final = 1 << 15
+LINK_MOTION_BYTES: Final = 1 << 20
+"""What may wait in a link's queues."""
+BY_THE_USER: Final = "stopped by the user"
+
+
+def play(scenario: Scenario, seed: int) -> Result:
+    """Run SEED of SCENARIO and return what became of it; what the code under test raises goes through."""
+    began_s = time.process_time()
+    stage = Stage(scenario, seed)
+    run = _Run(stage)
+    run.perform()
+    return _judge(stage, run, began_s)
+
+
+class _Text:
+    """The g-code as a file that is read."""
+
+    def __init__(self, text: str) -> None:
+        self._data = text.encode()
+
+    def read(self, size: int, /) -> bytes:
+        """Return at most SIZE bytes."""
+        part, self._data = self._data[:size], self._data[size:]
+        return part
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+@dataclass(slots=True)
+class _Run:
+    """The coordinator's part, and what was seen of it."""
+
+    stage: Stage
+    record: PlanRecord = field(default_factory=lambda: PlanRecord((0.0, 0.0, 0.0, 0.0)))
+    outcome: Outcome | None = None
+    cause: str | None = None
+    stopped_ns: int | None = None
+    job_ns: int = 0
+    ready_s: float = 0.0
+    links: dict[str, Link] = field(default_factory=dict)
+    both_edges: dict[str, bool] = field(default_factory=dict)
+    found: list[Violation] = field(default_factory=list)
+    watch: asyncio.Task[None] | None = None
+    """Keeps the task that notes the stop alive."""
+
+    def perform(self) -> None:
+        """Connect, run the job, and let the boards go on for a while afterwards."""
+        with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
+            runner.get_loop().set_exception_handler(self._exception)
+            try:
+                self.outcome = runner.run(self._main())
+            except ScenarioError:
+                raise  # a mistake in the file, not the machine's doing
+            except CanductorError as error:
+                self.cause = str(error)
+            except asyncio.CancelledError:
+                self.cause = BY_THE_USER
+            except TimeoutError:
+                self.found.append(Violation("exception", f"not over after {LIMIT_S:g} simulated seconds"))
+            if self.cause is not None and self.stopped_ns is None:
+                self.stopped_ns = self.stage.now_ns()
+            runner.run(asyncio.sleep(AFTERWARDS_S))
+
+    async def _main(self) -> Outcome:
+        self.stage.faults.begin("start", self._interrupt())
+        program = Program(_Text(make_program(self.stage.scenario.program, self.stage.dice)), "job")
+        async with asyncio.timeout(LIMIT_S):
+            return await run_job(
+                self.stage.description,
+                program,
+                lambda _: None,
+                record=self.record,
+                on_told=lambda _: None,
+                on_ready=self._ready,
+                host=self.stage.host,
+            )
+
+    def _interrupt(self) -> Any:
+        task = asyncio.current_task()
+        assert task is not None
+        return task.cancel
+
+    def _ready(self, machine: Machine) -> None:
+        self.job_ns = self.stage.now_ns()
+        self.ready_s = self.stage.elapsed_s()
+        for name, node in machine.nodes.items():
+            with contextlib.suppress(CanductorError):  # one that may be absent is
+                self.links[name] = link_of(node)
+        self.both_edges = {name: s.steps_on_both_edges for name, s in machine.devices.steppers.items()}
+        self.stage.faults.begin("job", self._interrupt())
+        self.watch = asyncio.get_running_loop().create_task(self._note_stop(machine))
+
+    async def _note_stop(self, machine: Machine) -> None:
+        await machine.wait_stopped()
+        self.stopped_ns = self.stage.now_ns()
+
+    def _exception(self, _: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        self.found.append(Violation("exception", f"{context['message']}: {type(error).__name__}: {error}"))
+
+
+# ---------------------------------------------------------------------------------------------- judgement
+
+
+def _judge(stage: Stage, run: _Run, began_s: float) -> Result:
+    scenario = stage.scenario
+    ending = _ending(stage, run)
+    found = [*run.found, *checker.check_ending(scenario.expect, scenario.causes, ending)]
+    steppers = [_stepper(stage, run, ending, stepper) for stepper in stage.description.steppers]
+    for stepper in steppers:
+        found += checker.check_stepper(stepper, stage.print_time, ending)
+    found += checker.check_queues([*_link_queues(run), *stage.queues()])
+    errors_us = {s.stepper: checker.worst_error_s(s, stage.print_time) * 1e6 for s in steppers}
+    primary = stage.description.nodes[0].name
+    return Result(
+        scenario=scenario.given,
+        seed=stage.seed,
+        violations=tuple(found),
+        cause=run.cause,
+        steps=sum(len(s.executed.at_ns) for s in steppers),
+        planned=sum(len(s.planned.print_time) for s in steppers),
+        virtual_s=stage.elapsed_s(),
+        ready_s=run.ready_s,
+        faults=stage.fault_count(),
+        worst_primary_us=max((errors_us[s.stepper] for s in steppers if s.node == primary), default=0.0),
+        worst_secondary_us=max((errors_us[s.stepper] for s in steppers if s.node != primary), default=0.0),
+        trace=_trace(stage, run, steppers),
+        events=stage.events(),
+        cpu_s=time.process_time() - began_s,
+    )
+
+
+def _ending(stage: Stage, run: _Run) -> Ending:
+    if run.cause is None:
+        return Ending()
+    assert run.stopped_ns is not None
+    return Ending(
+        cause=run.cause,
+        stopped_ns=run.stopped_ns,
+        complete_until_ns=stage.faults.sound_until_ns(run.job_ns, run.stopped_ns),
+        stop_s=stage.scenario.bounds.stop_s,
+    )
+
+
+def _stepper(stage: Stage, run: _Run, ending: Ending, stepper: StepperDescription) -> StepperTruth:
+    node, bounds = stepper.node, stage.scenario.bounds
+    primary = node == stage.description.nodes[0].name
+    allowed_s = checker.STEP_BAND_S + checker.ROUNDING_TICKS / stage.clock_hz(node) + bounds.late_us * 1e-6
+    executed = truth.executed(
+        stage.board(node),
+        stepper,
+        stage.pins(node),
+        both_edges=run.both_edges.get(stepper.name, False),
+        since_ns=run.job_ns,
+    )
+    reachable = ending.stopped_ns is None or stage.faults.can_reach(
+        node, ending.stopped_ns, ending.stopped_ns + round(ending.stop_s * 1e9)
+    )
+    return StepperTruth(
+        stepper=stepper.name,
+        node=node,
+        planned=truth.planned(run.record, stepper),
+        executed=executed,
+        allowed_s=allowed_s if primary else allowed_s + bounds.clock_error_us * 1e-6,
+        counted=None if run.outcome is None else run.outcome.positions[stepper.name],
+        reachable=reachable,
+    )
+
+
+def _link_queues(run: _Run) -> list[QueueDepth]:
+    depths = []
+    for name, link in run.links.items():
+        stats = link.stats()
+        depths.append(
+            QueueDepth(f"control queue of node {name}", stats.control_bytes_max, LINK_CONTROL_BYTES)
+        )
+        depths.append(QueueDepth(f"motion queue of node {name}", stats.motion_bytes_max, LINK_MOTION_BYTES))
+    return depths
+
+
+def _trace(stage: Stage, run: _Run, steppers: list[StepperTruth]) -> str:
+    """Return a hash of what happened: the world's events, every step, and how it ended."""
+    digest = hashlib.sha256(f"{stage.trace()} {run.cause} {run.stopped_ns} {run.job_ns}".encode())
+    for stepper in steppers:
+        digest.update(stepper.executed.at_ns.tobytes() + stepper.executed.direction.tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,195 @@
+// SPDX-License-Identifier: Apache-2.0
+// What goes into a link's next block, and when: classes by urgency, clocks, packing.
+#include "nodes/link/link_core.h"
+
+// No command whose req_clock lies further ahead is sent: its 32-bit clocks would be ambiguous from 2^31 ticks
+// on, and the other half of that range is left to times inside the command that lie behind req_clock.
+#define CLOCK_REACH ((uint64_t)1 << 30)
+// A block that could still be filled by commands whose min_clock comes soon waits for them, but not when its
+// first command is due within this time: fewer, fuller blocks cost less of the bus.
+#define PACK_LEAD_NS (100 * NS_PER_MS)
+// What a class may wait for others that are due earlier. Control: a person or a control loop waits for the
+// answer, and 5 ms are a few blocks of all others. Bulk: long enough to give way to whatever a plan does,
+// short of the seconds after which those who transfer it give up.
+#define CONTROL_DUE_NS (5 * NS_PER_MS)
+#define BULK_DUE_NS (1000 * NS_PER_MS)
+#define MARGIN_MAX_NS (100 * NS_PER_MS)
+
+// ------------------------------------------------------------------------------------------------- packing
+
+static uint64_t gate_of(const struct link *link, const struct link_command *command) {
+    uint64_t reach = command->req_clock > CLOCK_REACH ? command->req_clock - CLOCK_REACH : 0;
+    uint64_t ticks = command->min_clock > reach ? command->min_clock : reach;
+    if (link->clock_hz > 0)
+        return ticks ? link_clock_to_ns(link, ticks) : 0;
+    return command->min_clock ? LINK_NEVER : 0;
+}
+
+static struct link_front ready(const struct link *link, const struct link_queue *queue, uint64_t now,
+                               size_t room) {
+    struct link_front front = {.end = queue->head, .gate_ns = LINK_NEVER};
+    while (front.end < queue->tail) {
+        struct link_command command;
+        uint64_t behind = link_queue_peek(queue, front.end, &command);
+        if (command.size > room - front.size)
+            break;
+        uint64_t gate_ns = gate_of(link, &command);
+        if (gate_ns > now) {
+            front.gate_ns = gate_ns;
+            break;
+        }
+        front.end = behind;
+        front.size += command.size;
+        front.commands++;
+    }
+    return front;
+}
+
+// When the last of the motion commands that fit into the block may go.
+static uint64_t filled_at(const struct link *link, const struct link_front *front) {
+    const struct link_queue *motion = &link->queues[LINK_MOTION];
+    uint64_t latest = 0;
+    size_t size = front->size;
+    for (uint64_t at = front->end; at < motion->tail;) {
+        struct link_command command;
+        at = link_queue_peek(motion, at, &command);
+        if (command.size > WIRE_CONTENT_MAX - size)
+            break;
+        uint64_t gate_ns = gate_of(link, &command);
+        if (gate_ns > latest)
+            latest = gate_ns;
+        size += command.size;
+    }
+    return latest;
+}
+
+uint64_t link_motion_due(const struct link *link, uint64_t req_clock) {
+    if (!req_clock || !(link->clock_hz > 0))
+        return 0;
+    uint64_t due_ns = link_clock_to_ns(link, req_clock);
+    uint64_t margin_ns = link->stats.srtt_ns + link_first_rto(link);
+    margin_ns = margin_ns < MARGIN_MAX_NS ? margin_ns : MARGIN_MAX_NS;
+    return due_ns > margin_ns ? due_ns - margin_ns : 1;
+}
+
+static struct link_offer offer_of(const struct link *link, enum link_class kind,
+                                  const struct link_command *head, uint64_t now) {
+    struct link_offer offer = {.kind = (uint8_t)kind};
+    uint64_t due_ns = kind == LINK_BULK ? 0 : link_motion_due(link, head->req_clock);
+    if (kind == LINK_MOTION) {
+        offer.due_ns = due_ns ? due_ns : now; // nothing is known: at once, but not before what waited longer
+        offer.pressing = due_ns && due_ns <= now;
+        return offer;
+    }
+    offer.due_ns = head->queued_ns + (kind == LINK_BULK ? BULK_DUE_NS : CONTROL_DUE_NS);
+    if (due_ns && due_ns < offer.due_ns)
+        offer.due_ns = due_ns;
+    if (kind == LINK_CONTROL && link->urgent) {
+        offer.due_ns = 0;
+        offer.pressing = 1;
+    }
+    return offer;
+}
+
+static int is_before(const struct link_offer *a, const struct link_offer *b) {
+    return a->pressing != b->pressing ? a->pressing : a->due_ns < b->due_ns;
+}
+
+// Finds which classes have something to go now, and orders them.
+static void order_classes(const struct link *link, uint64_t now, unsigned allowed, struct link_plan *plan) {
+    static const enum link_class ranks[LINK_CLASSES] = {LINK_CONTROL, LINK_MOTION, LINK_BULK}; // if equal
+    struct link_offer offers[LINK_CLASSES];
+    for (size_t rank = 0; rank < LINK_CLASSES; rank++) {
+        enum link_class kind = ranks[rank];
+        const struct link_queue *queue = &link->queues[kind];
+        plan->fronts[kind].end = queue->head;
+        if (queue->head == queue->tail || (kind != LINK_MOTION && !(allowed & 1u << kind)))
+            continue;
+        struct link_command head;
+        link_queue_peek(queue, queue->head, &head);
+        uint64_t gate_ns = gate_of(link, &head);
+        if (gate_ns > now) {
+            plan->at_ns = gate_ns < plan->at_ns ? gate_ns : plan->at_ns;
+            continue;
+        }
+        offers[kind] = offer_of(link, kind, &head, now);
+        if (!(allowed & 1u << kind) && !offers[kind].pressing) { // motion may not be sent ahead
+            plan->at_ns = offers[kind].due_ns < plan->at_ns ? offers[kind].due_ns : plan->at_ns;
+            continue;
+        }
+        size_t at = plan->classes++;
+        for (; at > 0 && is_before(&offers[kind], &offers[plan->order[at - 1]]); at--)
+            plan->order[at] = plan->order[at - 1];
+        plan->order[at] = kind;
+    }
+    if (plan->classes)
+        plan->offer = offers[plan->order[0]];
+}
+
+// A block of motion alone that could still be filled waits, within bounds.
+static uint64_t hold_motion(const struct link *link, const struct link_front *front) {
+    if (front->gate_ns == LINK_NEVER)
+        return 0;
+    struct link_command head;
+    const struct link_queue *motion = &link->queues[LINK_MOTION];
+    link_queue_peek(motion, motion->head, &head);
+    uint64_t due_ns = head.req_clock && link->clock_hz > 0 ? link_clock_to_ns(link, head.req_clock) : 0;
+    uint64_t pressing_ns = due_ns > PACK_LEAD_NS ? due_ns - PACK_LEAD_NS : 0;
+    uint64_t full_ns = filled_at(link, front);
+    return full_ns < pressing_ns ? full_ns : pressing_ns;
+}
+
+static struct link_plan plan_allowed(const struct link *link, uint64_t now, unsigned allowed) {
+    struct link_plan plan = {.at_ns = LINK_NEVER};
+    order_classes(link, now, allowed, &plan);
+    size_t filled = 0;
+    for (size_t i = 0; i < plan.classes; i++) {
+        enum link_class kind = plan.order[i];
+        plan.fronts[kind] = ready(link, &link->queues[kind], now, WIRE_CONTENT_MAX - plan.size);
+        plan.size += plan.fronts[kind].size;
+        filled += plan.fronts[kind].commands > 0;
+    }
+    if (filled == 1 && plan.fronts[LINK_MOTION].commands) {
+        uint64_t hold_ns = hold_motion(link, &plan.fronts[LINK_MOTION]);
+        plan.at_ns = hold_ns < plan.at_ns ? hold_ns : plan.at_ns;
+    } else if (filled) {
+        plan.at_ns = 0;
+    }
+    return plan;
+}
+
+void link_take(struct link *link, enum link_class kind, const struct link_front *front,
+               struct link_block *block) {
+    struct link_queue *queue = &link->queues[kind];
+    while (queue->head < front->end) {
+        struct link_command command;
+        uint64_t behind = link_queue_peek(queue, queue->head, &command);
+        link_queue_payload(queue, queue->head, &command, block->bytes + WIRE_HEADER + block->length);
+        block->length = (uint8_t)(block->length + command.size);
+        block->commands++;
+        if (kind == LINK_MOTION) {
+            link->motion_content += command.size;
+            if (command.req_clock)
+                block->req_clock[block->leads++] = command.req_clock;
+        }
+        link_queue_drop(queue, behind, 1);
+    }
+}
+
+// Bulk leaves room for a block of something else in the node's buffer: without it, motion that becomes ready
+// would wait for a round trip.
+static int room_for(const struct link *link, const struct link_plan *plan) {
+    size_t spare = plan->offer.kind == LINK_BULK ? WIRE_BLOCK_MAX : 0;
+    return link_fits(link, WIRE_BLOCK_MIN + plan->size + spare);
+}
+
+struct link_plan link_plan_block(const struct link *link, uint64_t now, unsigned allowed) {
+    struct link_plan plan = plan_allowed(link, now, allowed);
+    if (plan.classes && plan.offer.kind == LINK_BULK && !room_for(link, &plan))
+        plan = plan_allowed(link, now, allowed & ~(1u << LINK_BULK));
+    return plan;
+}
+
+int link_may_go(const struct link *link, const struct link_plan *plan, uint64_t now) {
+    return plan->at_ns <= now && link->next - link->first < LINK_BLOCKS_MAX && room_for(link, plan);
+}

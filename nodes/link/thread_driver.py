@@ -1,0 +1,39 @@
+"""The driver of a real bus: its I/O thread (io_thread.h)."""
+
+import asyncio
+import os
+from collections.abc import Callable
+from typing import Any
+
+from nodes.link._link import ffi as _ffi
+from nodes.link._link import lib as _lib
+from nodes.link.types import BusSettings, LinkError, LinkTransport, TransportKind
+
+
+class ThreadDriver:
+    """Runs TRANSPORT, which stays the caller's, by a thread of its own; tells LOOP what arrives."""
+
+    def __init__(
+        self, transport: LinkTransport, loop: asyncio.AbstractEventLoop, settings: BusSettings
+    ) -> None:
+        self.name = transport.name
+        self.serial = transport.kind == TransportKind.BYTES
+        self.ffi = _ffi
+        self.lib = _lib
+        self._loop = loop
+        os.set_blocking(transport.fileno(), False)
+        line = _ffi.new("struct io_settings *", settings.as_dict())
+        self._thread: Any = _lib.io_start(transport.fileno(), int(transport.kind), line)
+        if self._thread == _ffi.NULL:
+            raise LinkError(f"{self.name}: cannot start the I/O thread; out of memory or threads")
+        self.bus: Any = _lib.io_thread_bus(self._thread)
+        self._notice_fd: int = _lib.io_notice_fd(self._thread)
+
+    def listen(self, handler: Callable[[], None]) -> None:
+        """Call HANDLER in the loop's thread when io_take() has something."""
+        self._loop.add_reader(self._notice_fd, handler)
+
+    def close(self) -> None:
+        """Join the thread and free the bus."""
+        self._loop.remove_reader(self._notice_fd)
+        _lib.io_stop(self._thread)

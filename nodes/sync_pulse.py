@@ -1,0 +1,199 @@
+"""Sync pulses: the clocks of a bus's nodes tied together by one frame that all hear at once.
+
+Firmware of this project latches its clock in the receive interrupt of an admin frame SYNC_PULSE and tells
+the pair when asked (`get_sync_pulse`). The first capable node of a bus is the reference; every other is
+fitted to it (`nodes.pulse_fit`), far better than answers that pass a host could tell. Nodes without the
+extension keep their own estimate. `PulseRounds` is sans-IO; `PulseKeeper` sends and asks.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from nodes.assign import ADMIN_ID
+from nodes.clock import HostTime, Ticks, extend32
+from nodes.errors import CanductorError
+from nodes.estimated_clock import EstimatedClock
+from nodes.message_format import Message
+from nodes.pulse_fit import PulseFit, PulseLine
+
+SYNC_PULSE: Final = 0x40
+CONSTANT: Final = "CAN_SYNC_PULSE"
+"""Of the dictionary: the firmware knows sync pulses."""
+SETTLE_ROUNDS: Final = 40
+SETTLE_INTERVAL_S: Final = 0.05
+INTERVAL_S: Final = 0.933
+"""Not a divisor of a second: periodic work on a node must not meet every pulse."""
+IDLE_S: Final = 0.25
+"""How often to look whether there are two capable nodes."""
+ANSWER_TIMEOUT_S: Final = 0.2
+MISSED_MAX: Final = 5
+"""Rounds in a row without a node's answer after which its fit is no longer used."""
+
+
+@dataclass(frozen=True, slots=True)
+class PulseClock:
+    """A follower's clock: the host knows the reference's, pulses tell the rest.
+
+    When print time is the reference's own clock the host's error cancels: the same estimate turns print time
+    into host time and host time into the reference's ticks.
+    """
+
+    reference: EstimatedClock
+    line: PulseLine
+
+    @property
+    def error_s(self) -> float:
+        """Bound of the error against the reference node's clock."""
+        return self.line.error_s
+
+    def ticks_at(self, at_ns: HostTime, /) -> Ticks:
+        """Return the node's 64-bit ticks at a moment of host time."""
+        return self.line.ticks_at(self.reference.ticks_at(at_ns))
+
+    def ns_at(self, ticks: Ticks, /) -> HostTime:
+        """Return the host time at which the node's clock stands at TICKS."""
+        return self.reference.ns_at(self.line.reference_at(ticks))
+
+
+@dataclass(slots=True)
+class _Follower:
+    fit: PulseFit
+    missed: int = 0
+
+
+class PulseRounds:
+    """Pairs what the nodes latched. A round is one pulse; answers of an older one do not count."""
+
+    def __init__(self) -> None:
+        self.seq = 0
+        """Of the last pulse, 1..255; 0 before the first."""
+        self.rounds = 0
+        """Since the reference became it."""
+        self.late = 0
+        """Answers that told of another pulse than the last, or of none."""
+        self.reference: str | None = None
+        self._followers: dict[str, _Follower] = {}
+        self._latched: dict[str, Ticks] = {}
+
+    def next_pulse(self, members: Mapping[str, int]) -> int:
+        """Begin a round with these nodes (nominal Hz by name; the first may become reference): its seq."""
+        if self.reference not in members:
+            self.reference = next(iter(members), None)
+            self._followers.clear()
+            self.rounds = 0
+        self._followers = {name: f for name, f in self._followers.items() if name in members}
+        for name, freq_hz in members.items():
+            if name != self.reference and self.reference is not None:
+                fit = PulseFit(members[self.reference], freq_hz)
+                self._followers.setdefault(name, _Follower(fit)).missed += 1
+        self._latched.clear()
+        self.rounds += 1
+        self.seq = self.seq % 255 + 1
+        return self.seq
+
+    def answer(self, name: str, seq: int, clock32: int, near: Ticks) -> None:
+        """Take a node's answer; NEAR is its clock as far as it is known, within 2^31 ticks."""
+        if seq != self.seq:
+            self.late += 1
+            return
+        if name not in self._latched:
+            self._latched[name] = extend32(clock32, near)
+            for other in tuple(self._latched) if name == self.reference else (name,):
+                self._pair(other)
+
+    def line(self, name: str) -> PulseLine | None:
+        """Return the fit of a follower that can be relied on now, else None."""
+        follower = self._followers.get(name)
+        if follower is None or follower.missed > MISSED_MAX or not follower.fit.settled:
+            return None
+        return follower.fit.line
+
+    def _pair(self, name: str) -> None:
+        reference = self._latched.get(self.reference or "")
+        follower = self._followers.get(name)
+        if reference is not None and follower is not None:
+            follower.fit.add(reference, self._latched[name])
+            follower.missed = 0
+
+
+class PulseNode(Protocol):
+    """What the keeper needs of a node."""
+
+    name: str
+    pulse_clock: PulseClock | None
+
+    @property
+    def clock(self) -> EstimatedClock:
+        """The host's own estimate of its clock."""
+        ...
+
+    @property
+    def clock_freq_hz(self) -> int:
+        """Nominal."""
+        ...
+
+    async def query(
+        self, name: str, response: str, /, *, timeout_s: float = ..., tries: int = ...
+    ) -> Message:
+        """Ask the node."""
+        ...
+
+
+class PulseKeeper:
+    """Keeps the clocks of one CAN bus together for as long as `run` runs.
+
+    CAPABLE returns the nodes that know pulses and can be asked now, in the order of preference as reference.
+    SEND_FRAME sends a frame ahead of all data; NOW is host time.
+    """
+
+    def __init__(
+        self,
+        capable: Callable[[], Sequence[PulseNode]],
+        send_frame: Callable[[int, bytes], None],
+        now: Callable[[], HostTime],
+    ) -> None:
+        self._capable = capable
+        self._send_frame = send_frame
+        self._now = now
+        self._asked: dict[str, PulseNode] = {}
+        self.rounds = PulseRounds()
+
+    async def run(self) -> None:
+        """Send pulses and ask for them until cancelled; a bus that fails is others' concern."""
+        while True:
+            nodes = self._capable()
+            if len(nodes) < 2:
+                self._publish(())
+                await asyncio.sleep(IDLE_S)
+                continue
+            with contextlib.suppress(CanductorError):  # a reference without a clock yet, a bus that closes
+                await self._round(nodes)
+                self._publish(nodes)
+            settling = self.rounds.rounds < SETTLE_ROUNDS
+            await asyncio.sleep(SETTLE_INTERVAL_S if settling else INTERVAL_S)
+
+    async def _round(self, nodes: Sequence[PulseNode]) -> None:
+        seq = self.rounds.next_pulse({node.name: node.clock_freq_hz for node in nodes})
+        self._send_frame(ADMIN_ID, bytes((SYNC_PULSE, seq)))
+        await asyncio.gather(*(self._ask(node) for node in nodes))
+
+    async def _ask(self, node: PulseNode) -> None:
+        with contextlib.suppress(CanductorError):  # lost on the way, or the node is: it misses this round
+            answer = await node.query("get_sync_pulse", "sync_pulse", timeout_s=ANSWER_TIMEOUT_S, tries=1)
+            near = node.clock.ticks_at(self._now())
+            self.rounds.answer(node.name, answer.integer("seq"), answer.integer("clock"), near)
+
+    def _publish(self, nodes: Sequence[PulseNode]) -> None:
+        """Give every node its clock by pulses, or take it away."""
+        present = {node.name: node for node in nodes}
+        for name, node in self._asked.items():
+            if name not in present:
+                node.pulse_clock = None
+        self._asked = present
+        reference = present.get(self.rounds.reference or "")
+        for node in nodes:
+            line = self.rounds.line(node.name)
+            node.pulse_clock = PulseClock(reference.clock, line) if line and reference else None

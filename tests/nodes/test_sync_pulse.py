@@ -1,0 +1,288 @@
+"""Sync pulses: fits of one clock to another, rounds, and the keeper over nodes that come and go."""
+
+import asyncio
+import math
+import random
+from collections.abc import Callable
+
+import pytest
+
+from nodes.clock import HostTime, Ticks
+from nodes.message_format import Message
+from nodes.node_errors import NodeLost
+from nodes.pulse_fit import PulseFit
+from nodes.sync_pulse import INTERVAL_S, MISSED_MAX, PulseClock, PulseKeeper, PulseRounds
+from tests.nodes import virtual_time
+
+PRIMARY_HZ, SECONDARY_HZ = 168_000_000, 64_000_000
+RAMP_S, RAMP_PPM = 600.0, 10.0
+
+
+def warming(
+    freq_hz: int, start: int, ppm: float, ramp_ppm: float, ramp_from_s: float
+) -> Callable[[float], int]:
+    """Return a clock PPM off that changes by RAMP_PPM within ten minutes, as a function of true time."""
+
+    def clock(t: float) -> int:
+        u = min(max(t - ramp_from_s, 0.0), RAMP_S)
+        v = max(t - ramp_from_s - RAMP_S, 0.0)
+        return start + round(freq_hz * (t + 1e-6 * (ppm * t + ramp_ppm * (u * u / (2 * RAMP_S) + v))))
+
+    return clock
+
+
+def follow(
+    seed: int, until_s: float, *, late_share: float = 0.0, ahead_s: float = 1.5, rate: float = 1.0
+) -> list[tuple[float, float, float]]:
+    """Fit a warming secondary to a warming primary; return (true time, error s, bound s) AHEAD_S later."""
+    rng = random.Random(seed)
+    primary = warming(PRIMARY_HZ, 2**32 - 3 * PRIMARY_HZ, 50, RAMP_PPM, 60)
+    secondary = warming(SECONDARY_HZ, 2**33 - 30 * SECONDARY_HZ, -50, -RAMP_PPM, 60)
+    fit = PulseFit(PRIMARY_HZ, SECONDARY_HZ)
+
+    def latency() -> float:
+        return rng.uniform(0, 1e-6) + (30e-6 if rng.random() < late_share else 0)
+
+    found = []
+    t = 0.0
+    while t < until_s:
+        fit.add(Ticks(primary(t + latency())), Ticks(secondary(t + latency())))
+        if fit.settled:
+            assert fit.line is not None
+            then = t + ahead_s
+            error = (fit.line.ticks_at(Ticks(primary(then))) - secondary(then)) / SECONDARY_HZ
+            found.append((then, error, fit.line.error_s))
+        t += (0.05 if t < 2 else INTERVAL_S) / rate
+    assert fit.restarts == 0
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("late_share", [0.0, 0.01])
+def test_nodes_agree_within_a_microsecond_through_the_ramp(seed: int, late_share: float) -> None:
+    found = [entry for entry in follow(seed, 760.0, late_share=late_share) if entry[0] > 10]
+    rms = math.sqrt(sum(error * error for _, error, _ in found) / len(found))
+    assert rms < 0.6e-6
+    assert max(abs(error) for _, error, _ in found) < 3e-6
+
+
+def test_the_bound_holds_and_is_not_absurd() -> None:
+    found = [entry for seed in range(5) for entry in follow(seed, 200.0)]
+    outside = sum(abs(error) > bound for _, error, bound in found)
+    assert outside <= 0.003 * len(found)
+    assert sorted(bound for *_, bound in found)[len(found) // 2] < 4e-6
+
+
+def test_a_sudden_change_of_rate_is_followed_in_the_end() -> None:
+    """Doubting what does not fit must not lock the fit out."""
+    fit = PulseFit(PRIMARY_HZ, SECONDARY_HZ)
+    off_s = 0.0
+    for i in range(120):
+        off_s += 0.0 if i < 60 else 20e-6
+        fit.add(Ticks(i * PRIMARY_HZ), Ticks(round((i + off_s) * SECONDARY_HZ)))
+    assert fit.line is not None
+    assert fit.line.rate == pytest.approx(20e-6, abs=0.1e-6)
+    assert abs(fit.line.offset_s) < 1e-6
+
+
+def test_a_line_and_its_inverse_agree() -> None:
+    fit = PulseFit(PRIMARY_HZ, SECONDARY_HZ)
+    for i in range(30):
+        fit.add(Ticks(i * PRIMARY_HZ), Ticks(5_000_000_000 + round(i * SECONDARY_HZ * (1 + 300e-6))))
+    assert fit.line is not None
+    for ahead_s in (-20, 0, 1, 5, 60):
+        reference = Ticks(round((29 + ahead_s) * PRIMARY_HZ))
+        assert (
+            abs(fit.line.reference_at(fit.line.ticks_at(reference)) - reference) <= 3
+        )  # a tick of the slower
+
+
+def test_a_node_that_restarts_begins_anew() -> None:
+    fit = PulseFit(PRIMARY_HZ, SECONDARY_HZ)
+    for i in range(40):
+        fit.add(Ticks(i * PRIMARY_HZ), Ticks(i * SECONDARY_HZ + 10**9))
+    assert fit.settled
+    fit.add(Ticks(40 * PRIMARY_HZ), Ticks(SECONDARY_HZ))
+    assert (fit.restarts, fit.settled) == (1, False)
+    fit.add(Ticks(41 * PRIMARY_HZ), Ticks(2 * SECONDARY_HZ))
+    assert fit.line is not None
+    assert abs(fit.line.ticks_at(Ticks(41 * PRIMARY_HZ)) - 2 * SECONDARY_HZ) <= 1
+
+
+# ------------------------------------------------------------------------------------------------- rounds
+
+
+def play(rounds: PulseRounds, count: int, *, silent: str = "") -> None:
+    """Play COUNT rounds of nodes a, b and c, which all answer but SILENT."""
+    members = {"a": PRIMARY_HZ, "b": SECONDARY_HZ, "c": SECONDARY_HZ}
+    for _ in range(count):
+        seq = rounds.next_pulse(members)
+        t = rounds.rounds
+        for name, freq_hz in members.items():
+            if name != silent:
+                clock = 2**32 - 5 * freq_hz + t * freq_hz  # rolls over in round 5
+                rounds.answer(name, seq, clock % 2**32, Ticks(clock - 1000))
+
+
+def test_the_first_node_is_the_reference_and_the_others_follow() -> None:
+    rounds = PulseRounds()
+    play(rounds, 30)
+    assert rounds.reference == "a"
+    assert rounds.line("a") is None
+    for name in ("b", "c"):
+        line = rounds.line(name)
+        assert line is not None
+        assert line.ticks_at(Ticks(2**32)) == pytest.approx(2**32, abs=2)
+
+
+def test_a_sequence_number_is_never_zero_and_comes_round() -> None:
+    rounds = PulseRounds()
+    seen = [rounds.next_pulse({"a": 1, "b": 1}) for _ in range(600)]
+    assert set(seen) == set(range(1, 256))
+
+
+def test_an_answer_about_another_pulse_does_not_count() -> None:
+    rounds = PulseRounds()
+    seq = rounds.next_pulse({"a": PRIMARY_HZ, "b": SECONDARY_HZ})
+    rounds.answer("a", seq, 1, Ticks(0))
+    rounds.answer("b", seq - 1, 1, Ticks(0))
+    rounds.answer("b", 0, 1, Ticks(0))
+    assert rounds.late == 2
+    assert rounds.line("b") is None
+
+
+def test_a_node_that_misses_many_pulses_is_not_relied_on() -> None:
+    rounds = PulseRounds()
+    play(rounds, 30)
+    play(rounds, MISSED_MAX, silent="b")
+    assert rounds.line("b") is not None
+    play(rounds, 1, silent="b")
+    assert rounds.line("b") is None
+    assert rounds.line("c") is not None
+    play(rounds, 1)
+    assert rounds.line("b") is not None
+
+
+def test_another_node_becomes_reference_when_the_first_is_gone() -> None:
+    rounds = PulseRounds()
+    play(rounds, 30)
+    rounds.next_pulse({"c": SECONDARY_HZ, "b": SECONDARY_HZ})
+    assert rounds.reference == "c"
+    assert rounds.line("b") is None
+
+
+# ------------------------------------------------------------------------------------------------- keeper
+
+
+class Bus:
+    """Nodes that latch true time; frames and answers take none, but may get lost."""
+
+    def __init__(self, seed: int, loss: float) -> None:
+        self.random = random.Random(seed)
+        self.loss = loss
+        self.nodes: list[FakeNode] = []
+        self.pulses = 0
+
+    def send_frame(self, can_id: int, data: bytes) -> None:
+        assert can_id == 0x3F0
+        assert data[0] == 0x40
+        self.pulses += 1
+        for node in self.nodes:
+            if self.random.random() >= self.loss:
+                node.latched = (data[1], node.true_ticks() % 2**32)
+
+
+class FakeNode:
+    """A node whose host-side estimate is 100 µs wrong, as an exchange's may be."""
+
+    def __init__(self, bus: Bus, name: str, clock_freq_hz: int, ppm: float, start: int) -> None:
+        self.name = name
+        self.clock_freq_hz = clock_freq_hz
+        self.pulse_clock: PulseClock | None = None
+        self.latched = (0, 0)
+        self.lost = False
+        self._bus = bus
+        self._rate = clock_freq_hz * (1 + ppm * 1e-6)
+        self._start = start
+        bus.nodes.append(self)
+
+    @property
+    def clock(self) -> "FakeNode":
+        return self
+
+    def true_ticks(self, ahead_s: float = 0.0) -> int:
+        return self._start + round((asyncio.get_running_loop().time() + ahead_s) * self._rate)
+
+    def ticks_at(self, at_ns: HostTime, /) -> Ticks:
+        return Ticks(self._start + round((at_ns * 1e-9 + 100e-6) * self._rate))
+
+    def ns_at(self, ticks: Ticks, /) -> HostTime:
+        return HostTime(round(((ticks - self._start) / self._rate - 100e-6) * 1e9))
+
+    async def query(self, name: str, response: str, /, *, timeout_s: float = 1.0, tries: int = 1) -> Message:
+        assert (name, response) == ("get_sync_pulse", "sync_pulse")
+        if self.lost or self._bus.random.random() < self._bus.loss:
+            await asyncio.sleep(timeout_s)
+            raise NodeLost(f"{self.name} does not answer")
+        return Message("sync_pulse", {"seq": self.latched[0], "clock": self.latched[1]})
+
+
+def now() -> HostTime:
+    return HostTime(round(asyncio.get_running_loop().time() * 1e9))
+
+
+def keep(bus: Bus, seconds: float, *actions: Callable[[], None]) -> None:
+    """Run a keeper over the bus's nodes for SECONDS, then after each of ACTIONS again."""
+
+    async def main() -> None:
+        keeper = PulseKeeper(lambda: [node for node in bus.nodes if not node.lost], bus.send_frame, now)
+        task = asyncio.create_task(keeper.run())
+        await asyncio.sleep(seconds)
+        for action in actions:
+            action()
+            await asyncio.sleep(seconds)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    virtual_time.run(main())
+
+
+def two_nodes(bus: Bus) -> tuple[FakeNode, FakeNode]:
+    first = FakeNode(bus, "first", PRIMARY_HZ, 30, 2**32 - 1002 * PRIMARY_HZ)
+    return first, FakeNode(bus, "second", SECONDARY_HZ, -80, 2**34 - 1004 * SECONDARY_HZ)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.05])
+def test_a_follower_agrees_with_the_reference_whatever_the_host_believes(loss: float) -> None:
+    bus = Bus(1, loss)
+    first, second = two_nodes(bus)
+    errors: list[float] = []
+
+    def look() -> None:
+        clock = second.pulse_clock
+        assert clock is not None
+        at_ns = first.ns_at(
+            Ticks(first.true_ticks(1.2))
+        )  # print time to host time by the reference's estimate
+        errors.append((clock.ticks_at(at_ns) - second.true_ticks(1.2)) / SECONDARY_HZ)
+        assert first.pulse_clock is None
+
+    keep(bus, 5.0, look, look, look)
+    assert max(map(abs, errors)) < 0.5e-6
+
+
+def test_a_lost_node_gives_up_its_clock_and_a_lonely_one_gets_no_pulses() -> None:
+    bus = Bus(1, 0.0)
+    first, second = two_nodes(bus)
+    sent: list[int] = []
+
+    def lose() -> None:
+        assert second.pulse_clock is not None
+        first.lost = True
+
+    def count() -> None:
+        assert second.pulse_clock is None
+        sent.append(bus.pulses)
+
+    keep(bus, 5.0, lose, count, count)
+    assert sent[0] == sent[1]
