@@ -14,6 +14,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final, NewType
 
+from nodes.clock_blend import Blend
 from nodes.clock_fit import Filter
 from nodes.clock_start import Start
 
@@ -90,7 +91,7 @@ class ClockEstimator:
         self._last_ns = -1
         self._contradictions = 0
         self._start = Start()
-        self._filter: Filter | None = None
+        self._filter: Blend | None = None
         self._estimate: ClockEstimate | None = None
         self.accepted = 0
         self.unusable = 0
@@ -182,7 +183,7 @@ class ClockEstimator:
         if self._filter is None:
             state, covariance = self._start.add(at_s, lead_s, round_trip_s)
             if self._start.samples >= START_SAMPLES:
-                self._filter = Filter(state, covariance, at_s, self._start.spread_s)
+                self._filter = Blend(Filter(state, covariance, at_s, self._start.spread_s))
         else:
             self._filter.add(at_s, lead_s, round_trip_s)
             state, covariance = self._filter.state, self._filter.covariance

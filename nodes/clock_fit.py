@@ -6,6 +6,7 @@ way back - lead likewise; the distance to the bound is exponential. Each bound u
 with the exact mean and variance of the product, so tight bounds cut and loose ones hardly count.
 """
 
+import copy
 import math
 from collections.abc import Sequence
 from typing import Final
@@ -15,6 +16,8 @@ RATE_SD: Final = 1.5e-4
 """Standard deviation of a clock's rate against its nominal one, before anything is measured."""
 CURVATURE_SD: Final = 1e-8
 """Standard deviation of a rate's change per second: a crystal in a warming board."""
+RATE_WALK: Final = 4e-10
+"""How far a steady rate wanders in a second (square root of)."""
 CURVATURE_FADE_S: Final = 250.0
 SKEW_FADE_S: Final = 1000.0
 DELAY_WANDER: Final = 0.01
@@ -30,6 +33,10 @@ LATE: Final = 16
 LEAST_SPREAD_S: Final = 1e-7
 
 
+OUTLIERS: Final = 1e-4
+"""Density of an exchange that no bound explains, against the mean delay: what one may count as evidence."""
+
+
 def hazard(k: float) -> float:
     """Return φ(k)/Φ(k) of the normal distribution, for any K without underflow."""
     if k < -25.0:
@@ -39,8 +46,18 @@ def hazard(k: float) -> float:
     return math.exp(-k * k / 2) * 0.3989422804014327 / (0.5 * math.erfc(-k * 0.7071067811865476))
 
 
+def log_share(k: float) -> float:
+    """Return log Φ(k) of the normal distribution, for any K without underflow."""
+    if k < -25.0:
+        return -k * k / 2 - math.log(-k) - 0.9189385332046727
+    return math.log(0.5 * math.erfc(-k * 0.7071067811865476))
+
+
 class Filter:
     """Goes on from STATE and COVARIANCE (lead, rate, curvature, delay) at AT_S."""
+
+    warming = True
+    """Whether the rate may change for long in one direction; else it only wanders a little."""
 
     def __init__(
         self, state: Sequence[float], covariance: Sequence[Sequence[float]], at_s: float, spread_s: float
@@ -51,18 +68,35 @@ class Filter:
         self._spread_s = spread_s
         self._nearest: dict[int, tuple[int, float]] = {1: (0, math.inf), -1: (0, math.inf)}
 
-    def add(self, at_s: float, lead_s: float, round_trip_s: float) -> None:
-        """Take an exchange in whose middle, AT_S, the clock would have been ahead by LEAD_S."""
+    def steady(self) -> "Filter":
+        """Return a filter that knows the same but believes that from now on the rate stays what it is."""
+        other = copy.copy(self)
+        other.state = [*self.state]
+        other.covariance = [[*row] for row in self.covariance]
+        other._nearest = {**self._nearest}
+        other.warming = False
+        other.state[2] = 0.0
+        for i in range(SIZE):
+            other.covariance[2][i] = other.covariance[i][2] = 0.0
+        return other
+
+    def add(self, at_s: float, lead_s: float, round_trip_s: float) -> float:
+        """Take an exchange in whose middle, AT_S, the clock would have been ahead by LEAD_S.
+
+        Return how well it was foretold: the logarithm of its density against the mean delay.
+        """
+        foretold = 0.0
         self._predict(at_s - self._at_s)
         self._at_s = at_s
         for sign in (1, -1):
             bound_s = sign * lead_s + round_trip_s / 2
             self._watch(sign, bound_s)
-            self._bound(sign, bound_s)
+            foretold += self._bound(sign, bound_s)
             gap_s = min(max(self._gap(sign, bound_s), 0.0), 5 * self._spread_s)
             # 1.03: what the limit of 5 takes off the mean
             self._spread_s += (1.03 * gap_s - self._spread_s) / MEMORY
             self._spread_s = max(self._spread_s, LEAST_SPREAD_S)
+        return foretold
 
     def _gap(self, sign: int, bound_s: float) -> float:
         x = self.state
@@ -82,7 +116,10 @@ class Filter:
             p1[i] += p2[i] * dt
             p2[i] *= keep
             p4[i] *= relax
-        p2[2] += CURVATURE_SD**2 * (1 - keep * keep)
+        if self.warming:
+            p2[2] += CURVATURE_SD**2 * (1 - keep * keep)
+        else:
+            p1[1] += RATE_WALK**2 * dt
         p[3][3] += (DELAY_WANDER * self._spread_s) ** 2 * dt
 
     def _doubt(self, sign: int, by_s: float) -> None:
@@ -106,8 +143,8 @@ class Filter:
             count, nearest_s = 0, math.inf
         self._nearest[sign] = count, nearest_s
 
-    def _bound(self, sign: int, bound_s: float) -> None:
-        """Cut by: sign·(lead + skew) + delay <= BOUND_S, with an exponential distance."""
+    def _bound(self, sign: int, bound_s: float) -> float:
+        """Cut by: sign·(lead + skew) + delay <= BOUND_S, with an exponential distance; return as ``add``."""
         x, p = self.state, self.covariance
         column = [sign * (row[0] + row[4]) + row[3] for row in p]
         variance = sign * (column[0] + column[4]) + column[3]
@@ -120,6 +157,7 @@ class Filter:
         s = math.sqrt(max(variance, 0.0) + noise)
         pull = 1 / self._spread_s if gap_s < LOOSE * self._spread_s else 0.0
         k = gap_s / s - pull * s
+        foretold = min(log_share(k) + (s * pull) ** 2 / 2 - gap_s * pull, 3.0) if pull else -math.inf
         r = hazard(k)
         push, cut = pull - r / s, min(max(r * (k + r), 0.0), 1.0) / (s * s)
         for i, own in enumerate(column):
@@ -127,3 +165,4 @@ class Filter:
             row = p[i]
             for j, other in enumerate(column):
                 row[j] -= own * cut * other
+        return math.log(math.exp(foretold) + OUTLIERS)

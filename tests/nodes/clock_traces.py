@@ -7,7 +7,7 @@ what counts: at each moment, only what was received by then is used.
 import math
 import random
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ STEP_S = 0.25
 
 
 class Profile(NamedTuple):
-    """Delays in one direction, in seconds: base + exponential; one in a hundred is later by up to OUTLIER_S."""
+    """Delays in one direction, in seconds: base + exponential; 1 % are later by up to OUTLIER_S."""
 
     base_s: float
     mean_s: float
