@@ -10,9 +10,9 @@ from typing import Final
 
 from nodes.clock_fit import Filter
 
-FIRST_ODDS: Final = -1.0
+FIRST_ODDS: Final = -2.0
 """Logarithm of the odds of a steady filter that begins anew."""
-MOST_ODDS: Final = 4.0
+MOST_ODDS: Final = 1.0
 """Not believed more than so, so that a change is noticed soon."""
 LEAST_ODDS: Final = -3.0
 """Believed less than so, it begins anew."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nodes.clock_fit import CURVATURE_SD, LEAST_SPREAD_S, LOOSE, NOISE, RATE_SD, hazard
 
-SWEEPS: Final = 8
+SWEEPS: Final = 5
 DAMPING: Final = 0.6
 Array = NDArray[np.float64]
 
