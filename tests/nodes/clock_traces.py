@@ -1,6 +1,6 @@
-"""Exchanges with two nodes whose true clocks are known, recorded or generated, and the score of an estimate.
+"""Exchanges with two nodes of known true clocks, recorded or generated; the score of an estimate.
 
-Shared by the tests and by bench/clock.py. The score is the error of the secondary's clock when the primary's is
+Shared by the tests and by bench/clock.py. The score is the error of the secondary's clock when the primary is
 what counts: at each moment, only what was received by then is used.
 """
 
