@@ -1,113 +1,84 @@
 """Error of a secondary node's clock relative to the primary's, before, during and after a temperature ramp.
 
-``bench/clock.py [MAIN.csv SEC.csv …]``: pairs of recorded traces (``t_send,clock,t_recv,t_mcu_read``, the
-header giving the exact truth); without arguments, those of ../shared/data/clock when present. The
-estimates are causal: at each moment between two samples only what was received by then is used. The first
-5 s are not scored in the first phase but reported by "below 50 µs after" (the last moment the error was
-larger, from the first sample).
+``bench/clock.py [MAIN.csv SEC.csv …]``: pairs of recorded traces; without arguments, those of
+../shared/data/clock when present. ``bench/clock.py --seeds N [--first S]``: N pairs of generated traces per
+profile, median and 90th percentile beside the goals. How it is scored: tests/nodes/clock_traces.py.
 """
 
-import math
-import re
+import argparse
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
 from pathlib import Path
 
-from nodes.clock import ClockEstimate, ClockEstimator, HostTime, Ticks
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from nodes.clock import START_SAMPLES, ClockEstimator
+from tests.nodes import clock_traces as traces
 
 SHARED = Path(__file__).parents[1] / ".." / "shared" / "data" / "clock"
-SETTLED_S = 5.0
-GOOD_S = 50e-6
-STEP_S = 0.25
 
 
-@dataclass
-class Trace:
-    """A recording with its truth: rows are (sent ns, received ns, clock)."""
-
-    freq_hz: float
-    ramp_start_s: float
-    ramp_end_s: float
-    truth: Callable[[float], float]
-    rows: list[tuple[int, int, int]]
-
-
-def read(path: Path) -> Trace:
-    header, *lines = path.read_text().splitlines()
-    value = {key: float(text) for key, text in re.findall(r"(\w+)=([\d.e+-]+)(?=[ ;])", header)}
-    f, start, length = value["F"], value["ramp_start"], value["ramp_len"]
-
-    def truth(t: float) -> float:
-        u, v = min(max(t - start, 0), length), max(t - start - length, 0)
-        ramp = value["ramp_ppm"] * (u * u / (2 * length) + v)
-        return value["c0"] + f * (t + 1e-6 * (value["drift_ppm"] * t + ramp))
-
-    rows = []
-    for line in lines:
-        sent, clock, received, _ = line.split(",")
-        rows.append((round(float(sent) * 1e9), round(float(received) * 1e9), int(clock)))
-    return Trace(f, start, start + length, truth, rows)
-
-
-def estimates(trace: Trace) -> list[tuple[float, ClockEstimate]]:
-    """Return (host time from which it is known, estimate) for every sample."""
-    estimator = ClockEstimator(round(trace.freq_hz))
-    found = []
-    for i, (sent_ns, received_ns, clock) in enumerate(trace.rows):
-        if i:
-            estimator.add(sent_ns, received_ns, clock % (1 << 32))
-        else:
-            estimator.begin(sent_ns, received_ns, clock >> 32, clock % (1 << 32))
-        found.append((received_ns * 1e-9, estimator.estimate()))
-    return found
-
-
-def errors(main: Trace, secondary: Trace) -> list[tuple[float, float]]:
-    """Return (host time, error of the secondary's clock in s), when the primary's clock is what counts."""
-    of_main, of_secondary = estimates(main), estimates(secondary)
-    result = []
-    i = j = 0
-    t = max(of_main[0][0], of_secondary[0][0])
-    while t < of_main[-1][0]:
-        while i + 1 < len(of_main) and of_main[i + 1][0] <= t:
-            i += 1
-        while j + 1 < len(of_secondary) and of_secondary[j + 1][0] <= t:
-            j += 1
-        believed_ns = of_main[i][1].ns_at(Ticks(round(main.truth(t))))
-        ticks = of_secondary[j][1].ticks_at(HostTime(believed_ns))
-        result.append((t, (ticks - secondary.truth(t)) / secondary.freq_hz))
-        t += STEP_S
-    return result
-
-
-def rms_us(values: list[float]) -> float:
-    return 1e6 * math.sqrt(sum(x * x for x in values) / len(values))
-
-
-def score(main: Path, secondary: Path) -> tuple[float, float, float, float, float]:
-    """Return rms before, during and after the ramp, the largest settled error (µs), and the time to 50 µs."""
-    trace = read(main)
-    found = errors(trace, read(secondary))
-    first_s = trace.rows[0][0] * 1e-9
-    phases: tuple[list[float], list[float], list[float]] = ([], [], [])
-    for t, error_s in found:
-        if t >= first_s + SETTLED_S:
-            phases[(t >= trace.ramp_start_s) + (t >= trace.ramp_end_s)].append(error_s)
-    late_s = max((t - first_s for t, error_s in found if abs(error_s) > GOOD_S), default=0.0)
-    worst_us = 1e6 * max(abs(x) for phase in phases for x in phase)
-    before, during, after = (rms_us(phase) for phase in phases)
-    return before, during, after, worst_us, late_s
-
-
-def main() -> None:
-    paths = [Path(arg) for arg in sys.argv[1:]] or sorted(SHARED.glob("trace_*.csv"))
+def recorded(paths: list[Path]) -> None:
     if not paths:
         print("no traces given and none in ../shared")
     print(f"{'trace':<28}{'before':>9}{'during':>9}{'after':>9}{'worst':>9} µs   below 50 µs after")
     for first, second in zip(paths[::2], paths[1::2], strict=True):
-        *figures, late_s = score(first, second)
-        print(f"{first.stem:<28}" + "".join(f"{x:9.1f}" for x in figures) + f"      {late_s:6.1f} s")
+        found = traces.score(traces.read(first), traces.read(second))
+        figures = (*found.phases_us, found.worst_us)
+        print(f"{first.stem:<28}" + "".join(f"{x:9.1f}" for x in figures) + f"      {found.late_s:6.1f} s")
+
+
+def generated(profile: str, seeds: range) -> None:
+    """Print one profile's figures over SEEDS."""
+    found = [
+        traces.score(*(traces.generate(seed, profile, secondary=which) for which in (False, True)))
+        for seed in seeds
+    ]
+    for i, phase in enumerate(("before", "during", "after")):
+        ranked = sorted(score.phases_us[i] for score in found)
+        middle, high = ranked[len(ranked) // 2], ranked[min(len(ranked) * 9 // 10, len(ranked) - 1)]
+        goal = traces.PROFILES[profile].goals_us[i]
+        verdict = "" if high <= goal else "   MISSED"
+        print(f"{profile} {phase:<8}{middle:8.1f}{high:8.1f}{goal:8.1f} µs{verdict}")
+    settled = traces.rms_us([score.settled_us * 1e-6 for score in found])
+    own = traces.rms_us([score.settled_sd_us * 1e-6 for score in found])
+    over = sum(score.dishonest for score in found) / sum(score.moments for score in found)
+    loose = sorted(score.looseness for score in found)[len(found) // 2]
+    print(
+        f"{profile} 5 s after the first sample: {settled:.0f} µs rms (its own standard deviation: {own:.0f} µs)"
+    )
+    print(
+        f"{profile} error over its bound: {100 * over:.2f} % of moments; median bound / rms error: {loose:.1f}"
+    )
+
+
+def cost() -> None:
+    """Print the time a sample takes, in the fit of the first ones and after."""
+    trace = traces.generate(0, "C", secondary=False, until_s=600)
+    took = []
+    known = traces.feed(ClockEstimator(round(trace.truth.freq_hz)), trace)
+    for _ in trace.rows:
+        began = time.perf_counter()
+        next(known)
+        took.append(time.perf_counter() - began)
+    start, later = took[:START_SAMPLES], took[START_SAMPLES:]
+    print(f"a sample takes {1e3 * sum(start) / len(start):.2f} ms in the beginning (mean), ", end="")
+    print(f"{1e3 * sum(later) / len(later):.2f} ms later")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("traces", nargs="*", type=Path)
+    parser.add_argument("--seeds", type=int, default=0, help="score so many generated pairs per profile")
+    parser.add_argument("--first", type=int, default=1000, help="the first seed")
+    args = parser.parse_args()
+    if args.seeds:
+        print(f"{'phase':<10}{'median':>8}{'p90':>8}{'goal':>8}")
+        for profile in traces.PROFILES:
+            generated(profile, range(args.first, args.first + args.seeds))
+    else:
+        recorded(args.traces or sorted(SHARED.glob("trace_*.csv")))
+    cost()
 
 
 if __name__ == "__main__":

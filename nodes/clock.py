@@ -3,20 +3,20 @@
 Sans-IO: samples come in with their times, an estimate and the time of the next sample go out. Host time
 is CLOCK_MONOTONIC in integer nanoseconds; a node's ticks have 64 bits in the host and 32 on the wire.
 
-How it estimates. An answer sent for at S and received at R was read somewhere in between. The fastest
-exchange shows what cannot be avoided; what an exchange took longer, its excess X, was lost in one
-direction or the other, we cannot know which: the reading is spread evenly over X around the middle,
-variance X²/12. So every sample counts with the weight that its own excess earns it. A slow exchange
-weighs almost nothing but is never thrown away, and therefore no series of bad samples, the very first
-included, can lock the estimate out. A parabola is fitted, because a crystal that warms up changes its
-rate, with weights that fade over FADE_S; rate and curvature are held by what is known of crystals before
-there are samples enough.
+How it estimates. An answer sent for at S and received at R was read after S plus the fastest way out and
+before R minus the fastest way back: two bounds on the clock, most of them loose, some tight. The first
+START_SAMPLES are fitted together (clock_start.py), the later ones update a filter that follows temperature
+(clock_fit.py). A slow exchange only makes loose bounds, so no series of them can spoil the estimate.
 """
 
 import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Final, NewType
+
+from nodes.clock_blend import Blend
+from nodes.clock_fit import Filter
+from nodes.clock_start import Start
 
 HostTime = NewType("HostTime", int)
 """Nanoseconds of the host's CLOCK_MONOTONIC."""
@@ -30,18 +30,17 @@ SETTLE_INTERVAL_NS: Final = 50_000_000
 """After the burst, up to SETTLE_SAMPLES: two seconds after the start the rate is known to some 10 ppm."""
 SAMPLE_INTERVAL_NS: Final = 984_300_000
 """Not a divisor or multiple of a second: periodic work on a node must not meet every sample."""
-MAX_SAMPLES: Final = 160
-"""The oldest are dropped; at one a second they have faded by then."""
-
-FADE_S: Final = 90.0
-RATE_PRIOR: Final = 1e-3
-"""Standard deviation of a clock's rate against its nominal one, before anything is measured."""
-CURVATURE_PRIOR_PER_S: Final = 1.5e-8
-"""Standard deviation of a rate's change per second: a crystal in a warming board."""
-READING_FLOOR_S: Final = 10e-6
-"""No reading is trusted better than this: threads wake up late by as much, on either side. A lower floor lets
-one lucky exchange outweigh all others and bend the rate of a young estimate."""
-CONFIDENCE: Final = 3.0
+START_SAMPLES: Final = 64
+"""So many are fitted together before the filter goes on alone."""
+REMEMBERED: Final = 160
+"""Exchanges among which the fastest is looked for."""
+CONTRADICTIONS: Final = 3
+"""So many answers in a row that the estimate says are impossible begin it anew."""
+GAP_NS: Final = 600_000_000_000
+"""A silence after which the filter begins anew: temperature may have done anything."""
+AHEAD_S: Final = 1.0
+"""The error bound holds for so long after the sample."""
+CONFIDENCE: Final = 4.0
 """Standard deviations in the published error bound."""
 _HALF: Final = 1 << 31
 _WHOLE: Final = 1 << 32
@@ -65,7 +64,9 @@ class ClockEstimate:
     at_ns: HostTime
     at_ticks: Ticks
     error_s: float
-    """Bound of the error at AT_NS: what the fastest exchange leaves open, and three standard deviations."""
+    """Bound of the error, from AT_NS to a second later, if the fastest ways out and back take as long."""
+    asymmetry_s: float = 0.0
+    """What they may add when not: half the fastest exchange, were all of it spent in one direction."""
 
     def ticks_at(self, at_ns: HostTime) -> Ticks:
         """Return the node's clock at host time AT_NS."""
@@ -76,13 +77,6 @@ class ClockEstimate:
         return HostTime(self.at_ns + round((ticks - self.at_ticks) * 1e9 / self.freq_hz))
 
 
-@dataclass(frozen=True, slots=True)
-class _Sample:
-    middle_ns: int
-    round_trip_s: float
-    ticks: Ticks
-
-
 class ClockEstimator:
     """Estimates one node's clock. NOMINAL_FREQ_HZ > 0 comes from its dictionary.
 
@@ -91,7 +85,13 @@ class ClockEstimator:
 
     def __init__(self, nominal_freq_hz: int) -> None:
         self._freq_hz = nominal_freq_hz
-        self._samples: deque[_Sample] = deque(maxlen=MAX_SAMPLES)
+        self._round_trips_s: deque[float] = deque(maxlen=REMEMBERED)
+        self._zero_ns = 0
+        self._zero_ticks = 0
+        self._last_ns = -1
+        self._contradictions = 0
+        self._start = Start()
+        self._filter: Blend | None = None
         self._estimate: ClockEstimate | None = None
         self.accepted = 0
         self.unusable = 0
@@ -105,11 +105,13 @@ class ClockEstimator:
     @property
     def round_trip_s(self) -> float:
         """The fastest exchange remembered; 0 before the first."""
-        return min((sample.round_trip_s for sample in self._samples), default=0.0)
+        return min(self._round_trips_s, default=0.0)
 
     def begin(self, sent_ns: int, received_ns: int, high: int, clock32: int) -> bool:
         """Start, or start anew, with an answer to get_uptime. Returns whether it was usable."""
-        self._samples.clear()
+        self._round_trips_s.clear()
+        self._last_ns = -1
+        self._contradictions = 0
         self._estimate = None
         self.accepted = 0
         return self._take(sent_ns, received_ns, Ticks(high * _WHOLE + clock32 % _WHOLE))
@@ -142,65 +144,54 @@ class ClockEstimator:
     # ------------------------------------------------------------------------------------------------- fit
 
     def _take(self, sent_ns: int, received_ns: int, ticks: Ticks) -> bool:
-        last_ns = self._samples[-1].middle_ns if self._samples else -1
         middle_ns = (sent_ns + received_ns) // 2
-        if sent_ns <= 0 or received_ns < sent_ns or middle_ns <= last_ns:
+        if sent_ns <= 0 or received_ns <= sent_ns or middle_ns <= self._last_ns:
             self.unusable += 1
             return False
-        self._samples.append(_Sample(middle_ns, (received_ns - sent_ns) * 1e-9, ticks))
+        round_trip_s = (received_ns - sent_ns) * 1e-9
+        if (
+            self._last_ns < 0
+            or middle_ns - self._last_ns > GAP_NS
+            or self._impossible(middle_ns, ticks, round_trip_s)
+        ):
+            self._restart(middle_ns, ticks)
+        self._last_ns = middle_ns
+        self._round_trips_s.append(round_trip_s)
         self.accepted += 1
-        self._fit()
+        self._fit(middle_ns, ticks, round_trip_s)
         return True
 
-    def _fit(self) -> None:
-        """Fit offset, rate and curvature, in seconds against the nominal clock, around the last sample."""
-        last = self._samples[-1]
-        fastest_s = self.round_trip_s
-        normal = _Normal()
-        normal.hold(1, 1 / RATE_PRIOR**2)
-        normal.hold(2, 1 / CURVATURE_PRIOR_PER_S**2)
-        for sample in self._samples:
-            age_s = (sample.middle_ns - last.middle_ns) * 1e-9
-            ahead_s = (sample.ticks - last.ticks) / self._freq_hz - age_s
-            excess_s = sample.round_trip_s - fastest_s
-            weight = math.exp(age_s / FADE_S) / (excess_s**2 / 12 + READING_FLOOR_S**2)
-            normal.add(weight, age_s, ahead_s)
-        offset_s, rate, offset_variance = normal.solve()
-        error_s = fastest_s / 2 + CONFIDENCE * math.sqrt(offset_variance)
+    def _restart(self, middle_ns: int, ticks: Ticks) -> None:
+        """Measure from here on, as if nothing were known."""
+        self._zero_ns, self._zero_ticks = middle_ns, ticks
+        self._start, self._filter = Start(), None
+        self._round_trips_s.clear()
+        self._contradictions = 0
+
+    def _impossible(self, middle_ns: int, ticks: Ticks, round_trip_s: float) -> bool:
+        """Whether this reading, like the ones before it, was not taken between question and answer."""
+        estimate = self.estimate()
+        off_s = abs(ticks - estimate.ticks_at(HostTime(middle_ns))) / self._freq_hz
+        age_s = (middle_ns - estimate.at_ns) * 1e-9
+        allowed_s = round_trip_s / 2 + estimate.error_s * (1 + age_s / AHEAD_S)
+        self._contradictions = self._contradictions + 1 if off_s > allowed_s else 0
+        return self._contradictions >= CONTRADICTIONS
+
+    def _fit(self, middle_ns: int, ticks: Ticks, round_trip_s: float) -> None:
+        at_s = (middle_ns - self._zero_ns) * 1e-9
+        lead_s = (ticks - self._zero_ticks) / self._freq_hz - at_s
+        if self._filter is None:
+            state, covariance = self._start.add(at_s, lead_s, round_trip_s)
+            if self._start.samples >= START_SAMPLES:
+                self._filter = Blend(Filter(state, covariance, at_s, self._start.spread_s))
+        else:
+            self._filter.add(at_s, lead_s, round_trip_s)
+            state, covariance = self._filter.state, self._filter.covariance
+        variance = covariance[0][0] + 2 * AHEAD_S * covariance[0][1] + AHEAD_S**2 * covariance[1][1]
         self._estimate = ClockEstimate(
-            self._freq_hz * (1 + rate),
-            HostTime(last.middle_ns),
-            Ticks(last.ticks + round(offset_s * self._freq_hz)),
-            error_s,
+            self._freq_hz * (1 + state[1]),
+            HostTime(middle_ns),
+            Ticks(self._zero_ticks + round((at_s + state[0]) * self._freq_hz)),
+            CONFIDENCE * math.sqrt(max(covariance[0][0], variance, 0.0)) + 1e-6,
+            self.round_trip_s / 2,
         )
-
-
-class _Normal:
-    """Normal equations of a weighted fit of y = a + b·t + c·t²/2."""
-
-    def __init__(self) -> None:
-        self._m = [[0.0] * 3 for _ in range(3)]
-        self._v = [0.0] * 3
-
-    def hold(self, index: int, weight: float) -> None:
-        """Hold one coefficient near zero."""
-        self._m[index][index] += weight
-
-    def add(self, weight: float, t: float, y: float) -> None:
-        row = (1.0, t, t * t / 2)
-        for i, left in enumerate(row):
-            self._v[i] += weight * left * y
-            for j, right in enumerate(row):
-                self._m[i][j] += weight * left * right
-
-    def solve(self) -> tuple[float, float, float]:
-        """Return a, b and the variance of a."""
-        (m00, m01, m02), (_, m11, m12), (_, _, m22) = self._m
-        v0, v1, v2 = self._v
-        # The matrix is symmetric and, thanks to the holds and one sample at t = 0, positive definite.
-        c00, c01, c02 = m11 * m22 - m12 * m12, m02 * m12 - m01 * m22, m01 * m12 - m02 * m11
-        c11, c12 = m00 * m22 - m02 * m02, m01 * m02 - m00 * m12
-        determinant = m00 * c00 + m01 * c01 + m02 * c02
-        a = (c00 * v0 + c01 * v1 + c02 * v2) / determinant
-        b = (c01 * v0 + c11 * v1 + c12 * v2) / determinant
-        return a, b, c00 / determinant

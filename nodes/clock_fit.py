@@ -1,0 +1,168 @@
+"""The filter behind a settled clock: a node's lead over host time, cut by one-sided bounds.
+
+State: lead of the node's clock over host time (s), its rate, the rate's change (1/s), the fastest way one
+way (s) and half the difference of the two ways (s). An exchange bounds lead + way out from above and
+way back - lead likewise; the distance to the bound is exponential. Each bound updates the Gaussian belief
+with the exact mean and variance of the product, so tight bounds cut and loose ones hardly count.
+"""
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Final
+
+SIZE: Final = 5
+RATE_SD: Final = 1.5e-4
+"""Standard deviation of a clock's rate against its nominal one, before anything is measured."""
+CURVATURE_SD: Final = 1e-8
+"""Standard deviation of a rate's change per second: a crystal in a warming board."""
+RATE_WALK: Final = 4e-10
+"""How far a steady rate wanders in a second (square root of)."""
+CURVATURE_FADE_S: Final = 250.0
+SKEW_FADE_S: Final = 1000.0
+DELAY_WANDER: Final = 0.01
+"""How far the fastest way wanders in a second (square root of), against the mean delay on top of it."""
+NOISE: Final = 0.005
+"""Reading noise against the mean delay on top of the fastest way."""
+LOOSE: Final = 7.0
+"""Further from its bound than so many mean delays, an exchange says nothing about them."""
+MEMORY: Final = 256.0
+"""Delays over which their mean is taken."""
+LATE: Final = 16
+"""So many exchanges later than believable, in one direction, mean that the way has become slower."""
+LEAST_SPREAD_S: Final = 1e-7
+
+
+OUTLIERS: Final = 1e-4
+"""Density of an exchange that no bound explains, against the mean delay: what one may count as evidence."""
+
+
+def hazard(k: float) -> float:
+    """Return φ(k)/Φ(k) of the normal distribution, for any K without underflow."""
+    if k < -25.0:
+        return -k - 1 / k
+    if k > 37.0:
+        return 0.0
+    return math.exp(-k * k / 2) * 0.3989422804014327 / (0.5 * math.erfc(-k * 0.7071067811865476))
+
+
+def log_share(k: float) -> float:
+    """Return log Φ(k) of the normal distribution, for any K without underflow."""
+    if k < -25.0:
+        return -k * k / 2 - math.log(-k) - 0.9189385332046727
+    return math.log(0.5 * math.erfc(-k * 0.7071067811865476))
+
+
+class Filter:
+    """Goes on from STATE and COVARIANCE (lead, rate, curvature, delay) at AT_S."""
+
+    warming = True
+    """Whether the rate may change for long in one direction; else it only wanders a little."""
+
+    def __init__(
+        self, state: Sequence[float], covariance: Sequence[Sequence[float]], at_s: float, spread_s: float
+    ) -> None:
+        self.state = [*state, 0.0]
+        self.covariance = [[*row, 0.0] for row in covariance] + [[0.0] * SIZE]
+        self._at_s = at_s
+        self._spread_s = spread_s
+        self._nearest: dict[int, tuple[int, float]] = {1: (0, math.inf), -1: (0, math.inf)}
+
+    def steady(self) -> "Filter":
+        """Return a filter that knows the same but believes that from now on the rate stays what it is."""
+        other = copy.copy(self)
+        other.state = [*self.state]
+        other.covariance = [[*row] for row in self.covariance]
+        other._nearest = {**self._nearest}
+        other.warming = False
+        other.state[2] = 0.0
+        for i in range(SIZE):
+            other.covariance[2][i] = other.covariance[i][2] = 0.0
+        return other
+
+    def add(self, at_s: float, lead_s: float, round_trip_s: float) -> float:
+        """Take an exchange in whose middle, AT_S, the clock would have been ahead by LEAD_S.
+
+        Return how well it was foretold: the logarithm of its density against the mean delay.
+        """
+        foretold = 0.0
+        self._predict(at_s - self._at_s)
+        self._at_s = at_s
+        for sign in (1, -1):
+            bound_s = sign * lead_s + round_trip_s / 2
+            self._watch(sign, bound_s)
+            foretold += self._bound(sign, bound_s)
+            gap_s = min(max(self._gap(sign, bound_s), 0.0), 5 * self._spread_s)
+            # 1.03: what the limit of 5 takes off the mean
+            self._spread_s += (1.03 * gap_s - self._spread_s) / MEMORY
+            self._spread_s = max(self._spread_s, LEAST_SPREAD_S)
+        return foretold
+
+    def _gap(self, sign: int, bound_s: float) -> float:
+        x = self.state
+        return bound_s - sign * (x[0] + x[4]) - x[3]
+
+    def _predict(self, dt: float) -> None:
+        x, p = self.state, self.covariance
+        keep, relax, half = math.exp(-dt / CURVATURE_FADE_S), math.exp(-dt / SKEW_FADE_S), dt * dt / 2
+        for row in (x, *p):
+            row[0] += row[1] * dt + row[2] * half
+            row[1] += row[2] * dt
+            row[2] *= keep
+            row[4] *= relax
+        p0, p1, p2, p4 = p[0], p[1], p[2], p[4]
+        for i in range(SIZE):
+            p0[i] += p1[i] * dt + p2[i] * half
+            p1[i] += p2[i] * dt
+            p2[i] *= keep
+            p4[i] *= relax
+        if self.warming:
+            p2[2] += CURVATURE_SD**2 * (1 - keep * keep)
+        else:
+            p1[1] += RATE_WALK**2 * dt
+        p[3][3] += (DELAY_WANDER * self._spread_s) ** 2 * dt
+
+    def _doubt(self, sign: int, by_s: float) -> None:
+        """Allow the fastest way in one direction to be another by about BY_S."""
+        p, variance = self.covariance, by_s * by_s / 4
+        p[3][3] += variance
+        p[4][4] += variance
+        p[3][4] += sign * variance
+        p[4][3] += sign * variance
+
+    def _watch(self, sign: int, bound_s: float) -> None:
+        """Notice when one direction has become slower: none of LATE exchanges comes near its bound."""
+        count, nearest_s = self._nearest[sign]
+        count, nearest_s = count + 1, min(nearest_s, self._gap(sign, bound_s))
+        if nearest_s < self._spread_s:
+            count, nearest_s = 0, math.inf
+        elif count >= LATE:
+            self.state[3] += nearest_s / 2
+            self.state[4] += sign * nearest_s / 2
+            self._doubt(sign, nearest_s)
+            count, nearest_s = 0, math.inf
+        self._nearest[sign] = count, nearest_s
+
+    def _bound(self, sign: int, bound_s: float) -> float:
+        """Cut by: sign·(lead + skew) + delay <= BOUND_S, with an exponential distance; return as ``add``."""
+        x, p = self.state, self.covariance
+        column = [sign * (row[0] + row[4]) + row[3] for row in p]
+        variance = sign * (column[0] + column[4]) + column[3]
+        gap_s = self._gap(sign, bound_s)
+        noise = (NOISE * self._spread_s) ** 2
+        if gap_s < 0 and gap_s * gap_s > 16 * (variance + noise):
+            self._doubt(sign, gap_s)
+            column = [sign * (row[0] + row[4]) + row[3] for row in p]
+            variance = sign * (column[0] + column[4]) + column[3]
+        s = math.sqrt(max(variance, 0.0) + noise)
+        pull = 1 / self._spread_s if gap_s < LOOSE * self._spread_s else 0.0
+        k = gap_s / s - pull * s
+        foretold = min(log_share(k) + (s * pull) ** 2 / 2 - gap_s * pull, 3.0) if pull else -math.inf
+        r = hazard(k)
+        push, cut = pull - r / s, min(max(r * (k + r), 0.0), 1.0) / (s * s)
+        for i, own in enumerate(column):
+            x[i] += own * push
+            row = p[i]
+            for j, other in enumerate(column):
+                row[j] -= own * cut * other
+        return math.log(math.exp(foretold) + OUTLIERS)
