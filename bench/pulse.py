@@ -209,7 +209,7 @@ def look(machine: Machine, node: Node, board: WorldNode, errors: Errors) -> None
     believed_ns = machine.nodes[0].clock.ns_at(Ticks(machine.boards[0].clock))
     off = (node.best_clock.ticks_at(believed_ns) - board.clock) / node.clock_freq_hz
     errors.estimate.append(off)
-    errors.bound.append(node.pulse_clock.error_s if node.pulse_clock else node.clock.estimate().error_s)
+    errors.bound.append(node.clock_error_s or math.inf)
 
 
 def score(machine: Machine, followers: Sequence[Follower], errors: Errors) -> None:
