@@ -24,7 +24,7 @@ from nodes.bus import CanBus, UartBus
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
-from nodes.link import Link
+from nodes.link import IOStats, Link
 from nodes.node import Node
 from nodes.node_config import NodeConfig
 from nodes.node_states import NodeState
@@ -215,6 +215,10 @@ class Machine:
         if node is self.primary:
             return time_base.primary_map(print_time)
         return time_base.secondary_map(node.best_clock, node.dictionary.clock_freq_hz, print_time)
+
+    def bus_stats(self) -> dict[str, IOStats]:
+        """Return the counters of every bus that is open, by its name."""
+        return {o.bus.name: o.bus.io.stats() for o in self._open if o.bus.closed_because is None}
 
     def check_load(self) -> None:
         """Raise BusOverload when a bus will not carry the motion queued on it in time."""

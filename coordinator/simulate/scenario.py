@@ -81,7 +81,9 @@ class BusSetting:
     noise_bytes: Range = option(span(0, 500), Range(0, 0))
     """UART: garbage that stands on the line when it is opened."""
     load: Range = option(span(0, 1.5), Range(0, 0))
-    """Other traffic of low priority, as a share of the bus."""
+    """Other traffic, as a share of the bus."""
+    load_id: int = option(whole(0, 0x7FC), 0x7E0)
+    """The first of its four CAN ids; by default it gives way to all else, 260 goes before all nodes' data."""
 
 
 FAULT_KINDS: Final = {

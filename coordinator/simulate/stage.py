@@ -14,7 +14,7 @@ from coordinator.machine.description import (
     UartConnection,
     load_machine,
 )
-from coordinator.simulate.actor import FRAME_BITS, SimActor, bit_errors
+from coordinator.simulate.actor import SimActor, bit_errors
 from coordinator.simulate.boards import PS_PER_NS, Board
 from coordinator.simulate.checker import QueueDepth
 from coordinator.simulate.faults import NS, Faults
@@ -25,7 +25,9 @@ from coordinator.simulate.values import Dice, ScenarioError
 from nodes.clock import HostTime
 from nodes.link import LinkIO
 from nodes.seams import LinkIOLike, OnFrame, OnLost
+from nodes.virtual._sim import lib
 from nodes.virtual.world import (
+    CanController,
     CanPort,
     CanWire,
     ControllerSettings,
@@ -41,8 +43,9 @@ GRID_S: Final = 0.005
 """Between two points of the primary clock's map; a ramp of 20 ppm/s bends by 0.1 ns over it."""
 ADMIN_ID: Final = 0x3F0
 SET_NODE_ID: Final = 1
-LOAD_ID: Final = 0x7E0
-LOAD_EVERY_NS: Final = 5_000_000
+LOAD_EVERY_NS: Final = 500_000
+LOAD_OWED_BITS: Final = 4_000.0
+"""What a sender may be behind with."""
 LOAD_UUID: Final = "10ad00000000"
 LIMIT_S: Final = 3600.0
 
@@ -166,11 +169,20 @@ class Stage:
             return
         sender = self._world.add_node(wire, LOAD_UUID).controller
         assert sender is not None
-        count = round(load * LOAD_EVERY_NS / NS * wire.bitrate / (FRAME_BITS + 20))
+        self._keep_sending(sender, setting.load_id, load * wire.bitrate)
+
+    def _keep_sending(self, sender: CanController, first_id: int, bits_per_s: float) -> None:
+        owed_bits, number = 0.0, 0
 
         def send() -> None:
-            for n in range(count):
-                sender.send(LOAD_ID + n % 16, bytes([n & 0xFF] * 8))
+            nonlocal owed_bits, number
+            owed_bits = min(owed_bits + bits_per_s * LOAD_EVERY_NS / NS, LOAD_OWED_BITS)
+            while owed_bits > 0:
+                data = bytes((number + n) * 37 & 0xFF for n in range(8))
+                if not sender.send(first_id + number % 4, data):
+                    break  # the bus is full; what it cannot carry is lost, as a sensor's samples are
+                owed_bits -= lib.can_frame_bits(first_id + number % 4, len(data), data)
+                number += 1
             self._world.at(self._world.now_ns + LOAD_EVERY_NS, send)
 
         send()

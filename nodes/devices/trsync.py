@@ -56,7 +56,7 @@ class Trsync:
         config.add_config(self.purpose, f"config_trsync oid={self.oid}")
 
     def start(self, node: Node, *, report_clock: int, report_ticks: int, timeout_clock: int) -> None:
-        """Arm it: it reports every REPORT_TICKS from REPORT_CLOCK on and triggers by itself at TIMEOUT_CLOCK."""
+        """Arm it: reports come every REPORT_TICKS from REPORT_CLOCK on, and it triggers at TIMEOUT_CLOCK."""
         node.send(
             "trsync_start",
             oid=self._oid,

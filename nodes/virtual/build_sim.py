@@ -45,7 +45,8 @@ ffibuilder = builder(
     "nodes.virtual._sim",
     headers=[
         *CORE_HEADERS,
-        *("firmware/boards/sim/sim.h", "nodes/virtual/world/can_wire.h", "nodes/virtual/world/world.h"),
+        *("nodes/can_bits.h", "firmware/boards/sim/sim.h"),
+        *("nodes/virtual/world/can_wire.h", "nodes/virtual/world/world.h"),
     ],
     # The wire codec is in both, and linked once.
     sources=list(dict.fromkeys([*map(str, SOURCES), str(TABLES), *CORE_SOURCES, *WORLD])),
