@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coordinator.simulate.boards import dictionary_blob
 from coordinator.streamer import CYCLE_S, SEND_AHEAD_S
@@ -81,6 +82,7 @@ class Errors:
     bound: list[float] = field(default_factory=list)
 
     def row(self) -> str:
+        """Return the figures of the table."""
         figures = [
             rms_us(self.estimate),
             worst_us(self.estimate),
@@ -120,7 +122,9 @@ class Machine:
             for n in range(len(PPM))
         ]
         self.bus = CanBus("can0", self._start_io)
-        self.nodes = [self.bus.add_node(f"n{n}", Uuid.parse(b.uuid), config) for n, b in enumerate(self.boards)]
+        self.nodes = [
+            self.bus.add_node(f"n{n}", Uuid.parse(b.uuid), config) for n, b in enumerate(self.boards)
+        ]
         self.port.controller.set_faults(loss=setting.loss)
         for board, ppm in zip(self.boards, PPM, strict=True):
             board.set_rate(ppm)
@@ -133,6 +137,7 @@ class Machine:
         return LinkIO.driven_by(port.open(), on_frame=on_frame, on_closed=on_closed)
 
     def ramp(self, *, begins: bool) -> None:
+        """Begin to warm the boards up, or stay where that ends."""
         for board, ppm, change in zip(self.boards, PPM, RAMP_PPM, strict=True):
             board.set_rate(ppm if begins else ppm + change, change / RAMP_S if begins else 0.0)
 
@@ -151,10 +156,13 @@ def config(dictionary: Dictionary) -> NodeConfig:
     return NodeConfig("board", dictionary)
 
 
-def true_s(board: WorldNode, ticks: Sequence[float]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def true_s(board: WorldNode, ticks: Sequence[float]) -> NDArray[np.float64]:
     """Return the true times of TICKS, between the whole ones as well."""
     whole = np.floor(np.array(ticks))
-    return board.true_ps(whole.astype(np.uint64)) * 1e-12 + (np.array(ticks) - whole) / board_hz(board)
+    found: NDArray[np.float64] = board.true_ps(whole.astype(np.uint64)) * 1e-12 + (
+        np.array(ticks) - whole
+    ) / board_hz(board)
+    return found
 
 
 def board_hz(board: WorldNode) -> int:

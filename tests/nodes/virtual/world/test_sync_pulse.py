@@ -12,7 +12,7 @@ from tests.nodes.virtual.world.machines import CanMachine
 
 
 def watch(machine: CanMachine, seconds: int, found: list[tuple[float, float]]) -> Callable[[], object]:
-    """Return what looks twice a second, for so long, by how much each secondary's clock is wrong, and the bound."""
+    """Return what looks for SECONDS by how much each secondary's clock is wrong, and at the bound."""
 
     async def look() -> None:
         primary, *others = machine.nodes
@@ -23,6 +23,7 @@ def watch(machine: CanMachine, seconds: int, found: list[tuple[float, float]]) -
             for node, board in zip(others, machine.boards[1:], strict=True):
                 assert node.clock_source == "pulse"
                 off = node.best_clock.ticks_at(believed_ns) - board.clock
+                assert node.clock_error_s is not None
                 found.append((off / node.clock_freq_hz, node.clock_error_s))
 
     return look
