@@ -25,7 +25,7 @@ from coordinator.simulate.boards import dictionary_blob
 from coordinator.streamer import CYCLE_S, SEND_AHEAD_S
 from coordinator.timebase import ClockMap, TimeBase
 from nodes.assign import Uuid
-from nodes.bus import CanBus
+from nodes.can_bus import CanBus
 from nodes.clock import HostTime, Ticks
 from nodes.dictionary import Dictionary
 from nodes.link import LinkIO
@@ -82,7 +82,7 @@ class Errors:
     bound: list[float] = field(default_factory=list)
 
     def row(self) -> str:
-        """Return the figures of the table."""
+        """Return a line of the table."""
         figures = [
             rms_us(self.estimate),
             worst_us(self.estimate),
@@ -137,7 +137,7 @@ class Machine:
         return LinkIO.driven_by(port.open(), on_frame=on_frame, on_closed=on_closed)
 
     def ramp(self, *, begins: bool) -> None:
-        """Begin to warm the boards up, or stay where that ends."""
+        """Let the boards begin to warm up, or end it."""
         for board, ppm, change in zip(self.boards, PPM, RAMP_PPM, strict=True):
             board.set_rate(ppm if begins else ppm + change, change / RAMP_S if begins else 0.0)
 

@@ -20,7 +20,8 @@ from coordinator.node_care import JobGate, NodeCare
 from coordinator.timebase import ClockMap, TimeBase
 from coordinator.wire import Wire
 from nodes.assign import Uuid
-from nodes.bus import CanBus, UartBus
+from nodes.bus import UartBus
+from nodes.can_bus import CanBus
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError

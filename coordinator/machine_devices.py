@@ -10,7 +10,7 @@ from coordinator.machine.description import (
     StepperDescription,
 )
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
-from nodes.bus import KNOWS_BUS_STOP
+from nodes.can_bus import KNOWS_BUS_STOP
 from nodes.devices.endstop import Endstop
 from nodes.devices.stepper import Stepper
 from nodes.devices.trsync import Trsync

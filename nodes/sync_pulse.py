@@ -93,7 +93,7 @@ class PulseRounds:
         self._history.clear()
 
     def next_pulse(self, members: Mapping[str, int]) -> int:
-        """Begin a round with MEMBERS (nominal Hz by name; at least one, the preferred one first): its seq.
+        """Begin a round with these nodes (nominal Hz by name, not none, the preferred one first): its seq.
 
         The preferred node is the reference, once it was seen often enough for all others to follow at once.
         """
@@ -130,7 +130,7 @@ class PulseRounds:
         return follower.fit.line
 
     def _refer_to(self, reference: str, members: Mapping[str, int]) -> None:
-        """Make REFERENCE the reference; what was latched before ties the others to it at once."""
+        """Let REFERENCE be it; nodes known against another node are known against this one at once."""
         self.reference = reference
         self._followers = {
             name: self._follower(name, freq_hz, members[reference])

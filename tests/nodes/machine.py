@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from nodes.assign import Uuid
-from nodes.bus import CanBus
+from nodes.can_bus import CanBus
 from nodes.devices.stepper import Stepper
 from nodes.dictionary import Dictionary
 from nodes.node_config import NodeConfig

@@ -8,7 +8,8 @@ import zlib
 import pytest
 
 from nodes.assign import AssignError
-from nodes.bus import CanBus, UartBus
+from nodes.bus import UartBus
+from nodes.can_bus import CanBus
 from nodes.dictionary_parts import DictionaryError
 from nodes.message_format import Message
 from nodes.node_errors import NodeLost

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from nodes.bus import CanBus
+from nodes.can_bus import CanBus
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import MAX_FILES, MAX_KEPT, DictionaryCache
 from nodes.dictionary_parts import DictionaryError

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from nodes.bus import BUS_OFF, CanBus
+from nodes.can_bus import BUS_OFF, CanBus
 from nodes.errors import CanductorError
 from nodes.node_errors import NodeError, NodeRestarted
 from nodes.node_states import NodeState

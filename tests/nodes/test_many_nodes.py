@@ -3,7 +3,7 @@
 import asyncio
 from dataclasses import dataclass, field
 
-from nodes.bus import CanBus
+from nodes.can_bus import CanBus
 from nodes.dictionary_cache import DictionaryCache
 from nodes.node_states import NodeState
 from tests.nodes import virtual_time

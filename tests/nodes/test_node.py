@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from nodes.assign import AssignError
-from nodes.bus import CanBus, UartBus
+from nodes.bus import UartBus
+from nodes.can_bus import CanBus
 from nodes.clock import HostTime
 from nodes.errors import CanductorError
 from nodes.node_errors import NodeError, NodeLost, NodeShutdown

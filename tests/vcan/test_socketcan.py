@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, Uuid
-from nodes.bus import CanBus
+from nodes.can_bus import CanBus
 from nodes.errors import CanductorError
 from nodes.link import LinkIO
 from nodes.message_format import Message

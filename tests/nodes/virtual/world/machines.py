@@ -4,7 +4,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from nodes.assign import Uuid
-from nodes.bus import CanBus, UartBus
+from nodes.bus import UartBus
+from nodes.can_bus import CanBus
 from nodes.link import LinkIO
 from nodes.seams import IoFactory, LinkIOLike, OnFrame, OnLost
 from nodes.virtual.world import CanPort, CanWire, Port, UartSettings, World, WorldNode
