@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coordinator.simulate.boards import dictionary_blob
 from coordinator.streamer import CYCLE_S, SEND_AHEAD_S
@@ -155,10 +156,13 @@ def config(dictionary: Dictionary) -> NodeConfig:
     return NodeConfig("board", dictionary)
 
 
-def true_s(board: WorldNode, ticks: Sequence[float]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def true_s(board: WorldNode, ticks: Sequence[float]) -> NDArray[np.float64]:
     """Return the true times of TICKS, between the whole ones as well."""
     whole = np.floor(np.array(ticks))
-    return board.true_ps(whole.astype(np.uint64)) * 1e-12 + (np.array(ticks) - whole) / board_hz(board)
+    found: NDArray[np.float64] = board.true_ps(whole.astype(np.uint64)) * 1e-12 + (
+        np.array(ticks) - whole
+    ) / board_hz(board)
+    return found
 
 
 def board_hz(board: WorldNode) -> int:
@@ -213,7 +217,7 @@ def look(machine: Machine, node: Node, board: WorldNode, errors: Errors) -> None
     believed_ns = machine.nodes[0].clock.ns_at(Ticks(machine.boards[0].clock))
     off = (node.best_clock.ticks_at(believed_ns) - board.clock) / node.clock_freq_hz
     errors.estimate.append(off)
-    errors.bound.append(node.pulse_clock.error_s if node.pulse_clock else node.clock.estimate().error_s)
+    errors.bound.append(node.clock_error_s or math.inf)
 
 
 def score(machine: Machine, followers: Sequence[Follower], errors: Errors) -> None:

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final, Literal
 
 from nodes.clock import ClockEstimate, ClockEstimator
 from nodes.clock_keeper import ClockKeeper
@@ -20,11 +20,9 @@ from nodes.node_config import NodeConfig
 from nodes.node_errors import NodeError, NodeLost, NodeShutdown, shutdown_sentence
 from nodes.node_states import NodeEvent, NodeState, following
 from nodes.seams import BuildConfig, Connector, LinkLike
+from nodes.sync_pulse import PulseClock
 from nodes.vigil import Vigil, get_config, restarted
 from nodes.vocabulary import carries_identity, check_vocabulary
-
-if TYPE_CHECKING:
-    from nodes.sync_pulse import PulseClock
 
 MAX_STARTS: Final = 3
 """How often a node is connected anew in one start because only a reset rids it of an old configuration."""
@@ -37,6 +35,7 @@ CLOCK_TIMEOUT_S: Final = 15.0
 """On a bus that loses one frame in twenty every fourth sample is lost or of no use."""
 
 
+ClockSource = Literal["pulse", "exchange"]
 OnState = Callable[["Node"], None]
 OnClock = Callable[["Node", ClockEstimate], None]
 
@@ -111,15 +110,27 @@ class Node:
     @property
     def best_clock(self) -> EstimatedClock:
         """The node's clock as well as it is known: by sync pulses, else by exchanges; NodeError before."""
-        return self.pulse_clock or self.clock
+        pulses = self.pulse_clock
+        # Interrupts of some boards come so unevenly that exchanges tell more.
+        if pulses is not None and pulses.error_s <= self.clock.estimate().error_s:
+            return pulses
+        return self.clock
+
+    @property
+    def clock_source(self) -> ClockSource:
+        """What ``best_clock`` rests on; NodeError before the first sample."""
+        return "pulse" if isinstance(self.best_clock, PulseClock) else "exchange"
 
     @property
     def clock_error_s(self) -> float | None:
-        """Bound of the error of ``best_clock``; None while that is not known."""
-        if self.pulse_clock is not None:
-            return self.pulse_clock.error_s
-        known = self._keeper is not None and self._keeper.estimator.accepted
-        return self.clock.estimate().error_s if known else None
+        """Bound of the error of ``best_clock``; None while that is not known.
+
+        By pulses it is against the reference node's clock, by exchanges against host time.
+        """
+        if self._keeper is None or not self._keeper.estimator.accepted:
+            return None
+        best = self.best_clock
+        return best.error_s if isinstance(best, PulseClock) else self.clock.estimate().error_s
 
     @property
     def clock_freq_hz(self) -> int:

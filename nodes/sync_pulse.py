@@ -113,7 +113,7 @@ class PulseRounds:
 
     def answer(self, name: str, seq: int, clock32: int, near: Ticks) -> None:
         """Take a node's answer; NEAR is its clock as far as it is known, within 2^31 ticks."""
-        if seq != self.seq:
+        if seq != self.seq or not self._history:
             self.late += 1
             return
         latched = self._history[-1]

@@ -5,6 +5,8 @@ import pytest
 
 from coordinator.timebase import SLEW_LIMIT, ClockJumpError, ClockPiece, TimeBase
 from nodes.clock import HostTime, Ticks
+from nodes.pulse_fit import PulseFit
+from nodes.sync_pulse import PulseClock
 
 
 class Clock:
@@ -67,3 +69,51 @@ def test_a_clock_that_jumps_is_refused() -> None:
 def test_primary_map_is_exact() -> None:
     clock_map = base().primary_map(50.0)
     assert clock_map.last == ClockPiece(50.0, 50.0 * PRIMARY_FREQ, PRIMARY_FREQ)
+
+
+def by_pulses(primary: Clock, secondary: Clock) -> PulseClock:
+    """Return what pulses tell of SECONDARY after a minute."""
+    fit = PulseFit(round(PRIMARY_FREQ), round(SECONDARY_FREQ))
+    for moment in range(1, 61):
+        at_ns = HostTime(moment * 1_000_000_000)
+        fit.add(primary.ticks_at(at_ns), secondary.ticks_at(at_ns))
+    assert fit.line is not None
+    return PulseClock(primary, fit.line)
+
+
+class Restless(Clock):
+    """An estimate that is renewed, and moves by 100 µs, whenever one has looked at it: by another thread."""
+
+    def ns_at(self, ticks: Ticks, /) -> HostTime:
+        found = super().ns_at(ticks)
+        self.ticks0 += 100e-6 * PRIMARY_FREQ
+        return found
+
+
+def test_by_pulses_the_primarys_estimate_has_no_part_even_while_it_changes() -> None:
+    primary, secondary = Restless(1e9, PRIMARY_FREQ * (1 - 20e-6)), Clock(5e9, SECONDARY_FREQ * (1 + 70e-6))
+    pulses = by_pulses(primary, secondary)
+    begin = primary.ticks_at(HostTime(61_000_000_000)) / PRIMARY_FREQ
+    time_base = TimeBase(primary, PRIMARY_FREQ)
+    clock_map = time_base.secondary_map(pulses, SECONDARY_FREQ, begin)
+    piece = time_base.steer("toolhead", clock_map, pulses, begin + 1)
+    assert piece.ticks == pytest.approx(secondary.ticks_at(HostTime(62_000_020_000)), abs=3)
+    assert piece.ticks_per_s == pytest.approx(SECONDARY_FREQ * (1 + 90e-6), rel=0.1e-6)
+
+
+def test_the_change_from_exchanges_to_pulses_and_back_bends_but_never_jumps() -> None:
+    primary, secondary = Clock(1e9, PRIMARY_FREQ * (1 - 20e-6)), Clock(5e9, SECONDARY_FREQ * (1 + 70e-6))
+    time_base, pulses = TimeBase(primary, PRIMARY_FREQ), by_pulses(primary, secondary)
+    exchanges = Clock(secondary.ticks0 + 30e-6 * SECONDARY_FREQ, secondary.rate)
+    begin = time_base.print_time_at(HostTime(60_000_000_000))
+    clock_map = time_base.secondary_map(exchanges, SECONDARY_FREQ, begin)
+    moments = begin + np.arange(0, 20, 0.05)
+    for n, moment in enumerate(moments):
+        time_base.steer("toolhead", clock_map, pulses if 100 <= n < 300 else exchanges, float(moment))
+    truth = np.array([secondary.ticks_at(time_base.host_ns_at(float(m))) for m in moments])
+    error_s = (clock_map.ticks(moments) - truth) / SECONDARY_FREQ
+    assert error_s[100] == pytest.approx(30e-6, abs=0.1e-6)
+    assert abs(error_s[300]) < 0.1e-6
+    assert error_s[-1] == pytest.approx(30e-6, abs=0.4e-6)  # e^-5 of the way is left
+    # Never faster than the whole difference over a second: 30 µs per s.
+    assert np.abs(np.diff(error_s)).max() / 0.05 < 31e-6

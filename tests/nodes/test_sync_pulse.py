@@ -169,6 +169,18 @@ def test_an_answer_about_another_pulse_does_not_count() -> None:
     assert rounds.line("b") is None
 
 
+def test_after_forgetting_answers_do_not_count_and_all_begins_anew() -> None:
+    play = Play()
+    play(30)
+    play.rounds.forget()
+    play.rounds.answer("a", play.rounds.seq, 1, Ticks(0))
+    assert play.rounds.late == 1
+    play(SETTLE_PAIRS - 1)
+    assert play.rounds.line("b") is None
+    play(1)
+    assert abs(play.off("b")) <= 1
+
+
 def test_a_node_that_misses_many_pulses_is_not_relied_on() -> None:
     play = Play()
     play(30)
