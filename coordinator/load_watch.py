@@ -17,8 +17,8 @@ class BusOverload(CanductorError):  # noqa: N818
     """A bus is asked for more than it can carry."""
 
 
-LOSSY: Final = 0.05
-"""With more blocks sent again than that it is the losses that make motion late."""
+LOSSY: Final = 0.15
+"""With more blocks sent again than that it is losses that make motion late; a full bus alone causes a few."""
 
 
 @dataclass(slots=True)
