@@ -44,12 +44,8 @@ def generated(profile: str, seeds: range) -> None:
     own = traces.rms_us([score.settled_sd_us * 1e-6 for score in found])
     over = sum(score.dishonest for score in found) / sum(score.moments for score in found)
     loose = sorted(score.looseness for score in found)[len(found) // 2]
-    print(
-        f"{profile} 5 s after the first sample: {settled:.0f} µs rms (its own standard deviation: {own:.0f} µs)"
-    )
-    print(
-        f"{profile} error over its bound: {100 * over:.2f} % of moments; median bound / rms error: {loose:.1f}"
-    )
+    print(f"{profile} after 5 s: {settled:.0f} µs rms (its own standard deviation: {own:.0f} µs)")
+    print(f"{profile} error over its bound: {100 * over:.2f} % of moments; bound / rms error: {loose:.1f}")
 
 
 def cost() -> None:

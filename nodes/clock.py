@@ -178,6 +178,7 @@ class ClockEstimator:
         return self._contradictions >= CONTRADICTIONS
 
     def _fit(self, middle_ns: int, ticks: Ticks, round_trip_s: float) -> None:
+        faded_s = 0.0
         at_s = (middle_ns - self._zero_ns) * 1e-9
         lead_s = (ticks - self._zero_ticks) / self._freq_hz - at_s
         if self._filter is None:
@@ -187,11 +188,12 @@ class ClockEstimator:
         else:
             self._filter.add(at_s, lead_s, round_trip_s)
             state, covariance = self._filter.state, self._filter.covariance
+            faded_s = self._filter.faded_s
         variance = covariance[0][0] + 2 * AHEAD_S * covariance[0][1] + AHEAD_S**2 * covariance[1][1]
         self._estimate = ClockEstimate(
             self._freq_hz * (1 + state[1]),
             HostTime(middle_ns),
             Ticks(self._zero_ticks + round((at_s + state[0]) * self._freq_hz)),
-            CONFIDENCE * math.sqrt(max(covariance[0][0], variance, 0.0)) + 1e-6,
+            CONFIDENCE * math.sqrt(max(covariance[0][0], variance, 0.0)) + faded_s + 1e-6,
             self.round_trip_s / 2,
         )

@@ -37,6 +37,11 @@ class Blend:
             self._steady, self._odds = self._warming.steady(), FIRST_ODDS
         self._mix(1 / (1 + math.exp(-self._odds)))
 
+    @property
+    def faded_s(self) -> float:
+        """Most that forgetting a difference of the ways may have moved the lead."""
+        return max(abs(self._warming.faded_s), abs(self._steady.faded_s))
+
     def _mix(self, share: float) -> None:
         """Set state and covariance to those of both filters together, the steady one having SHARE."""
         one, two = self._warming, self._steady

@@ -66,6 +66,8 @@ class Filter:
         self.covariance = [[*row, 0.0] for row in covariance] + [[0.0] * SIZE]
         self._at_s = at_s
         self._spread_s = spread_s
+        self.faded_s = 0.0
+        """Skew given up so far for want of evidence: the lead may be wrong by so much."""
         self._nearest: dict[int, tuple[int, float]] = {1: (0, math.inf), -1: (0, math.inf)}
 
     def steady(self) -> "Filter":
@@ -73,7 +75,7 @@ class Filter:
         other = copy.copy(self)
         other.state = [*self.state]
         other.covariance = [[*row] for row in self.covariance]
-        other._nearest = {**self._nearest}
+        other._nearest = {**self._nearest}  # noqa: SLF001 - a copy of its own kind
         other.warming = False
         other.state[2] = 0.0
         for i in range(SIZE):
@@ -105,6 +107,7 @@ class Filter:
     def _predict(self, dt: float) -> None:
         x, p = self.state, self.covariance
         keep, relax, half = math.exp(-dt / CURVATURE_FADE_S), math.exp(-dt / SKEW_FADE_S), dt * dt / 2
+        self.faded_s += x[4] * (1 - relax)
         for row in (x, *p):
             row[0] += row[1] * dt + row[2] * half
             row[1] += row[2] * dt

@@ -71,7 +71,9 @@ def read(path: Path) -> Trace:
     header, *lines = path.read_text().splitlines()
     value = {key: float(text) for key, text in re.findall(r"(\w+)=([\d.e+-]+)(?=[ ;])", header)}
     truth = Truth(
-        *(value[key] for key in ("F", "drift_ppm", "ramp_ppm")),
+        value["F"],
+        value["drift_ppm"],
+        value["ramp_ppm"],
         c0=int(value["c0"]),
         ramp_start_s=value["ramp_start"],
         ramp_s=value["ramp_len"],

@@ -59,6 +59,7 @@ def test_both_ways_slower_for_good() -> None:
 def test_one_way_slower_for_good_moves_the_clock_by_no_more_than_asymmetry_can(way: int) -> None:
     found = follow(lambda t: (400e-6 * (1 - way), 400e-6 * way) if t > 100 else (0.0, 0.0), 500)
     assert worst(found, 100) < 260e-6
+    assert sum(abs(error_s) > bound_s for _, error_s, bound_s in found) <= 0.003 * len(found)
 
 
 def test_wake_ups_late_by_ten_microseconds_leave_the_rate_good() -> None:
