@@ -68,6 +68,11 @@ class ClockEstimate:
     asymmetry_s: float = 0.0
     """What they may add when not: half the fastest exchange, were all of it spent in one direction."""
 
+    @property
+    def bound_s(self) -> float:
+        """What the error may be in all: ``error_s``, and what unequal ways may add unseen."""
+        return self.error_s + self.asymmetry_s
+
     def ticks_at(self, at_ns: HostTime) -> Ticks:
         """Return the node's clock at host time AT_NS."""
         return Ticks(self.at_ticks + round((at_ns - self.at_ns) * (self.freq_hz * 1e-9)))

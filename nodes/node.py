@@ -112,7 +112,7 @@ class Node:
         """The node's clock as well as it is known: by sync pulses, else by exchanges; NodeError before."""
         pulses = self.pulse_clock
         # Interrupts of some boards come so unevenly that exchanges tell more.
-        if pulses is not None and pulses.error_s <= self.clock.estimate().error_s:
+        if pulses is not None and pulses.error_s <= self.clock.estimate().bound_s:
             return pulses
         return self.clock
 
@@ -130,7 +130,7 @@ class Node:
         if self._keeper is None or not self._keeper.estimator.accepted:
             return None
         best = self.best_clock
-        return best.error_s if isinstance(best, PulseClock) else self.clock.estimate().error_s
+        return best.error_s if isinstance(best, PulseClock) else self.clock.estimate().bound_s
 
     @property
     def clock_freq_hz(self) -> int:
