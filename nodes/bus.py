@@ -184,7 +184,7 @@ class _UartConnector:
             LinkSettings(None, lost_after_s=LOST_AFTER_S), on_responses=on_responses, on_lost=on_lost
         )
 
-    def wire_ns(self, content_bytes: int, bitrate: int) -> int:  # noqa: ARG002
+    def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:  # noqa: ARG002
         return 0  # a device file does not tell whether a baud rate is real, or a USB or pseudo-terminal's
 
     def forget(self) -> None:

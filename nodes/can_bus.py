@@ -225,8 +225,8 @@ class _CanConnector:
         settings = LinkSettings(self._bus.nodeid(self._uuid), lost_after_s=LOST_AFTER_S)
         return self._bus.io.open_link(settings, on_responses=on_responses, on_lost=on_lost)
 
-    def wire_ns(self, content_bytes: int, bitrate: int) -> int:
-        return can_wire_ns(content_bytes, bitrate) if bitrate > 0 else 0
+    def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
+        return can_wire_ns(content_bytes, bitrate, answer=answer) if bitrate > 0 else 0
 
     def forget(self) -> None:
         self.assignment = None

@@ -98,8 +98,8 @@ class ClockKeeper:
         sent_ns, received_ns = narrow(
             answer.sent_ns,
             answer.received_ns,
-            self._connector.wire_ns(answer.asked_bytes, bitrate),
-            self._connector.wire_ns(answer.answered_bytes, bitrate),
+            self._connector.wire_ns(answer.asked_bytes, bitrate, answer=False),
+            self._connector.wire_ns(answer.answered_bytes, bitrate, answer=True),
         )
         if message.name == "clock":
             return self.estimator.add(sent_ns, received_ns, message.integer("clock"))

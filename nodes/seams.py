@@ -75,7 +75,7 @@ class Connector(Protocol):
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
         """Open a link, giving the node its id first where it needs one."""
 
-    def wire_ns(self, content_bytes: int, bitrate: int) -> int:
+    def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
         """Return how long a block is on the wire for certain; 0 where that is not known."""
 
     def forget(self) -> None:

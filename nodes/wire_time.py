@@ -5,18 +5,23 @@ from typing import Final
 BLOCK_FRAMING: Final = 5
 """Bytes that a block has beside its content."""
 FRAME_BYTES: Final = 8
-FRAME_BITS: Final = 47 + 8 * FRAME_BYTES
-"""A full CAN frame with interframe space, stuff bits not counted."""
+OVERHEAD_BITS: Final = 44
+"""Of a frame, up to the end at which it counts as received; stuff bits, of which there may be none, apart."""
+PAUSE_BITS: Final = 3
+"""Between two frames."""
+FRAME_BITS: Final = OVERHEAD_BITS + 8 * FRAME_BYTES
 
 
-def can_wire_ns(content_bytes: int, bitrate: int) -> int:
-    """Return how long a block with so much content needs on a CAN bus of BITRATE bit/s, stuffing apart.
+def can_wire_ns(content_bytes: int, bitrate: int, *, answer: bool) -> int:
+    """Return how long a block with so much content needs on a CAN bus of BITRATE bit/s, for certain.
 
-    The last frame counts as full: an answer shares it with the acknowledgement behind it, and is received no
-    sooner than that frame ends.
+    The last frame of an ANSWER is full: it shares it with the acknowledgement behind it.
     """
-    frames = -(-(content_bytes + BLOCK_FRAMING) // FRAME_BYTES)
-    return frames * FRAME_BITS * 1_000_000_000 // bitrate
+    size = content_bytes + BLOCK_FRAMING
+    frames = -(-size // FRAME_BYTES)
+    last_bytes = FRAME_BYTES if answer else size - (frames - 1) * FRAME_BYTES
+    bits = (frames - 1) * (FRAME_BITS + PAUSE_BITS) + OVERHEAD_BITS + 8 * last_bytes
+    return bits * 1_000_000_000 // bitrate
 
 
 def narrow(sent_ns: int, received_ns: int, out_ns: int, back_ns: int) -> tuple[int, int]:

@@ -6,11 +6,18 @@ from nodes.wire_time import can_wire_ns, narrow
 
 
 @pytest.mark.parametrize(
-    ("content_bytes", "bitrate", "frames"),
-    [(0, 1_000_000, 1), (3, 1_000_000, 1), (4, 500_000, 2), (59, 250_000, 8)],
+    ("content_bytes", "bitrate", "answer", "bits"),
+    [
+        (1, 1_000_000, False, 44 + 6 * 8),
+        (3, 1_000_000, False, 44 + 8 * 8),
+        (4, 500_000, False, 111 + 44 + 8),
+        (6, 500_000, True, 111 + 108),
+        (59, 250_000, False, 7 * 111 + 108),
+        (59, 250_000, True, 7 * 111 + 108),
+    ],
 )
-def test_a_block_is_cut_into_full_frames(content_bytes: int, bitrate: int, frames: int) -> None:
-    assert can_wire_ns(content_bytes, bitrate) == frames * 111 * (1_000_000_000 // bitrate)
+def test_a_block_takes_at_least_its_frames(content_bytes: int, bitrate: int, answer: bool, bits: int) -> None:
+    assert can_wire_ns(content_bytes, bitrate, answer=answer) == bits * (1_000_000_000 // bitrate)
 
 
 def test_known_time_is_taken_off_both_ends() -> None:
