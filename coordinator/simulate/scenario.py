@@ -148,7 +148,7 @@ class Program:
 class Bounds:
     """What is still right; beside what always has to hold."""
 
-    clock_error_us: float = option(number(0, 2000, "µs"), 60.0)
+    clock_error_us: float = option(number(0, 2000, "µs"), 8.0)
     """How far a secondary node's clock may be from print time, in truth, while it steps."""
     late_us: float = option(number(0, 2000, "µs"), 0.0)
     """What the scenario allows every step beside that."""
