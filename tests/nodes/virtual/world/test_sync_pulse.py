@@ -68,7 +68,7 @@ def test_where_interrupts_come_unevenly_exchanges_are_trusted_more() -> None:
     def look() -> None:
         assert machine.nodes[1].pulse_clock is not None
         assert machine.nodes[1].clock_source == "exchange"
-        assert machine.nodes[1].clock_error_s == machine.nodes[1].clock.estimate().error_s
+        assert machine.nodes[1].clock_error_s == machine.nodes[1].clock.estimate().bound_s
 
     play(machine, lambda: asyncio.sleep(10), look)
 
