@@ -41,7 +41,7 @@ def play(scenario: Scenario, seed: int) -> Result:
     return _judge(stage, run, began_s)
 
 
-class _Text:
+class Text:
     """The g-code as a file that is read."""
 
     def __init__(self, text: str) -> None:
@@ -93,7 +93,7 @@ class _Run:
 
     async def _main(self) -> Outcome:
         self.stage.faults.begin("start", self._interrupt())
-        program = Program(_Text(make_program(self.stage.scenario.program, self.stage.dice)), "job")
+        program = Program(Text(make_program(self.stage.scenario.program, self.stage.dice)), "job")
         async with asyncio.timeout(LIMIT_S):
             return await run_job(
                 self.stage.description,

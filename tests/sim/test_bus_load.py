@@ -10,10 +10,10 @@ from coordinator.app import Machine, link_of
 from coordinator.gcode.program import Program
 from coordinator.session import Outcome, run_job
 from coordinator.simulate import scenario as scenarios
+from coordinator.simulate.play import Text
 from coordinator.simulate.stage import Stage
 from nodes.errors import CanductorError
 from nodes.link import IOStats, LinkError
-from tests.sim.text import Text
 
 SENSORS = 0x104
 """An id that wins against the data of all nodes."""
