@@ -53,7 +53,7 @@ def trapezoid(t: float, start: Position, end: Position, v: float, joints: tuple[
     top = max(v0, v1, min(v, math.sqrt(ACCEL * length + (v0 * v0 + v1 * v1) / 2)))
     ramps = (2 * top * top - v0 * v0 - v1 * v1) / (2 * ACCEL)
     times = [(top - v0) / ACCEL, max(length - ramps, 0) / top, (top - v1) / ACCEL]
-    return [t, *times, v0, top, ACCEL, *start, *ratio]
+    return [t, *times, v0, top, ACCEL, *start, *ratio, 0.0, 0.0]
 
 
 def corner_speed(before: list[float], after: list[float]) -> float:

@@ -184,6 +184,7 @@ int gcode_move(struct gcode_state *state, struct planner *planner, const struct 
     }
     if (words->given >> 4 & 1)
         speed = words->value[4] * state->unit / 60;
+    planner->line = (int64_t)state->lines + 1;
     if ((words->given & 15) && planner_add(planner, target, speed * state->speed_factor))
         return -1;
     memcpy(state->position, target, sizeof target);

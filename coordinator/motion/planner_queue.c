@@ -195,6 +195,8 @@ int planner_add(struct planner *p, const double target[4], double speed) {
     for (int axis = 0; axis < 4; axis++)
         if (move->ratio[axis] != 0)
             p->position[axis] = target[axis];
+    move->pressure_advance = p->pressure_advance;
+    move->line = p->line;
     p->tail++;
     p->moves_added++;
     if (++p->fresh >= p->plan_after)
@@ -288,6 +290,8 @@ static void hand_out(struct planner *p, const struct planned_move *move, double 
     out->accel = accel;
     memcpy(out->start, move->start, sizeof out->start);
     memcpy(out->ratio, move->ratio, sizeof out->ratio);
+    out->pressure_advance = move->pressure_advance;
+    out->line = move->line;
     p->print_time += out->accel_s + out->cruise_s + out->decel_s;
     p->speed = end;
     p->speed_v2 = end_v2;

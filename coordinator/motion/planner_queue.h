@@ -61,6 +61,8 @@ struct planned_move {
     double reach_v2, smooth_reach_v2;         // by how much v² may change over the move
     double max_start_v2, max_smooth_start_v2; // bound of the start by all moves before
     double start_v2, smooth_start_v2;         // start if the program ended after the last move
+    double pressure_advance;
+    int64_t line;
     int32_t extrude_only;
 };
 
@@ -68,6 +70,8 @@ struct planner {
     struct planner_limits limits; // may change between moves; holds for moves added later
     double accel;                 // mm/s² asked for, at most limits.max_accel
     double position[4];           // mm, end of the last move added
+    double pressure_advance;      // s; this and the line are noted with moves added later
+    int64_t line;                 // of the program; 0: none
     uint32_t homed;               // bit per axis X Y Z
     double plan_until;            // print time, s: planner_ready says no when trapezoids reach beyond it
     struct planner_fault fault;   // why planner_add said no

@@ -12,6 +12,8 @@ import numpy.typing as npt
 from coordinator.motion._planner import ffi, lib
 from coordinator.motion.specs import MotionLimits
 
+_FORMATS: Mapping[str, Any] = {"double": "f8", "double[4]": ("f8", 4), "int64_t": "i8"}
+
 
 def _trapezoid_dtype() -> np.dtype[np.void]:
     """Describe struct trapezoid to numpy, with the offsets the compiler chose."""
@@ -19,7 +21,7 @@ def _trapezoid_dtype() -> np.dtype[np.void]:
     return np.dtype(
         {
             "names": list(layout),
-            "formats": [("f8", 4) if field.type.kind == "array" else "f8" for field in layout.values()],
+            "formats": [_FORMATS[field.type.cname] for field in layout.values()],
             "offsets": [field.offset for field in layout.values()],
             "itemsize": ffi.sizeof("struct trapezoid"),
         }

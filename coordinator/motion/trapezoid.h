@@ -3,6 +3,8 @@
 #ifndef MOTION_TRAPEZOID_H
 #define MOTION_TRAPEZOID_H
 
+#include <stdint.h>
+
 // cffi: begin
 enum { AXIS_X, AXIS_Y, AXIS_Z, AXIS_E, AXES };
 
@@ -18,6 +20,8 @@ struct trapezoid {
     double accel;                      // mm/s², >= 0
     double start[4];                   // mm, X Y Z E
     double ratio[4];                   // mm per mm of s
+    double pressure_advance;           // s, of the extruder that E stands for
+    int64_t line;                      // of the program; 0: none
 };
 // cffi: end
 

@@ -33,7 +33,7 @@ class Move:
 
     def row(self) -> list[float]:
         head = [self.print_time, *self.seconds, self.start_v, self.cruise_v, self.accel]
-        return [*head, *self.start, *self.ratio]
+        return [*head, *self.start, *self.ratio, 0.0, 0.0]  # no pressure advance, of no line
 
     def way(self, t: Longs) -> Longs:
         """Return s after T seconds, straight from the definition of a trapezoid."""
