@@ -14,6 +14,7 @@ ffibuilder = builder(
         "coordinator/motion/steps.c",
         "coordinator/motion/step_times.c",
         "coordinator/motion/step_compress.c",
+        "coordinator/motion/step_fit.c",
         "coordinator/motion/step_stream.c",
         "firmware/wire/vlq.c",
     ],

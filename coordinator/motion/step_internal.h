@@ -57,8 +57,7 @@ struct stepper {
     double sent_ticks;
     int64_t sent_clock;
     int sent_direction;
-    int guess_add;
-    size_t guess_count;
+    uint32_t expected; // steps of the last segment: the next will not be much different
 
     double max_error_ticks, closest_ticks;
     int64_t pulse_ticks, lead_ticks, reset_margin_ticks;
