@@ -74,8 +74,13 @@ class PlanOptions:
 
     config: Path
     gcode: Path
+    """``-``: standard input."""
     output: Path | None = None
-    """Folder for each node's command stream; None: only the report."""
+    """Folder for each node's command stream, the report and its plot; None: only the report."""
+    plot: Path | None = None
+    """SVG of velocity, flow and bus load."""
+    can_bitrate: int = 1_000_000
+    """Bit/s of every CAN bus."""
     json: bool = False
     dictionaries: Mapping[str, Path] = field(default_factory=dict)
     """By node: its data dictionary as JSON; other nodes take the project's own firmware."""
