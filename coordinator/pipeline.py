@@ -6,7 +6,7 @@ program and keeps no clock. Not thread-safe: one thread at a time.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from coordinator.gcode.interpreter import Job
 from coordinator.motion.planner import Planner, Position
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 BatchSink = Callable[[int, bytes], None]
 """Takes a node's index and a piece of its stream (nodes/link/batch.h)."""
+
+MoveWatch = Callable[[Any, int], None]
+"""Takes a pointer to trapezoids, and how many there are, as they go to step generation."""
 
 BATCH_ROOM = 1 << 16
 
@@ -53,13 +56,21 @@ class Pipeline:
     """Moves of JOB, planned by its planner, turned by STEPS into batches that SINK takes."""
 
     def __init__(
-        self, job: Job, steps: StepGenerator, sink: BatchSink, *, nodes: int, record: PlanRecord | None = None
+        self,
+        job: Job,
+        steps: StepGenerator,
+        sink: BatchSink,
+        *,
+        nodes: int,
+        record: PlanRecord | None = None,
+        watch: MoveWatch | None = None,
     ) -> None:
         self.job = job
         self.steps = steps
         self._sink = sink
         self._nodes = nodes
         self._record = record
+        self._watch = watch
         self._appended_until = 0.0
         self.moves = 0
         """Trapezoids handed to step generation."""
@@ -89,6 +100,8 @@ class Pipeline:
                 end = last.print_time + last.accel_s + last.cruise_s + last.decel_s
                 self._appended_until = float(end)
                 self.moves += taken
+                if self._watch is not None:
+                    self._watch(waiting.pointer, taken)
                 if self._record is not None:
                     self._record.add(waiting.array()[:taken])
                 self.planner.release(taken)

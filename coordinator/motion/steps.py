@@ -17,6 +17,9 @@ Position = tuple[float, float, float, float]
 class StepError(CanductorError):
     """Step generation cannot go on; the sentence says where and why."""
 
+    print_time_s: float | None = None
+    """Of the step or move that cannot be; None: it is no matter of time."""
+
 
 @dataclass(frozen=True, slots=True)
 class StepperStats:
@@ -231,7 +234,9 @@ class StepGenerator:
         e: Any = ffi.new("struct step_error *")
         lib.step_last_error(self._gen, e)
         who = self._steppers[e.stepper].name if e.stepper >= 0 else "the plan"
-        return StepError(f"{who} at print time {e.print_time:.6f} s: {_REASONS[e.status].format(e.value)}")
+        error = StepError(f"{who} at print time {e.print_time:.6f} s: {_REASONS[e.status].format(e.value)}")
+        error.print_time_s = e.print_time
+        return error
 
 
 _REASONS = {
