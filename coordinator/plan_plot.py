@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 from coordinator.plan_report import Timeline
 
-WIDTH, PANEL, LEFT, RIGHT, TOP, GAP, BOTTOM = 1000, 170, 70, 20, 40, 50, 40
+WIDTH, PANEL, LEFT, RIGHT, TOP, GAP, BOTTOM = 1000, 170, 70, 20, 52, 50, 40
 COLOURS = ("#1f6fb4", "#d1495b", "#2e8b57", "#8e5bb5", "#c77d0a", "#4a4a4a")
 TICKS = 5
 COLUMNS_MAX = 1000
@@ -55,10 +55,11 @@ def _panel(top: int, heading: str, curves: list[Curve], bin_s: float, end_s: flo
     for number, (name, values) in enumerate(curves):
         colour = COLOURS[number % len(COLOURS)]
         yield _curve(values, colour, (LEFT, top + PANEL), (width * bin_s / end_s, PANEL / high))
-        if name:
-            x = LEFT + width - 8
-            y = top + 16 + 15 * number
-            yield f'<text x="{x}" y="{y}" text-anchor="end" fill="{colour}">{_escape(name)}</text>'
+    names = "".join(
+        f'<tspan dx="14" fill="{COLOURS[number % len(COLOURS)]}">{_escape(name)}</tspan>'
+        for number, (name, _) in enumerate(curves)
+    )
+    yield f'<text x="{LEFT + width}" y="{top - 6}" text-anchor="end">{names}</text>'
 
 
 def _curve(values: Sequence[float], colour: str, origin: tuple[int, int], scale: tuple[float, float]) -> str:
@@ -73,10 +74,11 @@ def _curve(values: Sequence[float], colour: str, origin: tuple[int, int], scale:
 
 
 def _round_up(value: float) -> float:
-    """Return the next of 1, 2, 5 times a power of ten; 1 for nothing."""
+    """Return the next short number from VALUE on; 1 for nothing."""
     if value <= 0:
         return 1.0
-    candidates = (factor * 10.0**exponent for exponent in range(-6, 13) for factor in (1, 2, 5))
+    short = (1, 1.5, 2, 3, 4, 5, 6, 8)
+    candidates = (factor * 10.0**exponent for exponent in range(-6, 13) for factor in short)
     return next((candidate for candidate in candidates if value <= candidate), value)
 
 

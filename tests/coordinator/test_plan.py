@@ -178,7 +178,7 @@ def test_the_picture_is_xml_for_any_title_and_any_length() -> None:
         curves = [e for e in root.iter() if e.tag.endswith("polyline")]
         assert len(curves) == 3
         assert all(len(curve.attrib["points"]) < 40_000 for curve in curves)
-        texts = [e.text for e in root.iter() if e.tag.endswith("text")]
+        texts = [e.text for e in root.iter() if e.tag.endswith(("text", "tspan"))]
         assert texts[0] == 'a<b>&"?.gcode'
         assert "<can & co>" in texts
 
