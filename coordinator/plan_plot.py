@@ -52,7 +52,7 @@ def _panel(top: int, heading: str, curves: list[Curve], bin_s: float, end_s: flo
         x = LEFT + width * i * step / end_s
         yield f'<line x1="{x:.1f}" y1="{top}" x2="{x:.1f}" y2="{top + PANEL}" stroke="#eee"/>'
         yield f'<text x="{x:.1f}" y="{top + PANEL + 15}" text-anchor="middle">{i * step:g}</text>'
-    for number, (name, values) in enumerate(curves):
+    for number, (_, values) in enumerate(curves):
         colour = COLOURS[number % len(COLOURS)]
         yield _curve(values, colour, (LEFT, top + PANEL), (width * bin_s / end_s, PANEL / high))
     names = "".join(
