@@ -1,16 +1,16 @@
 """What a plan asks of machine and buses over print time: the skin of motion/plan_stats.h."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from coordinator.motion._plan_stats import ffi, lib
+from nodes.records import record
 
 BIN_S = 1.0
 """Length of a bin at the start; it doubles whenever the bins run out (68 minutes, and so on)."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class WatchedNode:
     """A node whose stream is counted, and the bus it goes over."""
 
@@ -22,7 +22,7 @@ class WatchedNode:
     queue_step_id: int
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Peak:
     """The greatest of a quantity."""
 
@@ -32,7 +32,7 @@ class Peak:
     """Of the program; 0: there was none."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Bus:
     """The load of one bus over print time."""
 

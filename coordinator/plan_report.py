@@ -1,12 +1,13 @@
 """What ``canductor plan`` tells: figures, warnings, and how they read."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 from coordinator.plan_figures import Peak
+from nodes.records import record
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class AxisReport:
     """The most one axis is asked for: mm/s and mm/s² of X, Y, Z, or of filament for E."""
 
@@ -15,7 +16,7 @@ class AxisReport:
     accel: Peak
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class StepperReport:
     """What one stepper is asked to do."""
 
@@ -29,7 +30,7 @@ class StepperReport:
     worst_error_us: float
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class NodeReport:
     """What one node is sent."""
 
@@ -47,7 +48,7 @@ class NodeReport:
     """Commands whose slot is only free after they are due."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class BusReport:
     """What one bus carries; its load over time stands in the timeline."""
 
@@ -66,7 +67,7 @@ class BusReport:
     """Print time in bins above the share of the bit rate that is given out."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Timeline:
     """Figures by bin of print time: bin i is from i·bin_s to (i + 1)·bin_s."""
 
@@ -79,7 +80,7 @@ class Timeline:
     """By bus: share of the bit rate."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class PlanReport:
     """The figures of a plan; ``to_json`` gives them by these names."""
 

@@ -3,7 +3,7 @@
 import math
 import resource
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from coordinator.commands import PlanOptions
@@ -14,6 +14,7 @@ from coordinator.plan_figures import Bus, Peak, PlanFigures, WatchedNode
 from coordinator.plan_report import AxisReport, BusReport, NodeReport, PlanReport, StepperReport, Timeline
 from coordinator.plan_warnings import CEILING, bus_warnings, queue_warnings, step_rate_warnings
 from nodes.errors import CanductorError
+from nodes.records import record
 
 
 def watched_nodes(
@@ -38,7 +39,7 @@ def watched_nodes(
     return result
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Made:
     """A plan that is finished."""
 

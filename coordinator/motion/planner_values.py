@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coordinator.motion._planner import lib
 from coordinator.motion.specs import MotionLimits
+from nodes.records import record
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,7 +48,7 @@ class FaultKind(IntEnum):
     SPEED = lib.PLANNER_SPEED
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Fault:
     """A move the machine must not make."""
 
@@ -82,7 +83,7 @@ _FAULTS: Mapping[FaultKind, Callable[[Fault], str]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Trapezoids:
     """Consecutive trapezoids in the planner's memory: valid until they are released."""
 

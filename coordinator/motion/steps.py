@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import fields
 from typing import Any
 
 from coordinator.motion._steps import ffi, lib
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from nodes.errors import CanductorError
+from nodes.records import record
 
 MAX_ERROR_S = 12.5e-6
 """How far a step may be from its true time by default."""
@@ -21,7 +22,7 @@ class StepError(CanductorError):
     """Of the step or move that cannot be; None: it is no matter of time."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class StepperStats:
     """What one stepper's stream amounts to so far."""
 
@@ -45,7 +46,7 @@ class StepperStats:
     """Steps/s."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class NodeStats:
     """What one node's stream amounts to so far."""
 
@@ -62,7 +63,7 @@ class NodeStats:
     """Bytes of the batch not yet taken."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class StepStats:
     """Totals since construction."""
 
@@ -210,14 +211,14 @@ class StepGenerator:
             raise StepError(f"there is no stepper {index}; the generator has {len(self._steppers)}")
         s = ffi.new("struct step_stepper_stats *")
         lib.step_stepper_stats(self._gen, index, s)
-        fields = (getattr(s, name) for name in StepperStats.__slots__[1:])
-        return StepperStats(self._steppers[index].name, *fields)
+        values = (getattr(s, field.name) for field in fields(StepperStats)[1:])
+        return StepperStats(self._steppers[index].name, *values)
 
     def _node_stats(self, index: int) -> NodeStats:
         s = ffi.new("struct step_node_stats *")
         lib.step_node_stats(self._gen, index, s)
-        fields = (getattr(s, name) for name in NodeStats.__slots__[1:])
-        return NodeStats(self._nodes[index].name, *fields)
+        values = (getattr(s, field.name) for field in fields(NodeStats)[1:])
+        return NodeStats(self._nodes[index].name, *values)
 
     def _check_node(self, node: int) -> None:
         if not 0 <= node < len(self._nodes):
