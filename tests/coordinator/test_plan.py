@@ -7,7 +7,9 @@ import struct
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -34,13 +36,10 @@ RECORD = struct.Struct("<QQB")
 DATA = Path(__file__).parents[2] / ".." / "shared" / "data"
 
 
-def plan(tmp_path: Path, text: str = SQUARE, **options: object) -> PlanReport:
+def plan(tmp_path: Path, text: str = SQUARE, **options: Any) -> PlanReport:
     gcode = tmp_path / "square.gcode"
     gcode.write_text(text)
-    given = PlanOptions(config=DEMO_MACHINE, gcode=gcode, json=True)
-    for name, value in options.items():
-        object.__setattr__(given, name, value)
-    return plan_file(given)
+    return plan_file(replace(PlanOptions(config=DEMO_MACHINE, gcode=gcode, json=True), **options))
 
 
 def records(path: Path) -> list[tuple[int, bytes]]:
