@@ -4,11 +4,12 @@ Imports nothing that is slow: ``canductor plan`` is measured from its first inst
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Protocol
 
 from nodes.errors import CanductorError
+from nodes.records import record
 
 EXAMPLES = Path(__file__).parent.parent / "config"
 """The example machines."""
@@ -34,7 +35,7 @@ class Report(Protocol):
         """Return the same for a reader; when not ok it says what failed and what to do."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class DemoOptions:
     """``canductor demo``."""
 
@@ -58,7 +59,7 @@ class DemoOptions:
     """Folder that keeps step logs and captures; None: they are removed at the end."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class RunOptions:
     """``canductor run``."""
 
@@ -68,20 +69,25 @@ class RunOptions:
     json: bool = False
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class PlanOptions:
     """``canductor plan``."""
 
     config: Path
     gcode: Path
+    """``-``: standard input."""
     output: Path | None = None
-    """Folder for each node's command stream; None: only the report."""
+    """Folder for each node's command stream, the report and its plot; None: only the report."""
+    plot: Path | None = None
+    """SVG of velocity, flow and bus load."""
+    can_bitrate: int = 1_000_000
+    """Bit/s of every CAN bus."""
     json: bool = False
     dictionaries: Mapping[str, Path] = field(default_factory=dict)
     """By node: its data dictionary as JSON; other nodes take the project's own firmware."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class SimulateOptions:
     """``canductor simulate``."""
 

@@ -10,12 +10,12 @@ from coordinator.machine.description import (
     StepperDescription,
 )
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
-from nodes.can_bus import KNOWS_BUS_STOP
 from nodes.devices.endstop import Endstop
 from nodes.devices.stepper import Stepper
 from nodes.devices.trsync import Trsync
 from nodes.dictionary import Dictionary
 from nodes.node_config import NodeConfig
+from nodes.vocabulary import KNOWS_BUS_STOP
 
 
 class MachineDevices:

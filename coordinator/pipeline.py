@@ -6,16 +6,21 @@ program and keeps no clock. Not thread-safe: one thread at a time.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from coordinator.gcode.interpreter import Job
-from coordinator.motion.planner import TRAPEZOID, Planner, Position
+from coordinator.motion.planner import Planner, Position
 from coordinator.motion.steps import StepGenerator
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 BatchSink = Callable[[int, bytes], None]
 """Takes a node's index and a piece of its stream (nodes/link/batch.h)."""
+
+MoveWatch = Callable[[Any, int], None]
+"""Takes a pointer to trapezoids, and how many there are, as they go to step generation."""
 
 BATCH_ROOM = 1 << 16
 
@@ -25,18 +30,22 @@ class PlanRecord:
     """What was planned, for whoever checks it: trapezoids in order, and where positions were declared."""
 
     start: Position
-    pieces: list[NDArray[np.void]] = field(default_factory=list)
+    pieces: "list[NDArray[np.void]]" = field(default_factory=list)
     declared: list[tuple[int, Position]] = field(default_factory=list)
     """Before trapezoid number N the machine was declared to stand at a position."""
     count: int = 0
 
-    def add(self, trapezoids: NDArray[np.void]) -> None:
+    def add(self, trapezoids: "NDArray[np.void]") -> None:
         """Keep a copy."""
         self.pieces.append(trapezoids.copy())
         self.count += len(trapezoids)
 
-    def epochs(self) -> list[tuple[Position, NDArray[np.void]]]:
+    def epochs(self) -> "list[tuple[Position, NDArray[np.void]]]":
         """Return the stretches between declarations: where each begins, and its trapezoids."""
+        import numpy as np  # noqa: PLC0415 (start-up time: only proofs keep a record)
+
+        from coordinator.motion.trapezoid_array import TRAPEZOID  # noqa: PLC0415
+
         every = np.concatenate(self.pieces) if self.pieces else np.empty(0, TRAPEZOID)
         cuts = [(0, self.start), *self.declared]
         ends = [at for at, _ in cuts[1:]] + [len(every)]
@@ -47,13 +56,21 @@ class Pipeline:
     """Moves of JOB, planned by its planner, turned by STEPS into batches that SINK takes."""
 
     def __init__(
-        self, job: Job, steps: StepGenerator, sink: BatchSink, *, nodes: int, record: PlanRecord | None = None
+        self,
+        job: Job,
+        steps: StepGenerator,
+        sink: BatchSink,
+        *,
+        nodes: int,
+        record: PlanRecord | None = None,
+        watch: MoveWatch | None = None,
     ) -> None:
         self.job = job
         self.steps = steps
         self._sink = sink
         self._nodes = nodes
         self._record = record
+        self._watch = watch
         self._appended_until = 0.0
         self.moves = 0
         """Trapezoids handed to step generation."""
@@ -77,15 +94,16 @@ class Pipeline:
     def transfer(self) -> bool:
         """Hand planned moves to step generation while it has room; return whether all were handed over."""
         while (waiting := self.planner.take()).count:
-            view = waiting.array()
             taken = self.steps.append(waiting.pointer, waiting.count)
             if taken:
-                last = view[taken - 1]
-                end = last["print_time"] + last["accel_s"] + last["cruise_s"] + last["decel_s"]
+                last = waiting.pointer[taken - 1]
+                end = last.print_time + last.accel_s + last.cruise_s + last.decel_s
                 self._appended_until = float(end)
                 self.moves += taken
+                if self._watch is not None:
+                    self._watch(waiting.pointer, taken)
                 if self._record is not None:
-                    self._record.add(view[:taken])
+                    self._record.add(waiting.array()[:taken])
                 self.planner.release(taken)
             if taken < waiting.count:
                 return False

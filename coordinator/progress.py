@@ -6,9 +6,10 @@ Whoever runs the job calls ``update`` as often as is handy; drawing is limited h
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, TextIO
+
+from nodes.records import record
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -18,7 +19,7 @@ LIVE_INTERVAL_S = 0.2
 PLAIN_INTERVAL_S = 5.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class NodeFigures:
     """How the link to one node does; None where nothing is known yet."""
 
@@ -32,7 +33,7 @@ class NodeFigures:
     clock_error_us: float | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class Progress:
     """One state of a job."""
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from coordinator.app import Machine, link_of
 from coordinator.machine.description import StepperDescription
-from coordinator.motion.planner import TRAPEZOID
 from coordinator.motion.steps import StepGenerator
+from coordinator.motion.trapezoid_array import TRAPEZOID
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

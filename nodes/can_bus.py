@@ -25,14 +25,13 @@ from nodes.node_errors import NodeError, NodeLost
 from nodes.node_states import NodeState
 from nodes.seams import BuildConfig, FrameLike, IoFactory, LinkLike, OnLost, OnResponses
 from nodes.sync_pulse import CONSTANT, PulseKeeper
+from nodes.vocabulary import KNOWS_BUS_STOP
 from nodes.wire_time import can_wire_ns
 
 SUSPECT_INTERVAL_S: Final = 0.1
 """The bus is asked at most that often who waits for an id."""
 BUS_STOP_ID: Final = 0x010
 """Frame ``<reason> <node id of the origin>``: every node of this project's firmware shuts down at once."""
-KNOWS_BUS_STOP: Final = "CAN_BUS_STOP"
-"""Of the dictionary: the firmware does so."""
 BUS_STOP_FRAMES: Final = 3
 """Nobody acknowledges it, and a bus that has to be stopped may be one that loses frames."""
 BUS_OFF: Final = 0x2000_0040

@@ -8,6 +8,8 @@ from typing import Final
 from nodes.dictionary import Dictionary
 from nodes.dictionary_parts import DictionaryError
 
+KNOWS_BUS_STOP: Final = "CAN_BUS_STOP"
+"""A constant: firmware that has it stops its whole bus when it is told so, or when it shuts down itself."""
 REQUIRED_COMMANDS: Final = {
     "get_config": (),
     "allocate_oids": ("count",),

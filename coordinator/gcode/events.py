@@ -14,10 +14,10 @@ End             takes all trapezoids; the job is over
 ==============  ==========================================================================================
 """
 
-from dataclasses import dataclass
+from nodes.records import record
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Progress:
     """A piece of the program was read."""
 
@@ -27,17 +27,17 @@ class Progress:
     """None where the length is not known."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Idle:
     """The program's source has nothing at present, but has not ended: someone is typing."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Full:
     """The planner has no room for the next line."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Wait:
     """M400: all moves are planned to a standstill that is reached at PRINT_TIME_S."""
 
@@ -45,7 +45,7 @@ class Wait:
     print_time_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class PositionSet:
     """G28: from PRINT_TIME_S the machine stands at POSITION (X Y Z E, mm); AXES (letters) were set.
 
@@ -58,7 +58,7 @@ class PositionSet:
     print_time_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Reply:
     """An answer that the program asked for (M114)."""
 
@@ -66,7 +66,7 @@ class Reply:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Notice:
     """Something the user should know; each is told once per job."""
 
@@ -74,14 +74,14 @@ class Notice:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Emergency:
     """M112."""
 
     line: int
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class End:
     """The program has ended; the machine comes to a standstill at PRINT_TIME_S."""
 

@@ -1,14 +1,14 @@
 """The machine as the configuration describes it: frozen, checked, ready to be built."""
 
-from dataclasses import dataclass
 from enum import Enum
 
 from coordinator.machine.pins import PinDescription
 from coordinator.machine.problem import Place
 from coordinator.motion.specs import MotionLimits
+from nodes.records import record
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class CanConnection:
     """A node on a CAN bus."""
 
@@ -19,7 +19,7 @@ class CanConnection:
     place: Place
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class UartConnection:
     """A node on a serial line."""
 
@@ -41,7 +41,7 @@ class NodePolicy(Enum):
     """The node's features are off until it is back; it may even be absent at start."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class NodeDescription:
     """One micro-controller; ``mcu`` is the primary whose clock is print time."""
 
@@ -53,7 +53,7 @@ class NodeDescription:
     """Where the policy is given; the section where it is not."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class StepperDescription:
     """One motor driver."""
 
@@ -83,7 +83,7 @@ class StepperDescription:
         return self.step_pin.node
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class HomingDescription:
     """How a rail finds its origin; kept for the homing module: until then G28 takes the axis as home."""
 
@@ -103,7 +103,7 @@ class HomingDescription:
     """Whether the endstop stands at the upper end."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class RailDescription:
     """One axis with its steppers, which move together."""
 
@@ -117,7 +117,7 @@ class RailDescription:
     place: Place
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class ExtruderDescription:
     """The extruder's mechanics."""
 
@@ -128,7 +128,7 @@ class ExtruderDescription:
     """mm."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class NotYetActing:
     """What was recognised but belongs to a module that is not built yet."""
 
@@ -142,7 +142,7 @@ class NotYetActing:
         return f"{self.place}: {what} recognised, not yet acting"
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class MachineDescription:
     """Everything the configuration says about the machine."""
 

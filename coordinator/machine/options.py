@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar
 
 from coordinator.machine.config_file import RawOption, RawSection
 from coordinator.machine.problem import ConfigError, Place, nearest, shown
+from nodes.records import record
 
 T = TypeVar("T")
 _FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
@@ -24,7 +25,7 @@ class BadValue(ValueError):  # noqa: N818 (the answer of a parser, not a failure
     """The text is no value of the option; the argument says why where the rule alone does not."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class Option(Generic[T]):
     """One option of a section."""
 
@@ -44,7 +45,7 @@ class Option(Generic[T]):
         raise NotImplementedError
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class _Bounded(Option[T]):
     """Bounds common to the numeric kinds."""
 
@@ -78,7 +79,7 @@ class _Bounded(Option[T]):
             raise BadValue
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class FloatOption(_Bounded[float]):
     """A decimal number."""
 
@@ -94,7 +95,7 @@ class FloatOption(_Bounded[float]):
         return self._rule("a number")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class IntOption(_Bounded[int]):
     """A whole number."""
 
@@ -115,7 +116,7 @@ class IntOption(_Bounded[int]):
         return self._rule("a whole number" if self.multiple_of == 1 else f"a multiple of {self.multiple_of}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class BoolOption(Option[bool]):
     """A truth value."""
 
@@ -130,7 +131,7 @@ class BoolOption(Option[bool]):
         return "True or False"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class ChoiceOption(Option[str]):
     """One word of several."""
 
@@ -151,7 +152,7 @@ class ChoiceOption(Option[str]):
         return _one_of(self.choices)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class TextOption(Option[str]):
     """A line of text, by a pattern if one is given."""
 
@@ -169,7 +170,7 @@ class TextOption(Option[str]):
         return self.pattern_rule
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class ListOption(Option[tuple[str, ...]]):
     """Words separated by commas or line ends."""
 
@@ -185,7 +186,7 @@ class ListOption(Option[tuple[str, ...]]):
         return "a list of words separated by commas"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class GearRatioOption(Option[float]):
     """A chain of gears, ``50:10, 2:1``; the value is the motor's turns per turn of the output."""
 
@@ -213,7 +214,7 @@ def _one_of(words: tuple[str, ...]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class SectionSpec:
     """All a section may contain; the reference page is made from it."""
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from coordinator.machine.config_file import RawOption, RawSection
 from coordinator.machine.options import BadValue, Option
 from coordinator.machine.problem import ConfigError, Place, nearest, shown
+from nodes.records import record
 
 PRIMARY_NODE = "mcu"
 _PIN = re.compile(r"([!^~ ]*)(?:([A-Za-z0-9_.-]+) *: *)?([!^~ ]*)([A-Za-z0-9_./-]+)", re.ASCII)
@@ -18,7 +19,7 @@ _MAX_PIN_CHARS = 100
 _EXCLUSIVE = ""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class PinName:
     """A pin as written in an option."""
 
@@ -29,7 +30,7 @@ class PinName:
     """1 pull-up, -1 pull-down, 0 none."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class PinDescription:
     """A pin with aliases resolved; whether the node has it only its dictionary knows: see ``number``."""
 
@@ -54,7 +55,7 @@ class PinDescription:
         return number
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@record(kw_only=True)
 class PinOption(Option[PinName]):
     """A pin."""
 

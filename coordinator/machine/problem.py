@@ -2,15 +2,15 @@
 
 import difflib
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 from nodes.errors import CanductorError
+from nodes.records import record
 
 _SHOWN_CHARS = 60
 _SHOWN_PATH_CHARS = 300
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Place:
     """A line of a configuration file; prints as ``printer.cfg:12``."""
 

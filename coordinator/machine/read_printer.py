@@ -1,11 +1,10 @@
 """The section [printer], and how it and [extruder] limit every move."""
 
-from dataclasses import dataclass
-
 from coordinator.machine.config_file import RawSection
 from coordinator.machine.model import NotYetActing
 from coordinator.machine.options import ChoiceOption, FloatOption, SectionReader, SectionSpec
 from coordinator.machine.well_known import LATER_PRINTER_OPTIONS
+from nodes.records import record
 
 # Far above any machine, low enough that squares and sums stay exact and a slipped digit group is seen.
 MAX_SPEED = 100_000.0
@@ -86,7 +85,7 @@ PRINTER = SectionSpec(
 )
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class PrinterSection:
     """[printer] as read; units as in MotionLimits."""
 

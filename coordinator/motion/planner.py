@@ -11,7 +11,6 @@ from typing import Any
 
 from coordinator.motion._planner import ffi, lib
 from coordinator.motion.planner_values import (
-    TRAPEZOID,
     Fault,
     FaultKind,
     Feed,
@@ -26,7 +25,6 @@ __all__ = [
     "AXIS_LETTERS",
     "DEFAULT_SPEED_MM_S",
     "RING_TRAPEZOIDS",
-    "TRAPEZOID",
     "WORD_LETTERS",
     "Fault",
     "FaultKind",

@@ -2,34 +2,17 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
-from coordinator.motion._planner import ffi, lib
+from coordinator.motion._planner import lib
 from coordinator.motion.specs import MotionLimits
+from nodes.records import record
 
-_FORMATS: Mapping[str, Any] = {"double": "f8", "double[4]": ("f8", 4), "int64_t": "i8"}
-
-
-def _trapezoid_dtype() -> np.dtype[np.void]:
-    """Describe struct trapezoid to numpy, with the offsets the compiler chose."""
-    layout = dict(ffi.typeof("struct trapezoid").fields)
-    return np.dtype(
-        {
-            "names": list(layout),
-            "formats": [_FORMATS[field.type.cname] for field in layout.values()],
-            "offsets": [field.offset for field in layout.values()],
-            "itemsize": ffi.sizeof("struct trapezoid"),
-        }
-    )
-
-
-TRAPEZOID = _trapezoid_dtype()
-"""struct trapezoid as a numpy dtype."""
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
 
 
 class FeedStatus(IntEnum):
@@ -65,7 +48,7 @@ class FaultKind(IntEnum):
     SPEED = lib.PLANNER_SPEED
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Fault:
     """A move the machine must not make."""
 
@@ -100,7 +83,7 @@ _FAULTS: Mapping[FaultKind, Callable[[Fault], str]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class Trapezoids:
     """Consecutive trapezoids in the planner's memory: valid until they are released."""
 
@@ -112,8 +95,12 @@ class Trapezoids:
     offset: int
     """Of the first trapezoid in ``memory``, bytes."""
 
-    def array(self) -> npt.NDArray[np.void]:
-        """Return a numpy view (dtype TRAPEZOID) of the same memory."""
+    def array(self) -> "npt.NDArray[np.void]":
+        """Return a numpy view (dtype TRAPEZOID of trapezoid_array) of the same memory."""
+        import numpy as np  # noqa: PLC0415 (start-up time: planning does without)
+
+        from coordinator.motion.trapezoid_array import TRAPEZOID  # noqa: PLC0415
+
         return np.frombuffer(self.memory, TRAPEZOID, self.count, self.offset)
 
 

@@ -1,9 +1,9 @@
 """What motion is told about the machine: plain values, checked by whoever builds them."""
 
-from dataclasses import dataclass
+from nodes.records import record
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class MotionLimits:
     """What every move must respect. Lengths in mm, times in s; vectors are X Y Z."""
 
@@ -30,7 +30,7 @@ class MotionLimits:
     """mm/s by which the filament's speed may jump at a junction."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class NodeStreamSpec:
     """How one node takes step commands. Ids come from its dictionary."""
 
@@ -44,7 +44,7 @@ class NodeStreamSpec:
     reset_step_clock_id: int
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class StepperSpec:
     """One stepper of a linear kinematics."""
 

@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import fields
 from typing import Any
 
 from coordinator.motion._steps import ffi, lib
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from nodes.errors import CanductorError
+from nodes.records import record
 
 MAX_ERROR_S = 12.5e-6
 """How far a step may be from its true time by default."""
@@ -17,8 +18,11 @@ Position = tuple[float, float, float, float]
 class StepError(CanductorError):
     """Step generation cannot go on; the sentence says where and why."""
 
+    print_time_s: float | None = None
+    """Of the step or move that cannot be; None: it is no matter of time."""
 
-@dataclass(frozen=True, slots=True)
+
+@record
 class StepperStats:
     """What one stepper's stream amounts to so far."""
 
@@ -42,7 +46,7 @@ class StepperStats:
     """Steps/s."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class NodeStats:
     """What one node's stream amounts to so far."""
 
@@ -59,7 +63,7 @@ class NodeStats:
     """Bytes of the batch not yet taken."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class StepStats:
     """Totals since construction."""
 
@@ -207,14 +211,14 @@ class StepGenerator:
             raise StepError(f"there is no stepper {index}; the generator has {len(self._steppers)}")
         s = ffi.new("struct step_stepper_stats *")
         lib.step_stepper_stats(self._gen, index, s)
-        fields = (getattr(s, name) for name in StepperStats.__slots__[1:])
-        return StepperStats(self._steppers[index].name, *fields)
+        values = (getattr(s, field.name) for field in fields(StepperStats)[1:])
+        return StepperStats(self._steppers[index].name, *values)
 
     def _node_stats(self, index: int) -> NodeStats:
         s = ffi.new("struct step_node_stats *")
         lib.step_node_stats(self._gen, index, s)
-        fields = (getattr(s, name) for name in NodeStats.__slots__[1:])
-        return NodeStats(self._nodes[index].name, *fields)
+        values = (getattr(s, field.name) for field in fields(NodeStats)[1:])
+        return NodeStats(self._nodes[index].name, *values)
 
     def _check_node(self, node: int) -> None:
         if not 0 <= node < len(self._nodes):
@@ -231,7 +235,9 @@ class StepGenerator:
         e: Any = ffi.new("struct step_error *")
         lib.step_last_error(self._gen, e)
         who = self._steppers[e.stepper].name if e.stepper >= 0 else "the plan"
-        return StepError(f"{who} at print time {e.print_time:.6f} s: {_REASONS[e.status].format(e.value)}")
+        error = StepError(f"{who} at print time {e.print_time:.6f} s: {_REASONS[e.status].format(e.value)}")
+        error.print_time_s = e.print_time
+        return error
 
 
 _REASONS = {

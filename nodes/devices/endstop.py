@@ -1,13 +1,15 @@
 """An endstop on a node: an input that is sampled while an axis moves towards it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from nodes.devices.trsync import TriggerReason
-from nodes.node import Node
 from nodes.node_config import NodeConfig
 from nodes.node_errors import NodeError
+from nodes.records import record
+
+if TYPE_CHECKING:
+    from nodes.node import Node  # planning needs no node, which draws in asyncio
 
 COMMANDS: Final = ("config_endstop", "endstop_home", "endstop_query_state")
 SAMPLE_S: Final = 15e-6
@@ -16,7 +18,7 @@ SAMPLE_COUNT: Final = 4
 """Samples in a row that have to agree: a spike of the cable is shorter."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class EndstopState:
     """What an endstop's node says."""
 
@@ -45,17 +47,17 @@ class Endstop:
         self.oid = config.create_oid()
         config.add_config(what, f"config_endstop oid={self.oid} pin={self._pin} pull_up={self._pull}")
 
-    def home(self, node: Node, *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
+    def home(self, node: "Node", *, clock: int, rest_ticks: int, trsync_oid: int) -> None:
         """Look every REST_TICKS from CLOCK on, and trigger the stop group when it is pressed."""
         sample_ticks = max(1, round(SAMPLE_S * node.clock_freq_hz))
         times = {"clock": clock % 2**32, "sample_ticks": sample_ticks, "rest_ticks": rest_ticks}
         self._home(node, times, SAMPLE_COUNT, trsync_oid)
 
-    def end(self, node: Node) -> None:
+    def end(self, node: "Node") -> None:
         """Look no more."""
         self._home(node, {"clock": 0, "sample_ticks": 0, "rest_ticks": 0}, 0, 0)
 
-    def _home(self, node: Node, times: Mapping[str, int], sample_count: int, trsync_oid: int) -> None:
+    def _home(self, node: "Node", times: Mapping[str, int], sample_count: int, trsync_oid: int) -> None:
         node.send(
             "endstop_home",
             oid=self._oid,
@@ -66,7 +68,7 @@ class Endstop:
             trigger_reason=int(TriggerReason.ENDSTOP),
         )
 
-    async def state(self, node: Node) -> EndstopState:
+    async def state(self, node: "Node") -> EndstopState:
         """Ask its node."""
         answer = await node.query("endstop_query_state", "endstop_state", oid=self._oid)
         pressed = bool(answer.integer("pin_value")) != self._invert

@@ -1,11 +1,13 @@
 """A stepper motor on a node: its configuration, and where it stands."""
 
 import math
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from nodes.node import Node
 from nodes.node_config import NodeConfig, NodeConfigError
 from nodes.node_errors import NodeError
+
+if TYPE_CHECKING:
+    from nodes.node import Node  # planning needs no node, which draws in asyncio
 
 BOTH_EDGE_CONSTANTS: Final = ("STEPPER_BOTH_EDGE", "STEPPER_STEP_BOTH_EDGE")
 COMMANDS: Final = (
@@ -70,7 +72,7 @@ class Stepper:
             f"invert_step={invert} step_pulse_ticks={pulse_ticks}",
         )
 
-    async def position(self, node: Node) -> int:
+    async def position(self, node: "Node") -> int:
         """Ask NODE how many steps the stepper stands from where it began, as the node counts them."""
         if self.oid is None:
             raise NodeError(f"stepper {self.name} is not configured on any node")

@@ -1,14 +1,16 @@
 """Stop groups on a node (trsync): what has to stop when something triggers, anywhere on the machine."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from nodes.message_format import Message
-from nodes.node import Node
 from nodes.node_config import NodeConfig
 from nodes.node_errors import NodeError
+from nodes.records import record
+
+if TYPE_CHECKING:
+    from nodes.node import Node  # planning needs no node, which draws in asyncio
 
 COMMANDS: Final = ("config_trsync", "trsync_start", "trsync_set_timeout", "trsync_trigger")
 GROUPS_CONSTANT: Final = "CAN_TRIGGER_GROUPS"
@@ -28,7 +30,7 @@ class TriggerReason(IntEnum):
     """Nobody renewed the time-out: host and node had lost each other."""
 
 
-@dataclass(frozen=True, slots=True)
+@record
 class TrsyncState:
     """What a stop group reports."""
 
@@ -55,7 +57,7 @@ class Trsync:
         self.oid = config.create_oid()
         config.add_config(self.purpose, f"config_trsync oid={self.oid}")
 
-    def start(self, node: Node, *, report_clock: int, report_ticks: int, timeout_clock: int) -> None:
+    def start(self, node: "Node", *, report_clock: int, report_ticks: int, timeout_clock: int) -> None:
         """Arm it: reports come every REPORT_TICKS from REPORT_CLOCK on, and it triggers at TIMEOUT_CLOCK."""
         node.send(
             "trsync_start",
@@ -66,31 +68,31 @@ class Trsync:
         )
         self.renew(node, timeout_clock)
 
-    def renew(self, node: Node, timeout_clock: int) -> None:
+    def renew(self, node: "Node", timeout_clock: int) -> None:
         """Put its time-out off to TIMEOUT_CLOCK (64 or 32 bits, less than 2^31 ticks away)."""
         node.send("trsync_set_timeout", oid=self._oid, clock=timeout_clock % 2**32)
 
-    def join(self, node: Node, group: int) -> None:
+    def join(self, node: "Node", group: int) -> None:
         """Let it trigger with all others of GROUP on its bus; NO_GROUP: alone. See ``groups``."""
         node.send("trsync_set_group", oid=self._oid, group=group)
 
-    def stop_on_trigger(self, node: Node, stepper_oid: int) -> None:
+    def stop_on_trigger(self, node: "Node", stepper_oid: int) -> None:
         """Have a stepper of NODE stop when it triggers; after ``start``."""
         node.send("stepper_stop_on_trigger", oid=stepper_oid, trsync_oid=self._oid)
 
-    def trigger_now(self, node: Node) -> None:
+    def trigger_now(self, node: "Node") -> None:
         """Trigger it ahead of all that is queued for NODE; what is queued and unsent is dropped."""
         content = node.dictionary.encode("trsync_trigger", oid=self._oid, reason=int(TriggerReason.HOST))
         node.link.send_urgent(content)
 
-    async def finish(self, node: Node) -> TrsyncState:
+    async def finish(self, node: "Node") -> TrsyncState:
         """End the round and return how it ended; triggers it when nothing did."""
         answer = await node.query(
             "trsync_trigger", "trsync_state", oid=self._oid, reason=int(TriggerReason.HOST)
         )
         return _state(answer)
 
-    def listen(self, node: Node, on_state: Callable[[TrsyncState], None]) -> Callable[[], None]:
+    def listen(self, node: "Node", on_state: Callable[[TrsyncState], None]) -> Callable[[], None]:
         """Call ON_STATE for every report; returns what ends that."""
         return node.on("trsync_state", self._oid, lambda message: on_state(_state(message)))
 

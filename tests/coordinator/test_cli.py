@@ -174,10 +174,14 @@ def test_a_bug_leaves_its_traceback_in_a_file(
 
 
 USAGE = {
-    "plam": "No such command 'plam'",
-    "plan": "Missing argument 'config'",
-    "demo --sed 1": "No such option: --sed",
-    "demo --seed x": "Invalid value for '--seed'",
+    "plam": "invalid choice: 'plam' (choose from 'demo', 'run', 'plan', 'simulate')",
+    "plan": "the following arguments are required: config, gcode",
+    "demo --sed 1": "unrecognized arguments: --sed 1",
+    "demo --seed x": "--seed is 'x', must be a whole number of at least 0",
+    "plan my.cfg part.gcode --plot a.gif": "--plot is 'a.gif', must be a file that ends in .svg",
+    "plan my.cfg - --bitrate 5": "--bitrate is '5', must be a whole number from 10000 to 8000000",
+    "simulate --seed 1 --seeds 1:2": "--seed and --seeds exclude each other",
+    "simulate --jobs 257": "--jobs is '257', must be a whole number from 0 to 256",
     "demo --loss 60%": "--loss is '60%', must be a share from 0 to 0.5, or a percentage such as 1%",
     "demo --loss nan": "--loss is 'nan', must be a share from 0 to 0.5, or a percentage such as 1%",
     "demo --loss much": "--loss is 'much', must be a share from 0 to 0.5, or a percentage such as 1%",
@@ -191,7 +195,9 @@ USAGE = {
 
 
 @pytest.mark.parametrize("words", USAGE)
-def test_a_mistaken_command_line(runners: Runners, capsys: pytest.CaptureFixture[str], words: str) -> None:
+def test_a_mistaken_command_line(
+    runners: Runners, files: Path, capsys: pytest.CaptureFixture[str], words: str
+) -> None:
     assert cli.main(words.split()) == 2
     out, err = capsys.readouterr()
     assert out == ""
@@ -264,5 +270,14 @@ def test_starting_imports_nothing_slow() -> None:
     out = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
     ).stdout
-    slow = {"numpy", "can", "serial", "rich", "asyncio", "importlib.metadata", "coordinator.machine.options"}
+    slow = {
+        "numpy",
+        "typer",
+        "can",
+        "serial",
+        "rich",
+        "asyncio",
+        "importlib.metadata",
+        "coordinator.machine.options",
+    }
     assert not slow & set(out.split())

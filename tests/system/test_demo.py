@@ -8,7 +8,7 @@ import pytest
 
 from coordinator.demo.expected import expected_steps
 from coordinator.demo.proof import EDGE_TOLERANCE_S, PrimaryClock, StepperProof, prove_stepper
-from coordinator.motion.planner import TRAPEZOID
+from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.timebase import ClockMap, ClockPiece
 from tests.system.stage import SQUARE, canductor, write_gcode
 

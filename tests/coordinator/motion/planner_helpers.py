@@ -6,8 +6,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from coordinator.motion.planner import TRAPEZOID, FeedStatus, Planner
+from coordinator.motion.planner import FeedStatus, Planner
 from coordinator.motion.specs import MotionLimits
+from coordinator.motion.trapezoid_array import TRAPEZOID
 
 GCODE = Path(__file__).parents[3] / ".." / "shared" / "data" / "gcode"
 LIMITS = MotionLimits(

@@ -1,0 +1,295 @@
+"""The words of the command line: which commands there are, what they take, and the job each of them is.
+
+argparse, because the start counts: a library that is nicer to write with cost more than half of a short plan.
+"""
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NoReturn, TypeVar, cast
+
+from coordinator.commands import (
+    DemoOptions,
+    PlanOptions,
+    Report,
+    RunOptions,
+    SimulateOptions,
+    find_machine,
+)
+from nodes.errors import CanductorError
+
+Job = Callable[[], Report]
+T = TypeVar("T")
+
+SEED_MAX = 2**32
+SEEDS_AT_ONCE_MAX = 10_000_000
+JOBS_MAX = 256
+
+
+class UsageError(Exception):
+    """The words make no command; the sentence says why."""
+
+
+class Answered(Exception):  # noqa: N818 (no failure: the words asked for help or the version, and got it)
+    """There is nothing left to do."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Raises where argparse would print and exit."""
+
+    def error(self, message: str) -> NoReturn:
+        """Tell what is wrong."""
+        raise UsageError(message)
+
+    def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
+        """End after --help."""
+        del status, message
+        raise Answered
+
+
+def read_words(words: Sequence[str]) -> Job:
+    """Return the job that WORDS ask for.
+
+    Raises UsageError, Answered after --help or --version, CanductorError for a file that is not there.
+    """
+    arguments = _parser().parse_args(list(words))
+    if arguments.version:
+        sys.stdout.write(f"canductor {version()}\n")
+        raise Answered
+    if arguments.make_job is None:
+        raise UsageError("the command is missing")
+    return cast("Job", arguments.make_job(arguments))
+
+
+def print_help() -> None:
+    """Write what --help writes."""
+    _parser().print_help()
+
+
+def version() -> str:
+    """Return the version of the installed project."""
+    from importlib import metadata  # noqa: PLC0415 (start-up time: it draws in the mail parser)
+
+    try:
+        return metadata.version("canductor")
+    except metadata.PackageNotFoundError:
+        return "(not installed)"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="canductor",
+        description="One coordinator conducts many micro-controllers on CAN buses and UARTs as one machine.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="store_true", help="print the version")
+    parser.set_defaults(make_job=None)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    for name, summary, declare, make_job in (
+        ("demo", "print on virtual nodes and compare every stepper with the plan", _declare_demo, _demo),
+        ("run", "bring up the machine of a configuration file", _declare_run, _run),
+        ("plan", "plan a file without hardware: time, steps, bus load, warnings", _declare_plan, _plan),
+        (
+            "simulate",
+            "run machines in virtual time, with faults, and check steps",
+            _declare_simulate,
+            _simulate,
+        ),
+    ):
+        command = commands.add_parser(name, help=summary, description=f"{summary}.", allow_abbrev=False)
+        declare(command)
+        command.add_argument("--json", action="store_true", help="print one JSON object as the last line")
+        command.set_defaults(make_job=make_job)
+    return parser
+
+
+def _runner(module: str, function: str) -> Callable[[object], Report]:
+    """Import a runner when it is needed: motion costs more than the rest of a start."""
+    return cast("Callable[[object], Report]", getattr(importlib.import_module(module), function))
+
+
+# ------------------------------------------------------------------------------------------------ commands
+
+
+def _declare_demo(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    add("--machine", default="demo", help="configuration file or example; its nodes become virtual ones")
+    add("--gcode", type=Path, metavar="FILE", help="g-code file to print")
+    add("--no-web", action="store_true", help="for scripts: there is no live page yet")
+    add("--loss", default="0", metavar="SHARE", help="share of frames the bus loses: 0.01 or 1%%")
+    add("--seed", default="1", metavar="N", help="decides which frames are lost")
+    add("--rate-ppm", action="append", metavar="NAME=X", help="a node's clock error in ppm")
+    add("--start-clock", action="append", metavar="NAME=N", help="a node's clock at its start, in ticks")
+    add("--keep", type=Path, metavar="DIR", help="keep step logs here")
+
+
+def _demo(given: argparse.Namespace) -> Job:
+    options = DemoOptions(
+        machine=find_machine(given.machine),
+        gcode=_existing_file(given.gcode),
+        json=given.json,
+        web=not given.no_web,
+        loss=_share(given.loss),
+        seed=_whole("--seed", given.seed),
+        rate_ppm=_assignments("--rate-ppm", given.rate_ppm, _ppm),
+        start_clock=_assignments("--start-clock", given.start_clock, _ticks),
+        keep=given.keep,
+    )
+    return lambda: _runner("coordinator.demo", "run_demo")(options)
+
+
+def _declare_run(command: argparse.ArgumentParser) -> None:
+    command.add_argument("config", type=Path, help="configuration file")
+    command.add_argument("--gcode", type=Path, metavar="FILE", help="g-code file to print")
+
+
+def _run(given: argparse.Namespace) -> Job:
+    _existing_file(given.config)
+    options = RunOptions(config=given.config, gcode=_existing_file(given.gcode), json=given.json)
+    return lambda: _runner("coordinator.run", "run_machine")(options)
+
+
+def _declare_plan(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    add("config", type=Path, help="configuration file")
+    add("gcode", type=Path, help="g-code file; - reads standard input")
+    add("-o", "--output", type=Path, metavar="DIR", help="write command streams, report and plot here")
+    add("--plot", type=Path, metavar="FILE.svg", help="draw velocity, flow and bus load over print time")
+    add("--dictionary", action="append", metavar="NAME=FILE", help="a node's data dictionary, as JSON")
+    add("--bitrate", default="1000000", metavar="BIT/S", help="of the CAN buses; 1000000 if not given")
+
+
+def _plan(given: argparse.Namespace) -> Job:
+    _existing_file(given.config)
+    if str(given.gcode) != "-":
+        _existing_file(given.gcode)
+    if given.plot is not None and given.plot.suffix.lower() != ".svg":
+        raise UsageError(f"--plot is '{given.plot}', must be a file that ends in .svg")
+    dictionaries = _assignments("--dictionary", given.dictionary, Path)
+    for path in dictionaries.values():
+        _existing_file(path)
+    options = PlanOptions(
+        config=given.config,
+        gcode=given.gcode,
+        output=given.output,
+        plot=given.plot,
+        json=given.json,
+        dictionaries=dictionaries,
+        can_bitrate=_whole("--bitrate", given.bitrate, 10_000, 8_000_000),
+    )
+    return lambda: _runner("coordinator.plan", "plan_file")(options)
+
+
+def _declare_simulate(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    add("scenario", nargs="*", help="names or files; all if none is named")
+    add("--seed", metavar="N", help="the one seed to run; 1 if none is given")
+    add("--seeds", metavar="A:B", help="seeds from A up to but not including B")
+    add("--jobs", default="0", metavar="N", help="processes; 0: one for every processor")
+    add("--list", action="store_true", help="only list the scenarios")
+
+
+def _simulate(given: argparse.Namespace) -> Job:
+    if given.seed is not None and given.seeds is not None:
+        raise UsageError("--seed and --seeds exclude each other; give one of them")
+    seed = 1 if given.seed is None else _whole("--seed", given.seed, 0, SEED_MAX)
+    options = SimulateOptions(
+        scenarios=tuple(dict.fromkeys(given.scenario)),
+        seeds=_one_seed(seed) if given.seeds is None else _seeds(given.seeds),
+        jobs=_whole("--jobs", given.jobs, 0, JOBS_MAX),
+        list=given.list,
+        json=given.json,
+    )
+    return lambda: _runner("coordinator.simulate", "run_simulation")(options)
+
+
+# -------------------------------------------------------------------------------------------------- values
+
+
+def _whole(option: str, text: str, low: int = 0, high: int | None = None) -> int:
+    digits = text.strip()
+    number = int(digits) if digits.isascii() and digits.isdecimal() and len(digits) <= 20 else -1
+    if number < low or (high is not None and number > high):
+        bounds = f"of at least {low}" if high is None else f"from {low} to {high}"
+        raise UsageError(f"{option} is '{text}', must be a whole number {bounds}")
+    return number
+
+
+def _one_seed(seed: int) -> range:
+    return range(seed, seed + 1)
+
+
+def _seeds(text: str) -> range:
+    first, colon, end = text.partition(":")
+    if not (colon and all(word.isascii() and word.isdecimal() and len(word) <= 10 for word in (first, end))):
+        raise UsageError(f"--seeds is '{text}', must be A:B, two whole numbers such as 0:100")
+    seeds = range(int(first), int(end))
+    if not 0 < len(seeds) <= SEEDS_AT_ONCE_MAX:
+        raise UsageError(
+            f"--seeds is '{text}', must be A:B with B above A, at most {SEEDS_AT_ONCE_MAX:,} seeds"
+        )
+    return seeds
+
+
+def _existing_file(path: Path | None) -> Path | None:
+    """Return the path; raises CanductorError early when nothing can be read there."""
+    if path is None:
+        return None
+    if not path.exists():
+        raise CanductorError(f"there is no file '{path}'")
+    if path.is_dir():
+        raise CanductorError(f"'{path}' is a folder, not a file")
+    if not os.access(path, os.R_OK):
+        raise CanductorError(f"'{path}' may not be read; check its permissions")
+    return path
+
+
+def _assignments(option: str, pairs: list[str] | None, convert: Callable[[str], T]) -> Mapping[str, T]:
+    """Return the values of repeated NAME=VALUE options by name."""
+    result: dict[str, T] = {}
+    for pair in pairs or ():
+        name, equals, value = pair.partition("=")
+        if not name or not equals or not value:
+            raise UsageError(f"{option} takes NAME=VALUE, not '{pair}'")
+        if name in result:
+            raise UsageError(f"{option} is given twice for '{name}'")
+        try:
+            result[name] = convert(value)
+        except ValueError as error:
+            raise UsageError(f"{option} for '{name}' is '{value}', must be {error}") from None
+    return result
+
+
+def _number(text: str, rule: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(rule) from None
+
+
+def _ppm(text: str) -> float:
+    rule = "a number in ppm, from -10000 to 10000"
+    value = _number(text, rule)
+    if not -10_000 <= value <= 10_000:
+        raise ValueError(rule)
+    return value
+
+
+def _ticks(text: str) -> int:
+    if not (text.isascii() and text.isdecimal() and len(text) <= 20 and int(text) < 2**64):
+        raise ValueError("a whole number of ticks, from 0 to 2^64 - 1")
+    return int(text)
+
+
+def _share(text: str) -> float:
+    rule = "a share from 0 to 0.5, or a percentage such as 1%"
+    try:
+        value = _number(text.removesuffix("%"), rule) / (100 if text.endswith("%") else 1)
+    except ValueError as error:
+        raise UsageError(f"--loss is '{text}', must be {error}") from None
+    if not 0 <= value <= 0.5:
+        raise UsageError(f"--loss is '{text}', must be {rule}")
+    return value

@@ -1,0 +1,61 @@
+"""What in a plan would go wrong on the machine, as sentences with the g-code line."""
+
+from collections.abc import Iterator, Sequence
+
+from coordinator.plan_figures import Peak
+from coordinator.plan_report import BusReport, NodeReport, StepperReport
+
+CEILING = 0.9
+"""Share of a bus's bit rate that its links give out; what is left carries everything unplanned."""
+TICKS_PER_STEP = 100
+"""Clock ticks that a micro-controller commonly needs for one step; fewer than that is asking for trouble."""
+
+
+def bus_warnings(program: str, buses: Sequence[BusReport]) -> Iterator[str]:
+    """Name each bus that gets more than it can carry."""
+    for bus in buses:
+        if bus.over_ceiling_s > 0:
+            yield (
+                f"{program}:{bus.peak_line}: {bus.kind} {bus.name} would need {bus.peak_load:.0%} of its "
+                f"{bus.bitrate:,} bit/s at print time {bus.peak_print_time_s:.0f} s, and more than "
+                f"{CEILING:.0%} for {bus.over_ceiling_s:.0f} s in all; raise the bit rate, lower speed or "
+                "microsteps, or spread the nodes over more buses"
+            )
+
+
+def queue_warnings(program: str, nodes: Sequence[NodeReport]) -> Iterator[str]:
+    """Name each node whose move queue is too short for what comes at once."""
+    for node in nodes:
+        if node.late_slots:
+            yield (
+                f"{program}: node {node.name} gets {node.late_slots:,} commands before one of its "
+                f"{node.move_count:,} queue slots is free for them; lower speed or microsteps"
+            )
+
+
+def step_rate_warnings(
+    program: str, node: str, clock_freq: int, together: Peak, steppers: Sequence[StepperReport]
+) -> Iterator[str]:
+    """Say when NODE has fewer clock ticks per step than micro-controllers commonly need.
+
+    TOGETHER: of all its steppers in the busiest bin; STEPPERS: those of the node.
+    """
+    limit = clock_freq / TICKS_PER_STEP
+    for stepper in steppers:
+        if stepper.max_step_rate > limit:
+            yield (
+                f"{program}:{stepper.max_step_rate_line}: {stepper.name} is to make "
+                f"{stepper.max_step_rate:,.0f} steps/s, {_too_fast(node, clock_freq, limit)}"
+            )
+    if together.value > limit:
+        yield (
+            f"{program}:{together.line}: the steppers of node {node} are to make "
+            f"{together.value:,.0f} steps/s together, {_too_fast(node, clock_freq, limit)}"
+        )
+
+
+def _too_fast(node: str, clock_freq: int, limit: float) -> str:
+    return (
+        f"more than the {limit:,.0f} that node {node} with its clock of {clock_freq / 1e6:g} MHz can be "
+        "trusted with; lower speed or microsteps"
+    )
