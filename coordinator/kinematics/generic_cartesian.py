@@ -9,12 +9,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from coordinator.kinematics.geometry import cross, dot
+from coordinator.kinematics.geometry import cross, dot, solve
 
 MIN_INDEPENDENCE = 1e-6
 """Smallest determinant of three motors' weights, each scaled to length 1, that counts as independent."""
-
-Rows = tuple[Point, Point, Point]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,15 +58,3 @@ class GenericCartesian:
             scale = (dot(a, a) * dot(b, b) * dot(c, c)) ** 0.5
             if abs(dot(a, cross(b, c))) > MIN_INDEPENDENCE * scale:
                 yield chosen
-
-
-def solve(rows: Rows, values: Point) -> Point:
-    """Return p with rows·p = values (Cramer's rule); the rows are independent."""
-    a, b, c = rows
-    columns = (cross(b, c), cross(c, a), cross(a, b))
-    determinant = dot(a, columns[0])
-    x, y, z = (
-        sum(value * column[i] for value, column in zip(values, columns, strict=True)) / determinant
-        for i in range(3)
-    )
-    return (x, y, z)

@@ -1,4 +1,4 @@
-"""Where spheres meet."""
+"""Vectors, three linear equations, and where spheres meet."""
 
 import math
 
@@ -25,6 +25,18 @@ def along(start: Point, *steps: tuple[float, Point]) -> Point:
     x, y, z = start
     for factor, vector in steps:
         x, y, z = x + factor * vector[0], y + factor * vector[1], z + factor * vector[2]
+    return (x, y, z)
+
+
+def solve(rows: tuple[Point, Point, Point], values: Point) -> Point:
+    """Return p with rows·p = values (Cramer's rule); the rows are independent."""
+    a, b, c = rows
+    columns = (cross(b, c), cross(c, a), cross(a, b))
+    determinant = dot(a, columns[0])
+    x, y, z = (
+        sum(value * column[i] for value, column in zip(values, columns, strict=True)) / determinant
+        for i in range(3)
+    )
     return (x, y, z)
 
 

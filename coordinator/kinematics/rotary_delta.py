@@ -15,7 +15,6 @@ Step generation takes ROTARY_DELTA with params (U, L, R, H, cos φ, sin φ).
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace
@@ -27,6 +26,7 @@ MIN_LEVERAGE = 1 / 3
 as the head, and the arms stay away from being stretched, where they would need to be infinitely fast."""
 _DIRECTIONS = 24
 _HALVINGS = 30
+_RADII = 50
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class RotaryDelta:
     """Z of the head in the middle when each arm's endstop switches."""
     min_z: float = 0.0
     print_radius: float | None = None
-    """None: as far as the arms allow."""
+    """None: what gives the largest cylinder."""
     name = "rotary_delta"
     rails = ("a", "b", "c")
     homing_order = (("a", "b", "c"),)
@@ -111,43 +111,57 @@ class RotaryDelta:
 
     @property
     def widest_radius(self) -> float:
-        """How far from the middle the head may be at the bottom; 0 where the arms do not reach it."""
-        return _largest(lambda radius: self._fits(radius, self.min_z), self.shoulder_height)
+        """How far from the middle the head may be; 0 where the arms do not reach the bed."""
+        low, high = 0.0, self.shoulder_height
+        for _ in range(_HALVINGS):
+            middle = (low + high) / 2
+            low, high = (middle, high) if self._reaches(middle) else (low, middle)
+        return low
 
     @property
     def work_space(self) -> WorkSpace:
-        """The cylinder in which no endstop is overrun and no arm nearly stretched; empty when there is none.
+        """The cylinder in which no endstop is overrun and no arm nearly stretched."""
+        radius = self._roomiest_radius() if self.print_radius is None else self.print_radius
+        return WorkSpace(
+            (-radius, -radius, self.min_z), (radius, radius, self._top(radius)), max_radius=radius
+        )
 
-        The widest at the bottom, or the print radius if smaller; then as high as the arms go with it.
+    def _roomiest_radius(self) -> float:
+        """Return the radius of the cylinder with the largest volume: a wide one is low."""
+        widest = self.widest_radius
+        radii = (widest * i / _RADII for i in range(1, _RADII + 1))
+        return max(radii, key=lambda radius: radius * radius * (self._top(radius) - self.min_z))
+
+    def _top(self, radius: float) -> float:
+        """Return how high the head may be within RADIUS of the middle.
+
+        At a given height an arm is highest when the head is straight below its elbow, or as near to that as
+        the radius lets it.
         """
-        wanted = self.print_radius
-        radius = (
-            _largest(lambda r: self._fits(r, self.min_z), self.shoulder_height) if wanted is None else wanted
+        tops = []
+        for arm, angle in zip(self.arms, self.endstop_angles, strict=True):
+            elbow = self.shoulder_radius + arm.upper_length * math.cos(angle)
+            drop = math.sqrt(arm.lower_length**2 - max(elbow - radius, 0.0) ** 2)
+            tops.append(self.shoulder_height + arm.upper_length * math.sin(angle) - drop)
+        return min(tops)
+
+    def _reaches(self, radius: float) -> bool:
+        """Tell whether the arms stay away from being stretched on the rims of the cylinder."""
+        top = self._top(radius)
+        return top >= self.min_z and all(
+            self._leverage(arm, (radius * math.cos(direction), radius * math.sin(direction), z))
+            >= MIN_LEVERAGE
+            for arm in self.arms
+            for direction in (arm.angle + i * math.tau / _DIRECTIONS for i in range(_DIRECTIONS))
+            for z in (self.min_z, top)
         )
-        rise = _largest(lambda dz: self._fits(radius, self.min_z + dz), self.shoulder_height - self.min_z)
-        top = self.min_z + rise
-        return WorkSpace((-radius, -radius, self.min_z), (radius, radius, top), max_radius=radius)
 
-    def _fits(self, radius: float, z: float) -> bool:
-        return all(
-            self._arm_fits(arm, end, radius, z)
-            for arm, end in zip(self.arms, self.endstop_angles, strict=True)
-        )
-
-    def _arm_fits(self, arm: Arm, end: float, radius: float, z: float) -> bool:
-        for i in range(_DIRECTIONS):
-            direction = arm.angle + i * math.tau / _DIRECTIONS
-            point = (radius * math.cos(direction), radius * math.sin(direction), z)
-            try:
-                angle = self.arm_angle(arm, point)
-            except ValueError:
-                return False
-            if angle > end + 1e-9 or self._leverage(arm, angle, point) < MIN_LEVERAGE:
-                return False
-        return True
-
-    def _leverage(self, arm: Arm, angle: float, point: Point) -> float:
-        """Return the share of the lower arm that is in the direction in which the elbow moves."""
+    def _leverage(self, arm: Arm, point: Point) -> float:
+        """Return the share of the lower arm that is in the direction of the elbow's motion; 0: no reach."""
+        try:
+            angle = self.arm_angle(arm, point)
+        except ValueError:
+            return 0.0
         outward = _turned(point, arm.angle)[0] - self.shoulder_radius - arm.upper_length * math.cos(angle)
         up = point[2] - self.shoulder_height - arm.upper_length * math.sin(angle)
         return (outward * math.sin(angle) - up * math.cos(angle)) / arm.lower_length
@@ -157,12 +171,3 @@ def _turned(point: Point, angle: float) -> tuple[float, float]:
     """Return X and Y of POINT in axes turned by ANGLE."""
     cos, sin = math.cos(angle), math.sin(angle)
     return (point[0] * cos + point[1] * sin, point[1] * cos - point[0] * sin)
-
-
-def _largest(fits: Callable[[float], bool], limit: float) -> float:
-    """Return the largest value up to LIMIT that fits, given that all smaller ones do; 0 if none does."""
-    low, high = 0.0, limit
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low
