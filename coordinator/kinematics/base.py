@@ -49,6 +49,8 @@ class WorkSpace:
     """Largest distance from the Z axis; 0: the box alone counts."""
     radius_min: float = 0.0
     """Smallest distance from the Z axis: a hole."""
+    cone_slope: float = 0.0
+    """Above the box, where homing leaves the head: how far it has to go down per mm away from the Z axis."""
 
     def contains(self, point: Point) -> bool:
         """Tell whether the head may be at POINT."""

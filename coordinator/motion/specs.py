@@ -29,6 +29,18 @@ class MotionLimits:
     """mm of filament per mm of path above which a printing move is refused (cross section over area)."""
     instantaneous_corner_velocity: float
     """mm/s by which the filament's speed may jump at a junction."""
+    max_x_velocity: float = 0.0
+    """mm/s along X; 0 here and below: no limit of its own."""
+    max_x_accel: float = 0.0
+    max_y_velocity: float = 0.0
+    max_y_accel: float = 0.0
+    max_radius: float = 0.0
+    """Largest distance of the head from the Z axis: a round work space within the box."""
+    radius_min: float = 0.0
+    """Smallest distance of the head from the Z axis, on all of its way."""
+    cone_slope: float = 0.0
+    """While the head is above position_max (after homing a delta): how far it has to go down per mm away from
+    the Z axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +85,13 @@ class StepperSpec:
     """Index into the list of NodeStreamSpec."""
     oid: int
     weights: tuple[float, float, float, float]
-    """The stepper's position in mm is the sum of weights[i] * axis[i] over X Y Z E."""
+    """Of a LINEAR stepper: its position in mm is the sum of weights[i] * axis[i] over X Y Z E."""
     step_distance: float
-    """mm per step, > 0."""
+    """mm (POLAR_ANGLE and ROTARY_DELTA: rad) per step, > 0."""
     invert_dir: bool
     """Whether set_next_step_dir takes 0 for a positive step."""
     step_pulse_s: float
     """Shortest high time of the step pin; steps are never closer than two of them. 0: both edges step."""
+    kinematics: StepKinematics = StepKinematics.LINEAR
+    params: tuple[float, ...] = ()
+    """Of the kinematics."""
