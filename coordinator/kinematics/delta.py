@@ -98,4 +98,5 @@ class Delta:
         )
         slope = max(self.radius / math.sqrt(t.rod_length**2 - self.radius**2) for t in self.towers)
         low, high = (-radius, -radius, self.min_z), (radius, radius, top)
-        return WorkSpace(low, high, max_radius=radius, cone_slope=slope)
+        cone_top = min(tower.endstop_height for tower in self.towers)
+        return WorkSpace(low, high, max_radius=radius, cone_slope=(slope, slope), cone_top=cone_top)

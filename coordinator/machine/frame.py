@@ -37,6 +37,12 @@ def box_of(x: RailDescription, y: RailDescription, z: RailDescription) -> WorkSp
     return WorkSpace((ranges[0][0], ranges[1][0], ranges[2][0]), (ranges[0][1], ranges[1][1], ranges[2][1]))
 
 
+def tidy(point: Point) -> Point:
+    """Return a point that was calculated without its rounding errors: to the picometre."""
+    x, y, z = (round(value, 9) + 0.0 for value in point)
+    return (x, y, z)
+
+
 def home_of(rail: RailDescription) -> float:
     """Return where an axis is after homing, mm."""
     return rail.homing.position_endstop or 0.0

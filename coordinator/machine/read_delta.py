@@ -3,7 +3,7 @@
 import math
 
 from coordinator.kinematics.delta import MAX_TOWER_SPEED, Delta, Tower
-from coordinator.machine.frame import Frame
+from coordinator.machine.frame import Frame, tidy
 from coordinator.machine.model import RailDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
 from coordinator.machine.read_homing import HOMING, POSITION_ENDSTOP, read_tower_homing
@@ -89,7 +89,7 @@ def read_delta(reading: Reading, printer: SectionReader) -> Frame:
         )
         reading.finish(reader, waiting=WAITING)
         rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
-    return Frame(delta, tuple(rails), delta.forward(delta.endstop_positions))
+    return Frame(delta, tuple(rails), tidy(delta.forward(delta.endstop_positions)))
 
 
 def _read_tower(reader: SectionReader, first: SectionReader, angle: float, radius: float) -> Tower:

@@ -4,7 +4,7 @@ import math
 
 from coordinator.kinematics.base import linear
 from coordinator.kinematics.deltesian import Arm, Deltesian
-from coordinator.machine.frame import Frame, axis_range, home_of
+from coordinator.machine.frame import Frame, axis_range, home_of, tidy
 from coordinator.machine.model import RailDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
 from coordinator.machine.read_delta import MINIMUM_Z, check_height
@@ -78,7 +78,7 @@ def read_deltesian(reading: Reading, printer: SectionReader) -> Frame:
         name = reader.name.removeprefix("stepper_")
         rails.append(RailDescription(name, steppers, None, None, homing, reader.place))
     home = deltesian.forward((*deltesian.endstop_positions, home_of(y)))
-    return Frame(deltesian, (*rails, y), home)
+    return Frame(deltesian, (*rails, y), tidy(home))
 
 
 def _read_side(reader: SectionReader, first: SectionReader, sign: float) -> Arm:

@@ -222,6 +222,7 @@ def _limits(
         max_radius=space.max_radius,
         radius_min=space.radius_min,
         cone_slope=space.cone_slope,
+        cone_top=space.cone_top,
         max_extrude_only_velocity=only[0],
         max_extrude_only_accel=only[1],
         max_extrude_only_distance=only[2],

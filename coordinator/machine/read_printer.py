@@ -114,18 +114,21 @@ def open_printer(section: RawSection, specs: Mapping[str, SectionSpec]) -> tuple
 
     SPECS: what [printer] may contain besides for some kinematics.
     """
-    every = {option.name: option for spec in specs.values() for option in spec.options}
-    later = tuple({name: None for spec in specs.values() for name in spec.later})
-    reader = SectionReader(section, SectionSpec(PRINTER.help, (*PRINTER.options, *every.values()), later))
-    kinematics = reader.get(KINEMATICS)
+    names = {k: (*spec.later, *(option.name for option in spec.options)) for k, spec in specs.items()}
+    every = tuple({name: None for owned in names.values() for name in owned})
+    kinematics = SectionReader(section, SectionSpec(PRINTER.help, PRINTER.options, every)).get(KINEMATICS)
     for name, option in section.options.items():
-        owners = [k for k, spec in specs.items() if name in (*spec.later, *(o.name for o in spec.options))]
+        owners = [owner for owner, owned in names.items() if name in owned]
         if owners and kinematics not in owners:
             raise ConfigError(
                 option.place,
                 f"option '{name}' of [{section.name}] belongs to kinematics {one_of(owners)}, but this"
                 f" machine is {kinematics}; remove it",
             )
+    own = specs.get(kinematics, SectionSpec("", ()))
+    spec = SectionSpec(PRINTER.help, (*PRINTER.options, *own.options), own.later)
+    reader = SectionReader(section, spec)
+    reader.get(KINEMATICS)
     return kinematics, reader
 
 

@@ -3,7 +3,7 @@
 import math
 
 from coordinator.kinematics.rotary_delta import Arm, RotaryDelta
-from coordinator.machine.frame import Frame
+from coordinator.machine.frame import Frame, tidy
 from coordinator.machine.model import RailDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
 from coordinator.machine.read_delta import MINIMUM_Z, check_directions, check_height
@@ -91,7 +91,7 @@ def read_rotary_delta(reading: Reading, printer: SectionReader) -> Frame:
         steppers = (first, *read_extra_steppers(reading, reader.name, function))
         reading.finish(reader, waiting=WAITING)
         rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
-    return Frame(machine, tuple(rails), machine.forward(machine.endstop_angles))
+    return Frame(machine, tuple(rails), tidy(machine.forward(machine.endstop_angles)))
 
 
 def _read_arm(reader: SectionReader, first: SectionReader, angle: float) -> Arm:

@@ -38,9 +38,10 @@ class MotionLimits:
     """Largest distance of the head from the Z axis: a round work space within the box."""
     radius_min: float = 0.0
     """Smallest distance of the head from the Z axis, on all of its way."""
-    cone_slope: float = 0.0
-    """While the head is above position_max (after homing a delta): how far it has to go down per mm away from
-    the Z axis."""
+    cone_slope: tuple[float, float] = (0.0, 0.0)
+    """Slopes 0: no cone. Else Z may be above position_max (as after homing a delta) within the cone
+    z + √((sx·x)² + (sy·y)²) <= cone_top, and moves that begin or end above stay within."""
+    cone_top: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
