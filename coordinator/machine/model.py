@@ -5,6 +5,7 @@ from enum import Enum
 
 from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
 from coordinator.kinematics.dual_carriage import DualCarriage
+from coordinator.kinematics.extruder import ExtruderMotion
 from coordinator.machine.pins import PinDescription
 from coordinator.machine.problem import Place
 from coordinator.motion.specs import MotionLimits
@@ -234,3 +235,11 @@ class MachineDescription:
         """All steppers: the head's, then those of the filament."""
         extruders = (extruder.stepper for extruder in self.extruders)
         return (*self.motors, *extruders, *(follower.stepper for follower in self.extruder_steppers))
+
+    @property
+    def extruder_motion(self) -> ExtruderMotion:
+        """Which filament steppers follow which extruder at start."""
+        followed = {extruder.stepper.name: extruder.name for extruder in self.extruders}
+        followed |= {follower.stepper.name: follower.extruder for follower in self.extruder_steppers}
+        names = tuple(extruder.name for extruder in self.extruders)
+        return ExtruderMotion(names, names[0] if names else "", followed)

@@ -181,7 +181,10 @@ def test_users_machines_load_unchanged(name: str) -> None:
     assert len(machine.steppers) == 4
     waiting = {entry.section for entry in machine.not_yet_acting}
     assert {"heater_bed", "fan", "extruder", "stepper_x"} <= waiting
-    assert ("input_shaper" in waiting) == name.startswith("corexy")
+    assert "input_shaper" not in waiting
+    assert [shaper.kind for shaper in machine.shapers] == (
+        ["mzv", "mzv"] if name.startswith("corexy") else []
+    )
     assert machine.steppers[3].node == ("toolhead" if name.endswith("toolhead") else "mcu")
 
 
