@@ -14,6 +14,8 @@ Point = tuple[float, float, float]
 Weights = tuple[float, float, float, float]
 
 NO_WEIGHTS: Weights = (0.0, 0.0, 0.0, 0.0)
+FILAMENT: Weights = (0.0, 0.0, 0.0, 1.0)
+"""Of a stepper that moves the filament."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,9 +10,7 @@ Everything here is a value; a change happens at standstill and gives a new ``Ext
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from coordinator.kinematics.base import NO_WEIGHTS, Weights
-
-MOVES: Weights = (0.0, 0.0, 0.0, 1.0)
+from coordinator.kinematics.base import FILAMENT, NO_WEIGHTS, Weights
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +40,9 @@ class ExtruderMotion:
     def weights(self) -> dict[str, Weights]:
         """Return the weights of all filament steppers."""
         active = self.active
-        return {name: MOVES if active and to == active else NO_WEIGHTS for name, to in self.followed.items()}
+        return {
+            name: FILAMENT if active and to == active else NO_WEIGHTS for name, to in self.followed.items()
+        }
 
     def _check(self, extruder: str) -> None:
         if extruder not in self.extruders:

@@ -19,9 +19,10 @@ from coordinator.machine.model import (
     UartConnection,
 )
 from coordinator.machine.pins import PinDescription
+from coordinator.machine.printer_options import PRINTER_SPECS
 from coordinator.machine.problem import ConfigError, Place, nearest
 from coordinator.machine.read_extruder import limits_without_extruder, read_extruder_steppers, read_extruders
-from coordinator.machine.read_kinematics import PRINTER_SPECS, read_frame
+from coordinator.machine.read_kinematics import read_frame
 from coordinator.machine.read_nodes import check_policies, make_pin_registry, read_nodes
 from coordinator.machine.read_printer import open_printer, read_printer
 from coordinator.machine.read_shaper import read_shapers

@@ -2,13 +2,16 @@
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
 from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
-from coordinator.kinematics.dual_carriage import DualCarriage
-from coordinator.kinematics.extruder import ExtruderMotion
 from coordinator.machine.pins import PinDescription
 from coordinator.machine.problem import Place
 from coordinator.motion.specs import MotionLimits
+
+if TYPE_CHECKING:
+    from coordinator.kinematics.dual_carriage import DualCarriage
+    from coordinator.kinematics.extruder import ExtruderMotion
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +168,7 @@ class DualCarriageDescription:
 
     rails: tuple[RailDescription, RailDescription]
     """The second is parked at start."""
-    carriages: DualCarriage
+    carriages: "DualCarriage"
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,8 +240,10 @@ class MachineDescription:
         return (*self.motors, *extruders, *(follower.stepper for follower in self.extruder_steppers))
 
     @property
-    def extruder_motion(self) -> ExtruderMotion:
+    def extruder_motion(self) -> "ExtruderMotion":
         """Which filament steppers follow which extruder at start."""
+        from coordinator.kinematics.extruder import ExtruderMotion  # noqa: PLC0415 (start-up time)
+
         followed = {extruder.stepper.name: extruder.name for extruder in self.extruders}
         followed |= {follower.stepper.name: follower.extruder for follower in self.extruder_steppers}
         names = tuple(extruder.name for extruder in self.extruders)

@@ -7,33 +7,14 @@ from coordinator.kinematics.deltesian import Arm, Deltesian
 from coordinator.machine.frame import Frame, axis_range, home_of, tidy
 from coordinator.machine.model import RailDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
-from coordinator.machine.read_delta import MINIMUM_Z, check_height
+from coordinator.machine.printer_options import MIN_ANGLE, MINIMUM_Z, PRINT_WIDTH
 from coordinator.machine.read_homing import HOMING, POSITION_ENDSTOP, read_tower_homing
 from coordinator.machine.read_rails import WAITING, read_extra_steppers, read_rail
 from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, read_stepper
 from coordinator.machine.reading import Reading
+from coordinator.machine.tower_checks import check_height
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
 
-MIN_ANGLE = FloatOption(
-    name="min_angle",
-    help="smallest angle between a rod and the horizontal, which limits X",
-    default=5.0,
-    unit="°",
-    above=0,
-    below=90,
-)
-PRINT_WIDTH = FloatOption(
-    name="print_width",
-    help="range of X, centred; by default what min_angle allows",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
-)
-DELTESIAN_PRINTER = SectionSpec(
-    help="What a deltesian needs besides",
-    options=(MINIMUM_Z, MIN_ANGLE, PRINT_WIDTH),
-    later=("slow_ratio",),
-)
 ARM_LENGTH = FloatOption(
     name="arm_length",
     help="length of the rod, from joint to joint; by default that of stepper_left",

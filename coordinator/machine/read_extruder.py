@@ -2,8 +2,7 @@
 
 import math
 
-from coordinator.kinematics.base import StepFunction, WorkSpace
-from coordinator.kinematics.extruder import MOVES as EXTRUDES
+from coordinator.kinematics.base import FILAMENT, StepFunction, WorkSpace
 from coordinator.machine.config_file import RawSection
 from coordinator.machine.model import ExtruderDescription, ExtruderStepperDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec, TextOption
@@ -100,7 +99,7 @@ EXTRUDER_STEPPER = SectionSpec(
     options=(*MOTOR, FOLLOWED, PRESSURE_ADVANCE, SMOOTH_TIME),
 )
 MAX_EXTRUDERS = 16
-MOVES = StepFunction(weights=EXTRUDES)
+MOVES = StepFunction(weights=FILAMENT)
 STANDS = StepFunction()
 
 

@@ -6,38 +6,19 @@ from coordinator.kinematics.rotary_delta import Arm, RotaryDelta
 from coordinator.machine.frame import Frame, tidy
 from coordinator.machine.model import RailDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
-from coordinator.machine.read_delta import MINIMUM_Z, check_directions, check_height
+from coordinator.machine.printer_options import (
+    ARMS_PRINT_RADIUS,
+    MINIMUM_Z,
+    SHOULDER_HEIGHT,
+    SHOULDER_RADIUS,
+)
 from coordinator.machine.read_homing import HOMING, POSITION_ENDSTOP, read_tower_homing
 from coordinator.machine.read_rails import WAITING, read_extra_steppers
 from coordinator.machine.read_steppers import MAX_POSITION, TURNING_MOTOR, read_stepper
 from coordinator.machine.reading import Reading
+from coordinator.machine.tower_checks import check_directions, check_height
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
 
-SHOULDER_RADIUS = FloatOption(
-    name="shoulder_radius",
-    help="radius of the shoulders' circle less that of the joints at the head",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
-)
-SHOULDER_HEIGHT = FloatOption(
-    name="shoulder_height",
-    help="height of the shoulders above the bed less that of the head's joints above the nozzle",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
-)
-PRINT_RADIUS = FloatOption(
-    name="print_radius",
-    help="how far from the middle the head may be; by default what gives the largest cylinder",
-    unit="mm",
-    above=0,
-    maximum=MAX_POSITION,
-)
-ROTARY_DELTA_PRINTER = SectionSpec(
-    help="What a rotary delta needs besides",
-    options=(SHOULDER_RADIUS, SHOULDER_HEIGHT, PRINT_RADIUS, MINIMUM_Z),
-)
 UPPER_LENGTH = FloatOption(
     name="upper_arm_length",
     help="length of the upper arm, from shoulder to elbow; by default that of stepper_a",
@@ -72,14 +53,14 @@ _ANGLES = (30.0, 150.0, 270.0)
 def read_rotary_delta(reading: Reading, printer: SectionReader) -> Frame:
     """Return the frame of a rotary delta; raises ConfigError."""
     radius, height = printer.get(SHOULDER_RADIUS), printer.get(SHOULDER_HEIGHT)
-    min_z, print_radius = printer.get(MINIMUM_Z), printer.find(PRINT_RADIUS)
+    min_z, print_radius = printer.get(MINIMUM_Z), printer.find(ARMS_PRINT_RADIUS)
     readers = [SectionReader(reading.get(f"stepper_{name}", WHY), ARM) for name in "abc"]
     arms, ends = [], []
     for reader, default in zip(readers, _ANGLES, strict=True):
         arms.append(_read_arm(reader, readers[0], default))
         end = reader.find(POSITION_ENDSTOP)
         ends.append(readers[0].get(POSITION_ENDSTOP) if end is None else end)
-    check_directions(readers, tuple(arm.angle for arm in arms))
+    check_directions(readers, ANGLE, tuple(arm.angle for arm in arms))
     machine = RotaryDelta(
         (arms[0], arms[1], arms[2]), radius, height, (ends[0], ends[1], ends[2]), min_z, print_radius
     )
@@ -119,6 +100,6 @@ def _check_reach(printer: SectionReader, first: SectionReader, machine: RotaryDe
         )
     if machine.print_radius is not None and machine.print_radius > widest:
         raise printer.bad(
-            PRINT_RADIUS, f"but the arms reach only to {widest:.5g} mm from the middle; reduce it"
+            ARMS_PRINT_RADIUS, f"but the arms reach only to {widest:.5g} mm from the middle; reduce it"
         )
     check_height(printer, machine.work_space.high[2], machine.min_z)

@@ -20,7 +20,7 @@ from coordinator.machine import (
     read_winch,
 )
 from coordinator.machine.options import Option, SectionSpec
-from coordinator.machine.read_kinematics import PRINTER_SPECS
+from coordinator.machine.printer_options import PRINTER_SPECS
 from coordinator.machine.well_known import LATER_SECTIONS
 
 SECTIONS: dict[str, SectionSpec] = {
