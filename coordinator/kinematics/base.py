@@ -33,9 +33,9 @@ class StepFunction:
         return self.kinematics in {StepKinematics.POLAR_ANGLE, StepKinematics.ROTARY_DELTA}
 
 
-def linear(x: float = 0.0, y: float = 0.0, z: float = 0.0, e: float = 0.0) -> StepFunction:
-    """Return a rail that moves by a sum of the axes."""
-    return StepFunction(weights=(x, y, z, e))
+def linear(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> StepFunction:
+    """Return a rail whose position is a sum of the axes."""
+    return StepFunction(weights=(x, y, z, 0.0))
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,12 +49,7 @@ def read_delta(reading: Reading, printer: SectionReader) -> Frame:
     )
     check_directions(readers, ANGLE, (a.angle, b.angle, c.angle))
     delta = Delta((a, b, c), radius, min_z, print_radius)
-    if print_radius is not None and print_radius > delta.widest_radius:
-        raise printer.bad(
-            PRINT_RADIUS,
-            f"but beyond {delta.widest_radius:.5g} mm carriages would be more than {MAX_TOWER_SPEED:g} times"
-            " as fast as the head; reduce it, or correct delta_radius and arm_length",
-        )
+    _check_radius(printer, readers[0], delta)
     check_height(printer, delta.work_space.high[2], min_z)
     rails = []
     for reader, tower, function in zip(readers, delta.towers, delta.step_functions(), strict=True):
@@ -79,3 +74,19 @@ def _read_tower(reader: SectionReader, first: SectionReader, angle: float, radiu
     if rod <= radius:
         raise reader.bad(ARM_LENGTH, f"must be above delta_radius ({radius:g} mm): the rods would not reach")
     return Tower(math.radians(angle if given is None else given), rod, height)
+
+
+def _check_radius(printer: SectionReader, first: SectionReader, delta: Delta) -> None:
+    widest = delta.widest_radius
+    if widest <= 0:
+        raise first.bad(
+            ARM_LENGTH,
+            f"so short that carriages would be more than {MAX_TOWER_SPEED:g} times as fast as the head even"
+            " in the middle; correct it or delta_radius",
+        )
+    if delta.print_radius is not None and delta.print_radius > widest:
+        raise printer.bad(
+            PRINT_RADIUS,
+            f"but beyond {widest:.5g} mm carriages would be more than {MAX_TOWER_SPEED:g} times as fast as"
+            " the head; reduce it, or correct delta_radius and arm_length",
+        )

@@ -46,6 +46,15 @@ BAD: dict[str, tuple[str, str, str, str]] = {
             " would not reach"
         ),
     ),
+    "nearly level rods": (
+        "delta",
+        "arm_length: 330",
+        "arm_length: 157",
+        (
+            "option 'arm_length' of [stepper_a] is '157', so short that carriages would be more than 3"
+            " times as fast as the head even in the middle; correct it or delta_radius"
+        ),
+    ),
     "towers side by side": (
         "delta",
         "angle: 330",

@@ -49,6 +49,13 @@ def test_a_delta() -> None:
     assert limits.cone_slope[0] == pytest.approx(150 / math.sqrt(330**2 - 150**2))
 
 
+def test_the_print_radius_ends_where_rods_lie_flat(tmp_path: Path) -> None:
+    text = changed("print_radius: 140\n", "", example_text("delta"))
+    assert load_machine(write(tmp_path, text)).limits.max_radius == 150  # delta_radius
+    limits = load_machine(write(tmp_path, changed("arm_length: 330", "arm_length: 200", text))).limits
+    assert limits.max_radius == pytest.approx(200 * math.sin(math.atan(3)) - 150)
+
+
 def test_endstops_of_different_height_tilt_where_homing_ends(tmp_path: Path) -> None:
     text = example_text("delta").replace("angle: 330\n", "angle: 330\nposition_endstop: 401\n")
     machine = load_machine(write(tmp_path, text))
