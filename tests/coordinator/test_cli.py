@@ -216,7 +216,7 @@ def test_a_mistaken_command_line(
         ("plan my.cfg no.gcode", "there is no file 'no.gcode'"),
         ("plan my.cfg part.gcode --dictionary mcu=no.json", "there is no file 'no.json'"),
         ("demo --gcode no.gcode", "there is no file 'no.gcode'"),
-        ("demo --machine no", "there is no machine 'no': neither a file nor an example; examples are demo"),
+        ("demo --machine no", "there is no machine 'no': neither a file nor an example; examples are "),
     ],
 )
 def test_files_that_are_not_there(
