@@ -23,7 +23,7 @@ from coordinator.gcode.events import (
 )
 from coordinator.gcode.program import Program
 from coordinator.gcode.words import Command, WordError, number, parse, quoted
-from coordinator.motion.planner import AXIS_LETTERS, WORD_LETTERS, FeedStatus, Planner
+from coordinator.motion.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus, Planner
 
 MAX_NOTICES = 100
 """Different notices a job gives; a file of garbage must not flood the screen."""
@@ -61,7 +61,6 @@ class Job:
         self._events: deque[Event] = deque()
         self._over: Event | GCodeError | None = None
         self._told: set[str] = set()
-        self._accel_words: dict[str, float] = {}
 
     @property
     def line(self) -> int:
@@ -166,11 +165,6 @@ class Job:
         """End the job with EVENT."""
         self._over = event
 
-    @property
-    def accel_words(self) -> dict[str, float]:
-        """P and T of M204 since the last S."""
-        return self._accel_words
-
 
 # ---- The commands ----------------------------------------------------------------------------------------
 
@@ -193,9 +187,9 @@ def _positive(command: Command, words: Mapping[str, float]) -> None:
 def _move(job: Job, command: Command) -> bool:
     """G0, G1 that the hot path refused: unusual words, or numbers of many digits."""
     words = command.words()
-    for letter in words.keys() - set(WORD_LETTERS):
+    for letter in words.keys() - set(MOVE_LETTERS):
         job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
-    numbers = {letter: number(command.name, words, letter) for letter in words if letter in WORD_LETTERS}
+    numbers = {letter: number(command.name, words, letter) for letter in words if letter in MOVE_LETTERS}
     status = job.planner.move(numbers)
     if status is FeedStatus.LIMIT:
         raise WordError(str(job.planner.fault))
@@ -265,21 +259,15 @@ def _set_origin(job: Job, command: Command) -> bool:
 
 
 def _set_accel(job: Job, command: Command) -> bool:
-    """S holds for everything; P (print) and T (travel) hold together as the lower of the two."""
+    """M204 that the hot path refused: above what is configured, or of unusual words."""
     words = _numbers(command, "SPTR")
     words.pop("R", None)
     _positive(command, words)
-    if not words:
-        raise WordError("M204 names no acceleration; give S, or P and T (mm/s²)")
-    kept = job.accel_words
     if "S" in words:
-        kept.clear()
-        accel = words["S"]
-    else:
-        kept.update(words)
-        accel = min(kept.values())
-    _cap(job, "the acceleration", accel, job.planner.limits.max_accel)
-    job.planner.accel = accel
+        words = {"S": words["S"]}
+    for accel in words.values():
+        _cap(job, "the acceleration", accel, job.planner.limits.max_accel)
+    job.planner.set_accel_words(words)
     return True
 
 
@@ -306,7 +294,6 @@ def _set_velocity_limit(job: Job, command: Command) -> bool:
         _cap(job, "the velocity", numbers["VELOCITY"], limits.max_velocity)
         planner.max_velocity = numbers["VELOCITY"]
     if "ACCEL" in numbers:
-        job.accel_words.clear()
         _cap(job, "the acceleration", numbers["ACCEL"], limits.max_accel)
         planner.accel = numbers["ACCEL"]
     if "SQUARE_CORNER_VELOCITY" in numbers:

@@ -25,9 +25,9 @@ from coordinator.motion.specs import MotionLimits
 __all__ = [
     "AXIS_LETTERS",
     "DEFAULT_SPEED_MM_S",
+    "MOVE_LETTERS",
     "RING_TRAPEZOIDS",
     "TRAPEZOID",
-    "WORD_LETTERS",
     "Fault",
     "FaultKind",
     "Feed",
@@ -40,7 +40,9 @@ __all__ = [
 Position = tuple[float, float, float, float]
 
 AXIS_LETTERS = "XYZE"
-WORD_LETTERS = "XYZEF"
+WORD_LETTERS = "XYZEFSPT"
+"""In the order of struct gcode_words."""
+MOVE_LETTERS = "XYZEF"
 _STATUS = tuple(FeedStatus)
 DEFAULT_SPEED_MM_S = 25.0
 """Speed of moves before the first F word."""
@@ -99,16 +101,20 @@ class Planner:
         self._state.lines += 1
 
     def move(self, words: Mapping[str, float]) -> FeedStatus:
-        """Act on a G1 with these WORDS (letters of WORD_LETTERS); NEED_DATA says that it was done."""
+        """Act on a G1 with these WORDS (letters of MOVE_LETTERS); NEED_DATA says that it was done."""
         if not lib.planner_ready(self._core):
             return FeedStatus.FULL
+        refused = lib.gcode_move(self._state, self._core, self._given(words))
+        return FeedStatus.LIMIT if refused else FeedStatus.NEED_DATA
+
+    def _given(self, words: Mapping[str, float]) -> Any:
+        """Fill struct gcode_words."""
         self._words.given = 0
         for letter, value in words.items():
             index = WORD_LETTERS.index(letter)
             self._words.value[index] = value
             self._words.given |= 1 << index
-        refused = lib.gcode_move(self._state, self._core, self._words)
-        return FeedStatus.LIMIT if refused else FeedStatus.NEED_DATA
+        return self._words
 
     @property
     def fault(self) -> Fault:
@@ -290,7 +296,14 @@ class Planner:
 
     @accel.setter
     def accel(self, accel: float) -> None:
-        self._core.accel = min(check_number("the acceleration", accel, 1e-3), self.limits.max_accel)
+        self.set_accel_words({"S": accel})
+
+    def set_accel_words(self, words: Mapping[str, float]) -> None:
+        """M204: S holds for all; P (print) and T (travel), until the next S, as the lower of the two."""
+        most = self.limits.max_accel
+        capped = {key: min(check_number("the acceleration", a, 1e-3), most) for key, a in words.items()}
+        if lib.gcode_accel(self._state, self._core, self._given(capped)):
+            raise ValueError("M204 names no acceleration; give S, or P and T (mm/s²)")
 
     @property
     def max_velocity(self) -> float:
