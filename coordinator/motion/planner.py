@@ -46,6 +46,14 @@ MOVE_LETTERS = "XYZEF"
 _STATUS = tuple(FeedStatus)
 DEFAULT_SPEED_MM_S = 25.0
 """Speed of moves before the first F word."""
+MAX_ADVANCE_S = 10.0
+EXTRUDER_LIMITS = (
+    "max_extrude_only_velocity",
+    "max_extrude_only_accel",
+    "max_extrude_only_distance",
+    "max_extrude_ratio",
+    "instantaneous_corner_velocity",
+)
 RING_TRAPEZOIDS = int(lib.PLANNER_RING)
 """Most trapezoids that can wait for ``take``."""
 
@@ -333,6 +341,28 @@ class Planner:
     @minimum_cruise_ratio.setter
     def minimum_cruise_ratio(self, ratio: float) -> None:
         self._core.limits.minimum_cruise_ratio = check_number("the minimum cruise ratio", ratio, 0, 0.999)
+
+    @property
+    def pressure_advance(self) -> float:
+        """Seconds, of the printing moves to come."""
+        return float(self._core.pressure_advance)
+
+    @pressure_advance.setter
+    def pressure_advance(self, advance_s: float) -> None:
+        self._core.pressure_advance = check_number("the pressure advance", advance_s, 0, MAX_ADVANCE_S)
+
+    # ---- Where and how the moves to come may go when the machine changes ----
+
+    def set_range(self, axis: int, low: float, high: float) -> None:
+        """AXIS (0 to 2) may go from LOW to HIGH, mm; nowhere when LOW is above HIGH."""
+        self._core.limits.position_min[axis] = check_number("position_min", low, -1e6, 1e6)
+        self._core.limits.position_max[axis] = check_number("position_max", high, -1e6, 1e6)
+
+    def set_extruder_limits(self, limits: MotionLimits) -> None:
+        """Take over what LIMITS say of filament: another extruder is active."""
+        check_limits(limits)
+        for name in EXTRUDER_LIMITS:
+            setattr(self._core.limits, name, getattr(limits, name))
 
     # ---- Counters ----
 

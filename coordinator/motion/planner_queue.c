@@ -65,6 +65,12 @@ static void limit(struct planned_move *move, double ratio, double velocity, doub
     move->accel = min_of(move->accel, accel / ratio);
 }
 
+// As limit; 0 stands for no limit.
+static void limit_axis(struct planned_move *move, double ratio, double velocity, double accel) {
+    if (velocity > 0 || accel > 0)
+        limit(move, fabs(ratio), velocity > 0 ? velocity : INFINITY, accel > 0 ? accel : INFINITY);
+}
+
 // How far Z stays below the top of the cone.
 static double below_cone(const struct planner_limits *l, const double at[4]) {
     double down_x = l->cone_slope[0] * at[AXIS_X], down_y = l->cone_slope[1] * at[AXIS_Y];
@@ -86,6 +92,26 @@ static int check_cone(struct planner *p, const double target[4]) {
     return refuse(p, PLANNER_OUTSIDE, AXIS_Z, target[AXIS_Z], l->position_min[AXIS_Z], high);
 }
 
+// Where moves end, and where they pass by the Z axis: the disc is convex, its hole is not.
+static int check_radius(struct planner *p, const double delta[4], const double target[4]) {
+    double high = p->limits.max_radius, low = p->limits.radius_min;
+    if (delta[AXIS_X] == 0 && delta[AXIS_Y] == 0)
+        return 0;
+    double radius = sqrt(target[0] * target[0] + target[1] * target[1]);
+    if (high > 0 && !(radius <= high + POSITION_EPS))
+        return refuse(p, PLANNER_TOO_FAR, AXIS_X, radius, low, high);
+    if (low <= 0)
+        return 0;
+    double way2 = delta[0] * delta[0] + delta[1] * delta[1];
+    double back = (target[0] * delta[0] + target[1] * delta[1]) / way2; // share of the way behind the foot
+    back = min_of(max_of(back, 0), 1);
+    double x = target[0] - back * delta[0], y = target[1] - back * delta[1];
+    double nearest = sqrt(x * x + y * y);
+    if (!(nearest >= low - POSITION_EPS))
+        return refuse(p, PLANNER_TOO_NEAR, AXIS_X, nearest, low, high);
+    return 0;
+}
+
 static int check_range(struct planner *p, const double delta[4], const double target[4]) {
     int has_cone = p->limits.cone_slope[0] > 0 || p->limits.cone_slope[1] > 0;
     for (int axis = 0; axis < 3; axis++) {
@@ -99,6 +125,8 @@ static int check_range(struct planner *p, const double delta[4], const double ta
         if (!(target[axis] >= low - POSITION_EPS && target[axis] <= high + POSITION_EPS))
             return refuse(p, PLANNER_OUTSIDE, axis, target[axis], low, high);
     }
+    if ((p->limits.max_radius > 0 || p->limits.radius_min > 0) && check_radius(p, delta, target))
+        return -1;
     return has_cone ? check_cone(p, target) : 0;
 }
 
@@ -106,6 +134,8 @@ static int check_range(struct planner *p, const double delta[4], const double ta
 static int check_path(struct planner *p, struct planned_move *move, double delta_e) {
     const struct planner_limits *l = &p->limits;
     double ratio = move->ratio[AXIS_E];
+    limit_axis(move, move->ratio[AXIS_X], l->max_x_velocity, l->max_x_accel);
+    limit_axis(move, move->ratio[AXIS_Y], l->max_y_velocity, l->max_y_accel);
     limit(move, fabs(move->ratio[AXIS_Z]), l->max_z_velocity, l->max_z_accel);
     if (ratio > l->max_extrude_ratio && delta_e > l->max_extrude_ratio * TINY_PATH)
         return refuse(p, PLANNER_EXTRUDE_RATIO, AXIS_E, ratio, 0, l->max_extrude_ratio);
@@ -219,7 +249,8 @@ int planner_add(struct planner *p, const double target[4], double speed) {
     for (int axis = 0; axis < 4; axis++)
         if (move->ratio[axis] != 0)
             p->position[axis] = target[axis];
-    move->pressure_advance = p->pressure_advance;
+    int prints = move->ratio[AXIS_E] > 0 && (move->ratio[AXIS_X] != 0 || move->ratio[AXIS_Y] != 0);
+    move->pressure_advance = prints ? p->pressure_advance : 0;
     move->line = p->line;
     p->tail++;
     p->moves_added++;
