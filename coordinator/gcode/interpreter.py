@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from coordinator.gcode import machine_commands
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import (
     Emergency,
@@ -21,6 +22,7 @@ from coordinator.gcode.events import (
     Reply,
     Wait,
 )
+from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
 from coordinator.gcode.words import Command, WordError, number, parse, quoted
 from coordinator.motion.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus, Planner
@@ -52,15 +54,24 @@ class Job:
     before that line are still in the planner, to be flushed or dropped by the driver.
     """
 
-    def __init__(self, program: Program, planner: Planner, homed_position: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        program: Program,
+        planner: Planner,
+        homed_position: Mapping[str, float],
+        machine: MachineState | None = None,
+    ) -> None:
         self.program = program
         self.planner = planner
+        self.machine = machine or MachineState()
+        """What the program may change; it is changed in place."""
         self.homed_position = dict(homed_position)
         self.recorded: dict[str, Recorded] = {}
         """By command name."""
         self._events: deque[Event] = deque()
         self._over: Event | GCodeError | None = None
         self._told: set[str] = set()
+        machine_commands.begin(self)
 
     @property
     def line(self) -> int:
@@ -129,8 +140,8 @@ class Job:
         handler = _HANDLERS.get(command.name)
         if handler:
             return handler(self, command)
-        if command.name[0] == "T" and command.name[1:].isdigit():
-            raise WordError(f"{command.name} selects a tool that does not exist; this machine has only T0")
+        if machine_commands.is_tool(command.name):
+            return machine_commands.select_tool(self, command)
         what = quoted(command.name).strip("'")
         self.notice(f"unknown command {what}", "unknown commands are skipped")
         return True
@@ -238,7 +249,7 @@ def _home(job: Job, command: Command) -> bool:
         if axis not in job.homed_position:
             raise WordError(f"G28 names the axis {axis}, which this machine does not have")
     planner = job.planner
-    if not planner.flush():
+    if not machine_commands.come_to_rest(job):
         return False
     x, y, z, e = (
         job.homed_position[letter] if letter in axes else now
@@ -247,6 +258,7 @@ def _home(job: Job, command: Command) -> bool:
     planner.set_position((x, y, z, e))
     planner.clear_gcode_base(axes)
     planner.homed = planner.homed + axes
+    machine_commands.home_carriages(job, axes)
     job.notice("G28", "there are no endstops to look for; the axes are taken as already home")
     job.emit(PositionSet(job.line, axes, (x, y, z, e), planner.print_time_end_s))
     return True
@@ -368,7 +380,7 @@ _HANDLERS: Mapping[str, Handler] = {
     "G91": _relative(relative=True),
     "G92": _set_origin,
     **dict.fromkeys(("M18", "M84"), _motors_off),
-    **dict.fromkeys(("M73", "M117", "M118", "T0"), _ignore),
+    **dict.fromkeys(("M73", "M117", "M118"), _ignore),
     "M82": _relative_extrusion(relative=False),
     "M83": _relative_extrusion(relative=True),
     **dict.fromkeys(("M104", "M105", "M106", "M107", "M109", "M140", "M190"), _heat),
@@ -378,4 +390,5 @@ _HANDLERS: Mapping[str, Handler] = {
     **dict.fromkeys(("M220", "M221"), _factor),
     "M400": _wait_for_moves,
     "SET_VELOCITY_LIMIT": _set_velocity_limit,
+    **machine_commands.HANDLERS,
 }

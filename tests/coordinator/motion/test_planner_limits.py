@@ -1,7 +1,7 @@
 """Limits not every machine has: speeds of X and Y, round work spaces; and what a change of tool changes."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coordinator.motion.planner import FaultKind, FeedStatus
+from coordinator.motion.specs import MotionLimits
 from tests.coordinator.motion.planner_helpers import (
     LIMITS,
     check_invariants,
@@ -43,7 +44,8 @@ def test_x_and_y_have_their_own_limits_on_every_slope() -> None:
 
 @pytest.mark.parametrize("name", ["max_x_velocity", "max_x_accel", "max_y_velocity", "max_y_accel"])
 def test_each_of_these_limits_stands_alone(name: str) -> None:
-    t = planned(homed_planner(replace(LIMITS, **{name: 30.0})), b"G1 X100 Y50 F24000\n")
+    limits = MotionLimits(**{**asdict(LIMITS), name: 30.0})
+    t = planned(homed_planner(limits), b"G1 X100 Y50 F24000\n")
     free = planned(homed_planner(), b"G1 X100 Y50 F24000\n")
     axis, what = "xy".index(name[4]), "cruise_v" if name.endswith("velocity") else "accel"
     other = "accel" if what == "cruise_v" else "cruise_v"
