@@ -8,7 +8,7 @@ NATIVE_INPUTS := $(C_SOURCES) $(wildcard firmware/Makefile firmware/tools/*.py) 
 
 C_WARNINGS := -std=gnu11 -Wall -Wextra -Wconversion -Werror -I. -Ifirmware
 
-.PHONY: demo test check pytest ctest sim mutants vcan bench clean setup format
+.PHONY: demo test check pytest ctest fuzz sim mutants vcan bench clean setup format
 .DEFAULT_GOAL := test
 
 setup: $(VENV)/.installed
@@ -38,11 +38,17 @@ check: setup
 
 ctest: setup
 	$(MAKE) -C tests PYTHON=$(abspath $(BIN)/python)
+	$(MAKE) -C tests/fuzz short
 
 pytest: setup
 	$(BIN)/pytest
 
 test: check ctest pytest
+
+# Ten minutes of hostile G-code through the motion engine, under the sanitizers; ctest has a short run of it.
+FUZZ_SECONDS ?= 600
+fuzz: setup
+	$(MAKE) -C tests/fuzz run SECONDS=$(FUZZ_SECONDS)
 
 # Whole machines in virtual time, each seed with other faults (docs/simulation.md).
 SIM_SEEDS ?= 2000

@@ -8,11 +8,17 @@ Idle            waits for input; plans what there is to a standstill before the 
 Full            takes and releases trapezoids (a streamer: waits until there is room, or raises plan_until_s)
 Wait            takes all trapezoids; in real time, waits until PRINT_TIME_S has been executed
 PositionSet     takes all trapezoids, then tells step generation where the machine stands
+ShaperChange,   takes all trapezoids, generates their steps up to PRINT_TIME_S with flush, then tells step
+WeightsChange,  generation what changed; the machine has been at rest for longer than every shaper and every
+SmoothTime-     smoothing window is wide
+Change
 Reply, Notice   shows the text
 Emergency       stops the machine at once; the job is over
 End             takes all trapezoids; the job is over
 ==============  ==========================================================================================
 """
+
+from collections.abc import Mapping
 
 from nodes.records import record
 
@@ -59,6 +65,38 @@ class PositionSet:
 
 
 @record
+class ShaperChange:
+    """SET_INPUT_SHAPER: from PRINT_TIME_S on AXIS (letter) is shaped so; FREQUENCY_HZ 0: not at all."""
+
+    line: int
+    axis: str
+    kind: str
+    """zv, mzv, zvd, ei, 2hump_ei or 3hump_ei."""
+    frequency_hz: float
+    damping_ratio: float
+    print_time_s: float
+
+
+@record
+class WeightsChange:
+    """Another carriage, mode or extruder: from PRINT_TIME_S on these steppers (by name) follow X Y Z E so."""
+
+    line: int
+    weights: Mapping[str, tuple[float, float, float, float]]
+    print_time_s: float
+
+
+@record
+class SmoothTimeChange:
+    """SET_PRESSURE_ADVANCE: from PRINT_TIME_S on the advance of EXTRUDER is spread over SMOOTH_S."""
+
+    line: int
+    extruder: str
+    smooth_s: float
+    print_time_s: float
+
+
+@record
 class Reply:
     """An answer that the program asked for (M114)."""
 
@@ -89,4 +127,6 @@ class End:
     print_time_s: float
 
 
-Event = Progress | Idle | Full | Wait | PositionSet | Reply | Notice | Emergency | End
+MachineChange = ShaperChange | WeightsChange | SmoothTimeChange
+"""Changes of what step generation does with the same moves."""
+Event = Progress | Idle | Full | Wait | PositionSet | MachineChange | Reply | Notice | Emergency | End

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from coordinator.gcode import machine_commands
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import (
     Emergency,
@@ -21,9 +22,10 @@ from coordinator.gcode.events import (
     Reply,
     Wait,
 )
+from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
 from coordinator.gcode.words import Command, WordError, number, parse, quoted
-from coordinator.motion.planner import AXIS_LETTERS, WORD_LETTERS, FeedStatus, Planner
+from coordinator.motion.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus, Planner
 
 MAX_NOTICES = 100
 """Different notices a job gives; a file of garbage must not flood the screen."""
@@ -52,16 +54,24 @@ class Job:
     before that line are still in the planner, to be flushed or dropped by the driver.
     """
 
-    def __init__(self, program: Program, planner: Planner, homed_position: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        program: Program,
+        planner: Planner,
+        homed_position: Mapping[str, float],
+        machine: MachineState | None = None,
+    ) -> None:
         self.program = program
         self.planner = planner
+        self.machine = machine or MachineState()
+        """What the program may change; it is changed in place."""
         self.homed_position = dict(homed_position)
         self.recorded: dict[str, Recorded] = {}
         """By command name."""
         self._events: deque[Event] = deque()
         self._over: Event | GCodeError | None = None
         self._told: set[str] = set()
-        self._accel_words: dict[str, float] = {}
+        machine_commands.begin(self)
 
     @property
     def line(self) -> int:
@@ -130,8 +140,8 @@ class Job:
         handler = _HANDLERS.get(command.name)
         if handler:
             return handler(self, command)
-        if command.name[0] == "T" and command.name[1:].isdigit():
-            raise WordError(f"{command.name} selects a tool that does not exist; this machine has only T0")
+        if machine_commands.is_tool(command.name):
+            return machine_commands.select_tool(self, command)
         what = quoted(command.name).strip("'")
         self.notice(f"unknown command {what}", "unknown commands are skipped")
         return True
@@ -166,11 +176,6 @@ class Job:
         """End the job with EVENT."""
         self._over = event
 
-    @property
-    def accel_words(self) -> dict[str, float]:
-        """P and T of M204 since the last S."""
-        return self._accel_words
-
 
 # ---- The commands ----------------------------------------------------------------------------------------
 
@@ -193,9 +198,9 @@ def _positive(command: Command, words: Mapping[str, float]) -> None:
 def _move(job: Job, command: Command) -> bool:
     """G0, G1 that the hot path refused: unusual words, or numbers of many digits."""
     words = command.words()
-    for letter in words.keys() - set(WORD_LETTERS):
+    for letter in words.keys() - set(MOVE_LETTERS):
         job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
-    numbers = {letter: number(command.name, words, letter) for letter in words if letter in WORD_LETTERS}
+    numbers = {letter: number(command.name, words, letter) for letter in words if letter in MOVE_LETTERS}
     status = job.planner.move(numbers)
     if status is FeedStatus.LIMIT:
         raise WordError(str(job.planner.fault))
@@ -244,7 +249,7 @@ def _home(job: Job, command: Command) -> bool:
         if axis not in job.homed_position:
             raise WordError(f"G28 names the axis {axis}, which this machine does not have")
     planner = job.planner
-    if not planner.flush():
+    if not machine_commands.come_to_rest(job):
         return False
     x, y, z, e = (
         job.homed_position[letter] if letter in axes else now
@@ -253,6 +258,7 @@ def _home(job: Job, command: Command) -> bool:
     planner.set_position((x, y, z, e))
     planner.clear_gcode_base(axes)
     planner.homed = planner.homed + axes
+    machine_commands.home_carriages(job, axes)
     job.notice("G28", "there are no endstops to look for; the axes are taken as already home")
     job.emit(PositionSet(job.line, axes, (x, y, z, e), planner.print_time_end_s))
     return True
@@ -265,21 +271,15 @@ def _set_origin(job: Job, command: Command) -> bool:
 
 
 def _set_accel(job: Job, command: Command) -> bool:
-    """S holds for everything; P (print) and T (travel) hold together as the lower of the two."""
+    """M204 that the hot path refused: above what is configured, or of unusual words."""
     words = _numbers(command, "SPTR")
     words.pop("R", None)
     _positive(command, words)
-    if not words:
-        raise WordError("M204 names no acceleration; give S, or P and T (mm/s²)")
-    kept = job.accel_words
     if "S" in words:
-        kept.clear()
-        accel = words["S"]
-    else:
-        kept.update(words)
-        accel = min(kept.values())
-    _cap(job, "the acceleration", accel, job.planner.limits.max_accel)
-    job.planner.accel = accel
+        words = {"S": words["S"]}
+    for accel in words.values():
+        _cap(job, "the acceleration", accel, job.planner.limits.max_accel)
+    job.planner.set_accel_words(words)
     return True
 
 
@@ -306,7 +306,6 @@ def _set_velocity_limit(job: Job, command: Command) -> bool:
         _cap(job, "the velocity", numbers["VELOCITY"], limits.max_velocity)
         planner.max_velocity = numbers["VELOCITY"]
     if "ACCEL" in numbers:
-        job.accel_words.clear()
         _cap(job, "the acceleration", numbers["ACCEL"], limits.max_accel)
         planner.accel = numbers["ACCEL"]
     if "SQUARE_CORNER_VELOCITY" in numbers:
@@ -381,7 +380,7 @@ _HANDLERS: Mapping[str, Handler] = {
     "G91": _relative(relative=True),
     "G92": _set_origin,
     **dict.fromkeys(("M18", "M84"), _motors_off),
-    **dict.fromkeys(("M73", "M117", "M118", "T0"), _ignore),
+    **dict.fromkeys(("M73", "M117", "M118"), _ignore),
     "M82": _relative_extrusion(relative=False),
     "M83": _relative_extrusion(relative=True),
     **dict.fromkeys(("M104", "M105", "M106", "M107", "M109", "M140", "M190"), _heat),
@@ -391,4 +390,5 @@ _HANDLERS: Mapping[str, Handler] = {
     **dict.fromkeys(("M220", "M221"), _factor),
     "M400": _wait_for_moves,
     "SET_VELOCITY_LIMIT": _set_velocity_limit,
+    **machine_commands.HANDLERS,
 }

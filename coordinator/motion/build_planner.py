@@ -14,5 +14,9 @@ ffibuilder = builder(
         "coordinator/motion/planner_queue.h",
         "coordinator/motion/gcode_lines.h",
     ],
-    sources=["coordinator/motion/planner_queue.c", "coordinator/motion/gcode_lines.c"],
+    sources=[
+        "coordinator/motion/planner_queue.c",
+        "coordinator/motion/planner_move.c",
+        "coordinator/motion/gcode_lines.c",
+    ],
 )

@@ -3,6 +3,8 @@
 #include <math.h>
 #include <string.h>
 
+static const double MIN_ACCEL = 1e-3; // mm/s²
+
 // ---- Numbers
 // -----------------------------------------------------------------------------------------------
 
@@ -35,7 +37,40 @@ static double scale_down(uint64_t mantissa, uint32_t decimals) {
     return ldexp((double)quotient, down - up - 64);
 }
 
-size_t gcode_number(const char *text, size_t size, double *value) {
+// Digits of up to 7 characters at once: the length of a number in a program is not predictable, so a loop
+// over its digits costs a mispredicted branch each time.
+enum { CHUNK = 8 };
+static const uint32_t SMALL_POWER[CHUNK] = {1, 10, 100, 1000, 10000, 100000, 1000000, 10000000};
+
+// Bytes of TEXT as a number, the first in the lowest byte.
+static inline uint64_t load_chunk(const char *text) {
+    uint64_t chunk;
+    memcpy(&chunk, text, sizeof chunk);
+#if __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+    chunk = __builtin_bswap64(chunk);
+#endif
+    return chunk;
+}
+
+// The digits that TEXT begins with: returns how many, CHUNK when there may be more.
+static inline uint32_t read_digits(const char *text, uint32_t *value) {
+    // '0' to '9' become 0 to 9; what then is 10 or above sets its byte's highest bit. A carry out of a byte
+    // only disturbs characters behind the first that is no digit.
+    uint64_t digits = load_chunk(text) ^ UINT64_C(0x3030303030303030);
+    uint64_t others = ((digits + UINT64_C(0x7676767676767676)) | digits) & UINT64_C(0x8080808080808080);
+    if (!others)
+        return CHUNK;
+    uint32_t count = (uint32_t)__builtin_ctzll(others) / 8;
+    digits = (digits << 8) << (56 - 8 * count); // zeros in front; 64 at once would be undefined
+    digits = digits * 10 + (digits >> 8);       // pairs, in every other byte
+    digits = (digits & UINT64_C(0x000000FF000000FF)) * (100 + (UINT64_C(1000000) << 32)) +
+             (digits >> 16 & UINT64_C(0x000000FF000000FF)) * (1 + (UINT64_C(10000) << 32));
+    *value = (uint32_t)(digits >> 32);
+    return count;
+}
+
+// Any number, digit by digit.
+static size_t read_long_number(const char *text, size_t size, double *value) {
     const char *at = text, *end = text + size;
     int negative = at < end && *at == '-';
     if (at < end && (*at == '-' || *at == '+'))
@@ -64,17 +99,35 @@ size_t gcode_number(const char *text, size_t size, double *value) {
     return (size_t)(at - text);
 }
 
+size_t gcode_number(const char *text, size_t size, double *value) {
+    if (size < 2 * CHUNK + 2) // sign, digits, point, digits
+        return read_long_number(text, size, value);
+    const char *at = text + (*text == '-' || *text == '+');
+    uint32_t whole, decimals = 0, count = read_digits(at, &whole), places = 0;
+    at += count;
+    if (*at == '.')
+        places = read_digits(++at, &decimals);
+    if (count == CHUNK || places == CHUNK)
+        return read_long_number(text, size, value);
+    if (count + places == 0)
+        return 0;
+    // Both operands are exact doubles, so IEEE division rounds the exact quotient.
+    double magnitude =
+        (double)(int64_t)((uint64_t)whole * SMALL_POWER[places] + decimals) / SMALL_POWER[places];
+    *value = *text == '-' ? -magnitude : magnitude;
+    return (size_t)(at - text) + places;
+}
+
 // ---- Lines
 // -------------------------------------------------------------------------------------------------
 
-enum line_kind { LINE_BLANK, LINE_MOVE, LINE_OTHER };
+enum line_kind { LINE_BLANK, LINE_MOVE, LINE_ORIGIN, LINE_ACCEL, LINE_OTHER };
 
 static inline char upper(char c) {
     return c >= 'a' && c <= 'z' ? (char)(c - 32) : c;
 }
 
-// Behind blanks and "(...)"; a parenthesis that does not close is left standing.
-static const char *skip_blanks(const char *at, const char *end) {
+static const char *skip_comments(const char *at, const char *end) {
     for (;;) {
         while (at < end && (*at == ' ' || *at == '\t' || *at == '\r'))
             at++;
@@ -85,6 +138,13 @@ static const char *skip_blanks(const char *at, const char *end) {
             return at;
         at = close + 1;
     }
+}
+
+// Behind blanks and "(...)"; a parenthesis that does not close is left standing.
+static inline const char *skip_blanks(const char *at, const char *end) {
+    if (at < end && *at == ' ')
+        at++;
+    return at < end && *at > '(' ? at : skip_comments(at, end);
 }
 
 // An unsigned integer below 65536; returns the position behind it, or NULL.
@@ -116,58 +176,106 @@ static const char *skip_line_number(const char *at, const char *end) {
     return at == digits ? digits - 1 : skip_blanks(at, end);
 }
 
-// "G0", "G1", "G01" and the like; NULL for anything else.
-static const char *skip_move_word(const char *at, const char *end) {
-    uint32_t code;
-    if (at == end || upper(*at) != 'G')
+// "G1", "M204", "G01" and the like; NULL for what has no place here.
+static const char *read_command(const char *at, const char *end, enum line_kind *kind) {
+    if (at == end)
         return NULL;
+    char letter = upper(*at);
+    uint32_t code;
     at = read_count(at + 1, end, &code);
-    return at && code <= 1 && (at == end || *at != '.') ? at : NULL;
+    if (!at || (at < end && *at == '.'))
+        return NULL;
+    if (letter == 'G' && code <= 1)
+        *kind = LINE_MOVE;
+    else if (letter == 'G' && code == 92)
+        *kind = LINE_ORIGIN;
+    else if (letter == 'M' && code == 204)
+        *kind = LINE_ACCEL;
+    else
+        return NULL;
+    return at;
 }
 
-static int word_index(char letter) {
-    switch (upper(letter)) {
-    case 'X':
-        return 0;
-    case 'Y':
-        return 1;
-    case 'Z':
-        return 2;
-    case 'E':
-        return 3;
-    case 'F':
-        return 4;
-    default:
-        return -1;
-    }
+// 1 + index into gcode_words.value; 0 for letters that have none.
+static inline int word_place(char letter) {
+    static const uint8_t PLACE[32] = {['X' & 31] = 1, ['Y' & 31] = 2, ['Z' & 31] = 3, ['E' & 31] = 4,
+                                      ['F' & 31] = 5, ['S' & 31] = 6, ['P' & 31] = 7, ['T' & 31] = 8};
+    return (letter & 0xC0) == 0x40 ? PLACE[letter & 31] : 0;
 }
 
-static enum line_kind read_words(const char *line, const char *at, const char *end,
-                                 struct gcode_words *words) {
-    words->given = 0;
+// The words of a command from AT on, which may be those of ALLOWED; READABLE: end of the text.
+static int read_words(const char *line, const char *at, const char *end, const char *readable,
+                      uint32_t allowed, struct gcode_words *words) {
+    uint32_t given = 0;
     for (;;) {
         at = skip_blanks(at, end);
         if (at == end || *at == ';')
-            return LINE_MOVE;
-        if (*at == '*')
-            return checksum_is(line, at, end) ? LINE_MOVE : LINE_OTHER;
-        int index = word_index(*at++);
-        if (index < 0 || words->given >> index & 1)
-            return LINE_OTHER;
-        size_t taken = gcode_number(at, (size_t)(end - at), &words->value[index]);
+            break;
+        if (*at == '*') {
+            if (!checksum_is(line, at, end))
+                return 0;
+            break;
+        }
+        int place = word_place(*at++);
+        uint32_t bit = place ? 1u << (place - 1) : 0;
+        if (!(allowed & bit & ~given))
+            return 0;
+        // No number goes beyond its line: a line feed ends it.
+        size_t taken = gcode_number(at, (size_t)(readable - at), &words->value[place - 1]);
         if (!taken)
-            return LINE_OTHER;
-        words->given |= 1u << index;
+            return 0;
+        given |= bit;
         at += taken;
     }
+    words->given = given;
+    return 1;
 }
 
-static enum line_kind read_line(const char *line, const char *end, struct gcode_words *words) {
+static enum line_kind read_line(const char *line, const char *end, const char *readable,
+                                struct gcode_words *words) {
+    static const uint32_t ALLOWED[] = {[LINE_MOVE] = GCODE_MOVE_WORDS,
+                                       [LINE_ORIGIN] = GCODE_AXIS_WORDS,
+                                       [LINE_ACCEL] = GCODE_ACCEL_WORDS,
+                                       [LINE_OTHER] = 0};
     const char *at = skip_blanks(line, end);
     if (at == end || *at == ';')
         return LINE_BLANK;
-    at = skip_move_word(skip_line_number(at, end), end);
-    return at ? read_words(line, at, end, words) : LINE_OTHER;
+    enum line_kind kind = LINE_OTHER;
+    at = read_command(skip_line_number(at, end), end, &kind);
+    return at && read_words(line, at, end, readable, ALLOWED[kind], words) ? kind : LINE_OTHER;
+}
+
+// ---- What a line does
+// --------------------------------------------------------------------------------------
+
+static void set_origin(struct gcode_state *state, const struct gcode_words *words) {
+    for (int axis = 0; axis < 4; axis++) {
+        double scale = axis == AXIS_E ? state->unit * state->extrude_factor : state->unit;
+        double value = words->given >> axis & 1 ? words->value[axis] : 0;
+        if (!words->given || words->given >> axis & 1)
+            state->base[axis] = state->position[axis] - value * scale;
+    }
+}
+
+int gcode_accel(struct gcode_state *state, struct planner *planner, const struct gcode_words *words) {
+    double print = state->print_accel, travel = state->travel_accel, accel;
+    if (words->given >> GCODE_S & 1) {
+        print = travel = 0;
+        accel = words->value[GCODE_S];
+    } else {
+        print = words->given >> GCODE_P & 1 ? words->value[GCODE_P] : print;
+        travel = words->given >> GCODE_T & 1 ? words->value[GCODE_T] : travel;
+        accel = print == 0 || (travel != 0 && travel < print) ? travel : print;
+    }
+    for (int i = GCODE_S; i <= GCODE_T; i++)
+        if (words->given >> i & 1 && !(words->value[i] >= MIN_ACCEL))
+            return -1;
+    if (!words->given || !(accel <= planner->limits.max_accel))
+        return -1;
+    state->print_accel = print;
+    state->travel_accel = travel;
+    planner->accel = accel;
+    return 0;
 }
 
 int gcode_move(struct gcode_state *state, struct planner *planner, const struct gcode_words *words) {
@@ -201,8 +309,8 @@ int gcode_feed(struct gcode_state *state, struct planner *planner, const char *t
         if (!stop && !final)
             break;
         struct gcode_words words;
-        enum line_kind kind = read_line(line, stop ? stop : end, &words);
-        if (kind == LINE_OTHER) {
+        enum line_kind kind = read_line(line, stop ? stop : end, end, &words);
+        if (kind == LINE_OTHER || (kind == LINE_ACCEL && gcode_accel(state, planner, &words))) {
             status = GCODE_OTHER_LINE;
             break;
         }
@@ -216,6 +324,8 @@ int gcode_feed(struct gcode_state *state, struct planner *planner, const char *t
                 break;
             }
         }
+        if (kind == LINE_ORIGIN)
+            set_origin(state, &words);
         state->lines++;
         line = stop ? stop + 1 : end;
     }

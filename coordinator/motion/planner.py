@@ -24,8 +24,8 @@ from coordinator.motion.specs import MotionLimits
 __all__ = [
     "AXIS_LETTERS",
     "DEFAULT_SPEED_MM_S",
+    "MOVE_LETTERS",
     "RING_TRAPEZOIDS",
-    "WORD_LETTERS",
     "Fault",
     "FaultKind",
     "Feed",
@@ -38,10 +38,20 @@ __all__ = [
 Position = tuple[float, float, float, float]
 
 AXIS_LETTERS = "XYZE"
-WORD_LETTERS = "XYZEF"
+WORD_LETTERS = "XYZEFSPT"
+"""In the order of struct gcode_words."""
+MOVE_LETTERS = "XYZEF"
 _STATUS = tuple(FeedStatus)
 DEFAULT_SPEED_MM_S = 25.0
 """Speed of moves before the first F word."""
+MAX_ADVANCE_S = 10.0
+EXTRUDER_LIMITS = (
+    "max_extrude_only_velocity",
+    "max_extrude_only_accel",
+    "max_extrude_only_distance",
+    "max_extrude_ratio",
+    "instantaneous_corner_velocity",
+)
 RING_TRAPEZOIDS = int(lib.PLANNER_RING)
 """Most trapezoids that can wait for ``take``."""
 
@@ -97,16 +107,20 @@ class Planner:
         self._state.lines += 1
 
     def move(self, words: Mapping[str, float]) -> FeedStatus:
-        """Act on a G1 with these WORDS (letters of WORD_LETTERS); NEED_DATA says that it was done."""
+        """Act on a G1 with these WORDS (letters of MOVE_LETTERS); NEED_DATA says that it was done."""
         if not lib.planner_ready(self._core):
             return FeedStatus.FULL
+        refused = lib.gcode_move(self._state, self._core, self._given(words))
+        return FeedStatus.LIMIT if refused else FeedStatus.NEED_DATA
+
+    def _given(self, words: Mapping[str, float]) -> Any:
+        """Fill struct gcode_words."""
         self._words.given = 0
         for letter, value in words.items():
             index = WORD_LETTERS.index(letter)
             self._words.value[index] = value
             self._words.given |= 1 << index
-        refused = lib.gcode_move(self._state, self._core, self._words)
-        return FeedStatus.LIMIT if refused else FeedStatus.NEED_DATA
+        return self._words
 
     @property
     def fault(self) -> Fault:
@@ -288,7 +302,14 @@ class Planner:
 
     @accel.setter
     def accel(self, accel: float) -> None:
-        self._core.accel = min(check_number("the acceleration", accel, 1e-3), self.limits.max_accel)
+        self.set_accel_words({"S": accel})
+
+    def set_accel_words(self, words: Mapping[str, float]) -> None:
+        """M204: S holds for all; P (print) and T (travel), until the next S, as the lower of the two."""
+        most = self.limits.max_accel
+        capped = {key: min(check_number("the acceleration", a, 1e-3), most) for key, a in words.items()}
+        if lib.gcode_accel(self._state, self._core, self._given(capped)):
+            raise ValueError("M204 names no acceleration; give S, or P and T (mm/s²)")
 
     @property
     def max_velocity(self) -> float:
@@ -318,6 +339,28 @@ class Planner:
     @minimum_cruise_ratio.setter
     def minimum_cruise_ratio(self, ratio: float) -> None:
         self._core.limits.minimum_cruise_ratio = check_number("the minimum cruise ratio", ratio, 0, 0.999)
+
+    @property
+    def pressure_advance(self) -> float:
+        """Seconds, of the printing moves to come."""
+        return float(self._core.pressure_advance)
+
+    @pressure_advance.setter
+    def pressure_advance(self, advance_s: float) -> None:
+        self._core.pressure_advance = check_number("the pressure advance", advance_s, 0, MAX_ADVANCE_S)
+
+    # ---- Where and how the moves to come may go when the machine changes ----
+
+    def set_range(self, axis: int, low: float, high: float) -> None:
+        """AXIS (0 to 2) may go from LOW to HIGH, mm; nowhere when LOW is above HIGH."""
+        self._core.limits.position_min[axis] = check_number("position_min", low, -1e6, 1e6)
+        self._core.limits.position_max[axis] = check_number("position_max", high, -1e6, 1e6)
+
+    def set_extruder_limits(self, limits: MotionLimits) -> None:
+        """Take over what LIMITS say of filament: another extruder is active."""
+        check_limits(limits)
+        for name in EXTRUDER_LIMITS:
+            setattr(self._core.limits, name, getattr(limits, name))
 
     # ---- Counters ----
 

@@ -1,14 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "coordinator/motion/planner_queue.h"
+#include "coordinator/motion/planner_internal.h"
 #include <math.h>
 #include <string.h>
 
-static const double MIN_LENGTH = 1e-9;   // mm
-static const double POSITION_EPS = 1e-9; // mm by which sums of relative moves may miss a limit
-static const double MAX_EXTRUSION = 1e9; // mm; also keeps infinity and NaN out
-static const double MIN_SPEED = 1e-4;    // mm/s; keeps every duration finite
-// A move that extrudes no more than this length of path may hold is never refused: slicers round.
-static const double TINY_PATH = 0.1; // mm
 // Flanks of the smooth profile are equal but for rounding; less than this is neither rise nor fall.
 static const double FLAT = 1e-9;
 // Rounding bends straight runs by less than this; no corner limit, even 0, may stop them.
@@ -18,14 +12,6 @@ enum { PLAN_AFTER_MIN = 32 };
 
 static inline struct planned_move *move_at(struct planner *p, uint64_t index) {
     return &p->queue[index & (PLANNER_QUEUE - 1)];
-}
-
-static inline double min_of(double a, double b) {
-    return a < b ? a : b;
-}
-
-static inline double max_of(double a, double b) {
-    return a > b ? a : b;
 }
 
 static inline int ring_is_full(const struct planner *p) {
@@ -47,114 +33,6 @@ void planner_init(struct planner *p, const struct planner_limits *limits, const 
     memcpy(p->position, position, sizeof p->position);
     p->plan_until = INFINITY;
     stand_still(p);
-}
-
-// ---- Checks of one move
-// ------------------------------------------------------------------------------------
-
-static int refuse(struct planner *p, int32_t kind, int32_t axis, double value, double low, double high) {
-    p->fault = (struct planner_fault){.kind = kind, .axis = axis, .value = value, .low = low, .high = high};
-    return -1;
-}
-
-static void limit(struct planned_move *move, double ratio, double velocity, double accel) {
-    if (ratio <= 0)
-        return;
-    double speed = velocity / ratio;
-    move->cruise_v2 = min_of(move->cruise_v2, speed * speed);
-    move->accel = min_of(move->accel, accel / ratio);
-}
-
-// How far Z stays below the top of the cone.
-static double below_cone(const struct planner_limits *l, const double at[4]) {
-    double down_x = l->cone_slope[0] * at[AXIS_X], down_y = l->cone_slope[1] * at[AXIS_Y];
-    return l->cone_top - sqrt(down_x * down_x + down_y * down_y) - at[AXIS_Z];
-}
-
-// Above the box Z stays within the cone; the way between a point of the box outside of the cone and one above
-// the box need not lie in either.
-static int check_cone(struct planner *p, const double target[4]) {
-    const struct planner_limits *l = &p->limits;
-    double box_top = l->position_max[AXIS_Z] + POSITION_EPS;
-    int from_above = p->position[AXIS_Z] > box_top, to_above = target[AXIS_Z] > box_top;
-    if (!from_above && !to_above)
-        return 0;
-    double room = below_cone(l, target);
-    if (room >= -POSITION_EPS && (from_above || below_cone(l, p->position) >= -POSITION_EPS))
-        return 0;
-    double high = room >= -POSITION_EPS ? l->position_max[AXIS_Z] : target[AXIS_Z] + room;
-    return refuse(p, PLANNER_OUTSIDE, AXIS_Z, target[AXIS_Z], l->position_min[AXIS_Z], high);
-}
-
-static int check_range(struct planner *p, const double delta[4], const double target[4]) {
-    int has_cone = p->limits.cone_slope[0] > 0 || p->limits.cone_slope[1] > 0;
-    for (int axis = 0; axis < 3; axis++) {
-        if (delta[axis] == 0)
-            continue;
-        double low = p->limits.position_min[axis], high = p->limits.position_max[axis];
-        if (has_cone && axis == AXIS_Z)
-            high = max_of(high, p->limits.cone_top);
-        if (!(p->homed >> axis & 1))
-            return refuse(p, PLANNER_NOT_HOMED, axis, target[axis], low, high);
-        if (!(target[axis] >= low - POSITION_EPS && target[axis] <= high + POSITION_EPS))
-            return refuse(p, PLANNER_OUTSIDE, axis, target[axis], low, high);
-    }
-    return has_cone ? check_cone(p, target) : 0;
-}
-
-// Limits of a move along X Y Z that may print, from its ratios.
-static int check_path(struct planner *p, struct planned_move *move, double delta_e) {
-    const struct planner_limits *l = &p->limits;
-    double ratio = move->ratio[AXIS_E];
-    limit(move, fabs(move->ratio[AXIS_Z]), l->max_z_velocity, l->max_z_accel);
-    if (ratio > l->max_extrude_ratio && delta_e > l->max_extrude_ratio * TINY_PATH)
-        return refuse(p, PLANNER_EXTRUDE_RATIO, AXIS_E, ratio, 0, l->max_extrude_ratio);
-    if (ratio < 0 || ratio > l->max_extrude_ratio)
-        limit(move, fabs(ratio), l->max_extrude_only_velocity, l->max_extrude_only_accel);
-    return 0;
-}
-
-static int check_extrude_only(struct planner *p, struct planned_move *move) {
-    const struct planner_limits *l = &p->limits;
-    if (!(move->length <= l->max_extrude_only_distance))
-        return refuse(p, PLANNER_EXTRUDE_LONG, AXIS_E, move->length, 0, l->max_extrude_only_distance);
-    limit(move, 1, l->max_extrude_only_velocity, l->max_extrude_only_accel);
-    return 0;
-}
-
-// Returns 1 when the move is to be added, 0 when it is too short, -1 when it is refused.
-static int describe(struct planner *p, struct planned_move *move, const double target[4], double speed) {
-    double delta[4];
-    for (int axis = 0; axis < 4; axis++)
-        delta[axis] = target[axis] - p->position[axis];
-    if (check_range(p, delta, target))
-        return -1;
-    if (!(fabs(delta[AXIS_E]) <= MAX_EXTRUSION))
-        return refuse(p, PLANNER_EXTRUDE_LONG, AXIS_E, delta[AXIS_E], 0, p->limits.max_extrude_only_distance);
-    if (!(speed >= MIN_SPEED))
-        return refuse(p, PLANNER_SPEED, 0, speed, MIN_SPEED, INFINITY);
-
-    double length = sqrt(delta[0] * delta[0] + delta[1] * delta[1] + delta[2] * delta[2]);
-    move->extrude_only = length < MIN_LENGTH;
-    if (move->extrude_only) {
-        delta[0] = delta[1] = delta[2] = 0;
-        length = fabs(delta[AXIS_E]);
-        if (length < MIN_LENGTH)
-            return 0;
-    }
-    double scale = 1 / length;
-    for (int axis = 0; axis < 4; axis++) {
-        move->start[axis] = p->position[axis];
-        move->ratio[axis] = delta[axis] * scale;
-    }
-    move->length = length;
-    move->accel = p->accel;
-    move->cruise_v2 = p->limits.max_velocity * p->limits.max_velocity;
-    if (speed < p->limits.max_velocity)
-        move->cruise_v2 = speed * speed;
-    if (move->extrude_only ? check_extrude_only(p, move) : check_path(p, move, delta[AXIS_E]))
-        return -1;
-    return 1;
 }
 
 // ---- Junctions
@@ -196,9 +74,9 @@ static void bound_start(struct planned_move *move, const struct planned_move *be
 
 int planner_add(struct planner *p, const double target[4], double speed) {
     if (p->tail - p->head == PLANNER_QUEUE)
-        return refuse(p, PLANNER_NO_FAULT, 0, 0, 0, 0);
+        return planner_refuse(p, PLANNER_NO_FAULT, 0, 0, 0, 0);
     struct planned_move *move = move_at(p, p->tail);
-    int what = describe(p, move, target, speed);
+    int what = planner_describe(p, move, target, speed);
     if (what <= 0) {
         p->moves_dropped += what == 0;
         return what;
@@ -219,7 +97,8 @@ int planner_add(struct planner *p, const double target[4], double speed) {
     for (int axis = 0; axis < 4; axis++)
         if (move->ratio[axis] != 0)
             p->position[axis] = target[axis];
-    move->pressure_advance = p->pressure_advance;
+    int prints = move->ratio[AXIS_E] > 0 && (move->ratio[AXIS_X] != 0 || move->ratio[AXIS_Y] != 0);
+    move->pressure_advance = prints ? p->pressure_advance : 0;
     move->line = p->line;
     p->tail++;
     p->moves_added++;

@@ -35,6 +35,8 @@ enum planner_fault_kind {
     PLANNER_EXTRUDE_LONG,  // value: mm of filament in one move of E alone, bound high
     PLANNER_EXTRUDE_RATIO, // value: mm of filament per mm of path, bound high
     PLANNER_SPEED,         // value: mm/s, below the bound low (or not a number)
+    PLANNER_TOO_FAR,       // value: mm from the Z axis at the end, bound high
+    PLANNER_TOO_NEAR,      // value: mm from the Z axis where the way is nearest, bound low
 };
 
 struct planner_fault {
@@ -73,8 +75,8 @@ struct planner {
     struct planner_limits limits; // may change between moves; holds for moves added later
     double accel;                 // mm/s² asked for, at most limits.max_accel
     double position[4];           // mm, end of the last move added
-    double pressure_advance;      // s; this and the line are noted with moves added later
-    int64_t line;                 // of the program; 0: none
+    double pressure_advance;      // s; holds for the moves added later that print (E forward, X or Y moves)
+    int64_t line;                 // of the program, noted with moves added later; 0: none
     uint32_t homed;               // bit per axis X Y Z
     double plan_until;            // print time, s: planner_ready says no when trapezoids reach beyond it
     struct planner_fault fault;   // why planner_add said no

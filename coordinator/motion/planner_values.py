@@ -46,6 +46,8 @@ class FaultKind(IntEnum):
     EXTRUDE_LONG = lib.PLANNER_EXTRUDE_LONG
     EXTRUDE_RATIO = lib.PLANNER_EXTRUDE_RATIO
     SPEED = lib.PLANNER_SPEED
+    TOO_FAR = lib.PLANNER_TOO_FAR
+    TOO_NEAR = lib.PLANNER_TOO_NEAR
 
 
 @record
@@ -79,6 +81,14 @@ _FAULTS: Mapping[FaultKind, Callable[[Fault], str]] = {
     ),
     FaultKind.SPEED: lambda f: (
         f"the speed is {f.value:.4g} mm/s, which is not above 0; give a positive F (mm/min)"
+    ),
+    FaultKind.TOO_FAR: lambda f: (
+        f"the move ends {f.value:.6g} mm from the middle, more than {f.high:.6g} mm; correct the program, "
+        "or the radius that the machine's configuration allows"
+    ),
+    FaultKind.TOO_NEAR: lambda f: (
+        f"the move passes the middle at {f.value:.6g} mm, nearer than {f.low:.6g} mm, which the arm cannot "
+        "reach; go around it"
     ),
 }
 

@@ -3,6 +3,8 @@
 import dataclasses
 import math
 import random
+from functools import reduce
+from operator import xor
 
 import numpy as np
 import pytest
@@ -38,8 +40,15 @@ def wiggle(count: int, step_mm: float, seed: int = 1) -> bytes:
 
 
 def number(text: bytes) -> tuple[int, float]:
-    value = ffi.new("double *")
-    return lib.gcode_number(text, len(text), value), value[0]
+    """Read a number: alone, where it is read digit by digit, and as every number in a text, eight at once."""
+    alone, within = ffi.new("double *"), ffi.new("double *")
+    taken = lib.gcode_number(text, len(text), alone)
+    for behind in (b"\n0123456789.0123456789", b" /:@\x80\xff\x7f Y1.5 E7 and more", b"\0" * 20):
+        within[0] = 0
+        assert lib.gcode_number(text + behind, len(text + behind), within) == taken
+        assert math.copysign(1, within[0]) == math.copysign(1, alone[0])
+        assert within[0] == alone[0]
+    return taken, alone[0]
 
 
 # ---- Numbers ----
@@ -321,6 +330,39 @@ def test_moves_without_length_are_dropped_and_nothing_is_lost() -> None:
     assert t["start"][-1][0] + 10 == pytest.approx(20.000001, abs=2e-9)
     check_invariants(t, end=planner.toolhead_position)
     assert planner.toolhead_position[0] == pytest.approx(20.000001, abs=1e-12)
+
+
+def test_the_commands_between_moves_that_are_read_with_them() -> None:
+    planner = homed_planner()
+    text = b"""M204 P2000
+G92 X5 E-1.5 ; X 0 reads as 5
+G1 X15 F12000
+m204 T1000 (travel)
+G1 X25
+N7 M204 S5000 P1*27
+G92
+G1 X10
+"""
+    feed = planner.feed(text, 0, len(text), final=True)
+    assert feed == (FeedStatus.OTHER_LINE, text.index(b"N7"), 6), "a wrong checksum is for Python"
+    text = text.replace(b"*27", b"*%d" % reduce(xor, b"N7 M204 S5000 P1"))
+    feed = planner.feed(text, feed.offset, len(text), final=True)
+    assert feed == (FeedStatus.NEED_DATA, len(text), 9)
+    t = joined(flushed(planner))
+    assert t["accel"].tolist() == [2000, 1000, 5000]
+    assert t["start"][:, 0].tolist() == [0, 10, 20]
+    assert planner.gcode_base == (20, 0, 0, 0)
+    planner.set_accel_words({"P": 3000})
+    assert planner.accel == 3000, "S forgot P and T"
+
+
+@pytest.mark.parametrize(
+    "line", [b"M204 S10001", b"M204 S0", b"M204", b"M204 P-1", b"M204 X1", b"G92 F1", b"G92.1"]
+)
+def test_commands_that_python_has_to_judge(line: bytes) -> None:
+    planner = homed_planner()
+    assert planner.feed(line, 0, len(line), final=True) == (FeedStatus.OTHER_LINE, 0, 1)
+    assert planner.accel == LIMITS.max_accel
 
 
 def test_a_change_of_acceleration_holds_from_its_place_on() -> None:

@@ -1,0 +1,73 @@
+"""What of the machine a program may change while it runs: extruders, carriages, shapers, pressure advance.
+
+A ``MachineState`` is what holds for the lines to come; the events that ``machine_commands`` emits carry each
+change to step generation at its print time.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from coordinator.kinematics.dual_carriage import CarriageState, DualCarriage
+from coordinator.kinematics.extruder import ExtruderMotion
+from coordinator.motion.specs import MotionLimits
+from nodes.records import record
+
+SHAPER_AXES = "XYZ"
+SHAPER_PERIODS = 2.0
+"""No shaper is wider than this many periods of its frequency."""
+
+
+@record
+class Shaper:
+    """How an axis is shaped."""
+
+    kind: str = "mzv"
+    frequency_hz: float = 0.0
+    """0: the axis is not shaped."""
+    damping_ratio: float = 0.1
+
+    @property
+    def width_s(self) -> float:
+        """No wider than this."""
+        return SHAPER_PERIODS / self.frequency_hz if self.frequency_hz else 0.0
+
+
+@dataclass(slots=True)
+class Extruder:
+    """What a program may change of one extruder."""
+
+    name: str
+    limits: MotionLimits
+    pressure_advance_s: float = 0.0
+    smooth_s: float = 0.0
+
+
+@dataclass(slots=True)
+class MachineState:
+    """What the machine is like for the next line."""
+
+    extruders: dict[str, Extruder] = field(default_factory=dict)
+    """By name; tool Tn is the n-th."""
+    filament: ExtruderMotion | None = None
+    """Which steppers move with the active extruder; None on a machine without one."""
+    carriages: DualCarriage | None = None
+    carriage_state: CarriageState | None = None
+    """None on a machine with one carriage."""
+    shapers: dict[str, Shaper] = field(default_factory=dict)
+    """By axis letter."""
+
+    @property
+    def active(self) -> Extruder | None:
+        """The extruder that E stands for."""
+        return self.extruders[self.filament.active] if self.filament and self.filament.active else None
+
+    def tool(self, number: int) -> Extruder | None:
+        """Return the extruder of tool NUMBER, or None."""
+        every = list(self.extruders.values())
+        return every[number] if number < len(every) else None
+
+    def settle_s(self, shapers: Mapping[str, Shaper] | None = None, smooth_s: float = 0.0) -> float:
+        """Return for how long steps may go on after the last move, also with other SHAPERS and SMOOTH_S."""
+        widths = [shaper.width_s for shaper in (*self.shapers.values(), *(shapers or {}).values())]
+        smooth = [extruder.smooth_s for extruder in self.extruders.values()]
+        return max([0.0, smooth_s, *widths, *smooth])

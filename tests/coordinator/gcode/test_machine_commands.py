@@ -1,0 +1,235 @@
+"""Commands that change the machine: what the planner and the events are told, from which print time on."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from coordinator.gcode.errors import GCodeError
+from coordinator.gcode.events import (
+    End,
+    Event,
+    Full,
+    MachineChange,
+    Notice,
+    PositionSet,
+    Progress,
+    Reply,
+    ShaperChange,
+    SmoothTimeChange,
+    WeightsChange,
+)
+from coordinator.gcode.interpreter import Job
+from coordinator.gcode.machine_state import Extruder, MachineState, Shaper
+from coordinator.gcode.program import Program
+from coordinator.kinematics.dual_carriage import Carriage, DualCarriage
+from coordinator.kinematics.extruder import ExtruderMotion
+from coordinator.motion.planner import Planner
+from tests.coordinator.motion.planner_helpers import LIMITS, Array, check_invariants, drain, joined
+
+HOME = {"X": 0.0, "Y": 0.0, "Z": 0.0}
+IDEX = DualCarriage(
+    0,
+    (
+        Carriage(0, 200, 0, (("stepper_x", (1, 0, 0, 0)),)),
+        Carriage(50, 250, 250, (("dual", (1, 0, 0, 0)),)),
+    ),
+    40,
+)
+SMALL = replace(LIMITS, max_extrude_only_distance=2)
+
+
+def about(value: float) -> Any:
+    """VALUE but for rounding."""
+    return pytest.approx(value)
+
+
+def machine(shapers: dict[str, Shaper] | None = None) -> MachineState:
+    """A machine with two carriages, two extruders and a stepper that follows the first of them."""
+    return MachineState(
+        {
+            "extruder": Extruder("extruder", LIMITS, 0.05, 0.04),
+            "extruder1": Extruder("extruder1", SMALL, 0.02, 0.03),
+        },
+        ExtruderMotion(
+            ("extruder", "extruder1"),
+            "extruder",
+            {"extruder": "extruder", "extruder1": "extruder1", "belted": ""},
+        ),
+        IDEX,
+        IDEX.home,
+        shapers or {},
+    )
+
+
+def run(*lines: str, on: MachineState | None = None) -> tuple[list[Event], Array, Job]:
+    job = Job(Program.from_lines(lines, "part.gcode"), Planner(LIMITS), HOME, on or machine())
+    events: list[Event] = []
+    pieces: list[Array] = []
+    while not (events and isinstance(events[-1], End)):
+        event = job.step()
+        pieces += drain(job.planner)
+        if isinstance(event, MachineChange | PositionSet):
+            assert job.planner.at_standstill
+        if not isinstance(event, Progress | Full | Notice):
+            events.append(event)
+    return events, joined(pieces), job
+
+
+def changes(events: list[Event]) -> list[Event]:
+    return [event for event in events if isinstance(event, MachineChange)]
+
+
+def ends(t: Array) -> list[float]:
+    return [float(end) for end in t["print_time"] + t["accel_s"] + t["cruise_s"] + t["decel_s"]]
+
+
+# ---- Pressure advance ----
+
+
+def test_an_advance_holds_from_its_line_on_and_stops_nothing() -> None:
+    events, t, _ = run(
+        "G28", "M83", "G1 X10 E1 F6000", "SET_PRESSURE_ADVANCE ADVANCE=0.1", "G1 X20 E1",
+        "SET_PRESSURE_ADVANCE EXTRUDER=extruder1 ADVANCE=0.3", "G1 X30 E1",
+    )  # fmt: skip
+    assert t["pressure_advance"].tolist() == [0.05, 0.1, 0.1]
+    assert not changes(events)
+    assert (t["start_v"][1:] > 50).all(), "the machine does not stop for it"
+    check_invariants(t)
+
+
+def test_a_smooth_time_comes_after_a_rest_as_wide_as_both_windows() -> None:
+    events, t, job = run(
+        "G28", "G1 X10 F6000", "SET_PRESSURE_ADVANCE SMOOTH_TIME=0.2 ADVANCE=0.01", "G1 X20",
+        "SET_PRESSURE_ADVANCE SMOOTH_TIME=0.2", "SET_PRESSURE_ADVANCE",
+    )  # fmt: skip
+    at = ends(t)[0] + 0.2
+    assert changes(events) == [SmoothTimeChange(3, "extruder", 0.2, about(at))]
+    assert t["print_time"][1] == pytest.approx(at)
+    assert Reply(6, "extruder: ADVANCE=0.01 SMOOTH_TIME=0.2") in events
+    assert job.planner.pressure_advance == 0.01
+
+
+# ---- Shapers ----
+
+
+def test_shapers_change_at_rest_and_only_where_they_do() -> None:
+    on = machine({"X": Shaper("ei", 40, 0.05)})
+    events, t, job = run(
+        "G28", "G1 X10 F6000", "SET_INPUT_SHAPER SHAPER_FREQ_Y=20 SHAPER_TYPE_Y=ZVD", "G1 X20",
+        "SET_INPUT_SHAPER SHAPER_FREQ_Y=20", "SET_INPUT_SHAPER SHAPER_TYPE=mzv DAMPING_RATIO_X=0", "G1 X30",
+        "SET_INPUT_SHAPER SHAPER_FREQ_X=0", "G1 X40", "SET_INPUT_SHAPER",
+        on=on,
+    )  # fmt: skip
+    end = ends(t)
+    assert changes(events) == [
+        ShaperChange(3, "Y", "zvd", 20, 0.1, about(end[0] + 0.1)),
+        ShaperChange(6, "X", "mzv", 40, 0, about(end[1] + 0.1)),
+        ShaperChange(6, "Y", "mzv", 20, 0.1, about(end[1] + 0.1)),
+        ShaperChange(8, "X", "mzv", 0, 0, about(end[2] + 0.1)),
+    ]
+    assert t["print_time"][1:].tolist() == pytest.approx([e + 0.1 for e in end[:3]])
+    told = [event.text for event in events if isinstance(event, Reply)]
+    assert told[0].startswith(
+        "SHAPER_TYPE_X=mzv SHAPER_FREQ_X=0 DAMPING_RATIO_X=0 SHAPER_TYPE_Y=mzv SHAPER_FREQ"
+    )
+    assert job.machine.shapers["Y"] == Shaper("mzv", 20, 0.1)
+
+
+# ---- Extruders ----
+
+
+def test_another_extruder_brings_its_limits_its_advance_and_its_steppers() -> None:
+    events, t, job = run(
+        "G28", "M83", "G1 X10 E1 F6000", "T1", "G1 X20 E1", "T1", "SYNC_EXTRUDER_MOTION EXTRUDER=belted "
+        "MOTION_QUEUE=extruder1", "ACTIVATE_EXTRUDER EXTRUDER=extruder", "G1 X30 E1",
+    )  # fmt: skip
+    end = ends(t)
+    still, moves = (0, 0, 0, 0), (0, 0, 0, 1)
+    assert changes(events) == [
+        WeightsChange(4, {"extruder": still, "extruder1": moves, "belted": still}, about(end[0] + 0.04)),
+        WeightsChange(7, {"extruder": still, "extruder1": moves, "belted": moves}, about(end[1] + 0.04)),
+        WeightsChange(8, {"extruder": moves, "extruder1": still, "belted": still}, about(end[1] + 0.08)),
+    ]
+    assert t["pressure_advance"].tolist() == [0.05, 0.02, 0.05]
+    assert job.machine.active is job.machine.extruders["extruder"]
+    with pytest.raises(GCodeError, match=r"part.gcode:4: the move pushes 3 mm of filament at once"):
+        run("G28", "G1 E3", "T1", "G1 E6")
+
+
+def test_one_extruder_needs_no_change() -> None:
+    assert not changes(run("T0", on=MachineState())[0])
+    with pytest.raises(GCodeError, match="this machine has only T0"):
+        run("T1", on=MachineState())
+
+
+# ---- Carriages ----
+
+
+def test_the_carriages_take_turns_copy_and_mirror() -> None:
+    events, t, job = run(
+        "G28", "G1 X100 F6000", "SET_DUAL_CARRIAGE CARRIAGE=1", "G1 X200", "SET_DUAL_CARRIAGE CARRIAGE=0",
+        "SET_DUAL_CARRIAGE CARRIAGE=1 MODE=mirror", "G1 X90", "G28", "G1 X10",
+    )  # fmt: skip
+    weights = [e.weights for e in events if isinstance(e, WeightsChange)]
+    one, other = (1, 0, 0, 0), (0, 0, 0, 0)
+    assert weights == [
+        {"stepper_x": other, "dual": one},
+        {"stepper_x": one, "dual": other},
+        {"stepper_x": one, "dual": (-1, 0, 0, 0)},
+        {"stepper_x": one, "dual": other},
+    ]
+    at = [event.position[0] for event in events if isinstance(event, PositionSet)]
+    assert at == [0, 250, 100, 0], "homed, the other carriage, the first again, homed"
+    assert t["start"][:, 0].tolist() == [0, 250, 100, 0]
+    where = [type(e) for e in events if isinstance(e, WeightsChange | PositionSet)]
+    assert where[1:3] == [WeightsChange, PositionSet], "the position is of the new head"
+    assert job.machine.carriage_state == IDEX.home
+
+
+@pytest.mark.parametrize(
+    ("lines", "sentence"),
+    [
+        (["G28", "G1 X211"], ":2: the move goes to X 211 mm, outside 0 to 200 mm"),
+        (
+            ["G28", "G1 X180", "SET_DUAL_CARRIAGE CARRIAGE=1", "G1 X215"],
+            ":4: the move goes to X 215 mm",
+        ),
+        (
+            ["G28", "SET_DUAL_CARRIAGE CARRIAGE=0 MODE=COPY"],
+            ":2: carriage 0 is the primary and cannot",
+        ),
+        (["SET_DUAL_CARRIAGE CARRIAGE=1"], ":1: SET_DUAL_CARRIAGE comes before X is homed"),
+        (["SET_DUAL_CARRIAGE"], ":1: SET_DUAL_CARRIAGE has no CARRIAGE; add CARRIAGE="),
+        (["SET_DUAL_CARRIAGE CARRIAGE=2"], ":1: CARRIAGE of SET_DUAL_CARRIAGE is '2'; give 0 or 1"),
+        (["SET_DUAL_CARRIAGE CARRIAGE=1 MODE=x"], ":1: MODE of SET_DUAL_CARRIAGE is 'X'; there are PRIMARY"),
+        (["SET_PRESSURE_ADVANCE ADVANCE=-1"], ":1: ADVANCE of SET_PRESSURE_ADVANCE is -1; 0 to 10 are"),
+        (
+            ["SET_PRESSURE_ADVANCE ADVANCE=x"],
+            ":1: ADVANCE of SET_PRESSURE_ADVANCE is 'x', which is",
+        ),
+        (["SET_PRESSURE_ADVANCE K=1"], ":1: SET_PRESSURE_ADVANCE has no parameter 'K'; it takes ADVANCE"),
+        (
+            ["SET_PRESSURE_ADVANCE EXTRUDER=e ADVANCE=1"],
+            ":1: SET_PRESSURE_ADVANCE names the extruder 'e'",
+        ),
+        (["SET_INPUT_SHAPER SHAPER_TYPE=box"], ":1: SET_INPUT_SHAPER names the shaper 'box'; there are zv"),
+        (
+            ["SET_INPUT_SHAPER SHAPER_FREQ_X=0.1"],
+            ":1: SHAPER_FREQ_X of SET_INPUT_SHAPER is 0.1; give 0 or",
+        ),
+        (["SET_INPUT_SHAPER DAMPING_RATIO_Z=1"], ":1: DAMPING_RATIO_Z of SET_INPUT_SHAPER is 1; 0 to 0.999"),
+        (
+            ["SYNC_EXTRUDER_MOTION EXTRUDER=nix MOTION_QUEUE="],
+            ":1: there is no extruder stepper 'nix'",
+        ),
+        (["SYNC_EXTRUDER_MOTION EXTRUDER=belted"], ":1: SYNC_EXTRUDER_MOTION has no MOTION_QUEUE"),
+        (["ACTIVATE_EXTRUDER"], ":1: ACTIVATE_EXTRUDER has no EXTRUDER"),
+        (["T2"], ":1: T2 selects a tool that does not exist; this machine has T0 to T1"),
+    ],
+)
+def test_what_cannot_be_is_told_in_one_sentence(lines: list[str], sentence: str) -> None:
+    with pytest.raises(GCodeError) as caught:
+        run(*lines)
+    assert str(caught.value).startswith(f"part.gcode{sentence}")
+    assert "\n" not in str(caught.value)
