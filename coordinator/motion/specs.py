@@ -1,6 +1,7 @@
 """What motion is told about the machine: plain values, checked by whoever builds them."""
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +45,28 @@ class NodeStreamSpec:
     reset_step_clock_id: int
 
 
+class StepKinematics(IntEnum):
+    """What a stepper's position is as a function of the axes; the numbers are those of steps.h."""
+
+    LINEAR = 0
+    """Sum of weights times axes."""
+    DELTA = 1
+    """Height of a carriage; params: arm², tower x, tower y."""
+    DELTESIAN = 2
+    """Height of a carriage; params: arm², arm x."""
+    POLAR_RADIUS = 3
+    """Distance from the Z axis."""
+    POLAR_ANGLE = 4
+    """Angle around the Z axis, unwrapped, rad."""
+    ROTARY_DELTA = 5
+    """Angle of an upper arm, rad; params: see kinematics/rotary_delta.py."""
+    WINCH = 6
+    """Distance from the anchor; params: x, y, z."""
+
+
 @dataclass(frozen=True, slots=True)
 class StepperSpec:
-    """One stepper of a linear kinematics."""
+    """One stepper."""
 
     name: str
     node: int

@@ -1,0 +1,28 @@
+"""Cartesian: each rail moves one axis. Formulas: none, a rail's position is the axis' position."""
+
+from dataclasses import dataclass
+
+from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
+
+
+@dataclass(frozen=True, slots=True)
+class Cartesian:
+    """Three axes with motors of their own."""
+
+    work_space: WorkSpace
+    name = "cartesian"
+    rails = ("x", "y", "z")
+    homing_order = (("x",), ("y",), ("z",))
+
+    def step_functions(self) -> tuple[StepFunction, ...]:
+        """Return the rails' functions."""
+        return (linear(x=1), linear(y=1), linear(z=1))
+
+    def inverse(self, point: Point) -> tuple[float, ...]:
+        """Return the rails' positions."""
+        return point
+
+    def forward(self, positions: tuple[float, ...]) -> Point:
+        """Return the head's place."""
+        x, y, z = positions
+        return (x, y, z)

@@ -1,0 +1,34 @@
+"""CoreXY: two motors that stand still move the head along X and Y by crossed belts.
+
+Both motors turning the same way move along X, against each other along Y: a = x + y, b = x - y, and so x =
+(a + b) / 2, y = (a - b) / 2. Source: I. Moyer, https://corexy.com/theory.html, with the belts scaled so
+that a motor alone moves its rail by the same way as on a cartesian machine.
+"""
+
+from dataclasses import dataclass
+
+from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
+
+
+@dataclass(frozen=True, slots=True)
+class CoreXY:
+    """Rail x has the motor that moves by x + y, rail y the one that moves by x - y."""
+
+    work_space: WorkSpace
+    name = "corexy"
+    rails = ("x", "y", "z")
+    homing_order = (("x",), ("y",), ("z",))
+
+    def step_functions(self) -> tuple[StepFunction, ...]:
+        """Return the rails' functions."""
+        return (linear(x=1, y=1), linear(x=1, y=-1), linear(z=1))
+
+    def inverse(self, point: Point) -> tuple[float, ...]:
+        """Return the rails' positions."""
+        x, y, z = point
+        return (x + y, x - y, z)
+
+    def forward(self, positions: tuple[float, ...]) -> Point:
+        """Return the head's place."""
+        a, b, c = positions
+        return ((a + b) / 2, (a - b) / 2, c)

@@ -1,0 +1,134 @@
+"""Every kinematics, on random machines: the formulas both ways, and that the work space is reachable."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coordinator.kinematics.base import Kinematics, Point, StepFunction
+from coordinator.motion.specs import StepKinematics
+from tests.coordinator.kinematics.machines import MACHINES, number, points
+
+EVERY = pytest.mark.parametrize("name", MACHINES)
+STEP = 1e-4
+"""mm, for differences."""
+
+
+def machine_and_point(data: st.DataObject, name: str) -> tuple[Kinematics, Point]:
+    machine = data.draw(MACHINES[name])
+    return machine, data.draw(points(machine.work_space))
+
+
+@EVERY
+@given(data=st.data())
+def test_forward_undoes_inverse_over_the_work_space(name: str, data: st.DataObject) -> None:
+    machine, point = machine_and_point(data, name)
+    again = machine.forward(machine.inverse(point))
+    assert again == pytest.approx(point, abs=1e-6)
+
+
+@EVERY
+@given(data=st.data())
+def test_inverse_undoes_forward(name: str, data: st.DataObject) -> None:
+    machine, point = machine_and_point(data, name)
+    positions = machine.inverse(point)
+    assert machine.inverse(machine.forward(positions)) == pytest.approx(positions, abs=1e-6)
+
+
+@EVERY
+@given(data=st.data())
+def test_the_names_fit(name: str, data: st.DataObject) -> None:
+    machine, point = machine_and_point(data, name)
+    assert machine.name == name
+    assert len(machine.rails) == len(machine.step_functions()) == len(machine.inverse(point))
+    homed = [rail for group in machine.homing_order for rail in group]
+    assert len(set(homed)) == len(homed)
+    if name != "generic_cartesian":
+        assert set(homed) <= set(machine.rails)
+
+
+def upper_arm_angle(params: tuple[float, ...], point: Point) -> float:
+    """Find the angle by bisection on the lower arm's length, instead of by the formula."""
+    upper, lower, radius, height, cos, sin = params
+    outward, beside = point[0] * cos + point[1] * sin, point[1] * cos - point[0] * sin
+
+    def too_long(angle: float) -> float:
+        elbow = (radius + upper * math.cos(angle), 0.0, height + upper * math.sin(angle))
+        return math.dist(elbow, (outward, beside, point[2])) - lower
+
+    # From the elbow's nearest place, outwards and up, the lower arm gets longer.
+    low = math.atan2(point[2] - height, outward - radius)
+    high = low + math.pi
+    for _ in range(80):
+        middle = (low + high) / 2
+        low, high = (low, middle) if too_long(middle) > 0 else (middle, high)
+    return math.remainder(low, math.tau)
+
+
+Formula = Callable[[tuple[float, ...], Point], float]
+
+FORMULAS: dict[StepKinematics, Formula] = {
+    StepKinematics.LINEAR: lambda p, at: p[0] * at[0] + p[1] * at[1] + p[2] * at[2],
+    StepKinematics.DELTA: lambda p, at: at[2] + math.sqrt(p[0] - (p[1] - at[0]) ** 2 - (p[2] - at[1]) ** 2),
+    StepKinematics.DELTESIAN: lambda p, at: at[2] + math.sqrt(p[0] - (p[1] - at[0]) ** 2),
+    StepKinematics.POLAR_RADIUS: lambda _, at: math.hypot(at[0], at[1]),
+    StepKinematics.POLAR_ANGLE: lambda _, at: math.atan2(at[1], at[0]),
+    StepKinematics.WINCH: math.dist,
+    StepKinematics.ROTARY_DELTA: upper_arm_angle,
+}
+"""A rail's position as step generation is to compute it, from the parameters (LINEAR: the weights) alone."""
+
+
+def evaluate(function: StepFunction, point: Point) -> float:
+    linear = function.kinematics is StepKinematics.LINEAR
+    return FORMULAS[function.kinematics](function.weights if linear else function.params, point)
+
+
+@EVERY
+@given(data=st.data())
+def test_step_generation_is_told_the_same(name: str, data: st.DataObject) -> None:
+    machine, point = machine_and_point(data, name)
+    positions = [evaluate(function, point) for function in machine.step_functions()]
+    assert positions == pytest.approx(machine.inverse(point), abs=1e-9)
+
+
+@EVERY
+@given(data=st.data())
+def test_no_rail_is_much_faster_than_the_head(name: str, data: st.DataObject) -> None:
+    """What the work space is for: no rail comes near a place where it would need to be infinitely fast."""
+    machine, point = machine_and_point(data, name)
+    allowed = {"deltesian": 1 / math.tan(math.radians(5)), "polar": math.inf, "generic_cartesian": 6}
+    direction = data.draw(st.tuples(number(-1, 1), number(-1, 1), number(-1, 1)).filter(any))
+    length = math.hypot(*direction) or 1.0
+    inward = [-1 if p > 0 else 1 for p in point]  # stay inside
+    near = tuple(p + s * STEP * abs(d) / length for p, s, d in zip(point, inward, direction, strict=True))
+    before, after = machine.inverse(point), machine.inverse((near[0], near[1], near[2]))
+    scale = [
+        f.params[0] if f.kinematics is StepKinematics.ROTARY_DELTA else 1.0 for f in machine.step_functions()
+    ]
+    for a, b, mm_per_unit in zip(before, after, scale, strict=True):
+        assert abs(b - a) * mm_per_unit <= STEP * (allowed.get(name, 1 + math.hypot(3, 1)) + 1e-3)
+
+
+@pytest.mark.parametrize("name", ["delta", "deltesian", "rotary_delta"])
+@given(data=st.data())
+def test_no_endstop_is_overrun_in_the_work_space(name: str, data: st.DataObject) -> None:
+    machine, point = machine_and_point(data, name)
+    ends = getattr(machine, "endstop_angles", None) or machine.endstop_positions  # type: ignore[attr-defined]
+    for position, end in zip(machine.inverse(point), ends, strict=False):
+        assert position <= end + 1e-3
+
+
+@EVERY
+@given(data=st.data())
+def test_the_work_space_contains_its_points_and_no_others(name: str, data: st.DataObject) -> None:
+    machine, point = machine_and_point(data, name)
+    space = machine.work_space
+    assert space.contains(point)
+    for axis in range(3):
+        for bound, away in ((space.low, -1e-3), (space.high, 1e-3)):
+            outside = list(point)
+            outside[axis] = bound[axis] + away
+            assert not space.contains((outside[0], outside[1], outside[2]))
