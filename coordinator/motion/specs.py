@@ -80,3 +80,5 @@ class StepperSpec:
     """Whether set_next_step_dir takes 0 for a positive step."""
     step_pulse_s: float
     """Shortest high time of the step pin; steps are never closer than two of them. 0: both edges step."""
+    kinematics: StepKinematics = StepKinematics.LINEAR
+    params: tuple[float, ...] = ()

@@ -90,6 +90,9 @@ class Signal:
     def breaks(self) -> Floats:
         return self.time[1:]
 
+    def scaled(self, factor: float) -> "Signal":
+        return Signal(self.time, factor * self.value, factor * self.speed, factor * self.accel)
+
 
 @dataclass(frozen=True)
 class Shaped:
