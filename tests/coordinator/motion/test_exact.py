@@ -243,3 +243,17 @@ def test_every_crossing_is_counted_and_solved() -> None:
     assert (np.abs(found - (t[at] + t[at + 1]) / 2) <= (t[1] - t[0]) / 2 + 1e-9).all()
     assert path.u(found) == pytest.approx(boundary, abs=1e-6)
     assert np.isnan(solve(path, boundary[:1], -direction[:1], found[:1], 1e-6)).all()
+
+
+def test_a_rest_just_below_a_boundary_is_a_step() -> None:
+    short = 1e-6  # of a step
+    moves = [make_move(1.0, ORIGIN, ((20.5 - short) * 0.00625, 0.0, 0.0, 0.0), (0.0, 20.0, 0.0), 1000.0)]
+    run = Run([stepper(0, X)], [NODES[0]])
+    batches = bytearray()
+    assert run.gen.append(np.array([m.row() for m in moves]), 1) == 1
+    assert run.gen.generate(9.0, flush=True)
+    while batch := run.gen.take_batch(0):
+        batches += batch
+    stream = replay(bytes(batches), NODES[0], [stepper(0, X)])["s0"]
+    verdict = check(proof_of(moves), stream, FREQ, 12.5e-6)
+    assert (verdict.emitted, verdict.wanted, verdict.outside) == (21, 21, 0)
