@@ -5,14 +5,18 @@
 Host and virtual nodes run with a clock that is FACTOR times as fast (fast_clock.c): the host prints FACTOR
 seconds of motion in every second, on a core of its own, the nodes execute every step of it on the others.
 All figures but the CPU time are in the seconds of that world: a lead of 500 ms lasts 50 ms of ours, and what
-the host computes counts ten times. At last, in real time: from the first G1 to the first step.
+the host computes counts ten times. The worker's lead is how far ahead of now its commands reach when it hands
+them over, smallest from a second after the start to the end of the file; a command's lead is from its arrival
+at the node until it is due, the start included. At last, in real time: from the first G1 to the first step.
 """
 
 import argparse
 import asyncio
 import json
+import math
 import os
 import re
+import resource
 import subprocess
 import sys
 import tempfile
@@ -25,7 +29,9 @@ from typing import Any
 from coordinator.app import Machine
 from coordinator.gcode.program import Program
 from coordinator.machine.description import CanConnection, MachineDescription, load_machine
+from coordinator.progress import Progress
 from coordinator.session import run_job
+from coordinator.streamer import Streamer
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import MAINBOARD, firmware_dictionary
 from nodes.virtual.hub import VirtualBus
@@ -35,7 +41,32 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
 FAST_CLOCK = ROOT / "build" / "bench" / "fast_clock.so"
 HOST_CORE = 0
-FIRST_MOVES = "G28\nG1 X10 F6000\nG1 X0\n"
+SETTLED_S = 1.0
+"""From the job's first motion until the look-ahead must be full."""
+TYPED_AFTER_NS = 1_000_000_000
+
+
+class Typed:
+    """A program that someone types: G28 at once, a G1 a second later, when the machine has long been idle."""
+
+    def __init__(self) -> None:
+        self.begun_ns = 0
+        self.typed_ns = 0
+        self._pieces = [b"G28\n", b"G1 X10 F6000\n"]
+
+    def read(self, _: int, /) -> bytes | None:
+        """Return what was typed, None when there is nothing, nothing at all at the end."""
+        now = time.monotonic_ns()
+        if len(self._pieces) == 2:
+            self.begun_ns = now
+        elif self._pieces and now < self.begun_ns + TYPED_AFTER_NS:
+            return None
+        else:
+            self.typed_ns = self.typed_ns or now
+        return self._pieces.pop(0) if self._pieces else b""
+
+    def close(self) -> None:
+        """Nothing to let go of."""
 
 
 def build_fast_clock() -> None:
@@ -94,36 +125,74 @@ def shortened(gcode: Path, lines: int | None, folder: Path) -> Path:
     return part
 
 
+class LeadWatch:
+    """Looks at the worker's lead whenever it hands commands over."""
+
+    def __init__(self) -> None:
+        self.machine: Machine | None = None
+        self.least_s = math.inf
+
+    def look(self, _: Progress) -> None:
+        """Take the lead as it is now."""
+        assert self.machine is not None
+        streamer = self.machine._job  # noqa: SLF001  (nobody but this bench needs to see into a running job)
+        if not isinstance(streamer, Streamer) or streamer.ended_s:
+            return
+        now = streamer.print_time_now()
+        if now > streamer.began_s + SETTLED_S:
+            self.least_s = min(self.least_s, streamer.steps.generated_until - now)
+
+    def note(self, machine: Machine) -> None:
+        """Learn of the machine once it is ready."""
+        self.machine = machine
+
+
+def host(config: Path, gcode: Path) -> None:
+    """Be the host: run GCODE and print what came of it as one JSON line."""
+    watch = LeadWatch()
+    with Program.open(gcode) as program:
+        job = run_job(
+            load_machine(str(config)), program, watch.look, on_told=lambda _: None, on_ready=watch.note
+        )
+        outcome = asyncio.run(job)
+    assert outcome.positions == outcome.issued, "the nodes counted other steps than were sent"
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    figures = {
+        "lead_s": watch.least_s,
+        "print_time_s": outcome.print_time_s,
+        "moves": outcome.moves,
+        "steps": outcome.steps,
+        "cpu_s": usage.ru_utime + usage.ru_stime,
+        "nodes": {
+            n.name: [n.link.min_lead_s, n.link.srtt_s, n.link.bytes_sent, n.link.bytes_repeated]
+            for n in outcome.nodes
+        },
+    }
+    print(json.dumps(figures))
+
+
 def stream(config: Path, gcode: Path, lines: int | None, factor: int) -> None:
     with tempfile.TemporaryDirectory() as name, fast_world(factor):
         folder = Path(name)
         with virtual_machine(config, folder) as played:
-            command = [str(Path(sys.executable).parent / "canductor"), "run", str(played)]
-            command += ["--gcode", str(shortened(gcode, lines, folder)), "--json"]
+            files = [str(played), str(shortened(gcode, lines, folder))]
+            command = ["taskset", "-c", str(HOST_CORE), sys.executable, __file__, "--host", *files]
             begin_s = time.monotonic()
-            with (folder / "out").open("w+b") as out:
-                process = subprocess.Popen(
-                    ["taskset", "-c", str(HOST_CORE), *command], stdout=out, stderr=out
-                )
-                _, status, usage = os.wait4(process.pid, 0)
-                process.returncode = os.waitstatus_to_exitcode(status)
-                out.seek(0)
-                text = out.read().decode()
+            done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
             took_s = time.monotonic() - begin_s
-    if process.returncode:
-        sys.exit(text)
-    report = json.loads(text.splitlines()[-1])
-    cpu_s = usage.ru_utime + usage.ru_stime
+    if done.returncode:
+        sys.exit(f"{gcode}: the job failed")
+    run: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     print(
-        f"{gcode.stem}, {config.stem}, {factor} times real time: {report['print_time_s']:.1f} s of print, "
-        f"{report['moves']:,} moves, {report['steps']:,} steps in {took_s:.1f} s; "
-        f"host {cpu_s:.1f} s of CPU on core {HOST_CORE} ({100 * cpu_s / took_s:.0f} %)"
+        f"{gcode.stem}, {config.stem}, {factor} times real time: {run['print_time_s']:.1f} s of print, "
+        f"{run['moves']:,} moves, {run['steps']:,} steps in {took_s:.1f} s; "
+        f"host {run['cpu_s']:.1f} s of CPU on core {HOST_CORE} ({100 * run['cpu_s'] / took_s:.0f} %)"
     )
-    for node, figures in report["nodes"].items():
-        lead = figures["min_lead_ms"]
+    print(f"  smallest lead of the worker {run['lead_s'] * 1e3:.0f} ms")
+    for node, (lead_s, round_trip_s, sent, repeated) in run["nodes"].items():
         print(
-            f"  {node}: smallest lead {lead} ms, round trip {figures['round_trip_us']:.0f} us, "
-            f"{figures['bytes_sent']:,} bytes, {figures['retransmitted_bytes']} of them again"
+            f"  {node}: smallest lead of a command {lead_s * 1e3:.0f} ms, "
+            f"round trip {round_trip_s * 1e6:.0f} us, {sent:,} bytes, {repeated:,} of them again"
         )
 
 
@@ -135,26 +204,20 @@ def first_step(description: MachineDescription, log: EdgeLog) -> int:
 
 
 def first_motion(config: Path) -> None:
-    """In real time: how long after the job begins the first step is done, by the node's own log."""
-    ready_ns = 0
-
-    def note(machine: Machine) -> None:
-        nonlocal ready_ns
-        ready_ns = machine.host.now()
-
+    """In real time: from reading a G1 at rest to the first step, by the node's own log."""
+    typed = Typed()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         with virtual_machine(config, folder, edges=True) as played:
-            gcode = folder / "first.gcode"
-            gcode.write_text(FIRST_MOVES)
             description = load_machine(str(played))
-            with Program.open(gcode) as program:
-                asyncio.run(
-                    run_job(description, program, lambda _: None, on_told=lambda _: None, on_ready=note)
-                )
+            with Program(typed, "typed") as program:
+                job = run_job(description, program, lambda _: None, on_told=lambda _: None)
+                asyncio.run(job)
         log = EdgeLog(folder / f"{description.nodes[0].name}.edges")
         first_ns = int(log.ticks_to_monotonic_ns(first_step(description, log)))
-    print(f"{config.stem}: first step {(first_ns - ready_ns) * 1e-6:.0f} ms after the job began with a G1")
+    print(
+        f"{config.stem}: first step {(first_ns - typed.typed_ns) * 1e-6:.0f} ms after the first G1 was read"
+    )
 
 
 def main() -> None:
@@ -162,7 +225,11 @@ def main() -> None:
     parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--factor", type=int, default=10)
     parser.add_argument("--lines", type=int, help="only so many lines of the file")
+    parser.add_argument("--host", action="store_true", help=argparse.SUPPRESS)
     chosen = parser.parse_args()
+    if chosen.host:
+        host(*chosen.files)
+        return
     configs = [f for f in chosen.files if f.suffix == ".cfg"]
     programs = [f for f in chosen.files if f.suffix != ".cfg"]
     config, program = DATA / "config/cartesian_plain.cfg", DATA / "gcode/vase.gcode"
