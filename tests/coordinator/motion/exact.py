@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.motion.specs import StepKinematics, StepperSpec
-from tests.coordinator.motion.exact_signal import Floats, Phases, Shaped, Signal, Smoothed
+from tests.coordinator.motion.exact_signal import REST_S, Floats, Phases, Shaped, Signal, Smoothed
 
 Ints = NDArray[np.int64]
 Impulses = tuple[tuple[float, float], ...]
@@ -116,7 +116,7 @@ class StepperPath:
         else:
             self._axes = [_axis(axis, 1.0, phases, setting) for axis in range(3)]
         self._origin = 0.0
-        self._origin = float(self.u(np.array([float(phases.time[0])]))[0]) - position
+        self._origin = float(self.u(np.array([REST_S]))[0]) - position
 
     def u(self, t: Floats, near: Floats | None = None) -> Floats:
         """Return the place at T; of an angle the turn that is next to NEAR (steps)."""

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 LONG_AGO_S = -1e6
+"""Begin of the rest before the first move; no time asked for lies before it."""
+REST_S = -1e3
+"""A time within that rest, whatever the delays."""
 BLOCK_S = 0.25
 """Antiderivatives are taken over stretches this long: their rounding grows with the square of it."""
 

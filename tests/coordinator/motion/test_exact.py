@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coordinator.motion.planner import TRAPEZOID
-from coordinator.motion.specs import StepKinematics
+from coordinator.motion.specs import StepKinematics, StepperSpec
 from tests.coordinator.motion.exact import INVERSE, Setting, StepperPath, crossings, solve
 from tests.coordinator.motion.exact_check import Epoch, StepperProof, check
 from tests.coordinator.motion.exact_signal import Floats, Phases, Shaped, Smoothed
@@ -228,21 +228,48 @@ def test_bad_steps_are_found(what: str) -> None:
     assert check(proof, stream, FREQ, 12.5e-6, [(0.0, t - 0.1)]).outside == 0
 
 
-def test_every_crossing_is_counted_and_solved() -> None:
-    moves = chain(9, 40)
-    spec = stepper(0, X)
-    path = StepperPath(spec, ORIGIN, trapezoids(moves), Setting({"X": ((0.5, -0.004), (0.5, 0.004))}), 0)
-    t: Floats = np.linspace(0.9, moves[-1].print_time + moves[-1].total_s + 0.1, 400_001)
+SHAPER = ((0.2, -0.006), (0.5, -0.001), (0.3, 0.017 / 3))
+SETTING = Setting({"X": SHAPER, "Y": ((0.5, -0.004), (0.5, 0.004))}, 0.04)
+AWAY: Position = (40.0, 30.0, 20.0, 0.0)
+LINEAR = {
+    "x": X,
+    "corexy": (1.0, -1.0, 0.0, 0.0),
+    "extruder": (0.0, 0.0, 0.0, 1.0),
+    "z": (0.0, 0.0, 1.0, 0.0),
+}
+
+
+def spec_of(kind: str) -> StepperSpec:
+    if kind in LINEAR:
+        return stepper(0, LINEAR[kind], 0.002 if kind == "extruder" else 0.00625)
+    found = next(k for k in PARAMS if k.name == kind)
+    rad = found in {StepKinematics.POLAR_ANGLE, StepKinematics.ROTARY_DELTA}
+    return replace(stepper(0, X, 1e-4 if rad else 0.00625), kinematics=found, params=PARAMS[found])
+
+
+@pytest.mark.parametrize("kind", [*LINEAR, *(k.name for k in PARAMS)])
+@pytest.mark.parametrize("setting", [Setting(), SETTING], ids=["plain", "shaped"])
+def test_every_crossing_is_counted_and_solved(kind: str, setting: Setting) -> None:
+    moves = trapezoids(chain(9, 40), 0.05)
+    moves["start"] += AWAY
+    path = StepperPath(spec_of(kind), AWAY, moves, setting, 0)
+    end = float(moves[-1]["print_time"]) + 0.5
+    assert path.u(np.array([0.5]))[0] == pytest.approx(0, abs=1e-9)
+    t: Floats = np.linspace(0.9, end, 400_001)
     place = np.floor(path.u(t) + 0.5).astype(np.int64)
-    count, end = crossings(path)
+    count, last = crossings(path)
     assert count == pytest.approx(int(np.abs(np.diff(place)).sum()), abs=4), "pairs between two samples"
-    assert end == place[-1]
+    assert last == place[-1]
     at = np.flatnonzero(np.abs(np.diff(place)) == 1)
+    assert len(at) > 100 or kind == "z"
     direction, boundary = np.diff(place)[at], (place[at] + place[at + 1]) / 2
-    found = solve(path, boundary, direction, (t[at] + t[at + 1]) / 2, float(t[1] - t[0]))
-    assert (np.abs(found - (t[at] + t[at + 1]) / 2) <= (t[1] - t[0]) / 2 + 1e-9).all()
+    middle, reach = (t[at] + t[at + 1]) / 2, float(t[1] - t[0])
+    found = solve(path, boundary, direction, middle, reach)
+    assert (np.abs(found - middle) <= reach / 2 + 1e-9).all()
     assert path.u(found) == pytest.approx(boundary, abs=1e-6)
     assert np.isnan(solve(path, boundary[:1], -direction[:1], found[:1], 1e-6)).all()
+    slope = (path.u(t[1:-1] + 1e-6) - path.u(t[1:-1] - 1e-6)) / 2e-6
+    assert np.median(np.abs(path.slope(t[1:-1]) - slope)) < 0.01
 
 
 def test_a_rest_just_below_a_boundary_is_a_step() -> None:
