@@ -101,6 +101,8 @@ class MachineDevices:
             step_distance=described.step_distance,
             invert_dir=described.dir_pin.invert,
             step_pulse_s=described.step_pulse_s,
+            kinematics=described.function.kinematics,
+            params=described.function.params,
         )
 
 

@@ -38,9 +38,9 @@ def linear(x: float = 0.0, y: float = 0.0, z: float = 0.0, e: float = 0.0) -> St
 
 @dataclass(frozen=True, slots=True)
 class WorkSpace:
-    """Where the head may be: a box, of which a cylinder around Z may be all that counts.
+    """Where the head may be: a box, of which a cylinder around Z may be all that counts, and a cone above.
 
-    Both are convex but for the hole, so that a straight move between two points within stays within.
+    Each is convex, so that a straight move between two points of the same one stays within; but for the hole.
     """
 
     low: Point
@@ -49,12 +49,24 @@ class WorkSpace:
     """Largest distance from the Z axis; 0: the box alone counts."""
     radius_min: float = 0.0
     """Smallest distance from the Z axis: a hole."""
+    cone_slope: tuple[float, float] = (0.0, 0.0)
+    """Slopes 0: no cone. Else the head may also be above the box, where homing leaves it, in the cone
+    z + √((sx·x)² + (sy·y)²) <= cone_top."""
+    cone_top: float = 0.0
 
     def contains(self, point: Point) -> bool:
         """Tell whether the head may be at POINT."""
         radius = math.hypot(point[0], point[1])
-        inside = all(a <= p <= b for a, p, b in zip(self.low, point, self.high, strict=True))
+        x, y, z = point
+        inside = all(a <= p <= b for a, p, b in zip(self.low[:2], (x, y), self.high[:2], strict=True))
+        if not self.low[2] <= z <= self.high[2]:
+            inside = inside and self._in_cone(point)
         return inside and radius >= self.radius_min and (radius <= self.max_radius or not self.max_radius)
+
+    def _in_cone(self, point: Point) -> bool:
+        x, y, z = point
+        down = math.hypot(self.cone_slope[0] * x, self.cone_slope[1] * y)
+        return any(self.cone_slope) and self.low[2] <= z <= self.cone_top - down
 
 
 class Kinematics(Protocol):

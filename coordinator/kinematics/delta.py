@@ -87,7 +87,8 @@ class Delta:
         """The cylinder in which no carriage overruns its endstop.
 
         A carriage is highest with the head as near to its tower as the cylinder lets it. In the middle the
-        head can be higher, up to where it is after homing, but from there it first has to go down.
+        head can be higher, up to where it is after homing. On the way down from there no carriage rises if
+        the way is at least as steep as the carriages there are fast: R / √(A² - R²).
         """
         radius = min(self.radius, self.widest_radius) if self.print_radius is None else self.print_radius
         nearest = max(self.radius - radius, 0.0)
@@ -95,4 +96,7 @@ class Delta:
             end - math.sqrt(tower.rod_length**2 - nearest**2)
             for tower, end in zip(self.towers, self.endstop_positions, strict=True)
         )
-        return WorkSpace((-radius, -radius, self.min_z), (radius, radius, top), max_radius=radius)
+        slope = max(self.radius / math.sqrt(t.rod_length**2 - self.radius**2) for t in self.towers)
+        low, high = (-radius, -radius, self.min_z), (radius, radius, top)
+        cone_top = min(tower.endstop_height for tower in self.towers)
+        return WorkSpace(low, high, max_radius=radius, cone_slope=(slope, slope), cone_top=cone_top)

@@ -84,4 +84,7 @@ class Deltesian:
             end - math.sqrt(arm.rod_length**2 - max(abs(arm.x) - half, 0.0) ** 2)
             for arm, end in zip(self._arms, self.endstop_positions, strict=True)
         )
-        return WorkSpace((-half, self.y_range[0], self.min_z), (half, self.y_range[1], top))
+        slope = max(abs(arm.x) / math.sqrt(arm.rod_length**2 - arm.x**2) for arm in self._arms)
+        low, high = (-half, self.y_range[0], self.min_z), (half, self.y_range[1], top)
+        cone_top = min(arm.endstop_height for arm in self._arms)
+        return WorkSpace(low, high, cone_slope=(slope, 0.0), cone_top=cone_top)

@@ -122,9 +122,18 @@ class RotaryDelta:
     def work_space(self) -> WorkSpace:
         """The cylinder in which no endstop is overrun and no arm nearly stretched."""
         radius = self._roomiest_radius() if self.print_radius is None else self.print_radius
-        return WorkSpace(
-            (-radius, -radius, self.min_z), (radius, radius, self._top(radius)), max_radius=radius
-        )
+        slope = self._cone_slope()
+        low, high = (-radius, -radius, self.min_z), (radius, radius, self._top(radius))
+        cone_top = min(self.endstop_height)
+        return WorkSpace(low, high, max_radius=radius, cone_slope=(slope, slope), cone_top=cone_top)
+
+    def _cone_slope(self) -> float:
+        """Return how steep the way down from the endstops must be so that no arm rises; see delta.py."""
+        slopes = []
+        for arm, angle in zip(self.arms, self.endstop_angles, strict=True):
+            outward = self.shoulder_radius + arm.upper_length * math.cos(max(0.0, -angle))
+            slopes.append(outward / math.sqrt(max(arm.lower_length**2 - outward**2, 1e-6)))
+        return max(slopes)
 
     def _roomiest_radius(self) -> float:
         """Return the radius of the cylinder with the largest volume: a wide one is low."""

@@ -1,30 +1,40 @@
 """From a configuration file to the description of a machine, in one call."""
 
+import re
+
 from coordinator.machine.config_file import ConfigFile, RawSection, parse_config
 from coordinator.machine.model import (
     CanConnection,
+    DualCarriageDescription,
     ExtruderDescription,
+    ExtruderStepperDescription,
     HomingDescription,
     MachineDescription,
     NodeDescription,
     NodePolicy,
     NotYetActing,
     RailDescription,
+    ShaperDescription,
     StepperDescription,
     UartConnection,
 )
-from coordinator.machine.pins import PinDescription, PinRegistry
+from coordinator.machine.pins import PinDescription
 from coordinator.machine.problem import ConfigError, Place, nearest
-from coordinator.machine.read_extruder import limits_without_extruder, read_extruder
+from coordinator.machine.read_extruder import limits_without_extruder, read_extruder_steppers, read_extruders
+from coordinator.machine.read_kinematics import PRINTER_SPECS, read_frame
 from coordinator.machine.read_nodes import check_policies, make_pin_registry, read_nodes
-from coordinator.machine.read_printer import read_printer
-from coordinator.machine.read_steppers import Weights, is_extra_stepper, read_rail
+from coordinator.machine.read_printer import open_printer, read_printer
+from coordinator.machine.read_shaper import read_shapers
+from coordinator.machine.read_steppers import is_extra_stepper
+from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_SECTIONS
 
 __all__ = [
     "CanConnection",
     "ConfigError",
+    "DualCarriageDescription",
     "ExtruderDescription",
+    "ExtruderStepperDescription",
     "HomingDescription",
     "MachineDescription",
     "NodeDescription",
@@ -33,17 +43,20 @@ __all__ = [
     "PinDescription",
     "Place",
     "RailDescription",
+    "ShaperDescription",
     "StepperDescription",
     "UartConnection",
     "load_machine",
 ]
 
-_SINGLE_SECTIONS = ("printer", "stepper_x", "stepper_y", "stepper_z", "extruder")
+_SINGLE_SECTIONS = ("printer", "stepper_x", "stepper_y", "stepper_z", "extruder", "input_shaper")
 _NAMED_SECTIONS = ("mcu", "board_pins", "duplicate_pin_override")
-_WEIGHTS: dict[str, tuple[Weights, Weights, Weights]] = {
-    "cartesian": ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)),
-    "corexy": ((1, 1, 0, 0), (1, -1, 0, 0), (0, 0, 1, 0)),
-}
+_MOTION_SECTIONS = re.compile(
+    r"stepper_([a-z]|bed|arm|left|right)|extruder[1-9]?|extruder1[0-5]|dual_carriage"
+    r"|(stepper|carriage|extra_carriage|dual_carriage|extruder_stepper) \S+",
+    re.ASCII,
+)
+"""Sections that have a place in some machine, besides further steppers."""
 
 
 def load_machine(path: str) -> MachineDescription:
@@ -55,30 +68,44 @@ def load_machine(path: str) -> MachineDescription:
     later: list[NotYetActing] = []
     _check_section_names(config)
     nodes = read_nodes(config, later)
-    pins = make_pin_registry(config, nodes)
-    printer = read_printer(_required(config, "printer"), later)
-    weights = _WEIGHTS[printer.kinematics]
-    rails = (
-        read_rail(config, "x", weights[0], pins, later),
-        read_rail(config, "y", weights[1], pins, later),
-        read_rail(config, "z", weights[2], pins, later),
-    )
-    extruder = None
-    limits = limits_without_extruder(printer, rails)
-    if "extruder" in config.sections:
-        extruder, limits = read_extruder(config.sections["extruder"], printer, rails, pins, later)
+    reading = Reading(config, make_pin_registry(config, nodes), later)
+    kinematics, reader = open_printer(_required(config, "printer"), PRINTER_SPECS)
+    printer = read_printer(reader)
+    frame = read_frame(reading, kinematics, reader)
+    reading.finish(reader)
+    space = frame.kinematics.work_space
+    extruders = read_extruders(reading, printer, space)
+    followers = read_extruder_steppers(reading, extruders)
+    shapers = read_shapers(reading)
     description = MachineDescription(
         path=config.path,
         nodes=nodes,
-        kinematics=printer.kinematics,
-        limits=limits,
-        rails=rails,
-        extruder=extruder,
-        not_yet_acting=(*later, *_later_sections(config, pins, later)),
+        kinematics=frame.kinematics,
+        limits=extruders[0].limits if extruders else limits_without_extruder(printer, space),
+        rails=frame.rails,
+        motors=frame.steppers,
+        home=frame.home,
+        dual_carriage=frame.dual_carriage,
+        extruders=extruders,
+        extruder_steppers=followers,
+        shapers=shapers,
+        not_yet_acting=(*later, *_later_sections(reading, kinematics)),
         notes=tuple(config.notes),
     )
+    _check_names(description)
     check_policies(description.nodes, description.steppers)
     return description
+
+
+def _check_names(description: MachineDescription) -> None:
+    """Refuse two steppers of one name, which commands could not tell apart; raises ConfigError."""
+    seen: dict[str, Place] = {}
+    for stepper in description.steppers:
+        other = seen.setdefault(stepper.name, stepper.place)
+        if other is not stepper.place:
+            raise ConfigError(
+                stepper.place, f"a stepper is named {stepper.name} here and at {other}; rename one of them"
+            )
 
 
 def _required(config: ConfigFile, name: str) -> RawSection:
@@ -90,7 +117,10 @@ def _required(config: ConfigFile, name: str) -> RawSection:
 
 def _is_acting(section: RawSection) -> bool:
     return (
-        section.name in _SINGLE_SECTIONS or section.kind in _NAMED_SECTIONS or is_extra_stepper(section.name)
+        section.name in _SINGLE_SECTIONS
+        or section.kind in _NAMED_SECTIONS
+        or _MOTION_SECTIONS.fullmatch(section.name) is not None
+        or is_extra_stepper(section.name)
     )
 
 
@@ -107,15 +137,24 @@ def _check_section_names(config: ConfigFile) -> None:
         raise ConfigError(section.place, f"there is no section [{section.name}]{hint}")
 
 
-def _later_sections(config: ConfigFile, pins: PinRegistry, later: list[NotYetActing]) -> list[NotYetActing]:
-    """Return the sections without a module; raises ConfigError when one takes a stepper's pin."""
-    waiting = {(entry.section, name) for entry in later for name in entry.options}
+def _later_sections(reading: Reading, kinematics: str) -> list[NotYetActing]:
+    """Return the sections without a module; raises ConfigError when one takes a stepper's pin.
+
+    So it does for a motion section that has no place in this machine.
+    """
+    waiting = {(entry.section, name) for entry in reading.later for name in entry.options}
     result = []
-    for section in config.sections.values():
+    for section in reading.config.sections.values():
         if not _is_acting(section):
             result.append(NotYetActing(section.name, section.place, ()))
-            pins.check_unclaimed(section.options.values(), section.name)
-        else:
-            options = [option for name, option in section.options.items() if (section.name, name) in waiting]
-            pins.check_unclaimed(options, section.name)
+            reading.pins.check_unclaimed(section.options.values(), section.name)
+            continue
+        if section.name not in reading.used and section.kind not in ("printer", *_NAMED_SECTIONS):
+            raise ConfigError(
+                section.place,
+                f"[{section.name}] has no place in a machine of kinematics {kinematics}; remove it, or"
+                " correct its name or 'kinematics' of [printer]",
+            )
+        options = [option for name, option in section.options.items() if (section.name, name) in waiting]
+        reading.pins.check_unclaimed(options, section.name)
     return result

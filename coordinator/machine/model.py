@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from enum import Enum
 
+from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
+from coordinator.kinematics.dual_carriage import DualCarriage
+from coordinator.kinematics.extruder import ExtruderMotion
 from coordinator.machine.pins import PinDescription
 from coordinator.machine.problem import Place
 from coordinator.motion.specs import MotionLimits
@@ -58,17 +61,17 @@ class StepperDescription:
     """One motor driver."""
 
     name: str
-    """The section's name: stepper_x, stepper_z1, extruder."""
+    """The section's name: stepper_x, stepper_z1, extruder, or NAME of [stepper NAME]."""
     step_pin: PinDescription
     dir_pin: PinDescription
     """Inverted: the pin is high for a step in negative direction."""
     enable_pin: PinDescription | None
-    weights: tuple[float, float, float, float]
-    """The stepper's position in mm is the sum of weights[i] * axis[i] over X Y Z E."""
+    function: StepFunction
+    """How its position follows from the axes."""
     step_distance: float
-    """mm per step."""
+    """mm per step; rad where the position is an angle."""
     rotation_distance: float
-    """mm per turn of the output after the gears."""
+    """mm (or rad) per turn of the output after the gears."""
     full_steps_per_rotation: int
     microsteps: int
     gear_ratio: float
@@ -82,50 +85,100 @@ class StepperDescription:
         """The node that drives it."""
         return self.step_pin.node
 
+    @property
+    def weights(self) -> Weights:
+        """Of a stepper whose position in mm is the sum of weights[i] * axis[i] over X Y Z E; else zeros."""
+        return self.function.weights
+
 
 @dataclass(frozen=True, slots=True)
 class HomingDescription:
     """How a rail finds its origin; kept for the homing module: until then G28 takes the axis as home."""
 
-    endstop_pin: PinDescription | None
-    virtual_endstop: str
+    endstop_pin: PinDescription | None = None
+    virtual_endstop: str = ""
     """Such as ``probe:z_virtual_endstop``; empty when there is a pin or nothing."""
-    position_endstop: float | None
-    """mm; None with a virtual endstop that knows its own position, or without endstop."""
-    speed: float
+    position_endstop: float | None = None
+    """mm; None with a virtual endstop that knows its own position, or without endstop. Of a tower or an arm:
+    Z of the head, in the middle, when the endstop switches."""
+    speed: float = 5.0
     """mm/s."""
-    second_speed: float
+    second_speed: float = 2.5
     """mm/s of the second approach."""
-    retract_distance: float
+    retract_distance: float = 5.0
     """mm; 0: no second approach."""
-    retract_speed: float
-    positive_dir: bool
+    retract_speed: float = 5.0
+    positive_dir: bool = False
     """Whether the endstop stands at the upper end."""
+
+
+NO_ENDSTOP = HomingDescription()
 
 
 @dataclass(frozen=True, slots=True)
 class RailDescription:
-    """One axis with its steppers, which move together."""
+    """What is homed as one: an axis, tower, arm or carriage with its steppers."""
 
     axis: str
-    """x, y or z."""
+    """x, y or z; else the rail's name in its kinematics."""
     steppers: tuple[StepperDescription, ...]
-    position_min: float
-    """mm."""
-    position_max: float
+    position_min: float | None
+    """mm; None where the kinematics says how far the rail may go."""
+    position_max: float | None
     homing: HomingDescription
     place: Place
 
 
 @dataclass(frozen=True, slots=True)
 class ExtruderDescription:
-    """The extruder's mechanics."""
+    """One extruder's mechanics."""
 
+    name: str
+    """extruder, extruder1, …"""
     stepper: StepperDescription
     nozzle_diameter: float
     """mm."""
     filament_diameter: float
     """mm."""
+    pressure_advance: float
+    """s: mm of filament pushed ahead per mm/s."""
+    smooth_time_s: float
+    """Width of the window over which the advance is spread; 0: no advance."""
+    limits: MotionLimits
+    """Of the machine while it prints with this extruder."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExtruderStepperDescription:
+    """A further stepper that moves filament along with an extruder."""
+
+    name: str
+    """As in [extruder_stepper NAME]."""
+    stepper: StepperDescription
+    extruder: str
+    """Name of the extruder whose motion it follows at start; empty: none."""
+
+
+@dataclass(frozen=True, slots=True)
+class DualCarriageDescription:
+    """Two carriages on one axis."""
+
+    rails: tuple[RailDescription, RailDescription]
+    """The second is parked at start."""
+    carriages: DualCarriage
+
+
+@dataclass(frozen=True, slots=True)
+class ShaperDescription:
+    """How one axis is shaped from the start."""
+
+    axis: str
+    """x, y or z."""
+    kind: str
+    """zv, mzv, zvd, ei, 2hump_ei or 3hump_ei."""
+    frequency_hz: float
+    damping_ratio: float
+    place: Place
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,12 +202,20 @@ class MachineDescription:
     path: str
     nodes: tuple[NodeDescription, ...]
     """The primary first, then in the order of the file."""
-    kinematics: str
-    """cartesian or corexy."""
+    kinematics: Kinematics
     limits: MotionLimits
-    rails: tuple[RailDescription, RailDescription, RailDescription]
-    """X Y Z; of a corexy the rail x has the motor that moves x + y, the rail y the one that moves x - y."""
-    extruder: ExtruderDescription | None
+    """Of the first extruder."""
+    rails: tuple[RailDescription, ...]
+    """X Y Z, or as the kinematics names them; of a corexy the rail x has the motor that moves x + y."""
+    motors: tuple[StepperDescription, ...]
+    """Steppers of the head: those of the rails in order, or of their own where rails share them."""
+    home: Point
+    """Where the head stands after G28."""
+    dual_carriage: DualCarriageDescription | None
+    extruders: tuple[ExtruderDescription, ...]
+    """By number."""
+    extruder_steppers: tuple[ExtruderStepperDescription, ...]
+    shapers: tuple[ShaperDescription, ...]
     not_yet_acting: tuple[NotYetActing, ...]
     notes: tuple[str, ...]
     """Sentences about what has no effect."""
@@ -162,10 +223,23 @@ class MachineDescription:
     @property
     def homed_position(self) -> dict[str, float]:
         """Where each axis (X, Y, Z) stands after G28, mm."""
-        return {rail.axis.upper(): rail.homing.position_endstop or 0.0 for rail in self.rails}
+        return dict(zip("XYZ", self.home, strict=True))
+
+    @property
+    def extruder(self) -> ExtruderDescription | None:
+        """The extruder that is active at start."""
+        return self.extruders[0] if self.extruders else None
 
     @property
     def steppers(self) -> tuple[StepperDescription, ...]:
-        """All steppers: rails X Y Z, then the extruder."""
-        extruder = (self.extruder.stepper,) if self.extruder else ()
-        return (*(stepper for rail in self.rails for stepper in rail.steppers), *extruder)
+        """All steppers: the head's, then those of the filament."""
+        extruders = (extruder.stepper for extruder in self.extruders)
+        return (*self.motors, *extruders, *(follower.stepper for follower in self.extruder_steppers))
+
+    @property
+    def extruder_motion(self) -> ExtruderMotion:
+        """Which filament steppers follow which extruder at start."""
+        followed = {extruder.stepper.name: extruder.name for extruder in self.extruders}
+        followed |= {follower.stepper.name: follower.extruder for follower in self.extruder_steppers}
+        names = tuple(extruder.name for extruder in self.extruders)
+        return ExtruderMotion(names, names[0] if names else "", followed)

@@ -6,6 +6,7 @@ handed back.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
@@ -141,14 +142,14 @@ class ChoiceOption(Option[str]):
     def parse(self, text: str) -> str:
         """Return the word."""
         if text in self.later:
-            raise BadValue(f"recognised but not built yet; use {_one_of(self.choices)}")
+            raise BadValue(f"recognised but not built yet; use {one_of(self.choices)}")
         if text not in self.choices:
             raise BadValue
         return text
 
     def rule(self) -> str:
         """Return the values allowed."""
-        return _one_of(self.choices)
+        return one_of(self.choices)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,7 +210,8 @@ class GearRatioOption(Option[float]):
         return "pairs of teeth as in 50:10 or 50:17, 3:1 (motor first)"
 
 
-def _one_of(words: tuple[str, ...]) -> str:
+def one_of(words: Sequence[str]) -> str:
+    """Join words as in "a, b or c"."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
 
 

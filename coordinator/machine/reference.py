@@ -5,16 +5,43 @@
 
 import sys
 
-from coordinator.machine import read_extruder, read_nodes, read_printer, read_steppers
+from coordinator.machine import (
+    read_delta,
+    read_deltesian,
+    read_dual,
+    read_extruder,
+    read_generic,
+    read_nodes,
+    read_polar,
+    read_printer,
+    read_rails,
+    read_rotary_delta,
+    read_shaper,
+    read_winch,
+)
 from coordinator.machine.options import Option, SectionSpec
+from coordinator.machine.read_kinematics import PRINTER_SPECS
 from coordinator.machine.well_known import LATER_SECTIONS
 
 SECTIONS: dict[str, SectionSpec] = {
     "[mcu], [mcu NAME]": read_nodes.MCU,
     "[printer]": read_printer.PRINTER,
-    "[stepper_x], [stepper_y], [stepper_z]": read_steppers.RAIL,
-    "[stepper_x1], [stepper_z1], [stepper_z2] …": read_steppers.EXTRA_STEPPER,
-    "[extruder]": read_extruder.EXTRUDER,
+    **{f"[printer] with kinematics {name}": spec for name, spec in PRINTER_SPECS.items()},
+    "[stepper_x], [stepper_y], [stepper_z], [stepper_arm]": read_rails.RAIL,
+    "[stepper_x1], [stepper_z1], [stepper_z2] …": read_rails.EXTRA_STEPPER,
+    "[stepper_a], [stepper_b], [stepper_c] of a delta": read_delta.TOWER,
+    "[stepper_left], [stepper_right] of a deltesian": read_deltesian.SIDE,
+    "[stepper_bed] of a polar machine": read_polar.BED,
+    "[stepper_a], [stepper_b], [stepper_c] of a rotary delta": read_rotary_delta.ARM,
+    "[stepper_a], [stepper_b], [stepper_c] … of winches": read_winch.WINCH,
+    "[carriage NAME]": read_generic.CARRIAGE,
+    "[stepper NAME]": read_generic.STEPPER,
+    "[extra_carriage NAME]": read_generic.EXTRA_CARRIAGE,
+    "[dual_carriage NAME]": read_generic.DUAL_CARRIAGE,
+    "[dual_carriage]": read_dual.DUAL_CARRIAGE,
+    "[extruder], [extruder1] …": read_extruder.EXTRUDER,
+    "[extruder_stepper NAME]": read_extruder.EXTRUDER_STEPPER,
+    "[input_shaper]": read_shaper.INPUT_SHAPER,
     "[board_pins], [board_pins NAME]": read_nodes.BOARD_PINS,
     "[duplicate_pin_override]": read_nodes.DUPLICATE_PIN_OVERRIDE,
 }

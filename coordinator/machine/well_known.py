@@ -11,11 +11,7 @@ def _words(text: str) -> tuple[str, ...]:
 
 LATER_SECTIONS = frozenset(
     (
-        *(f"extruder{number}" for number in range(1, 16)),
-        *_words("extruder_stepper manual_stepper dual_carriage carriage extra_carriage stepper"),
-        *_words(
-            "stepper_a stepper_b stepper_c stepper_bed stepper_arm stepper_left stepper_right delta_calibrate"
-        ),
+        *_words("manual_stepper delta_calibrate"),
         *_words(
             "heater_bed heater_generic verify_heater homing_heaters pid_profile thermistor adc_temperature"
         ),
@@ -31,9 +27,7 @@ LATER_SECTIONS = frozenset(
         *_words(
             "virtual_sdcard sdcard_loop force_move pause_resume firmware_retraction respond exclude_object"
         ),
-        *_words(
-            "input_shaper resonance_tester shaketune adxl345 icm20948 lis2dw lis3dh bmi160 mpu9250 angle"
-        ),
+        *_words("resonance_tester shaketune adxl345 icm20948 lis2dw lis3dh bmi160 mpu9250 angle"),
         *_words(
             "tmc2130 tmc2208 tmc2209 tmc2240 tmc2660 tmc5160 autotune_tmc ad5206 mcp4451 mcp4728 mcp4018"
         ),
@@ -61,8 +55,7 @@ LATER_EXTRUDER_OPTIONS = (
     *_words("spi_software_sclk_pin spi_software_mosi_pin spi_software_miso_pin"),
     *_words("i2c_address i2c_mcu i2c_bus i2c_speed i2c_software_scl_pin i2c_software_sda_pin"),
     # filament under pressure
-    *_words("pressure_advance pressure_advance_smooth_time per_move_pressure_advance shared_heater"),
+    *_words("per_move_pressure_advance shared_heater"),
 )
-LATER_PRINTER_OPTIONS = _words("max_x_velocity max_x_accel max_y_velocity max_y_accel")
 LATER_MCU_OPTIONS = _words("is_non_critical reconnect_interval max_stepper_error")
 LATER_STEPPER_OPTIONS = _words("homing_accel homing_current min_home_dist use_sensorless_homing")

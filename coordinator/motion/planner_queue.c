@@ -65,17 +65,41 @@ static void limit(struct planned_move *move, double ratio, double velocity, doub
     move->accel = min_of(move->accel, accel / ratio);
 }
 
+// How far Z stays below the top of the cone.
+static double below_cone(const struct planner_limits *l, const double at[4]) {
+    double down_x = l->cone_slope[0] * at[AXIS_X], down_y = l->cone_slope[1] * at[AXIS_Y];
+    return l->cone_top - sqrt(down_x * down_x + down_y * down_y) - at[AXIS_Z];
+}
+
+// Above the box Z stays within the cone; the way between a point of the box outside of the cone and one above
+// the box need not lie in either.
+static int check_cone(struct planner *p, const double target[4]) {
+    const struct planner_limits *l = &p->limits;
+    double box_top = l->position_max[AXIS_Z] + POSITION_EPS;
+    int from_above = p->position[AXIS_Z] > box_top, to_above = target[AXIS_Z] > box_top;
+    if (!from_above && !to_above)
+        return 0;
+    double room = below_cone(l, target);
+    if (room >= -POSITION_EPS && (from_above || below_cone(l, p->position) >= -POSITION_EPS))
+        return 0;
+    double high = room >= -POSITION_EPS ? l->position_max[AXIS_Z] : target[AXIS_Z] + room;
+    return refuse(p, PLANNER_OUTSIDE, AXIS_Z, target[AXIS_Z], l->position_min[AXIS_Z], high);
+}
+
 static int check_range(struct planner *p, const double delta[4], const double target[4]) {
+    int has_cone = p->limits.cone_slope[0] > 0 || p->limits.cone_slope[1] > 0;
     for (int axis = 0; axis < 3; axis++) {
         if (delta[axis] == 0)
             continue;
         double low = p->limits.position_min[axis], high = p->limits.position_max[axis];
+        if (has_cone && axis == AXIS_Z)
+            high = max_of(high, p->limits.cone_top);
         if (!(p->homed >> axis & 1))
             return refuse(p, PLANNER_NOT_HOMED, axis, target[axis], low, high);
         if (!(target[axis] >= low - POSITION_EPS && target[axis] <= high + POSITION_EPS))
             return refuse(p, PLANNER_OUTSIDE, axis, target[axis], low, high);
     }
-    return 0;
+    return has_cone ? check_cone(p, target) : 0;
 }
 
 // Limits of a move along X Y Z that may print, from its ratios.

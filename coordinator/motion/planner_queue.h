@@ -49,6 +49,9 @@ struct planner_limits {
     double position_min[3], position_max[3];
     double max_extrude_only_velocity, max_extrude_only_accel, max_extrude_only_distance;
     double max_extrude_ratio, instantaneous_corner_velocity;
+    double max_x_velocity, max_x_accel, max_y_velocity, max_y_accel; // 0: none
+    double max_radius, radius_min;                                   // 0: none
+    double cone_top, cone_slope[2];                                  // slopes 0: none
 };
 
 // v2: square of a speed, (mm/s)². The smooth values belong to the profile of the minimum cruise.

@@ -129,12 +129,18 @@ def check_number(
 
 def check_limits(limits: MotionLimits) -> None:
     """Refuse limits the arithmetic cannot stand: they would come out as NaN."""
-    may_be_zero = {"square_corner_velocity", "instantaneous_corner_velocity"}
+    may_be_zero = {"square_corner_velocity", "instantaneous_corner_velocity", "max_radius", "radius_min"}
+    may_be_zero |= {f"max_{axis}_{what}" for axis in "xy" for what in ("velocity", "accel")}
     for field in fields(limits):
         value = getattr(limits, field.name)
         if field.name in {"position_min", "position_max"}:
             for bound in value:
                 check_number(field.name, bound, -1e6, 1e6)
+        elif field.name == "cone_top":
+            check_number(field.name, value, -1e6, 1e6)
+        elif field.name == "cone_slope":
+            for slope in value:
+                check_number(field.name, slope, 0, 1e6)
         elif field.name == "minimum_cruise_ratio":
             check_number(field.name, value, 0, 0.999)
         else:

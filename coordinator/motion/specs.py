@@ -29,6 +29,19 @@ class MotionLimits:
     """mm of filament per mm of path above which a printing move is refused (cross section over area)."""
     instantaneous_corner_velocity: float
     """mm/s by which the filament's speed may jump at a junction."""
+    max_x_velocity: float = 0.0
+    """mm/s along X; 0 here and below: no limit of its own."""
+    max_x_accel: float = 0.0
+    max_y_velocity: float = 0.0
+    max_y_accel: float = 0.0
+    max_radius: float = 0.0
+    """Largest distance of the head from the Z axis: a round work space within the box."""
+    radius_min: float = 0.0
+    """Smallest distance of the head from the Z axis, on all of its way."""
+    cone_slope: tuple[float, float] = (0.0, 0.0)
+    """Slopes 0: no cone. Else Z may be above position_max (as after homing a delta) within the cone
+    z + √((sx·x)² + (sy·y)²) <= cone_top, and moves that begin or end above stay within."""
+    cone_top: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +86,13 @@ class StepperSpec:
     """Index into the list of NodeStreamSpec."""
     oid: int
     weights: tuple[float, float, float, float]
-    """The stepper's position in mm is the sum of weights[i] * axis[i] over X Y Z E."""
+    """Of a LINEAR stepper: its position in mm is the sum of weights[i] * axis[i] over X Y Z E."""
     step_distance: float
-    """mm per step, > 0."""
+    """mm (POLAR_ANGLE and ROTARY_DELTA: rad) per step, > 0."""
     invert_dir: bool
     """Whether set_next_step_dir takes 0 for a positive step."""
     step_pulse_s: float
     """Shortest high time of the step pin; steps are never closer than two of them. 0: both edges step."""
     kinematics: StepKinematics = StepKinematics.LINEAR
     params: tuple[float, ...] = ()
+    """Of the kinematics."""

@@ -112,16 +112,22 @@ MACHINES: Mapping[str, st.SearchStrategy[Kinematics]] = {
 """By the kinematics' name."""
 
 
+def ceiling(space: WorkSpace, x: float, y: float) -> float:
+    """How high the head may be at X and Y."""
+    down = math.hypot(space.cone_slope[0] * x, space.cone_slope[1] * y)
+    return max(space.high[2], space.cone_top - down) if any(space.cone_slope) else space.high[2]
+
+
 @st.composite
 def points(draw: Draw, space: WorkSpace) -> Point:
     """Draw a point of the work space, its borders included."""
     share = number(0, 1)
-    low, high = space.low, space.high
-    if not space.max_radius:
-        x, y, z = (a + (b - a) * draw(share) for a, b in zip(low, high, strict=True))
-        return (min(x, high[0]), min(y, high[1]), min(z, high[2]))
-    radius = space.radius_min + (space.max_radius - space.radius_min) * draw(share)
-    radius = radius * (1 - 1e-12) if radius > space.radius_min * 2 else radius * (1 + 1e-12)
-    angle = draw(number(-math.pi, math.pi))
-    z = min(low[2] + (high[2] - low[2]) * draw(share), high[2])
-    return (radius * math.cos(angle), radius * math.sin(angle), z)
+    if space.max_radius:
+        radius = space.radius_min + (space.max_radius - space.radius_min) * draw(share)
+        radius *= 1 - 1e-12 if radius > space.radius_min * 2 else 1 + 1e-12
+        angle = draw(number(-math.pi, math.pi))
+        x, y = radius * math.cos(angle), radius * math.sin(angle)
+    else:
+        x, y = (min(a + (b - a) * draw(share), b) for a, b in zip(space.low[:2], space.high[:2], strict=True))
+    floor, top = space.low[2], ceiling(space, x, y)
+    return (x, y, min(floor + (top - floor) * draw(share), top))

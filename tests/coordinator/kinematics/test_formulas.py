@@ -7,9 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.kinematics.base import Kinematics, Point, StepFunction
+from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpace
+from coordinator.kinematics.delta import Delta
+from coordinator.kinematics.deltesian import Deltesian
+from coordinator.kinematics.rotary_delta import RotaryDelta
 from coordinator.motion.specs import StepKinematics
-from tests.coordinator.kinematics.machines import MACHINES, number, points
+from tests.coordinator.kinematics.machines import MACHINES, ceiling, number, points
 
 EVERY = pytest.mark.parametrize("name", MACHINES)
 STEP = 1e-4
@@ -112,13 +115,23 @@ def test_no_rail_is_much_faster_than_the_head(name: str, data: st.DataObject) ->
         assert abs(b - a) * mm_per_unit <= STEP * (allowed.get(name, 1 + math.hypot(3, 1)) + 1e-3)
 
 
-@pytest.mark.parametrize("name", ["delta", "deltesian", "rotary_delta"])
+TOWERS = pytest.mark.parametrize("name", ["delta", "deltesian", "rotary_delta"])
+
+
+def endstops(machine: Kinematics) -> tuple[float, ...]:
+    """Return where the towers' or arms' endstops are."""
+    if isinstance(machine, RotaryDelta):
+        return machine.endstop_angles
+    assert isinstance(machine, Delta | Deltesian)
+    return machine.endstop_positions
+
+
+@TOWERS
 @given(data=st.data())
 def test_no_endstop_is_overrun_in_the_work_space(name: str, data: st.DataObject) -> None:
     machine, point = machine_and_point(data, name)
-    ends = getattr(machine, "endstop_angles", None) or machine.endstop_positions  # type: ignore[attr-defined]
-    for position, end in zip(machine.inverse(point), ends, strict=False):
-        assert position <= end + 1e-3
+    for position, end in zip(machine.inverse(point), endstops(machine), strict=False):
+        assert position <= end + 1e-6
 
 
 @EVERY
@@ -127,8 +140,37 @@ def test_the_work_space_contains_its_points_and_no_others(name: str, data: st.Da
     machine, point = machine_and_point(data, name)
     space = machine.work_space
     assert space.contains(point)
+    x, y, _ = point
+    high = (*space.high[:2], ceiling(space, x, y))
     for axis in range(3):
-        for bound, away in ((space.low, -1e-3), (space.high, 1e-3)):
+        for bound, away in ((space.low, -1e-3), (high, 1e-3)):
             outside = list(point)
             outside[axis] = bound[axis] + away
             assert not space.contains((outside[0], outside[1], outside[2]))
+
+
+@TOWERS
+@given(data=st.data())
+def test_no_endstop_is_overrun_on_the_way_through_the_cone(name: str, data: st.DataObject) -> None:
+    machine = data.draw(MACHINES[name])
+    space = machine.work_space
+    ends = endstops(machine)
+    one, two = (data.draw(points(space).filter(lambda p: in_cone(space, p))) for _ in range(2))
+    for i in range(11):
+        x, y, z = (a + (b - a) * i / 10 for a, b in zip(one, two, strict=True))
+        assert all(u <= end + 1e-6 for u, end in zip(machine.inverse((x, y, z)), ends, strict=False))
+
+
+def in_cone(space: WorkSpace, point: Point) -> bool:
+    down = math.hypot(space.cone_slope[0] * point[0], space.cone_slope[1] * point[1])
+    return point[2] <= space.cone_top - down
+
+
+@TOWERS
+@given(data=st.data())
+def test_homing_ends_in_the_cone_or_at_its_tip(name: str, data: st.DataObject) -> None:
+    machine = data.draw(MACHINES[name])
+    y = (0.0,) if name == "deltesian" else ()
+    home = machine.forward((*endstops(machine), *y))
+    assert machine.inverse(home)[: len(endstops(machine))] == pytest.approx(endstops(machine), abs=1e-6)
+    assert home[2] >= machine.work_space.cone_top - 3

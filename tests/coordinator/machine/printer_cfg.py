@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from coordinator.commands import EXAMPLES
+
 PRINTER_CFG = """\
 [mcu]
 canbus_uuid: 11aa22bb33cc
@@ -57,3 +59,8 @@ def changed(old: str, new: str, text: str = PRINTER_CFG) -> str:
     """Return the configuration with one place changed."""
     assert text.count(old) >= 1, old
     return text.replace(old, new, 1)
+
+
+def example_text(name: str) -> str:
+    """Return the text of an example machine."""
+    return (EXAMPLES / f"{name}.cfg").read_text()

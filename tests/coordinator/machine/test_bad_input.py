@@ -210,13 +210,17 @@ CASES = {
     ),
     "unknown kinematics": (
         changed("corexy", "corexyz"),
-        ("printer.cfg:8: option 'kinematics' of [printer] is 'corexyz', must be cartesian or corexy"),
+        (
+            "printer.cfg:8: option 'kinematics' of [printer] is 'corexyz', must be cartesian, corexy, corexz,"
+            " delta, deltesian, generic_cartesian, hybrid_corexy, hybrid_corexz, polar, rotary_delta or winch"
+        ),
     ),
     "later kinematics": (
-        changed("corexy", "delta"),
+        changed("corexy", "none"),
         (
-            "printer.cfg:8: option 'kinematics' of [printer] is 'delta', recognised but not built"
-            " yet; use cartesian or corexy"
+            "printer.cfg:8: option 'kinematics' of [printer] is 'none', recognised but not built yet; use"
+            " cartesian, corexy, corexz, delta, deltesian, generic_cartesian, hybrid_corexy, hybrid_corexz,"
+            " polar, rotary_delta or winch"
         ),
     ),
     "empty range": (

@@ -1,0 +1,128 @@
+"""A linear delta: [printer] delta_radius, and the towers [stepper_a], [stepper_b], [stepper_c]."""
+
+import math
+
+from coordinator.kinematics.delta import MAX_TOWER_SPEED, Delta, Tower
+from coordinator.machine.frame import Frame, tidy
+from coordinator.machine.model import RailDescription
+from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
+from coordinator.machine.read_homing import HOMING, POSITION_ENDSTOP, read_tower_homing
+from coordinator.machine.read_rails import WAITING, read_extra_steppers
+from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, read_stepper
+from coordinator.machine.reading import Reading
+from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
+
+MINIMUM_Z = FloatOption(
+    name="minimum_z_position",
+    help="lowest Z that the head may go to",
+    default=0.0,
+    unit="mm",
+    minimum=-MAX_POSITION,
+    maximum=MAX_POSITION,
+)
+DELTA_RADIUS = FloatOption(
+    name="delta_radius",
+    help="from a tower's joint to the head's, measured level, with the head in the middle",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+PRINT_RADIUS = FloatOption(
+    name="print_radius",
+    help="how far from the middle the head may be; by default delta_radius, or less where rods lie too flat",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+DELTA_PRINTER = SectionSpec(
+    help="What a delta needs besides", options=(DELTA_RADIUS, PRINT_RADIUS, MINIMUM_Z)
+)
+ARM_LENGTH = FloatOption(
+    name="arm_length",
+    help="length of the rods, from joint to joint; by default that of stepper_a",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+ANGLE = FloatOption(
+    name="angle",
+    help="direction in which the tower stands, from X towards Y; by default 210 for a, 330 for b, 90 for c",
+    unit="°",
+    minimum=-360,
+    maximum=720,
+)
+TOWER = SectionSpec(
+    help="A tower of a delta. position_endstop is Z of the head in the middle when the endstop switches; by"
+    " default that of stepper_a",
+    options=(*MOTOR, ARM_LENGTH, ANGLE, *HOMING),
+    later=LATER_STEPPER_OPTIONS,
+)
+WHY = "a delta has the towers stepper_a, stepper_b and stepper_c"
+_ANGLES = (210.0, 330.0, 90.0)
+_TOO_CLOSE_DEG = 30.0
+
+
+def read_delta(reading: Reading, printer: SectionReader) -> Frame:
+    """Return the frame of a delta; raises ConfigError."""
+    radius, min_z = printer.get(DELTA_RADIUS), printer.get(MINIMUM_Z)
+    print_radius = printer.find(PRINT_RADIUS)
+    readers = [SectionReader(reading.get(f"stepper_{name}", WHY), TOWER) for name in "abc"]
+    a, b, c = (
+        _read_tower(reader, readers[0], default, radius)
+        for reader, default in zip(readers, _ANGLES, strict=True)
+    )
+    check_directions(readers, (a.angle, b.angle, c.angle))
+    delta = Delta((a, b, c), radius, min_z, print_radius)
+    if print_radius is not None and print_radius > delta.widest_radius:
+        raise printer.bad(
+            PRINT_RADIUS,
+            f"but beyond {delta.widest_radius:.5g} mm carriages would be more than {MAX_TOWER_SPEED:g} times"
+            " as fast as the head; reduce it, or correct delta_radius and arm_length",
+        )
+    check_height(printer, delta.work_space.high[2], min_z)
+    rails = []
+    for reader, tower, function in zip(readers, delta.towers, delta.step_functions(), strict=True):
+        homing = read_tower_homing(reader, tower.endstop_height, reading.pins)
+        steppers = (
+            read_stepper(reader, function, reading.pins),
+            *read_extra_steppers(reading, reader.name, function),
+        )
+        reading.finish(reader, waiting=WAITING)
+        rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
+    return Frame(delta, tuple(rails), tidy(delta.forward(delta.endstop_positions)))
+
+
+def _read_tower(reader: SectionReader, first: SectionReader, angle: float, radius: float) -> Tower:
+    rod = reader.find(ARM_LENGTH)
+    if rod is None:
+        rod = first.get(ARM_LENGTH)
+    height = reader.find(POSITION_ENDSTOP)
+    if height is None:
+        height = first.get(POSITION_ENDSTOP)
+    given = reader.find(ANGLE)
+    if rod <= radius:
+        raise reader.bad(ARM_LENGTH, f"must be above delta_radius ({radius:g} mm): the rods would not reach")
+    return Tower(math.radians(angle if given is None else given), rod, height)
+
+
+def check_directions(readers: list[SectionReader], angles: tuple[float, ...]) -> None:
+    """Refuse two towers or arms that stand in nearly the same direction; raises ConfigError."""
+    for i, reader in enumerate(readers):
+        for other in range(i):
+            apart = abs(math.degrees(math.remainder(angles[i] - angles[other], math.tau)))
+            if apart < _TOO_CLOSE_DEG:
+                raise reader.bad(
+                    ANGLE,
+                    f"only {apart:.3g}° away from [{readers[other].name}]; they must be {_TOO_CLOSE_DEG:g}°"
+                    " apart at least",
+                )
+
+
+def check_height(printer: SectionReader, top: float, min_z: float) -> None:
+    """Refuse a machine whose head has no room up and down; raises ConfigError."""
+    if top <= min_z:
+        raise printer.bad(
+            MINIMUM_Z,
+            f"but at the rim the head reaches only up to Z {top:.5g} mm, which leaves no room above"
+            f" {min_z:g} mm; correct the lengths, position_endstop and print_radius",
+        )

@@ -1,0 +1,104 @@
+"""A deltesian: the towers [stepper_left] and [stepper_right], and [stepper_y]."""
+
+import math
+
+from coordinator.kinematics.base import linear
+from coordinator.kinematics.deltesian import Arm, Deltesian
+from coordinator.machine.frame import Frame, axis_range, home_of, tidy
+from coordinator.machine.model import RailDescription
+from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
+from coordinator.machine.read_delta import MINIMUM_Z, check_height
+from coordinator.machine.read_homing import HOMING, POSITION_ENDSTOP, read_tower_homing
+from coordinator.machine.read_rails import WAITING, read_extra_steppers, read_rail
+from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, read_stepper
+from coordinator.machine.reading import Reading
+from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
+
+MIN_ANGLE = FloatOption(
+    name="min_angle",
+    help="smallest angle between a rod and the horizontal, which limits X",
+    default=5.0,
+    unit="°",
+    above=0,
+    below=90,
+)
+PRINT_WIDTH = FloatOption(
+    name="print_width",
+    help="range of X, centred; by default what min_angle allows",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+DELTESIAN_PRINTER = SectionSpec(
+    help="What a deltesian needs besides",
+    options=(MINIMUM_Z, MIN_ANGLE, PRINT_WIDTH),
+    later=("slow_ratio",),
+)
+ARM_LENGTH = FloatOption(
+    name="arm_length",
+    help="length of the rod, from joint to joint; by default that of stepper_left",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+ARM_X_LENGTH = FloatOption(
+    name="arm_x_length",
+    help="level distance between tower and head with the head in the middle; by default that of stepper_left",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+SIDE = SectionSpec(
+    help="A tower of a deltesian. position_endstop is Z of the head in the middle when the endstop switches;"
+    " by default that of stepper_left",
+    options=(*MOTOR, ARM_LENGTH, ARM_X_LENGTH, *HOMING),
+    later=LATER_STEPPER_OPTIONS,
+)
+WHY = "a deltesian has the towers stepper_left and stepper_right"
+
+
+def read_deltesian(reading: Reading, printer: SectionReader) -> Frame:
+    """Return the frame of a deltesian; raises ConfigError."""
+    min_z, min_angle = printer.get(MINIMUM_Z), math.radians(printer.get(MIN_ANGLE))
+    width = printer.find(PRINT_WIDTH)
+    readers = [SectionReader(reading.get(f"stepper_{side}", WHY), SIDE) for side in ("left", "right")]
+    left, right = (
+        _read_side(reader, readers[0], sign) for reader, sign in zip(readers, (-1.0, 1.0), strict=True)
+    )
+    y = read_rail(reading, "y", linear(y=1))
+    deltesian = Deltesian(left, right, axis_range(y), min_z, min_angle, width)
+    _check_width(printer, readers[0], deltesian)
+    check_height(printer, deltesian.work_space.high[2], min_z)
+    rails = []
+    for reader, arm, function in zip(readers, (left, right), deltesian.step_functions()[:2], strict=True):
+        homing = read_tower_homing(reader, arm.endstop_height, reading.pins)
+        first = read_stepper(reader, function, reading.pins)
+        steppers = (first, *read_extra_steppers(reading, reader.name, function))
+        reading.finish(reader, waiting=WAITING)
+        name = reader.name.removeprefix("stepper_")
+        rails.append(RailDescription(name, steppers, None, None, homing, reader.place))
+    home = deltesian.forward((*deltesian.endstop_positions, home_of(y)))
+    return Frame(deltesian, (*rails, y), tidy(home))
+
+
+def _read_side(reader: SectionReader, first: SectionReader, sign: float) -> Arm:
+    rod, x, height = (
+        first.get(option) if (own := reader.find(option)) is None else own
+        for option in (ARM_LENGTH, ARM_X_LENGTH, POSITION_ENDSTOP)
+    )
+    if rod <= x:
+        raise reader.bad(ARM_LENGTH, f"must be above arm_x_length ({x:g} mm): the rod would not reach")
+    return Arm(sign * x, rod, height)
+
+
+def _check_width(printer: SectionReader, left: SectionReader, deltesian: Deltesian) -> None:
+    widest = deltesian.widest
+    if widest <= 0:
+        raise left.bad(
+            ARM_LENGTH,
+            "so short that the rod lies below min_angle already with the head in the middle; correct it",
+        )
+    if deltesian.print_width is not None and deltesian.print_width > 2 * widest:
+        raise printer.bad(
+            PRINT_WIDTH, f"but rods would lie below min_angle; it can be at most {2 * widest:.5g} mm"
+        )

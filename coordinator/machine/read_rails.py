@@ -1,0 +1,80 @@
+"""Rails along an axis: the range, the endstop, and all steppers that move it."""
+
+from coordinator.kinematics.base import StepFunction
+from coordinator.machine.model import RailDescription, StepperDescription
+from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
+from coordinator.machine.read_homing import ENDSTOP_PIN, HOMING, read_endstop, read_homing
+from coordinator.machine.read_homing import WAITING as HOMING_WAITING
+from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, TURNING_MOTOR, extra_sections, read_stepper
+from coordinator.machine.read_steppers import WAITING as MOTOR_WAITING
+from coordinator.machine.reading import Reading
+from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
+
+POSITION_MIN = FloatOption(
+    name="position_min",
+    help="lowest position of the axis",
+    default=0.0,
+    unit="mm",
+    minimum=-MAX_POSITION,
+    maximum=MAX_POSITION,
+)
+POSITION_MAX = FloatOption(
+    name="position_max",
+    help="highest position of the axis",
+    unit="mm",
+    minimum=-MAX_POSITION,
+    maximum=MAX_POSITION,
+)
+RANGE = (POSITION_MIN, POSITION_MAX)
+WAITING = (*MOTOR_WAITING, *HOMING_WAITING)
+RAIL = SectionSpec(
+    help="The first stepper of an axis, with the axis' range and its homing",
+    options=(*MOTOR, *RANGE, *HOMING),
+    later=LATER_STEPPER_OPTIONS,
+)
+EXTRA_STEPPER = SectionSpec(
+    help="A further stepper of an axis, tower or arm: stepper_z1, …; its endstop waits for homing",
+    options=(*MOTOR, ENDSTOP_PIN),
+)
+EXTRA_TURNING_STEPPER = SectionSpec(help=EXTRA_STEPPER.help, options=(*TURNING_MOTOR, ENDSTOP_PIN))
+
+EVERY_AXIS = "every axis needs its stepper"
+
+
+def read_rail(reading: Reading, axis: str, function: StepFunction) -> RailDescription:
+    """Return the rail of [stepper_AXIS] with all its steppers; raises ConfigError."""
+    reader = SectionReader(reading.get(f"stepper_{axis}", EVERY_AXIS), RAIL)
+    rail = read_axis(reading, reader, axis, function)
+    reading.finish(reader, waiting=WAITING)
+    return rail
+
+
+def read_axis(reading: Reading, reader: SectionReader, axis: str, function: StepFunction) -> RailDescription:
+    """Return a rail whose section is read by READER, which the caller finishes; raises ConfigError."""
+    first = read_stepper(reader, function, reading.pins)
+    low, high = read_range(reader)
+    homing = read_homing(reader, low, high, reading.pins)
+    further = read_extra_steppers(reading, reader.name, function)
+    return RailDescription(axis, (first, *further), low, high, homing, reader.place)
+
+
+def read_range(reader: SectionReader) -> tuple[float, float]:
+    """Return how far a rail goes, mm; raises ConfigError."""
+    low, high = reader.get(POSITION_MIN), reader.get(POSITION_MAX)
+    if high <= low:
+        raise reader.bad(POSITION_MAX, f"must be above position_min ({low:g} mm)")
+    return low, high
+
+
+def read_extra_steppers(
+    reading: Reading, name: str, function: StepFunction
+) -> tuple[StepperDescription, ...]:
+    """Return the further steppers of the rail whose first one is [NAME]; raises ConfigError."""
+    further = []
+    for section in extra_sections(reading, name):
+        reader = SectionReader(section, EXTRA_TURNING_STEPPER if function.turns else EXTRA_STEPPER)
+        further.append(read_stepper(reader, function, reading.pins))
+        if reader.has(ENDSTOP_PIN):
+            read_endstop(reader, reading.pins)
+        reading.finish(reader, waiting=WAITING)
+    return tuple(further)

@@ -1,0 +1,71 @@
+"""Every example machine plans a program, and each stepper makes as many steps as its kinematics says."""
+
+import itertools
+import math
+from pathlib import Path
+
+import pytest
+
+from coordinator.commands import EXAMPLES, PlanOptions
+from coordinator.kinematics.base import Point
+from coordinator.machine.description import MachineDescription, load_machine
+from coordinator.motion import _steps
+from coordinator.motion.specs import StepKinematics
+from coordinator.plan import plan_file
+
+SAMPLES = 2000
+EXAMPLE_FILES = sorted(EXAMPLES.glob("*.cfg"))
+
+
+def corners(machine: MachineDescription) -> list[Point]:
+    """Return a way through the work space: down from where homing leaves the head, then around."""
+    space = machine.kinematics.work_space
+    z = [
+        space.low[2] + (min(space.high[2], 300.0) - space.low[2]) * share for share in (0.05, 0.1, 0.15, 0.05)
+    ]
+    if space.max_radius:
+        r = (space.radius_min + space.max_radius) / 2
+        around = [(r * math.cos(a), r * math.sin(a)) for a in (0.1, 0.9, 1.7, 2.5)]
+    else:
+        x, y = ((low + high) / 2 for low, high in zip(space.low[:2], space.high[:2], strict=True))
+        dx, dy = (
+            min((high - low) / 4, 60.0) for low, high in zip(space.low[:2], space.high[:2], strict=True)
+        )
+        around = [(x - dx, y - dy), (x + dx, y - dy), (x + dx, y + dy), (x - dx, y)]
+    return [(*xy, height) for xy, height in zip(around, z, strict=True)]
+
+
+def travelled(machine: MachineDescription, way: list[Point]) -> list[float]:
+    """Return how far each rail goes back and forth along the straight lines of WAY."""
+    total = [0.0] * len(machine.kinematics.rails)
+    for start, end in itertools.pairwise(way):
+        before = machine.kinematics.inverse(start)
+        for i in range(1, SAMPLES + 1):
+            x, y, z = (a + (b - a) * i / SAMPLES for a, b in zip(start, end, strict=True))
+            after = machine.kinematics.inverse((x, y, z))
+            total = [t + abs(b - a) for t, a, b in zip(total, before, after, strict=True)]
+            before = after
+    return total
+
+
+@pytest.mark.parametrize("path", EXAMPLE_FILES, ids=lambda path: path.stem)
+def test_the_example_is_planned(tmp_path: Path, path: Path) -> None:
+    machine = load_machine(str(path))
+    functions = [stepper.function for stepper in machine.motors]
+    if not hasattr(_steps.lib, "STEP_DELTA") and any(
+        f.kinematics is not StepKinematics.LINEAR for f in functions
+    ):
+        pytest.skip("this build generates steps of linear kinematics only")
+    way = [machine.home, *corners(machine)]
+    gcode = tmp_path / "way.gcode"
+    lines = [f"G1 X{x:.9f} Y{y:.9f} Z{z:.9f} F6000" for x, y, z in way[1:]]
+    gcode.write_text("G28\nM83\n" + "\n".join(lines) + "\nG1 E10\n")
+    report = plan_file(PlanOptions(config=path, gcode=gcode))
+    made = {stepper.name: stepper.steps for stepper in report.steppers}
+    rails = dict(zip(machine.kinematics.step_functions(), travelled(machine, way), strict=False))
+    for stepper in machine.motors:
+        expected = rails.get(stepper.function, 0.0) / stepper.step_distance  # a parked carriage: 0
+        assert made[stepper.name] == pytest.approx(expected, abs=2 + 2 * len(way)), stepper.name
+    assert machine.extruder is not None
+    assert made["extruder"] == pytest.approx(10 / machine.extruder.stepper.step_distance, abs=1)
+    assert all(made[e.name] == 0 for e in machine.extruders[1:])
