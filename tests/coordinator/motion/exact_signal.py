@@ -11,6 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+TRAPEZOID = np.dtype(
+    [
+        (name, np.float64)
+        for name in ("print_time", "accel_s", "cruise_s", "decel_s", "start_v", "cruise_v", "accel")
+    ]
+    + [
+        ("start", np.float64, 4),
+        ("ratio", np.float64, 4),
+        ("pressure_advance", np.float64),
+        ("line", np.int64),
+    ]
+)
+"""struct trapezoid of trapezoid.h, member by member."""
 LONG_AGO_S = -1e6
 """Begin of the rest before the first move; no time asked for lies before it."""
 REST_S = -1e3

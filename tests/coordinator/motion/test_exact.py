@@ -7,42 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coordinator.motion.planner import TRAPEZOID
-from coordinator.motion.specs import StepKinematics, StepperSpec
+from coordinator.motion.specs import StepKinematics
 from tests.coordinator.motion.exact import INVERSE, Setting, StepperPath, crossings, solve
+from tests.coordinator.motion.exact_cases import AWAY, LINEAR, PARAMS, SETTING, chain, spec_of, trapezoids
 from tests.coordinator.motion.exact_check import Epoch, StepperProof, check
 from tests.coordinator.motion.exact_signal import Floats, Phases, Shaped, Smoothed
 from tests.coordinator.motion.replay import Stream, replay, replay_all
 from tests.coordinator.motion.steps_harness import MACHINES, NODES, ORIGIN, Run, X, stepper
-from tests.coordinator.motion.steps_oracle import Move, Position, make_move
+from tests.coordinator.motion.steps_oracle import Move, make_move
 
 FREQ = 168_000_000
-
-
-def chain(seed: int, count: int) -> list[Move]:
-    """Return random moves in a row, with rests now and then."""
-    rng = np.random.default_rng(seed)
-    moves: list[Move] = []
-    t, at, joint = 1.0, ORIGIN, 0.0
-    for _ in range(count):
-        dx, dy, de = rng.normal(0, 1.5, 3)
-        end: Position = (at[0] + dx, at[1] + dy, 0.0, at[3] + abs(de) * 0.05)
-        top = float(rng.uniform(20, 200))
-        moves.append(make_move(t, at, end, (joint, top, float(rng.choice([0.0, 8.0, top]))), 4000.0))
-        last = moves[-1]
-        joint = max(last.cruise_v - last.accel * last.seconds[2], 0.0)
-        t, at = t + last.total_s, end
-        if rng.random() < 0.1:
-            t, joint = t + 0.3, 0.0
-    return moves
-
-
-def trapezoids(moves: list[Move], advance: float = 0.0) -> "np.ndarray[tuple[int], np.dtype[np.void]]":
-    rows = np.array([m.row() for m in moves])
-    assert rows.dtype.itemsize * rows.shape[1] == TRAPEZOID.itemsize
-    found = np.frombuffer(rows.tobytes(), TRAPEZOID).copy()
-    found["pressure_advance"] = advance
-    return found
 
 
 def executed(seed: int) -> tuple[Run, list[Move], dict[str, Stream]]:
@@ -144,16 +118,6 @@ def test_shaping_is_a_sum_of_shifted_motions() -> None:
     assert shaped.slope(t) == pytest.approx((shaped.at(t + h) - shaped.at(t - h)) / (2 * h), abs=0.01)
 
 
-PARAMS = {
-    StepKinematics.DELTA: (250.0**2, 100.0, -60.0),
-    StepKinematics.DELTESIAN: (200.0**2, -110.0),
-    StepKinematics.POLAR_RADIUS: (),
-    StepKinematics.POLAR_ANGLE: (),
-    StepKinematics.WINCH: (-300.0, 500.0, 900.0),
-    StepKinematics.ROTARY_DELTA: (120.0, 300.0, 60.0, 250.0, math.cos(2.0), math.sin(2.0)),
-}
-
-
 @pytest.mark.parametrize("kind", list(PARAMS))
 def test_slopes_of_the_kinematics_are_their_derivatives(kind: StepKinematics) -> None:
     x, y, z = np.random.default_rng(7).uniform((-50, -50, 10), (50, 50, 60), (60, 3)).T
@@ -226,25 +190,6 @@ def test_bad_steps_are_found(what: str) -> None:
     t = verdict.outside_s
     assert check(proof, stream, FREQ, 12.5e-6, [(t - 0.1, t + 0.1)]).outside > 0
     assert check(proof, stream, FREQ, 12.5e-6, [(0.0, t - 0.1)]).outside == 0
-
-
-SHAPER = ((0.2, -0.006), (0.5, -0.001), (0.3, 0.017 / 3))
-SETTING = Setting({"X": SHAPER, "Y": ((0.5, -0.004), (0.5, 0.004))}, 0.04)
-AWAY: Position = (40.0, 30.0, 20.0, 0.0)
-LINEAR = {
-    "x": X,
-    "corexy": (1.0, -1.0, 0.0, 0.0),
-    "extruder": (0.0, 0.0, 0.0, 1.0),
-    "z": (0.0, 0.0, 1.0, 0.0),
-}
-
-
-def spec_of(kind: str) -> StepperSpec:
-    if kind in LINEAR:
-        return stepper(0, LINEAR[kind], 0.002 if kind == "extruder" else 0.00625)
-    found = next(k for k in PARAMS if k.name == kind)
-    rad = found in {StepKinematics.POLAR_ANGLE, StepKinematics.ROTARY_DELTA}
-    return replace(stepper(0, X, 1e-4 if rad else 0.00625), kinematics=found, params=PARAMS[found])
 
 
 @pytest.mark.parametrize("kind", [*LINEAR, *(k.name for k in PARAMS)])
