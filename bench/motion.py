@@ -28,7 +28,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from coordinator.motion.specs import NodeStreamSpec, StepperSpec
+from coordinator.motion.specs import NodeStreamSpec, StepKinematics, StepperSpec
 from coordinator.motion.steps import StepGenerator
 from tests.coordinator.motion.exact_program import Planned, plan_program
 
@@ -144,15 +144,79 @@ def prove(configs: Sequence[Path], programs: Sequence[Path]) -> None:
 ROUNDS = 3
 
 
-def generation_cost(steppers: Sequence[StepperSpec], moves: Any) -> tuple[float, int, int]:
-    """Return CPU seconds, steps and queue_steps of MOVES (struct trapezoid) for STEPPERS."""
+MIDDLE = (125.0, 125.0, 0.0, 0.0)
+"""Of the bed the programs are sliced for; machines without a corner have it at their origin."""
+OUTER = 1 - 0.5**0.5
+MZV_50_HZ = ((OUTER, -0.0075), (1 - 2 * OUTER, 0.0), (OUTER, 0.0075))
+"""Undamped."""
+ADVANCE_S, SMOOTH_S = 0.04, 0.04
+
+
+@dataclass(frozen=True)
+class Generation:
+    """Steppers to make steps for."""
+
+    name: str
+    steppers: Sequence[StepperSpec]
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    shaped: bool = False
+    advanced: bool = False
+
+
+def generation_cases() -> Iterator[Generation]:
+    cartesian, corexy = [(1.0, 0, 0, 0), (0, 1.0, 0, 0)], [(1.0, 1.0, 0, 0), (1.0, -1.0, 0, 0)]
+    extruder = linear([(0, 0, 0, 1.0)], 0.0014174)
+    yield Generation("cartesian x and y", linear(cartesian))
+    yield Generation("corexy", linear(corexy))
+    yield Generation("extruder", extruder)
+    if not hasattr(StepGenerator, "set_shaper"):
+        return
+    yield Generation("cartesian x and y, mzv", linear(cartesian), shaped=True)
+    yield Generation("corexy, mzv", linear(corexy), shaped=True)
+    yield Generation("extruder, pressure advance", extruder, advanced=True)
+    kinds = StepKinematics
+    delta, winch = (260.0**2, 130.0, -75.0), (-300.0, 500.0, 900.0)
+    rotary = (300.0, 700.0, 150.0, 600.0, cos(2.0), sin(2.0))
+    for kind, params in ((kinds.DELTA, delta), (kinds.WINCH, winch), (kinds.ROTARY_DELTA, rotary)):
+        distance = 1e-4 if kind == kinds.ROTARY_DELTA else 0.00625
+        specs = [curved(kind, params, distance)]
+        for shaped in (False, True):
+            yield Generation(kind.name.lower() + ", mzv" * shaped, specs, MIDDLE, shaped)
+    yield Generation("deltesian", [curved(kinds.DELTESIAN, (300.0**2, -150.0), 0.00625)], MIDDLE)
+    yield Generation("polar radius", [curved(kinds.POLAR_RADIUS, (), 0.00625)], (-10.0, -10.0, 0, 0))
+    yield Generation("polar angle", [curved(kinds.POLAR_ANGLE, (), 1e-4)], (-10.0, -10.0, 0, 0))
+
+
+def linear(
+    weights: Iterable[tuple[float, float, float, float]], distance: float = 0.00625
+) -> list[StepperSpec]:
+    return [StepperSpec(f"s{i}", 0, i, w, distance, False, 1e-7) for i, w in enumerate(weights)]
+
+
+def curved(kind: StepKinematics, params: tuple[float, ...], distance: float) -> StepperSpec:
+    return StepperSpec("s", 0, 0, (0.0, 0.0, 0.0, 0.0), distance, False, 1e-7, kind, params)
+
+
+def generator(case: Generation, start: Sequence[float]) -> StepGenerator:
     node = NodeStreamSpec("mcu", 168_000_000, 1024, 11, 12, 13)
-    start = tuple(float(v) for v in moves["start"][0])
-    gen = StepGenerator(steppers, [node], start=start)  # type: ignore[arg-type]
-    at, cpu = 0, 0.0
-    last = moves[-1]
+    gen = StepGenerator(case.steppers, [node], start=(start[0], start[1], start[2], start[3]))
+    if case.shaped:
+        for axis in (0, 1):
+            gen.set_shaper(axis, MZV_50_HZ)
+    if case.advanced:
+        gen.set_smooth_time(0, SMOOTH_S)
+    return gen
+
+
+def generation_cost(case: Generation, moves: Any) -> tuple[float, int, int]:
+    """Return CPU seconds, steps and queue_steps of MOVES (struct trapezoid) for CASE."""
+    moves = moves.copy()
+    moves["start"] -= case.origin
+    printing = (moves["ratio"][:, 3] > 0) & (moves["ratio"][:, :2] != 0).any(axis=1)
+    moves["pressure_advance"] = ADVANCE_S * printing * case.advanced
+    gen = generator(case, [float(v) for v in moves["start"][0]])
+    at, cpu, done, last = 0, 0.0, False, moves[-1]
     end = float(last["print_time"] + last["accel_s"] + last["cruise_s"] + last["decel_s"])
-    done = False
     while not done:
         begin = time.process_time()
         at += gen.append(moves[at : at + 4096], min(4096, len(moves) - at))
@@ -166,25 +230,13 @@ def generation_cost(steppers: Sequence[StepperSpec], moves: Any) -> tuple[float,
     return cpu, sum(s.steps for s in stats), sum(s.queue_steps for s in stats)
 
 
-def specs(weights: Iterable[tuple[float, float, float, float]], distance: float) -> list[StepperSpec]:
-    return [StepperSpec(f"s{i}", 0, i, w, distance, False, 1e-7) for i, w in enumerate(weights)]
-
-
-def generation_cases() -> Iterator[tuple[str, list[StepperSpec]]]:
-    yield "cartesian x and y", specs([(1, 0, 0, 0), (0, 1, 0, 0)], 0.00625)
-    yield "corexy", specs([(1, 1, 0, 0), (1, -1, 0, 0)], 0.00625)
-    yield "extruder", specs([(0, 0, 0, 1)], 0.0014174)
-
-
 def table_of_generation(planned: Planned) -> None:
     moves = np.concatenate([piece for _, piece in planned.record.epochs() if len(piece)])
     print(f"step generation alone, {len(moves):,} moves, best of {ROUNDS}, one core")
-    for name, steppers in generation_cases():
-        found = [generation_cost(steppers, moves) for _ in range(ROUNDS)]
-        cpu, steps, queued = min(found)
-        print(
-            f"{name:34}{cpu:8.3f} s {steps / cpu / 1e6:8.1f} M steps/s {steps / queued:8.1f} per queue_step"
-        )
+    for case in generation_cases():
+        cpu, steps, queued = min(generation_cost(case, moves) for _ in range(ROUNDS))
+        rate, share = steps / cpu / 1e6, steps / queued
+        print(f"{case.name:34}{cpu:8.3f} s {rate:8.1f} M steps/s {share:8.1f} per queue_step")
 
 
 # --------------------------------------------------------------------------------------------- scaling
