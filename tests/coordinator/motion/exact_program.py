@@ -1,12 +1,14 @@
 """Plans a program for a machine as ``canductor plan`` does, and keeps all that a proof needs."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from coordinator.gcode.events import End, Full, PositionSet
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
-from coordinator.machine.description import load_machine
+from coordinator.machine.description import MachineDescription, load_machine
 from coordinator.machine_devices import MachineDevices, stream_specs
 from coordinator.motion.planner import Planner
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
@@ -15,6 +17,7 @@ from coordinator.pipeline import Pipeline, PlanRecord
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary
 from tests.coordinator.motion.exact import Setting
 from tests.coordinator.motion.exact_check import StepperProof, Verdict, check
+from tests.coordinator.motion.exact_shapers import impulses
 from tests.coordinator.motion.replay import Stream, replay_all
 
 MOVE_COUNT = 1024
@@ -65,6 +68,7 @@ def plan_program(config: Path, gcode: Path) -> Planned:
     nodes = stream_specs((name, dictionaries[name], MOVE_COUNT) for name in devices.moving_nodes)
     steppers = devices.stepper_specs()
     steps = StepGenerator(steppers, nodes)
+    setting = _shape(steps, description, steppers)
     batches = {i: bytearray() for i in range(len(nodes))}
     record = PlanRecord((0.0, 0.0, 0.0, 0.0))
     with Program.open(str(gcode)) as program:
@@ -73,7 +77,21 @@ def plan_program(config: Path, gcode: Path) -> Planned:
             job, steps, lambda node, batch: batches[node].extend(batch), nodes=len(nodes), record=record
         )
         end = _run(pipeline)
-    return Planned(steppers, nodes, record, Setting(), steps.stats(), end.print_time_s, batches)
+    return Planned(steppers, nodes, record, setting, steps.stats(), end.print_time_s, batches)
+
+
+def _shape(steps: Any, description: MachineDescription, steppers: Sequence[StepperSpec]) -> Setting:
+    """Have STEPS shape as DESCRIPTION says, with impulses of our own; return what that is."""
+    if not hasattr(steps, "set_shaper"):
+        return Setting()
+    shapers = {s.axis.upper(): impulses(s.kind, s.frequency_hz, s.damping_ratio) for s in description.shapers}
+    for axis, found in shapers.items():
+        steps.set_shaper("XYZ".index(axis), found)
+    smooth_s = description.extruder.smooth_time_s if description.extruder else 0.0
+    for index, spec in enumerate(steppers):
+        if spec.weights[3]:
+            steps.set_smooth_time(index, smooth_s)
+    return Setting(shapers, smooth_s)
 
 
 def _run(pipeline: Pipeline) -> End:
