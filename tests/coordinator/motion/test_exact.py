@@ -200,7 +200,7 @@ def test_every_crossing_is_counted_and_solved(kind: str, setting: Setting) -> No
     path = StepperPath(spec_of(kind), AWAY, moves, setting, 0)
     end = float(moves[-1]["print_time"]) + 0.5
     assert path.u(np.array([0.5]))[0] == pytest.approx(0, abs=1e-9)
-    t: Floats = np.linspace(0.9, end, 400_001)
+    t: Floats = np.linspace(0.9, end, 200_001)
     place = np.floor(path.u(t) + 0.5).astype(np.int64)
     count, last = crossings(path)
     assert count == pytest.approx(int(np.abs(np.diff(place)).sum()), abs=4), "pairs between two samples"
