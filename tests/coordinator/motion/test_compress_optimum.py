@@ -11,8 +11,8 @@ from nodes.message_format import vlq
 from tests.coordinator.motion.compress_cases import OPTIMA, PREFIX, Case, Yield, cases, compress
 from tests.coordinator.motion.compress_oracle import Price, Problem, commands, optimum, payload_bytes
 
-EXCESS_MAX = 1.05
-"""The engine's total over the whole set, as a share of the optimum's."""
+COMMANDS_EXCESS = BYTES_EXCESS = 1.05
+"""Most that the engine's total over the whole set may be, as a share of the optimum's."""
 CHECKED = 40
 """Cases solved anew in every run: those with the slowest clock, whose bands are narrowest."""
 
@@ -26,7 +26,7 @@ def _optima() -> dict[str, tuple[int, int, int]]:
     return {name: tuple(row) for name, row in json.loads(OPTIMA.read_text()).items()}
 
 
-def test_compression_is_near_the_optimum() -> None:
+def test_the_optima_are_of_this_set_and_not_beaten() -> None:
     optima, made = _optima(), {name: found for name, (_, found) in _set().items()}
     assert optima.keys() == made.keys()
     assert len(made) >= 200
@@ -36,8 +36,16 @@ def test_compression_is_near_the_optimum() -> None:
         )
         assert made[name].commands >= fewest, f"{name}: better than the optimum cannot be"
         assert made[name].payload >= smallest, name
-    assert sum(m.commands for m in made.values()) <= EXCESS_MAX * sum(o[1] for o in optima.values())
-    assert sum(m.payload for m in made.values()) <= EXCESS_MAX * sum(o[2] for o in optima.values())
+
+
+def test_few_more_commands_than_the_optimum() -> None:
+    made = sum(found.commands for _, found in _set().values())
+    assert made <= COMMANDS_EXCESS * sum(fewest for _, fewest, _ in _optima().values())
+
+
+def test_few_more_bytes_than_the_optimum() -> None:
+    made = sum(found.payload for _, found in _set().values())
+    assert made <= BYTES_EXCESS * sum(smallest for _, _, smallest in _optima().values())
 
 
 def test_the_stored_optima_are_those_of_the_oracle() -> None:
