@@ -46,6 +46,10 @@ class Case:
     weights: Weights
 
     @property
+    def kind(self) -> str:
+        return self.name.split()[0]
+
+    @property
     def spec(self) -> StepperSpec:
         return StepperSpec("s", 0, 0, self.weights, DISTANCE, False, PULSE_S)
 
@@ -178,6 +182,7 @@ def _extruder(rng: random.Random, speed: float) -> Motion:
 
 
 _MAKERS = {"cruise": _cruise, "ramps": _ramps, "joints": _joints, "corexy": _corexy, "extruder": _extruder}
+KINDS = tuple(_MAKERS)
 
 
 def main() -> None:
