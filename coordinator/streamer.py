@@ -36,11 +36,15 @@ PLAN_AHEAD_S: Final = 3.0
 """Moves are planned so far ahead of now; beyond, the g-code waits."""
 SEND_AHEAD_S: Final = 1.2
 """Step commands are made so far ahead of now; the clocks of the nodes are predicted over this long."""
-START_LEAD_S: Final = 0.6
+START_LEAD_S: Final = 0.25
 """From standstill, the first move begins so far ahead of now."""
+BUSY_START_LEAD_S: Final = 0.6
+"""The same on a bus with other traffic, where the first commands, dense as in every ramp, take longer."""
+BUSY_LOAD: Final = 0.3
+"""Share of a bus's time from which it counts as busy."""
 RUN_DRY_S: Final = 0.8
 """When what is planned ends so soon and no more comes, it is planned to a standstill."""
-REST_BORDER_S: Final = 0.3
+REST_BORDER_S: Final = 0.15
 """At rest everything up to so far ahead of now counts as generated; below START_LEAD_S."""
 SETTLE_S: Final = 0.05
 """After the last step is due, before it is believed to be done."""
@@ -102,6 +106,7 @@ class Streamer:
         self._done = Progress(0, 0, None)
         self._failure: GCodeError | None = None
         self._held: str | None = None
+        self._start_lead_s = START_LEAD_S
 
     @property
     def _planner(self) -> Planner:
@@ -164,7 +169,8 @@ class Streamer:
     # ------------------------------------------------------------------------------------------- streaming
 
     def _begin(self) -> None:
-        self.began_s = self.print_time_now() + START_LEAD_S
+        self._look_at_load()
+        self.began_s = self.print_time_now() + self._start_lead_s
         self._planner.begin_at(self.began_s)
         for index, node in enumerate(self._nodes):
             clock_map = self._machine.clock_map(self._time_base, node, self.print_time_now())
@@ -195,9 +201,14 @@ class Streamer:
             link_of(self._nodes[node]).send_batch(batch)
         if cycle.batches:
             self._machine.check_load()
+        self._look_at_load()
         for told in cycle.told:
             self._on_told(told)
         self._report()
+
+    def _look_at_load(self) -> None:
+        busy = any(bus.load.total > BUSY_LOAD for bus in self._machine.bus_stats().values())
+        self._start_lead_s = BUSY_START_LEAD_S if busy else START_LEAD_S
 
     def _report(self) -> None:
         now = self.print_time_now()
@@ -290,8 +301,9 @@ class Streamer:
 
     def _begin_anew(self, now: float) -> None:
         """After a standstill the next move needs time to reach the nodes."""
-        if self._planner.at_standstill and self._planner.print_time_end_s < now + START_LEAD_S:
-            self._planner.begin_at(now + START_LEAD_S)
+        begin = now + self._start_lead_s
+        if self._planner.at_standstill and self._planner.print_time_end_s < begin:
+            self._planner.begin_at(begin)
 
     def _runs_dry(self, now: float) -> bool:
         return self._planner.print_time_end_s < now + RUN_DRY_S and not self._planner.at_standstill
