@@ -239,7 +239,8 @@ def turning_points(path: StepperPath) -> Floats:
     """Return times between which u is monotone, rising: breaks, and where the slope changes its sign."""
     breaks = path.breaks()
     begin, end = breaks[:-1], breaks[1:]
-    share = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    # From just inside one end to just inside the other: at a break itself the slope may jump.
+    share = np.linspace(1e-6, 1 - 1e-6, SAMPLES)
     at = begin[:, None] + (end - begin)[:, None] * share
     slope = path.slope(at.reshape(-1)).reshape(at.shape)
     row, column = np.nonzero(slope[:, :-1] * slope[:, 1:] < 0)

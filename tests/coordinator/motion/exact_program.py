@@ -21,6 +21,8 @@ from tests.coordinator.motion.exact_shapers import impulses
 from tests.coordinator.motion.replay import Stream, replay_all
 
 MOVE_COUNT = 1024
+SETTLE_S = 1.0
+"""Longer than any shaper and window."""
 
 
 @dataclass
@@ -72,7 +74,10 @@ def plan_program(config: Path, gcode: Path) -> Planned:
     batches = {i: bytearray() for i in range(len(nodes))}
     record = PlanRecord((0.0, 0.0, 0.0, 0.0))
     with Program.open(str(gcode)) as program:
-        job = Job(program, Planner(description.limits), description.homed_position)
+        planner: Any = Planner(description.limits)
+        if description.extruder and hasattr(Planner, "pressure_advance"):
+            planner.pressure_advance = description.extruder.pressure_advance
+        job = Job(program, planner, description.homed_position)
         pipeline = Pipeline(
             job, steps, lambda node, batch: batches[node].extend(batch), nodes=len(nodes), record=record
         )
@@ -103,6 +108,9 @@ def _run(pipeline: Pipeline) -> End:
             case PositionSet():
                 pipeline.finish()
                 pipeline.declare(event.position)
+                # What is shaped or smoothed comes to rest a little later than the planner.
+                if pipeline.steps.generated_until > pipeline.planner.print_time_end_s:
+                    pipeline.planner.begin_at(pipeline.steps.generated_until + SETTLE_S)
             case End():
                 pipeline.finish()
                 return event
