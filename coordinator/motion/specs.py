@@ -1,6 +1,7 @@
 """What motion is told about the machine: plain values, checked by whoever builds them."""
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,19 +45,41 @@ class NodeStreamSpec:
     reset_step_clock_id: int
 
 
+class StepKinematics(IntEnum):
+    """What a stepper's position is as a function of the axes; the numbers are those of steps.h."""
+
+    LINEAR = 0
+    """Sum of weights times axes."""
+    DELTA = 1
+    """Height of a carriage; params: arm², tower x, tower y."""
+    DELTESIAN = 2
+    """Height of a carriage; params: arm², arm x."""
+    POLAR_RADIUS = 3
+    """Distance from the Z axis."""
+    POLAR_ANGLE = 4
+    """Angle around the Z axis, unwrapped, rad."""
+    ROTARY_DELTA = 5
+    """Angle of an upper arm, rad; params: see kinematics/rotary_delta.py."""
+    WINCH = 6
+    """Distance from the anchor; params: x, y, z."""
+
+
 @dataclass(frozen=True, slots=True)
 class StepperSpec:
-    """One stepper of a linear kinematics."""
+    """One stepper."""
 
     name: str
     node: int
     """Index into the list of NodeStreamSpec."""
     oid: int
     weights: tuple[float, float, float, float]
-    """The stepper's position in mm is the sum of weights[i] * axis[i] over X Y Z E."""
+    """Of a LINEAR stepper: its position in mm is the sum of weights[i] * axis[i] over X Y Z E."""
     step_distance: float
-    """mm per step, > 0."""
+    """mm (POLAR_ANGLE and ROTARY_DELTA: rad) per step, > 0."""
     invert_dir: bool
     """Whether set_next_step_dir takes 0 for a positive step."""
     step_pulse_s: float
     """Shortest high time of the step pin; steps are never closer than two of them. 0: both edges step."""
+    kinematics: StepKinematics = StepKinematics.LINEAR
+    params: tuple[float, ...] = ()
+    """Of the kinematics."""
