@@ -28,7 +28,9 @@ def shaper_impulses(kind: str, frequency_hz: float, damping_ratio: float) -> Imp
     if not (0 < frequency_hz < math.inf):
         raise CanductorError(f"a shaper frequency of {frequency_hz} Hz is impossible; it must be above 0")
     if not 0 <= damping_ratio < 1:
-        raise CanductorError(f"a damping ratio of {damping_ratio} is impossible; it must be in 0 <= ratio < 1")
+        raise CanductorError(
+            f"a damping ratio of {damping_ratio} is impossible; it must be in 0 <= ratio < 1"
+        )
     damped = math.sqrt(1 - damping_ratio**2)
     period_s = 1 / (frequency_hz * damped)
     spacing = 0.375 if kind == "mzv" else 0.5

@@ -82,7 +82,7 @@ def smoothed(moves: Sequence[Move], times: Floats) -> Floats:
     half = round(SMOOTH_S / 2 / GRID_S)
     window = half - np.abs(np.arange(-half, half + 1)).astype(np.float64)
     values = np.convolve(planned(moves, grid, 3, pressed=True), window / window.sum(), "same")
-    out: Floats = np.interp(times, grid, values)
+    out: Floats = np.interp(times, grid[half:-half], values[half:-half])  # elsewhere the window has no values
     return out
 
 
