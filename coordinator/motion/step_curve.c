@@ -71,7 +71,9 @@ static struct piece make_piece(const struct step_gen *gen, struct stepper *s, do
         end = fmin(end, step_smooth(gen, s, s->time, smooth));
     if (p.linear)
         make_poly(s, &p, smooth);
-    p.still &= !p.smooth;
+    for (int i = 1; p.smooth && i < 5; i++)
+        p.still &= p.poly[i] == 0;
+    p.still &= p.linear || !p.smooth;
     p.seconds = fmax(end - s->time, ROUNDING_S / 2);
     return p;
 }
@@ -161,8 +163,11 @@ static int play_span(struct step_gen *gen, struct stepper *s, const struct piece
     const double begin = evaluate(s, p, from, &v0), end = evaluate(s, p, to, &v1);
     if (!(fabs(begin) < FURTHEST_STEPS && fabs(end) < FURTHEST_STEPS))
         return step_fail(gen, STEP_BAD_MOVE, s, p->begin, end);
-    const int direction = end > begin ? 1 : -1;
-    const int64_t target = step_nearest(end), count = (target - s->position) * direction;
+    // Only where the stepper rests does rounding decide: on the way, and at a turn, a boundary is crossed or
+    // not.
+    const int64_t target = p->still ? step_nearest(end) : (int64_t)floor(end + 0.5);
+    const int direction = p->still ? (target > s->position ? 1 : -1) : end > begin ? 1 : -1;
+    const int64_t count = (target - s->position) * direction;
     if (count <= 0)
         return STEP_OK;
     if (!p->linear || p->smooth)
