@@ -132,4 +132,4 @@ class Pipeline:
         while not self.planner.flush():
             self.run_through()
         self.run_through()
-        self.generate(self._appended_until, flush=True)
+        self.generate(self._appended_until + self.steps.lag_s, flush=True)

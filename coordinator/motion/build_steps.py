@@ -13,6 +13,10 @@ ffibuilder = builder(
     sources=[
         "coordinator/motion/steps.c",
         "coordinator/motion/step_times.c",
+        "coordinator/motion/step_axes.c",
+        "coordinator/motion/step_smooth.c",
+        "coordinator/motion/step_kinematics.c",
+        "coordinator/motion/step_curve.c",
         "coordinator/motion/step_compress.c",
         "coordinator/motion/step_fit.c",
         "coordinator/motion/step_stream.c",

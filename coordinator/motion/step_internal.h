@@ -15,6 +15,8 @@ enum {
     BUFFER_PAD = 16,     // the loops over steps work in blocks and may write behind the end
     STEP_STALLED = 1000, // internal status: no room for a segment now
     COMMANDS_PER_SEGMENT = 3,
+    STEP_TAPS = 3 * STEP_IMPULSES + 1,
+    USES_E = 1 << AXIS_E,
 };
 
 // Ticks of a node: whole + part + (print time − time)·ticks_per_s.
@@ -46,6 +48,15 @@ struct stepper {
     int64_t position; // steps generated (cancelled ones included)
     uint64_t move;    // number of the trapezoid that is next
     uint64_t begun;   // one more than the number of the last trapezoid whose begin was checked
+
+    // A stepper whose steps are not those of one move after the other: see step_curve.c.
+    bool curve;
+    unsigned uses;                  // axes, a bit each
+    double time, border;            // s: solved up to; to be solved up to
+    double checked;                 // s, where it was last seen to be where it should; -1: nowhere
+    double reach, lag;              // s: how far it sees ahead; how long it moves on
+    double smooth_s, angle;         // angle: the last one, rad
+    uint64_t cursor[STEP_TAPS + 3]; // moves; the last three are of the smoothing window
 
     // Steps that wait for compression: one direction, ticks relative to BASE. LOW and HIGH are their bands.
     double *ticks, *low, *high;
@@ -93,14 +104,45 @@ struct node {
     struct step_node_stats stats;
 };
 
+// The planned motion some time later, scaled for each axis.
+struct tap {
+    double time, amplitude[AXES];
+    unsigned axes;
+};
+
+struct shaper {
+    int n;
+    double amplitude[STEP_IMPULSES], time[STEP_IMPULSES];
+};
+
+// Planned motion around a time: position and derivatives of each axis, constant acceleration up to BORDER.
+struct motion {
+    double p[AXES], v[AXES], a[AXES];
+    double pressure_advance, border;
+};
+
+// A stretch of constant acceleration in one direction; lengths in any unit.
+struct phase {
+    double time, seconds; // s
+    double from, way;     // along the move
+    double speed, accel;  // at the slow end; 0: cruise
+    bool backwards;
+};
+
 struct step_gen {
     int32_t stepper_count, node_count;
     struct stepper *steppers;
     struct node *nodes;
-    struct trapezoid *moves; // ring
-    uint64_t moves_from, moves_to;
-    double until; // s, end of the last complete slice
-    double slice; // s, end of the slice in work; UNTIL when none is
+    struct trapezoid *moves;                  // ring
+    uint64_t kept_from, moves_from, moves_to; // kept, not yet generated, end
+    double rest[AXES];                        // mm, where the axes stand before the first kept move
+    struct shaper shapers[3];
+    struct tap taps[STEP_TAPS];
+    int tap_count;
+    double known;   // s, up to which the moves are known
+    double assumed; // s, up to which a flush took the machine to rest
+    double until;   // s, end of the last complete slice
+    double slice;   // s, end of the slice in work; UNTIL when none is
     double moves_end, max_error_s;
     struct step_error error;
 };
@@ -130,6 +172,32 @@ int step_fail(struct step_gen *gen, enum step_status status, const struct steppe
 
 // step_times.c: appends the stepper's steps before UNTIL to its buffer, compressing when it fills.
 int step_times_advance(struct step_gen *gen, struct stepper *stepper, double until);
+
+int64_t step_nearest(double u);
+
+// Appends COUNT steps of a phase in DIRECTION, the first at X from the phase's begin, DX apart. On a status
+// the stepper's position tells how far it came.
+int step_put(struct step_gen *gen, struct stepper *stepper, const struct phase *phase, int direction,
+             double x, double dx, int64_t count);
+
+// step_axes.c: the planned motion at TIME; CURSOR remembers the move and only goes forward.
+void step_locate(const struct step_gen *gen, uint64_t *cursor, double time, struct motion *out);
+void step_move_end_position(const struct trapezoid *move, double *position);
+void step_end_position(const struct step_gen *gen, double *position);
+void step_make_taps(struct step_gen *gen);
+void step_choose_way(struct step_gen *gen, struct stepper *stepper);
+bool step_settled(const struct step_gen *gen);
+
+// step_smooth.c: E of a smoothed stepper as a polynomial of the time since TIME, valid up to the result.
+double step_smooth(const struct step_gen *gen, struct stepper *stepper, double time, double poly[5]);
+
+// step_kinematics.c: position and speed of a stepper that is not linear, without distance and origin. ANGLE:
+// a value near by.
+double step_kinematic(const struct step_stepper_config *config, double angle, const double *position,
+                      const double *velocity, double *speed);
+
+// step_curve.c: as step_times_advance, for a stepper whose CURVE is set.
+int step_curve_advance(struct step_gen *gen, struct stepper *stepper, double until);
 
 void step_rebase(struct stepper *stepper, int64_t base);
 

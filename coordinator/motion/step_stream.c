@@ -137,8 +137,8 @@ static bool has_room(struct node *node) {
 
 // The earliest req_clock that segments not yet made may have.
 static int64_t horizon(const struct step_gen *gen, const struct stepper *s) {
-    const double earliest =
-        s->count ? s->ticks[0] - s->max_error_ticks : clock_relative(s->clock, gen->slice, s->base);
+    const double earliest = s->count ? s->ticks[0] - s->max_error_ticks
+                                     : clock_relative(s->clock, s->curve ? s->border : gen->slice, s->base);
     return s->base + (int64_t)floor(earliest) - s->lead_ticks - 1;
 }
 

@@ -10,18 +10,11 @@ static const double JUMP_STEPS = 0.01; // how far a move may begin from where th
 static const double FURTHEST_STEPS = 1e12;
 static const double TINY = 1e-300; // keeps 0/0 away
 
-struct phase {
-    double time, seconds; // s
-    double from, way;     // mm along the move
-    double speed, accel;  // mm/s at the slow end; mm/s²; 0: cruise
-    bool backwards;
-};
-
 static double mix(const double *weights, const double *values) {
     return weights[0] * values[0] + weights[1] * values[1] + weights[2] * values[2] + weights[3] * values[3];
 }
 
-static int64_t nearest(double u) {
+int64_t step_nearest(double u) {
     return (int64_t)floor(nearbyint(u * STEP_SNAP) / STEP_SNAP + 0.5);
 }
 
@@ -115,10 +108,8 @@ static void put_off(struct stepper *s, int direction, size_t count) {
     }
 }
 
-// Appends COUNT steps of a phase in DIRECTION, the first at X from the phase's begin, DX apart. On a status
-// the stepper's position tells how far it came.
-static int put(struct step_gen *gen, struct stepper *s, const struct phase *p, int direction, double x,
-               double dx, int64_t count) {
+int step_put(struct step_gen *gen, struct stepper *s, const struct phase *p, int direction, double x,
+             double dx, int64_t count) {
     for (int64_t done = 0; done < count;) {
         const double at = x + (double)done * dx;
         if (s->count && s->direction != direction) {
@@ -175,7 +166,7 @@ static int play(struct step_gen *gen, struct stepper *s, const struct trapezoid 
     if (!(fabs(begin) < FURTHEST_STEPS && fabs(end) < FURTHEST_STEPS))
         return step_fail(gen, STEP_BAD_MOVE, s, m->print_time, end);
     const int direction = ratio > 0 ? 1 : -1;
-    const int64_t target = nearest(end);
+    const int64_t target = step_nearest(end);
     int last = 2;
     while (last > 0 && !(phase[last].way > 0))
         last--;
@@ -196,7 +187,7 @@ static int play(struct step_gen *gen, struct stepper *s, const struct trapezoid 
             continue;
         const double boundary = (double)s->position + 0.5 * direction;
         const int status =
-            put(gen, s, p, direction, (boundary - begin) / ratio - p->from, 1 / fabs(ratio), count);
+            step_put(gen, s, p, direction, (boundary - begin) / ratio - p->from, 1 / fabs(ratio), count);
         if (status)
             return status;
     }

@@ -29,9 +29,12 @@ static bool is_legal(const struct step_config *c) {
     for (int i = 0; ok && i < c->stepper_count; i++) {
         const struct step_stepper_config *s = &c->steppers[i];
         ok = s->node >= 0 && s->node < c->node_count && in_range(s->step_distance, 0, LONGEST_S) &&
-             in_range(s->step_pulse_s, -1e-300, 1) && s->oid >= 0 && s->oid <= UINT8_MAX;
+             s->kinematics >= 0 && s->kinematics < STEP_KINEMATICS && in_range(s->step_pulse_s, -1e-300, 1) &&
+             s->oid >= 0 && s->oid <= UINT8_MAX;
         for (int j = 0; ok && j < AXES; j++)
             ok = fabs(s->weights[j]) < LONGEST_S;
+        for (int j = 0; ok && j < STEP_PARAMS; j++)
+            ok = fabs(s->params[j]) < LONGEST_S;
     }
     return ok;
 }
@@ -97,6 +100,16 @@ static double mix(const double *weights, const double *position) {
     return sum;
 }
 
+// The stepper's position at POSITION, in steps, not counted from its origin.
+static double absolute(struct stepper *s, const double *position) {
+    static const double still[AXES];
+    double speed;
+    if (s->config.kinematics == STEP_LINEAR)
+        return mix(s->config.weights, position) / s->config.step_distance;
+    s->angle = step_kinematic(&s->config, s->angle, position, still, &speed);
+    return s->angle / s->config.step_distance;
+}
+
 // What depends on how fast the stepper's node counts.
 static void set_tick_limits(struct stepper *s, double max_error_s) {
     const double rate = s->clock->ticks_per_s;
@@ -118,6 +131,11 @@ struct step_gen *step_gen_init(void *memory, const struct step_config *config) {
     gen->max_error_s = config->max_error_s;
     gen->moves_end = -LONGEST_S;
     gen->error.stepper = -1;
+    memcpy(gen->rest, config->start, sizeof(gen->rest));
+    for (int i = 0; i < 3; i++)
+        gen->shapers[i] = (struct shaper){.n = 1, .amplitude = {1}};
+    step_make_taps(gen);
+    gen->assumed = -LONGEST_S;
     for (int i = 0; i < gen->node_count; i++) {
         gen->nodes[i].config = config->nodes[i];
         gen->nodes[i].clock.ticks_per_s = config->nodes[i].clock_freq;
@@ -127,8 +145,11 @@ struct step_gen *step_gen_init(void *memory, const struct step_config *config) {
         s->config = config->steppers[i];
         struct node *node = &gen->nodes[s->config.node];
         s->clock = &node->clock;
-        s->origin = mix(s->config.weights, config->start) / s->config.step_distance;
+        s->origin = absolute(s, config->start);
+        if (!(fabs(s->origin) < 1e12))
+            return NULL;
         set_tick_limits(s, config->max_error_s);
+        step_choose_way(gen, s);
         step_make_prefix(&s->queue_step, node->config.queue_step_id, s->config.oid);
         step_make_prefix(&s->set_dir, node->config.set_next_step_dir_id, s->config.oid);
         step_make_prefix(&s->reset_clock, node->config.reset_step_clock_id, s->config.oid);
@@ -170,11 +191,11 @@ static bool move_is_legal(struct trapezoid *m) {
 
 int step_append(struct step_gen *gen, const struct trapezoid *moves, int n) {
     int taken = 0;
-    for (; taken < n && gen->moves_to - gen->moves_from < STEP_TRAPEZOIDS; taken++) {
+    for (; taken < n && gen->moves_to - gen->kept_from < STEP_TRAPEZOIDS; taken++) {
         struct trapezoid m = moves[taken];
         if (!move_is_legal(&m))
             return -step_fail(gen, STEP_BAD_MOVE, NULL, m.print_time, taken);
-        const double earliest = fmax(gen->moves_end, gen->slice);
+        const double earliest = fmax(fmax(gen->moves_end, gen->slice), gen->assumed);
         if (m.print_time < earliest - ROUNDING_S)
             return -step_fail(gen, STEP_BAD_ORDER, NULL, m.print_time, earliest);
         gen->moves[gen->moves_to++ % STEP_TRAPEZOIDS] = m;
@@ -189,6 +210,8 @@ int step_append(struct step_gen *gen, const struct trapezoid *moves, int n) {
 static int settle(struct step_gen *gen, struct stepper *s, double until_s, double force_s, bool flush) {
     if (!s->count)
         return STEP_OK;
+    until_s = s->curve ? s->border : until_s;
+    force_s -= s->reach;
     const double until = clock_relative(s->clock, until_s, s->base), last = s->ticks[s->count - 1];
     if (flush)
         return step_compress(gen, s, s->count, fmax(until, last + s->closest_ticks), HUGE_VAL);
@@ -205,7 +228,9 @@ static int settle(struct step_gen *gen, struct stepper *s, double until_s, doubl
 static int advance(struct step_gen *gen, double force_s, bool flush) {
     int result = STEP_OK;
     for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++) {
-        int status = step_times_advance(gen, s, gen->slice);
+        s->border = fmax(s->border, fmin(gen->slice, gen->known - s->reach));
+        int status =
+            s->curve ? step_curve_advance(gen, s, s->border) : step_times_advance(gen, s, gen->slice);
         if (!status)
             status = settle(gen, s, gen->slice, force_s, flush);
         if (status && status != STEP_STALLED)
@@ -221,6 +246,13 @@ static void finish_slice(struct step_gen *gen) {
     while (gen->moves_from < gen->moves_to &&
            is_over(move_end(&gen->moves[gen->moves_from % STEP_TRAPEZOIDS]), gen->until))
         gen->moves_from++;
+    const double past = gen->until - step_look_ahead(gen) - step_lag(gen) - ROUNDING_S;
+    for (; gen->kept_from < gen->moves_from; gen->kept_from++) {
+        const struct trapezoid *m = &gen->moves[gen->kept_from % STEP_TRAPEZOIDS];
+        if (move_end(m) > past && step_look_ahead(gen) + step_lag(gen) > 0)
+            break;
+        step_move_end_position(m, gen->rest);
+    }
     for (int i = 0; i < gen->node_count; i++)
         if (gen->until - gen->nodes[i].clock.time > PIVOT_S)
             step_set_clock(gen, i, gen->nodes[i].clock.ticks_per_s);
@@ -268,6 +300,7 @@ int step_generate(struct step_gen *gen, double until, int flush) {
         return step_fail(gen, STEP_BAD_ORDER, NULL, until, gen->until);
     if (gen->error.status)
         return gen->error.status;
+    gen->known = flush ? LONGEST_S : fmax(until, gen->moves_end);
     for (;;) {
         if (gen->slice <= gen->until)
             gen->slice = next_slice(gen, until);
@@ -276,6 +309,8 @@ int step_generate(struct step_gen *gen, double until, int flush) {
         if (status)
             return status;
         finish_slice(gen);
+        if (last && flush && until + step_look_ahead(gen) > gen->moves_end)
+            gen->assumed = fmax(gen->assumed, until + step_look_ahead(gen));
         if (last)
             return jammed(gen) ? STEP_FULL : STEP_OK;
     }
@@ -336,9 +371,108 @@ int step_set_axis_position(struct step_gen *gen, const double *position) {
     for (int i = 0; i < AXES; i++)
         if (!(fabs(position[i]) < LONGEST_S))
             return STEP_BAD_CONFIG;
+    const bool settled = step_settled(gen);
+    double shift[AXES];
+    step_end_position(gen, shift);
+    for (int i = 0; i < AXES; i++)
+        shift[i] = position[i] - shift[i];
     for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
-        s->origin = mix(s->config.weights, position) / s->config.step_distance - (double)s->position;
+        if (!settled && s->curve && s->config.kinematics != STEP_LINEAR)
+            return STEP_NOT_IDLE;
+    for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
+        if (!settled && s->curve)
+            s->origin += mix(s->config.weights, shift) / s->config.step_distance;
+        else
+            s->origin = absolute(s, position) - (double)s->position;
+    // Moves that still act are told as if they had led here.
+    for (uint64_t i = gen->kept_from; i < gen->moves_to; i++)
+        for (int j = 0; j < AXES; j++)
+            gen->moves[i % STEP_TRAPEZOIDS].start[j] += shift[j];
+    for (int j = 0; j < AXES; j++)
+        gen->rest[j] += shift[j];
     return STEP_OK;
+}
+
+// ----------------------------------------------------------------------------------------- what may change
+
+static bool may_change(const struct step_gen *gen) {
+    return gen->moves_from == gen->moves_to && gen->slice <= gen->until && step_settled(gen);
+}
+
+// All stands: what was before does not matter any more.
+static void start_afresh(struct step_gen *gen) {
+    step_end_position(gen, gen->rest);
+    gen->kept_from = gen->moves_to;
+    for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++) {
+        s->move = gen->moves_to;
+        s->time = s->border = fmax(gen->until, s->time);
+        step_choose_way(gen, s);
+    }
+}
+
+int step_set_shaper(struct step_gen *gen, int axis, int n, const double *amplitude, const double *time_s) {
+    struct shaper shaper = {.n = n};
+    double sum = 0, centre = 0;
+    if (axis < AXIS_X || axis > AXIS_Z || n < 1 || n > STEP_IMPULSES)
+        return STEP_BAD_CONFIG;
+    for (int i = 0; i < n; i++) {
+        if (!(fabs(amplitude[i]) <= 10 && fabs(time_s[i]) <= 1))
+            return STEP_BAD_CONFIG;
+        shaper.amplitude[i] = amplitude[i];
+        shaper.time[i] = time_s[i];
+        sum += amplitude[i];
+        centre += amplitude[i] * time_s[i];
+    }
+    if (!(fabs(sum - 1) < 1e-9 && fabs(centre) < 1e-9))
+        return STEP_BAD_CONFIG;
+    if (!may_change(gen))
+        return STEP_NOT_IDLE;
+    gen->shapers[axis] = shaper;
+    step_make_taps(gen);
+    start_afresh(gen);
+    return STEP_OK;
+}
+
+int step_set_weights(struct step_gen *gen, int stepper, const double *weights) {
+    if (stepper < 0 || stepper >= gen->stepper_count ||
+        gen->steppers[stepper].config.kinematics != STEP_LINEAR)
+        return STEP_BAD_CONFIG;
+    for (int i = 0; i < AXES; i++)
+        if (!(fabs(weights[i]) < LONGEST_S))
+            return STEP_BAD_CONFIG;
+    if (!may_change(gen))
+        return STEP_NOT_IDLE;
+    struct stepper *s = &gen->steppers[stepper];
+    start_afresh(gen);
+    const double before = absolute(s, gen->rest);
+    memcpy(s->config.weights, weights, sizeof(s->config.weights));
+    s->origin += absolute(s, gen->rest) - before;
+    step_choose_way(gen, s);
+    return STEP_OK;
+}
+
+int step_set_smooth_time(struct step_gen *gen, int stepper, double smooth_s) {
+    if (stepper < 0 || stepper >= gen->stepper_count || !(smooth_s == 0 || in_range(smooth_s, 1e-4, 1)))
+        return STEP_BAD_CONFIG;
+    if (!may_change(gen))
+        return STEP_NOT_IDLE;
+    gen->steppers[stepper].smooth_s = smooth_s;
+    start_afresh(gen);
+    return STEP_OK;
+}
+
+double step_look_ahead(const struct step_gen *gen) {
+    double most = 0;
+    for (int i = 0; i < gen->stepper_count; i++)
+        most = fmax(most, gen->steppers[i].reach);
+    return most;
+}
+
+double step_lag(const struct step_gen *gen) {
+    double most = 0;
+    for (int i = 0; i < gen->stepper_count; i++)
+        most = fmax(most, gen->steppers[i].lag);
+    return most;
 }
 
 // --------------------------------------------------------------------------------------------- statistics

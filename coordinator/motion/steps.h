@@ -34,6 +34,8 @@ enum {
     STEP_PAYLOAD_MAX = 59, // one command must fit into a block
     STEP_MOVE_COUNT_MAX = 65535,
     STEP_SNAP = 65536,
+    STEP_PARAMS = 8,
+    STEP_IMPULSES = 8,    // of one axis' shaper
     STEP_SLACK_TICKS = 2, // room for rounding that steps need beyond what the pulses need
 };
 
@@ -52,10 +54,24 @@ enum step_status {
     STEP_BAD_CONFIG, // see init
 };
 
+// What a stepper's position is, in units of step_distance; p = X Y Z (mm).
+enum step_kinematics {
+    STEP_LINEAR,       // Σ weights[i]·axis[i] over X Y Z E
+    STEP_DELTA,        // z + √(arm² − (tower_x − x)² − (tower_y − y)²); params: arm², tower_x, tower_y
+    STEP_DELTESIAN,    // z + √(arm² − (arm_x − x)²); params: arm², arm_x
+    STEP_POLAR_RADIUS, // √(x² + y²)
+    STEP_POLAR_ANGLE,  // atan2(y, x), unwrapped, rad
+    STEP_ROTARY_DELTA, // angle of the upper arm, rad; params: see step_kinematics.c
+    STEP_WINCH,        // distance to the anchor; params: x, y, z
+    STEP_KINEMATICS,
+};
+
 struct step_stepper_config {
     int32_t node, oid;
+    int32_t kinematics; // enum step_kinematics
     double weights[4];
-    double step_distance; // mm, > 0
+    double params[8];
+    double step_distance; // mm (angles: rad), > 0
     int32_t invert_dir;
     double step_pulse_s;
 };
@@ -131,6 +147,23 @@ int64_t step_clock_at(const struct step_gen *gen, int node, double print_time);
 
 // The axes stand at POSITION (mm, X Y Z E) from now on, without a step.
 int step_set_axis_position(struct step_gen *gen, const double *position);
+
+// Axis X, Y or Z moves as the sum of its planned motion, moved later by time_s[i] and scaled by amplitude[i].
+// Amplitudes sum to 1, times are centred (sum of amplitude·time 0). STEP_NOT_IDLE unless all has settled.
+int step_set_shaper(struct step_gen *gen, int axis, int n, const double *amplitude, const double *time_s);
+
+// The stepper follows other axes from now on, without a step. STEP_NOT_IDLE unless all has settled.
+int step_set_weights(struct step_gen *gen, int stepper, const double *weights);
+
+// The stepper's E part is E + pressure_advance·E', weighted by a triangle of full width SMOOTH_S. 0: plain E.
+// STEP_NOT_IDLE unless all has settled.
+int step_set_smooth_time(struct step_gen *gen, int stepper, double smooth_s);
+
+// How far (s) step times depend on moves later than themselves: so much more is held back without a flush.
+double step_look_ahead(const struct step_gen *gen);
+
+// How long (s) after the last move's end steps may still come.
+double step_lag(const struct step_gen *gen);
 
 // Merges another command of at most STEP_PAYLOAD_MAX bytes into a node's stream. It takes a slot until
 // FINISH_CLOCK. Returns STEP_FULL when STEP_TIMED wait already; STEP_BAD_CONFIG on a bad node or size.

@@ -199,6 +199,55 @@ class StepGenerator:
         if lib.step_set_axis_position(self._gen, ffi.new("double[4]", position)):
             raise StepError(f"the axes cannot be set to {position} mm while moves wait; generate them first")
 
+    @property
+    def look_ahead_s(self) -> float:
+        """How far step times depend on later moves (s): so much more is held back without a flush."""
+        return float(lib.step_look_ahead(self._gen))
+
+    @property
+    def lag_s(self) -> float:
+        """How long (s) after the end of the last move steps may still come."""
+        return float(lib.step_lag(self._gen))
+
+    def set_shaper(self, axis: int, impulses: Sequence[tuple[float, float]]) -> None:
+        """Shape axis 0..2 (X Y Z) by IMPULSES: (amplitude, time in s) each, centred; none: unshaped.
+
+        Raises StepError unless the machine has been at rest for the lag of all shapers and smoothing.
+        """
+        amplitudes = [amplitude for amplitude, _ in impulses] or [1.0]
+        times = [time_s for _, time_s in impulses] or [0.0]
+        status = lib.step_set_shaper(self._gen, axis, len(times), amplitudes, times)
+        self._check_settled(status, f"the shaper of axis {axis}", f"impulses {list(impulses)}")
+
+    def set_weights(self, stepper: int, weights: Position) -> None:
+        """Let STEPPER (LINEAR) follow other axes from now on; raises StepError unless all has settled."""
+        self._check_stepper(stepper)
+        status = lib.step_set_weights(self._gen, stepper, weights)
+        self._check_settled(status, f"what {self._steppers[stepper].name} follows", f"weights {weights}")
+
+    def set_smooth_time(self, stepper: int, smooth_s: float) -> None:
+        """Smooth STEPPER's E and its pressure advance by a triangle of full width SMOOTH_S; 0: neither.
+
+        Raises StepError unless all has settled.
+        """
+        self._check_stepper(stepper)
+        status = lib.step_set_smooth_time(self._gen, stepper, smooth_s)
+        what = f"the smooth time of {self._steppers[stepper].name}"
+        self._check_settled(status, what, f"a smooth time of {smooth_s} s")
+
+    def _check_settled(self, status: int, what: str, value: str) -> None:
+        if status == lib.STEP_NOT_IDLE:
+            raise StepError(
+                f"{what} cannot change while steps of earlier moves may come; "
+                f"generate until {self.lag_s:.3f} s after the last move first"
+            )
+        if status:
+            raise StepError(f"{what} is refused: {value} is out of range")
+
+    def _check_stepper(self, index: int) -> None:
+        if not 0 <= index < len(self._steppers):
+            raise StepError(f"there is no stepper {index}; the generator has {len(self._steppers)}")
+
     def stats(self) -> StepStats:
         """Return the totals of every stepper and node."""
         return StepStats(
@@ -207,8 +256,7 @@ class StepGenerator:
         )
 
     def _stepper_stats(self, index: int) -> StepperStats:
-        if not 0 <= index < len(self._steppers):
-            raise StepError(f"there is no stepper {index}; the generator has {len(self._steppers)}")
+        self._check_stepper(index)
         s = ffi.new("struct step_stepper_stats *")
         lib.step_stepper_stats(self._gen, index, s)
         values = (getattr(s, field.name) for field in fields(StepperStats)[1:])
@@ -277,6 +325,7 @@ def _config(
     c_nodes = ffi.new("struct step_node_config[]", max(len(nodes), 1))
     for c, s in zip(c_steppers, steppers, strict=False):
         c.node, c.oid, c.weights, c.step_distance = s.node, s.oid, s.weights, s.step_distance
+        c.kinematics, c.params = s.kinematics, s.params
         c.invert_dir, c.step_pulse_s = s.invert_dir, s.step_pulse_s
     for c, n in zip(c_nodes, nodes, strict=False):
         c.clock_freq, c.move_count, c.queue_step_id = n.clock_freq, n.move_count, n.queue_step_id

@@ -1,0 +1,219 @@
+// SPDX-License-Identifier: Apache-2.0
+// Steps of shaped, smoothed and non-linear steppers. Between the borders of all phases that a stepper sees,
+// its axes are polynomials of time, made afresh from the moves at each piece's begin, so that no error adds
+// up. A piece is cut into spans in which the stepper does not turn. Shaped linear steppers have constant
+// acceleration there: the closed form of step_times.c. The others are solved by safeguarded Newton.
+#include "coordinator/motion/step_internal.h"
+
+static const double FURTHEST_STEPS = 1e12;
+static const double JUMP_STEPS = 0.51;
+static const double SPAN_S = 0.002;  // in which a non-linear stepper turns at most once
+static const double EXACT_S = 1e-10; // of a solution
+static const int ITERATIONS = 80;
+
+struct piece {
+    double begin, seconds;
+    double axis[AXES][3]; // mm; powers of the time since BEGIN
+    double poly[5];       // steps, of a linear stepper
+    bool linear, smooth, still;
+};
+
+// The position since init at TIME after the piece's begin, in steps, and its speed.
+static double evaluate(const struct stepper *s, const struct piece *p, double t, double *speed) {
+    const double *c = p->poly;
+    if (p->linear) {
+        *speed = c[1] + t * (2 * c[2] + t * (3 * c[3] + t * 4 * c[4]));
+        return c[0] + t * (c[1] + t * (c[2] + t * (c[3] + t * c[4])));
+    }
+    double at[AXES], v[AXES];
+    for (int i = 0; i < AXES; i++) {
+        at[i] = p->axis[i][0] + t * (p->axis[i][1] + t * p->axis[i][2]);
+        v[i] = p->axis[i][1] + 2 * t * p->axis[i][2];
+    }
+    const double u = step_kinematic(&s->config, s->angle, at, v, speed);
+    *speed /= s->config.step_distance;
+    return u / s->config.step_distance - s->origin;
+}
+
+static void make_poly(const struct stepper *s, struct piece *p, const double *smooth) {
+    for (int k = 0; k < 5; k++) {
+        double sum = p->smooth ? s->config.weights[AXIS_E] * smooth[k] : 0;
+        for (int i = 0; k < 3 && i < AXES; i++)
+            sum += s->config.weights[i] * p->axis[i][k];
+        p->poly[k] = sum / s->config.step_distance;
+    }
+    p->poly[0] -= s->origin;
+}
+
+static struct piece make_piece(const struct step_gen *gen, struct stepper *s, double until) {
+    struct piece p = {.begin = s->time, .linear = s->config.kinematics == STEP_LINEAR};
+    p.smooth = s->smooth_s > 0 && s->uses & USES_E;
+    const unsigned axes = p.smooth ? s->uses & ~(unsigned)USES_E : s->uses;
+    double end = until, smooth[5];
+    p.still = true;
+    for (int i = 0; i < gen->tap_count; i++) {
+        const struct tap *tap = &gen->taps[i];
+        if (!(tap->axes & axes))
+            continue;
+        struct motion m;
+        step_locate(gen, &s->cursor[i], s->time - tap->time, &m);
+        end = fmin(end, m.border + tap->time);
+        for (int j = 0; j < AXES; j++) {
+            if (!(axes >> j & 1))
+                continue;
+            p.axis[j][0] += tap->amplitude[j] * m.p[j];
+            p.axis[j][1] += tap->amplitude[j] * m.v[j];
+            p.axis[j][2] += tap->amplitude[j] * m.a[j] / 2;
+            p.still &= m.v[j] == 0 && m.a[j] == 0;
+        }
+    }
+    if (p.smooth)
+        end = fmin(end, step_smooth(gen, s, s->time, smooth));
+    if (p.linear)
+        make_poly(s, &p, smooth);
+    for (int i = 1; p.smooth && i < 5; i++)
+        p.still &= p.poly[i] == 0;
+    p.still &= p.linear || !p.smooth;
+    p.seconds = fmax(end - s->time, ROUNDING_S / 2);
+    return p;
+}
+
+// The first time after FROM behind which the stepper's speed may behave otherwise.
+static double next_cut(const struct piece *p, double from) {
+    const double *c = p->poly;
+    double cut = p->seconds;
+    if (p->still)
+        return cut;
+    if (!p->linear)
+        return fmin(cut, from + SPAN_S);
+    if (!p->smooth) {
+        const double turn = -c[1] / (2 * c[2]); // not finite in a cruise
+        return turn > from + EXACT_S && turn < cut ? turn : cut;
+    }
+    // The roots of u'' = 2·c2 + 6·c3·t + 12·c4·t²: between them u' is monotone.
+    const double root = sqrt(9 * c[3] * c[3] - 24 * c[2] * c[4]);
+    const double q = -(3 * c[3] + copysign(root, c[3]));
+    const double roots[2] = {q / (12 * c[4]), 2 * c[2] / q};
+    for (int i = 0; i < 2; i++)
+        if (roots[i] > from + EXACT_S && roots[i] < cut)
+            cut = roots[i];
+    return cut;
+}
+
+// Where the speed changes its sign between FROM and TO, or TO.
+static double find_turn(const struct stepper *s, const struct piece *p, double from, double to) {
+    double first, last, speed, low = from, high = to;
+    evaluate(s, p, from, &first);
+    evaluate(s, p, to, &last);
+    if (!(first * last < 0))
+        return to;
+    while (high - low > EXACT_S) {
+        const double middle = 0.5 * (low + high);
+        if (middle <= low || middle >= high)
+            break;
+        evaluate(s, p, middle, &speed);
+        if (speed * first > 0)
+            low = middle;
+        else
+            high = middle;
+    }
+    return high - from > 2 * EXACT_S && to - high > 2 * EXACT_S ? high : to;
+}
+
+// The time in FROM..TO at which the stepper, moving in DIRECTION, is at BOUNDARY; GUESS is any time.
+static double solve(const struct stepper *s, const struct piece *p, double from, double to, double guess,
+                    int direction, double boundary) {
+    double low = from, high = to, t = guess > low && guess < high ? guess : low;
+    for (int i = 0; i < ITERATIONS && high - low > EXACT_S; i++) {
+        double speed;
+        const double off = (evaluate(s, p, t, &speed) - boundary) * direction;
+        if (off > 0)
+            high = t;
+        else
+            low = t;
+        double next = t - off / (speed * direction);
+        if (!(next >= low && next <= high))
+            next = 0.5 * (low + high);
+        const double change = fabs(next - t);
+        t = next;
+        if (change < EXACT_S)
+            break;
+    }
+    return t;
+}
+
+static int play_solved(struct step_gen *gen, struct stepper *s, const struct piece *p, double from, double to,
+                       int direction, int64_t target) {
+    const struct phase flow = {.time = p->begin, .seconds = p->seconds, .speed = 1}; // x is time
+    double last = from, guess = from;
+    while (s->position != target) {
+        const double boundary = (double)s->position + 0.5 * direction;
+        const double t = solve(s, p, last, to, guess, direction, boundary);
+        const int status = step_put(gen, s, &flow, direction, t, 0, 1);
+        if (status)
+            return status;
+        guess = t + (t - last);
+        last = t;
+    }
+    return STEP_OK;
+}
+
+static int play_span(struct step_gen *gen, struct stepper *s, const struct piece *p, double from, double to) {
+    double v0, v1;
+    const double begin = evaluate(s, p, from, &v0), end = evaluate(s, p, to, &v1);
+    if (!(fabs(begin) < FURTHEST_STEPS && fabs(end) < FURTHEST_STEPS))
+        return step_fail(gen, STEP_BAD_MOVE, s, p->begin, end);
+    // Only where the stepper rests does rounding decide: on the way, and at a turn, a boundary is crossed or
+    // not.
+    const int64_t target = p->still ? step_nearest(end) : (int64_t)floor(end + 0.5);
+    const int direction = p->still ? (target > s->position ? 1 : -1) : end > begin ? 1 : -1;
+    const int64_t count = (target - s->position) * direction;
+    if (count <= 0)
+        return STEP_OK;
+    if (!p->linear || p->smooth)
+        return play_solved(gen, s, p, from, to, direction, target);
+    struct phase span = {.time = p->begin + from, .seconds = to - from, .way = fabs(end - begin)};
+    span.backwards = fabs(v1) < fabs(v0);
+    span.speed = fmin(fabs(v0), fabs(v1));
+    span.accel = 2 * fabs(p->poly[2]);
+    if (span.way < 1e-4) { // no more than what snaps
+        span.backwards = false;
+        span.accel = 0;
+        span.speed = (double)(count + 1) / span.seconds;
+    }
+    const double boundary = (double)s->position + 0.5 * direction;
+    return step_put(gen, s, &span, direction, (boundary - begin) * direction, 1, count);
+}
+
+static int play_piece(struct step_gen *gen, struct stepper *s, const struct piece *p) {
+    double speed;
+    const double off = evaluate(s, p, 0, &speed) - (double)s->position;
+    if (s->time != s->checked && !(fabs(off) <= JUMP_STEPS))
+        return step_fail(gen, STEP_JUMP, s, p->begin, off);
+    s->checked = s->time;
+    for (double from = 0; from < p->seconds;) {
+        double to = next_cut(p, from);
+        if (!p->still && (!p->linear || p->smooth))
+            to = find_turn(s, p, from, to);
+        const int status = play_span(gen, s, p, from, to);
+        if (status)
+            return status;
+        if (s->config.kinematics == STEP_POLAR_ANGLE)
+            s->angle = (evaluate(s, p, to, &speed) + s->origin) * s->config.step_distance;
+        from = to;
+        s->time = s->checked = p->begin + to; // steps up to here are done, whatever comes
+    }
+    return STEP_OK;
+}
+
+int step_curve_advance(struct step_gen *gen, struct stepper *s, double until) {
+    while (s->time < until - ROUNDING_S) {
+        const struct piece piece = make_piece(gen, s, until);
+        const int status = play_piece(gen, s, &piece);
+        if (status)
+            return status;
+        s->time = piece.begin + piece.seconds;
+        s->checked = -1;
+    }
+    return STEP_OK;
+}
