@@ -19,6 +19,9 @@ enum {
 // What an end below, about and above the true time is worth, in shares of the segment's length. Measured on
 // sliced files; from 0/0.1/0.1 to 0/0.15/0.25 the number of segments differs by less than 1 %.
 static const double END_IS_WORTH[FIT_ENDS] = {0, 0.1, 0.15};
+// What a byte less in every command is worth, in shares of the way. More saves bytes at the price of
+// commands.
+static const double BYTE_IS_WORTH = 0.003;
 
 // ------------------------------------------------------------------------------------------------- bands
 
@@ -69,7 +72,8 @@ static double make_bands(struct stepper *s, size_t final, double next) {
 // One way to do the first AT steps of a stretch, the last of them at CLOCK.
 struct way {
     uint32_t at;
-    uint8_t from; // the way it goes on from, a segment earlier
+    uint8_t from;   // the way it goes on from, a segment earlier
+    uint16_t bytes; // of the numbers in its commands
     double clock, rank;
     struct fit_segment segment; // its last
 };
@@ -96,6 +100,18 @@ static struct fit_problem problem_behind(const struct search *q, const struct wa
     };
 }
 
+// Bytes of a number on the wire, see wire/vlq.c.
+static uint32_t size_of(double value) {
+    uint32_t bytes = 1;
+    for (double least = -32, most = 96; bytes < 5 && !(value >= least && value < most); bytes++)
+        least *= 128, most *= 128;
+    return bytes;
+}
+
+static uint16_t bytes_of(const struct fit_segment *g) {
+    return (uint16_t)(size_of(g->interval) + size_of(g->count) + size_of(g->add));
+}
+
 static double end_of(const struct fit_segment *g, double clock) {
     return clock + g->interval * g->count + 0.5 * g->add * g->count * (g->count - 1.0);
 }
@@ -117,6 +133,15 @@ static void keep(struct way *ways, int *found, struct way way, double band) {
         ways[(*found)++] = way;
 }
 
+// Of ways of equally many segments: the further the better, and a good end helps the next segment; of those
+// that did all steps the one in fewest bytes.
+static double rank_of(const struct search *q, const struct way *way, int end, int level) {
+    if (way->at == q->count)
+        return 2.0 * q->count - way->bytes * BYTE_IS_WORTH;
+    const double came = way->at + way->segment.count * END_IS_WORTH[end];
+    return came * (1 - BYTE_IS_WORTH * way->bytes / level);
+}
+
 // Goes on from every way of a level. Returns false when steps to come might lead one further.
 static bool look_on(struct search *q, int level) {
     struct way *next = q->ways[level + 1];
@@ -133,13 +158,14 @@ static bool look_on(struct search *q, int level) {
             const struct fit_segment *g = &fit.end[end];
             if (!g->count)
                 continue;
-            const struct way more = {
+            struct way more = {
                 .at = way->at + g->count,
                 .from = (uint8_t)i,
+                .bytes = (uint16_t)(way->bytes + bytes_of(g)),
                 .clock = end_of(g, way->clock),
-                .rank = way->at + g->count * (1 + END_IS_WORTH[end]),
                 .segment = *g,
             };
+            more.rank = rank_of(q, &more, end, level + 1);
             keep(next, found, more, p.high[g->count - 1] - p.low[g->count - 1]);
         }
     }
@@ -150,7 +176,7 @@ static bool look_on(struct search *q, int level) {
 // did all steps; it is the first then.
 static bool settle_level(struct search *q, int level) {
     struct way *ways = q->ways[level];
-    int good = 0;
+    int good = 0, whole = -1;
     for (int i = 0; i < q->found[level]; i++) {
         struct way way = ways[i];
         const struct way *before = &q->ways[level - 1][way.from];
@@ -159,14 +185,15 @@ static bool settle_level(struct search *q, int level) {
             continue;
         way.at = before->at + way.segment.count;
         way.clock = end_of(&way.segment, before->clock);
+        way.bytes = (uint16_t)(before->bytes + bytes_of(&way.segment));
+        if (way.at == q->count && (whole < 0 || way.bytes < ways[whole].bytes))
+            whole = good;
         ways[good++] = way;
-        if (way.at == q->count) {
-            ways[0] = way;
-            return true;
-        }
     }
     q->found[level] = good;
-    return false;
+    if (whole > 0)
+        ways[0] = ways[whole];
+    return whole >= 0;
 }
 
 // Returns how many segments the best way has that is certain; the way is the first of that level.

@@ -15,8 +15,8 @@
 
 enum {
     WIDE = 8,
-    GATES = 96,  // looked at, at most
-    FINE = 48,   // of them, over the expected steps
+    GATES = 128, // looked at, at most
+    FINE = 64,   // of them, over the expected steps
     COARSE = 12, // with less than these over the steps reached, look again
     TRIALS = 16,
 };
@@ -38,11 +38,12 @@ struct grid {
 
 #define EIGHT(f, k) f(k), f((k) - 1), f((k) - 2), f((k) - 3), f((k) - 4), f((k) - 5), f((k) - 6), f((k) - 7)
 #define ALL(f)                                                                                               \
-    EIGHT(f, 96), EIGHT(f, 88), EIGHT(f, 80), EIGHT(f, 72), EIGHT(f, 64), EIGHT(f, 56), EIGHT(f, 48),        \
-        EIGHT(f, 40), EIGHT(f, 32), EIGHT(f, 24), EIGHT(f, 16), EIGHT(f, 8)
+    EIGHT(f, 128), EIGHT(f, 120), EIGHT(f, 112), EIGHT(f, 104), EIGHT(f, 96), EIGHT(f, 88), EIGHT(f, 80),    \
+        EIGHT(f, 72), EIGHT(f, 64), EIGHT(f, 56), EIGHT(f, 48), EIGHT(f, 40), EIGHT(f, 32), EIGHT(f, 24),    \
+        EIGHT(f, 16), EIGHT(f, 8)
 #define INVERSE_OF(k) 1.0F / (float)(k)
 #define NOTHING(k) 0 * (k) - 1e30F
-_Static_assert(GATES == 96, "the tables have as many entries");
+_Static_assert(GATES == 128, "the tables have as many entries");
 // From [GATES − j] on: 1/j, 1/(j−1), … 1, then 0; and 0 for as many, then −huge.
 static const float INVERSE[2 * GATES] = {ALL(INVERSE_OF)};
 static const float BEHIND[2 * GATES] = {[GATES] = ALL(NOTHING)};
@@ -158,10 +159,16 @@ static inline struct range intervals(const struct grid *g, int32_t i, float add)
 
 // --------------------------------------------------------------------------------------------------- ends
 
-// Of the adds FIRST..LAST, measured from FROM, the one next to ADD that goes onto the wire as one byte.
+// Of the adds FIRST..LAST, measured from FROM, the one next to ADD that takes fewest bytes on the wire.
 static inline float shorter(float add, float from, float first, float last) {
-    const float low = -32 - from, high = 95 - from, near = add < low ? low : add > high ? high : add;
-    return near >= first && near <= last ? near : add;
+    static const float LEAST[] = {-32, -4096}, MOST[] = {95, 12287};
+    for (int bytes = 0; bytes < 2; bytes++) {
+        const float low = LEAST[bytes] - from, high = MOST[bytes] - from;
+        const float near = add < low ? low : add > high ? high : add;
+        if (near >= first && near <= last)
+            return near;
+    }
+    return add;
 }
 
 // The segment through the first I gates whose last step comes between FROM and TO, as shares of its band.

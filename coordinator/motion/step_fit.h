@@ -35,7 +35,7 @@ struct fit {
     bool open;                        // a segment might reach beyond the steps there are
 };
 
-// Finds the longest segment for each end. At most 48 to 96 steps are looked at, evenly spread: what lies
+// Finds the longest segment for each end. At most 64 to 128 steps are looked at, evenly spread: what lies
 // between must be checked. Without any, end[1] is the single next step; without that, nothing.
 void step_fit(const struct fit_problem *p, struct fit *out);
 
