@@ -102,10 +102,8 @@ static struct fit_problem problem_behind(const struct search *q, const struct wa
 
 // Bytes of a number on the wire, see wire/vlq.c.
 static uint32_t size_of(double value) {
-    uint32_t bytes = 1;
-    for (double least = -32, most = 96; bytes < 5 && !(value >= least && value < most); bytes++)
-        least *= 128, most *= 128;
-    return bytes;
+    return 1U + (value < -32 || value >= 96) + (value < -4096 || value >= 12288) +
+           (value < -524288 || value >= 1572864) + (value < -67108864 || value >= 201326592);
 }
 
 static uint16_t bytes_of(const struct fit_segment *g) {
