@@ -12,8 +12,8 @@ from tests.coordinator.motion.compress_cases import KINDS, OPTIMA, PREFIX, Case,
 from tests.coordinator.motion.compress_oracle import Price, Problem, commands, optimum, payload_bytes
 
 COMMANDS_EXCESS, BYTES_EXCESS = 1.05, 1.06
-"""Most that the engine's total over the whole set may be, as a share of the optimum's. The search spares commands
-first and bytes second; each optimum is that of its own price."""
+"""Most that the engine's total over the whole set may be, as a share of the optimum's. The search spares
+commands first and bytes second; each optimum is that of its own price."""
 CHECKED = 5
 """Cases of each kind solved anew in every run: those with the slowest clock, whose bands are narrowest."""
 
