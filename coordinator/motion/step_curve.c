@@ -10,6 +10,8 @@ static const double JUMP_STEPS = 0.51;
 static const double SPAN_S = 0.002;  // in which a non-linear stepper turns at most once
 static const double EXACT_S = 1e-10; // of a solution
 static const int ITERATIONS = 80;
+static const double NOISE_STEPS = 1e-7; // a stepper whose place changes by less in a span stands there
+static const double STANDS_S = 0.001;   // at least, to be sure that it is no turn
 
 struct piece {
     double begin, seconds;
@@ -163,10 +165,13 @@ static int play_span(struct step_gen *gen, struct stepper *s, const struct piece
     const double begin = evaluate(s, p, from, &v0), end = evaluate(s, p, to, &v1);
     if (!(fabs(begin) < FURTHEST_STEPS && fabs(end) < FURTHEST_STEPS))
         return step_fail(gen, STEP_BAD_MOVE, s, p->begin, end);
-    // Only where the stepper rests does rounding decide: on the way, and at a turn, a boundary is crossed or
+    const bool stands = p->still || fabs(end - begin) < NOISE_STEPS;
+    if (stands && !p->still && to - from < STANDS_S)
+        return STEP_OK;
+    // Only where the stepper stands does rounding decide: on the way, and at a turn, a boundary is crossed or
     // not.
-    const int64_t target = p->still ? step_nearest(end) : (int64_t)floor(end + 0.5);
-    const int direction = p->still ? (target > s->position ? 1 : -1) : end > begin ? 1 : -1;
+    const int64_t target = stands ? step_nearest(end) : (int64_t)floor(end + 0.5);
+    const int direction = stands ? (target > s->position ? 1 : -1) : end > begin ? 1 : -1;
     const int64_t count = (target - s->position) * direction;
     if (count <= 0)
         return STEP_OK;

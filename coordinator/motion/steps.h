@@ -5,8 +5,9 @@
 //
 // Where a stepper stands. With u = sum(weights·position)/step_distance − origin, a stepper whose axes rest at
 // u has done n = floor(snap(u) + ½) steps; snap rounds to 1/STEP_SNAP of a step, so that the noise of
-// floating point cannot decide a tie: a half goes up. A step is due when u crosses k + ½. Two opposite steps
-// closer than the stepper's pulses allow (a turn just behind a boundary) cancel out: neither is done. If the
+// floating point cannot decide a tie: a half goes up. A stepper that stands while its axes move (u changes by
+// less than 1e-7 steps for more than 1 ms) rests, too, and moves of unshaped linear steppers end snapped.
+// Elsewhere, also at a turn, nothing snaps: a step is due when u crosses k + ½. Two opposite steps closer than the stepper's pulses allow (a turn just behind a boundary) cancel out: neither is done. If the
 // first of them is already on its way (flushed), the second is put off until the pulses allow it.
 //
 // Segments. Step i (from 1) of a segment happens interval·i + add·i(i−1)/2 ticks after the last step before
