@@ -37,47 +37,83 @@ static double evaluate(const struct stepper *s, const struct piece *p, double t,
     return u / s->config.step_distance - s->origin;
 }
 
-static void make_poly(const struct stepper *s, struct piece *p, const double *smooth) {
-    for (int k = 0; k < 5; k++) {
-        double sum = p->smooth ? s->config.weights[AXIS_E] * smooth[k] : 0;
-        for (int i = 0; k < 3 && i < AXES; i++)
-            sum += s->config.weights[i] * p->axis[i][k];
-        p->poly[k] = sum / s->config.step_distance;
+// Looks through a tap anew: the weighted sum of the axes that it shows, in steps.
+static void look(const struct step_gen *gen, struct stepper *s, int index, unsigned axes) {
+    const struct tap *tap = &gen->taps[index];
+    struct seen *seen = &s->seen[index];
+    struct motion m;
+    step_locate(gen, &s->cursor[index], s->time - tap->time, &m);
+    *seen = (struct seen){.time = s->time, .border = m.border + tap->time, .still = true};
+    for (int j = 0; j < AXES; j++) {
+        if (!(tap->axes & axes & 1u << j))
+            continue;
+        const double weight = s->config.weights[j] * tap->amplitude[j] / s->config.step_distance;
+        seen->poly[0] += weight * m.p[j];
+        seen->poly[1] += weight * m.v[j];
+        seen->poly[2] += weight * (m.a[j] / 2);
+        seen->still &= m.v[j] == 0 && m.a[j] == 0;
     }
-    p->poly[0] -= s->origin;
 }
 
-static struct piece make_piece(const struct step_gen *gen, struct stepper *s, double until) {
-    struct piece p = {.begin = s->time, .linear = s->config.kinematics == STEP_LINEAR};
-    p.smooth = s->smooth_s > 0 && s->uses & USES_E;
-    const unsigned axes = p.smooth ? s->uses & ~(unsigned)USES_E : s->uses;
-    double end = until, smooth[5];
-    p.still = true;
+// The place of a linear stepper: taps are looked through anew only where their phase is over.
+static double add_taps(const struct step_gen *gen, struct stepper *s, unsigned axes, struct piece *p) {
+    double end = HUGE_VAL;
+    for (int i = 0; i < gen->tap_count; i++) {
+        struct seen *seen = &s->seen[i];
+        if (!(gen->taps[i].axes & axes))
+            continue;
+        if (is_over(seen->border, s->time))
+            look(gen, s, i, axes);
+        const double t = s->time - seen->time, a = seen->poly[2];
+        p->poly[0] += seen->poly[0] + t * (seen->poly[1] + t * a);
+        p->poly[1] += seen->poly[1] + 2 * t * a;
+        p->poly[2] += a;
+        p->still &= seen->still;
+        end = fmin(end, seen->border);
+        if (seen->border == HUGE_VAL)
+            seen->border = -HUGE_VAL; // a move may be appended at any time
+    }
+    return end;
+}
+
+static double add_axes(const struct step_gen *gen, struct stepper *s, struct piece *p) {
+    double end = HUGE_VAL;
     for (int i = 0; i < gen->tap_count; i++) {
         const struct tap *tap = &gen->taps[i];
-        if (!(tap->axes & axes))
+        if (!(tap->axes & s->uses))
             continue;
         struct motion m;
         step_locate(gen, &s->cursor[i], s->time - tap->time, &m);
         end = fmin(end, m.border + tap->time);
         for (int j = 0; j < AXES; j++) {
-            if (!(axes >> j & 1))
+            if (!(s->uses >> j & 1))
                 continue;
-            p.axis[j][0] += tap->amplitude[j] * m.p[j];
-            p.axis[j][1] += tap->amplitude[j] * m.v[j];
-            p.axis[j][2] += tap->amplitude[j] * m.a[j] / 2;
-            p.still &= m.v[j] == 0 && m.a[j] == 0;
+            p->axis[j][0] += tap->amplitude[j] * m.p[j];
+            p->axis[j][1] += tap->amplitude[j] * m.v[j];
+            p->axis[j][2] += tap->amplitude[j] * m.a[j] / 2;
+            p->still &= m.v[j] == 0 && m.a[j] == 0;
         }
     }
-    if (p.smooth)
+    return end;
+}
+
+static void make_piece(const struct step_gen *gen, struct stepper *s, double until, struct piece *p) {
+    *p = (struct piece){.begin = s->time, .linear = s->config.kinematics == STEP_LINEAR, .still = true};
+    p->smooth = p->linear && s->smooth_s > 0 && s->uses & USES_E;
+    const unsigned axes = p->smooth ? s->uses & ~(unsigned)USES_E : s->uses;
+    double end = fmin(until, p->linear ? add_taps(gen, s, axes, p) : add_axes(gen, s, p));
+    if (p->smooth) {
+        double smooth[5];
+        const double scale = s->config.weights[AXIS_E] / s->config.step_distance;
         end = fmin(end, step_smooth(gen, s, s->time, smooth));
-    if (p.linear)
-        make_poly(s, &p, smooth);
-    for (int i = 1; p.smooth && i < 5; i++)
-        p.still &= p.poly[i] == 0;
-    p.still &= p.linear || !p.smooth;
-    p.seconds = fmax(end - s->time, ROUNDING_S / 2);
-    return p;
+        for (int k = 0; k < 5; k++)
+            p->poly[k] += scale * smooth[k];
+        for (int k = 1; k < 5; k++)
+            p->still &= smooth[k] == 0;
+    }
+    if (p->linear)
+        p->poly[0] -= s->origin;
+    p->seconds = fmax(end - s->time, ROUNDING_S / 2);
 }
 
 // The first time after FROM behind which the stepper's speed may behave otherwise.
@@ -213,7 +249,8 @@ static int play_piece(struct step_gen *gen, struct stepper *s, const struct piec
 
 int step_curve_advance(struct step_gen *gen, struct stepper *s, double until) {
     while (s->time < until - ROUNDING_S) {
-        const struct piece piece = make_piece(gen, s, until);
+        struct piece piece;
+        make_piece(gen, s, until, &piece);
         const int status = play_piece(gen, s, &piece);
         if (status)
             return status;

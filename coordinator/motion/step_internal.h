@@ -19,6 +19,13 @@ enum {
     USES_E = 1 << AXIS_E,
 };
 
+// What a stepper sees of a phase through a tap: its share of the position, powers of the time since TIME,
+// which hold before BORDER.
+struct seen {
+    double time, border, poly[3];
+    bool still;
+};
+
 // Ticks of a node: whole + part + (print time − time)·ticks_per_s.
 struct clock_map {
     double time, part, ticks_per_s;
@@ -57,6 +64,10 @@ struct stepper {
     double reach, lag;              // s: how far it sees ahead; how long it moves on
     double smooth_s, angle;         // angle: the last one, rad
     uint64_t cursor[STEP_TAPS + 3]; // moves; the last three are of the smoothing window
+    struct seen seen[STEP_TAPS + 3];
+    // Smoothed E: the last piece's polynomial and begin, and how many more pieces may go on from their last.
+    double smoothed[5], smoothed_time;
+    int trusted;
 
     // Steps that wait for compression: one direction, ticks relative to BASE. LOW and HIGH are their bands.
     double *ticks, *low, *high;
@@ -182,13 +193,15 @@ int step_put(struct step_gen *gen, struct stepper *stepper, const struct phase *
 
 // step_axes.c: the planned motion at TIME; CURSOR remembers the move and only goes forward.
 void step_locate(const struct step_gen *gen, uint64_t *cursor, double time, struct motion *out);
+void step_forget(struct stepper *stepper);
 void step_move_end_position(const struct trapezoid *move, double *position);
 void step_end_position(const struct step_gen *gen, double *position);
 void step_make_taps(struct step_gen *gen);
 void step_choose_way(struct step_gen *gen, struct stepper *stepper);
 bool step_settled(const struct step_gen *gen);
 
-// step_smooth.c: E of a smoothed stepper as a polynomial of the time since TIME, valid up to the result.
+// step_smooth.c: E of a smoothed stepper as a polynomial of the time since TIME, valid up to the result. TIME
+// is where the last polynomial still holds.
 double step_smooth(const struct step_gen *gen, struct stepper *stepper, double time, double poly[5]);
 
 // step_kinematics.c: position and speed of a stepper that is not linear, without distance and origin. ANGLE:

@@ -394,6 +394,8 @@ int step_set_axis_position(struct step_gen *gen, const double *position) {
             s->origin += mix(s->config.weights, shift) / s->config.step_distance;
         else
             s->origin = absolute(s, position) - (double)s->position;
+    for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
+        step_forget(s);
     // Moves that still act are told as if they had led here.
     for (uint64_t i = gen->kept_from; i < gen->moves_to; i++)
         for (int j = 0; j < AXES; j++)
