@@ -10,6 +10,8 @@ static const double JUMP_STEPS = 0.51;
 static const double SPAN_S = 0.002;  // in which a non-linear stepper turns at most once
 static const double EXACT_S = 1e-10; // of a solution
 static const int ITERATIONS = 80;
+static const double CLOSE_S = 1e-8; // a change by Newton after which the next would be far below EXACT_S
+enum { NEWTONS = 4, SOLVED = 256 };
 static const double NOISE_STEPS = 1e-7; // a stepper whose place changes by less in a span stands there
 static const double STANDS_S = 0.001;   // at least, to be sure that it is no turn
 
@@ -110,6 +112,7 @@ static void make_piece(const struct step_gen *gen, struct stepper *s, double unt
             p->poly[k] += scale * smooth[k];
         for (int k = 1; k < 5; k++)
             p->still &= smooth[k] == 0;
+        p->smooth = smooth[3] != 0 || smooth[4] != 0; // else of constant acceleration
     }
     if (p->linear)
         p->poly[0] -= s->origin;
@@ -180,18 +183,72 @@ static double solve(const struct stepper *s, const struct piece *p, double from,
     return t;
 }
 
+// A quartic that rises from LOW to HIGH: when it is FIRST, FIRST + 1 ..., from a parabola's guesses by
+// Newton. False where that did not get all of the first COUNT right. Writes the whole block.
+STEP_VECTOR
+static bool solve_block(const double c[5], double low, double high, double first, int count,
+                        double t[FILL_BLOCK]) {
+    const double tiny = 1e-300;
+    const double u = c[0] + low * (c[1] + low * (c[2] + low * (c[3] + low * c[4])));
+    const double v = c[1] + low * (2 * c[2] + low * (3 * c[3] + low * 4 * c[4]));
+    const double twice = 4 * c[2] + low * (12 * c[3] + low * 24 * c[4]);
+    double change[FILL_BLOCK];
+    for (int j = 0; j < FILL_BLOCK; j++) {
+        double x = first + j - u, square = v * v + twice * (first + j - u);
+        x = x > 0 ? x : 0;
+        square = square > 0 ? square : 0;
+        const double guess = low + 2 * x / (v + __builtin_sqrt(square) + tiny);
+        t[j] = guess < high ? guess : high;
+    }
+    bool good = false;
+    for (int i = 0; i < NEWTONS && !good; i++) {
+        for (int j = 0; j < FILL_BLOCK; j++) {
+            const double at = t[j];
+            const double off = c[0] - (first + j) + at * (c[1] + at * (c[2] + at * (c[3] + at * c[4])));
+            const double speed = c[1] + at * (2 * c[2] + at * (3 * c[3] + at * 4 * c[4]));
+            double next = at - off / speed;
+            next = next > low ? next : low; // also what is no number
+            next = next < high ? next : high;
+            change[j] = __builtin_fabs(next - at);
+            t[j] = next;
+        }
+        good = true;
+        for (int j = 0; j < count; j++)
+            good &= change[j] < CLOSE_S;
+    }
+    return good;
+}
+
+static void solve_one_by_one(const struct stepper *s, const struct piece *p, double from, double to,
+                             int direction, int64_t position, int count, double *t) {
+    double last = from, guess = from;
+    for (int i = 0; i < count; i++) {
+        const double boundary = (double)(position + i * direction) + 0.5 * direction;
+        t[i] = solve(s, p, last, to, guess, direction, boundary);
+        guess = t[i] + (t[i] - last);
+        last = t[i];
+    }
+}
+
 static int play_solved(struct step_gen *gen, struct stepper *s, const struct piece *p, double from, double to,
                        int direction, int64_t target) {
-    const struct phase flow = {.time = p->begin, .seconds = p->seconds, .speed = 1}; // x is time
-    double last = from, guess = from;
+    double t[SOLVED + FILL_BLOCK] = {0}, c[5];
+    const struct phase flow = {.time = p->begin, .seconds = p->seconds, .solved = t};
+    for (int k = 0; k < 5; k++)
+        c[k] = p->poly[k] * direction;
     while (s->position != target) {
-        const double boundary = (double)s->position + 0.5 * direction;
-        const double t = solve(s, p, last, to, guess, direction, boundary);
-        const int status = step_put(gen, s, &flow, direction, t, 0, 1);
+        const int64_t left = (target - s->position) * direction;
+        const int count = left < SOLVED ? (int)left : SOLVED;
+        for (int i = 0; i < count; i += FILL_BLOCK) {
+            const int n = count - i < FILL_BLOCK ? count - i : FILL_BLOCK;
+            const int64_t position = s->position + i * direction;
+            if (!p->linear || !solve_block(c, from, to, (double)(position * direction) + 0.5, n, t + i))
+                solve_one_by_one(s, p, from, to, direction, position, n, t + i);
+            from = t[i + n - 1];
+        }
+        const int status = step_put(gen, s, &flow, direction, 0, 1, count);
         if (status)
             return status;
-        guess = t + (t - last);
-        last = t;
     }
     return STEP_OK;
 }

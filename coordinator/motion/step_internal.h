@@ -12,6 +12,7 @@ enum {
     SEGMENT_COUNT_MAX = 65535,
     PREFIX_MAX = 10,     // id and oid as VLQ
     RESET_GAP = 1 << 30, // ticks; longer rests are bridged by reset_step_clock, far from the 2^31 of the wire
+    FILL_BLOCK = 8,
     BUFFER_PAD = 16,     // the loops over steps work in blocks and may write behind the end
     STEP_STALLED = 1000, // internal status: no room for a segment now
     COMMANDS_PER_SEGMENT = 3,
@@ -138,7 +139,16 @@ struct phase {
     double from, way;     // along the move
     double speed, accel;  // at the slow end; 0: cruise
     bool backwards;
+    const double *solved; // or s from TIME of each step, FILL_BLOCK readable behind the last; x counts them
 };
+
+// Loops over steps, compiled for what the processor has; the same arithmetic either way.
+#if defined(__x86_64__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__) &&                          \
+    !defined(__SANITIZE_THREAD__)
+#define STEP_VECTOR __attribute__((target_clones("avx2", "default")))
+#else
+#define STEP_VECTOR
+#endif
 
 struct step_gen {
     int32_t stepper_count, node_count;
