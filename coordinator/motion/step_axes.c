@@ -63,6 +63,13 @@ void step_locate(const struct step_gen *gen, uint64_t *cursor, double time, stru
     out->pressure_advance = m->pressure_advance;
 }
 
+// What was seen of the moves does not hold any more.
+void step_forget(struct stepper *s) {
+    for (int i = 0; i < STEP_TAPS + 3; i++)
+        s->seen[i].border = -HUGE_VAL;
+    s->trusted = 0;
+}
+
 static void add_tap(struct step_gen *gen, int axis, double amplitude, double time) {
     int i = 0;
     while (i < gen->tap_count && gen->taps[i].time != time)
@@ -96,6 +103,7 @@ static unsigned axes_used(const struct step_stepper_config *config) {
 
 // One move after the other is the fast way; it does for linear steppers of axes as planned.
 void step_choose_way(struct step_gen *gen, struct stepper *s) {
+    step_forget(s);
     s->uses = axes_used(&s->config);
     const bool smooth = s->smooth_s > 0 && s->uses & USES_E;
     s->reach = s->lag = smooth ? s->smooth_s / 2 : 0;

@@ -10,6 +10,10 @@ static const double JUMP_STEPS = 0.51;
 static const double SPAN_S = 0.002;  // in which a non-linear stepper turns at most once
 static const double EXACT_S = 1e-10; // of a solution
 static const int ITERATIONS = 80;
+static const double CLOSE_S = 1e-8; // a change by Newton after which the next would be far below EXACT_S
+enum { NEWTONS = 4, SOLVED = 256 };
+static const double NOISE_STEPS = 1e-7; // a stepper whose place changes by less in a span stands there
+static const double STANDS_S = 0.001;   // at least, to be sure that it is no turn
 
 struct piece {
     double begin, seconds;
@@ -35,47 +39,84 @@ static double evaluate(const struct stepper *s, const struct piece *p, double t,
     return u / s->config.step_distance - s->origin;
 }
 
-static void make_poly(const struct stepper *s, struct piece *p, const double *smooth) {
-    for (int k = 0; k < 5; k++) {
-        double sum = p->smooth ? s->config.weights[AXIS_E] * smooth[k] : 0;
-        for (int i = 0; k < 3 && i < AXES; i++)
-            sum += s->config.weights[i] * p->axis[i][k];
-        p->poly[k] = sum / s->config.step_distance;
+// Looks through a tap anew: the weighted sum of the axes that it shows, in steps.
+static void look(const struct step_gen *gen, struct stepper *s, int index, unsigned axes) {
+    const struct tap *tap = &gen->taps[index];
+    struct seen *seen = &s->seen[index];
+    struct motion m;
+    step_locate(gen, &s->cursor[index], s->time - tap->time, &m);
+    *seen = (struct seen){.time = s->time, .border = m.border + tap->time, .still = true};
+    for (int j = 0; j < AXES; j++) {
+        if (!(tap->axes & axes & 1u << j))
+            continue;
+        const double weight = s->config.weights[j] * tap->amplitude[j] / s->config.step_distance;
+        seen->poly[0] += weight * m.p[j];
+        seen->poly[1] += weight * m.v[j];
+        seen->poly[2] += weight * (m.a[j] / 2);
+        seen->still &= m.v[j] == 0 && m.a[j] == 0;
     }
-    p->poly[0] -= s->origin;
 }
 
-static struct piece make_piece(const struct step_gen *gen, struct stepper *s, double until) {
-    struct piece p = {.begin = s->time, .linear = s->config.kinematics == STEP_LINEAR};
-    p.smooth = s->smooth_s > 0 && s->uses & USES_E;
-    const unsigned axes = p.smooth ? s->uses & ~(unsigned)USES_E : s->uses;
-    double end = until, smooth[5];
-    p.still = true;
+// The place of a linear stepper: taps are looked through anew only where their phase is over.
+static double add_taps(const struct step_gen *gen, struct stepper *s, unsigned axes, struct piece *p) {
+    double end = HUGE_VAL;
+    for (int i = 0; i < gen->tap_count; i++) {
+        struct seen *seen = &s->seen[i];
+        if (!(gen->taps[i].axes & axes))
+            continue;
+        if (is_over(seen->border, s->time))
+            look(gen, s, i, axes);
+        const double t = s->time - seen->time, a = seen->poly[2];
+        p->poly[0] += seen->poly[0] + t * (seen->poly[1] + t * a);
+        p->poly[1] += seen->poly[1] + 2 * t * a;
+        p->poly[2] += a;
+        p->still &= seen->still;
+        end = fmin(end, seen->border);
+        if (seen->border == HUGE_VAL)
+            seen->border = -HUGE_VAL; // a move may be appended at any time
+    }
+    return end;
+}
+
+static double add_axes(const struct step_gen *gen, struct stepper *s, struct piece *p) {
+    double end = HUGE_VAL;
     for (int i = 0; i < gen->tap_count; i++) {
         const struct tap *tap = &gen->taps[i];
-        if (!(tap->axes & axes))
+        if (!(tap->axes & s->uses))
             continue;
         struct motion m;
         step_locate(gen, &s->cursor[i], s->time - tap->time, &m);
         end = fmin(end, m.border + tap->time);
         for (int j = 0; j < AXES; j++) {
-            if (!(axes >> j & 1))
+            if (!(s->uses >> j & 1))
                 continue;
-            p.axis[j][0] += tap->amplitude[j] * m.p[j];
-            p.axis[j][1] += tap->amplitude[j] * m.v[j];
-            p.axis[j][2] += tap->amplitude[j] * m.a[j] / 2;
-            p.still &= m.v[j] == 0 && m.a[j] == 0;
+            p->axis[j][0] += tap->amplitude[j] * m.p[j];
+            p->axis[j][1] += tap->amplitude[j] * m.v[j];
+            p->axis[j][2] += tap->amplitude[j] * m.a[j] / 2;
+            p->still &= m.v[j] == 0 && m.a[j] == 0;
         }
     }
-    if (p.smooth)
+    return end;
+}
+
+static void make_piece(const struct step_gen *gen, struct stepper *s, double until, struct piece *p) {
+    *p = (struct piece){.begin = s->time, .linear = s->config.kinematics == STEP_LINEAR, .still = true};
+    p->smooth = p->linear && s->smooth_s > 0 && s->uses & USES_E;
+    const unsigned axes = p->smooth ? s->uses & ~(unsigned)USES_E : s->uses;
+    double end = fmin(until, p->linear ? add_taps(gen, s, axes, p) : add_axes(gen, s, p));
+    if (p->smooth) {
+        double smooth[5];
+        const double scale = s->config.weights[AXIS_E] / s->config.step_distance;
         end = fmin(end, step_smooth(gen, s, s->time, smooth));
-    if (p.linear)
-        make_poly(s, &p, smooth);
-    for (int i = 1; p.smooth && i < 5; i++)
-        p.still &= p.poly[i] == 0;
-    p.still &= p.linear || !p.smooth;
-    p.seconds = fmax(end - s->time, ROUNDING_S / 2);
-    return p;
+        for (int k = 0; k < 5; k++)
+            p->poly[k] += scale * smooth[k];
+        for (int k = 1; k < 5; k++)
+            p->still &= smooth[k] == 0;
+        p->smooth = smooth[3] != 0 || smooth[4] != 0; // else of constant acceleration
+    }
+    if (p->linear)
+        p->poly[0] -= s->origin;
+    p->seconds = fmax(end - s->time, ROUNDING_S / 2);
 }
 
 // The first time after FROM behind which the stepper's speed may behave otherwise.
@@ -142,18 +183,72 @@ static double solve(const struct stepper *s, const struct piece *p, double from,
     return t;
 }
 
+// A quartic that rises from LOW to HIGH: when it is FIRST, FIRST + 1 ..., from a parabola's guesses by
+// Newton. False where that did not get all of the first COUNT right. Writes the whole block.
+STEP_VECTOR
+static bool solve_block(const double c[5], double low, double high, double first, int count,
+                        double t[FILL_BLOCK]) {
+    const double tiny = 1e-300;
+    const double u = c[0] + low * (c[1] + low * (c[2] + low * (c[3] + low * c[4])));
+    const double v = c[1] + low * (2 * c[2] + low * (3 * c[3] + low * 4 * c[4]));
+    const double twice = 4 * c[2] + low * (12 * c[3] + low * 24 * c[4]);
+    double change[FILL_BLOCK];
+    for (int j = 0; j < FILL_BLOCK; j++) {
+        double x = first + j - u, square = v * v + twice * (first + j - u);
+        x = x > 0 ? x : 0;
+        square = square > 0 ? square : 0;
+        const double guess = low + 2 * x / (v + __builtin_sqrt(square) + tiny);
+        t[j] = guess < high ? guess : high;
+    }
+    bool good = false;
+    for (int i = 0; i < NEWTONS && !good; i++) {
+        for (int j = 0; j < FILL_BLOCK; j++) {
+            const double at = t[j];
+            const double off = c[0] - (first + j) + at * (c[1] + at * (c[2] + at * (c[3] + at * c[4])));
+            const double speed = c[1] + at * (2 * c[2] + at * (3 * c[3] + at * 4 * c[4]));
+            double next = at - off / speed;
+            next = next > low ? next : low; // also what is no number
+            next = next < high ? next : high;
+            change[j] = __builtin_fabs(next - at);
+            t[j] = next;
+        }
+        good = true;
+        for (int j = 0; j < count; j++)
+            good &= change[j] < CLOSE_S;
+    }
+    return good;
+}
+
+static void solve_one_by_one(const struct stepper *s, const struct piece *p, double from, double to,
+                             int direction, int64_t position, int count, double *t) {
+    double last = from, guess = from;
+    for (int i = 0; i < count; i++) {
+        const double boundary = (double)(position + i * direction) + 0.5 * direction;
+        t[i] = solve(s, p, last, to, guess, direction, boundary);
+        guess = t[i] + (t[i] - last);
+        last = t[i];
+    }
+}
+
 static int play_solved(struct step_gen *gen, struct stepper *s, const struct piece *p, double from, double to,
                        int direction, int64_t target) {
-    const struct phase flow = {.time = p->begin, .seconds = p->seconds, .speed = 1}; // x is time
-    double last = from, guess = from;
+    double t[SOLVED + FILL_BLOCK] = {0}, c[5];
+    const struct phase flow = {.time = p->begin, .seconds = p->seconds, .solved = t};
+    for (int k = 0; k < 5; k++)
+        c[k] = p->poly[k] * direction;
     while (s->position != target) {
-        const double boundary = (double)s->position + 0.5 * direction;
-        const double t = solve(s, p, last, to, guess, direction, boundary);
-        const int status = step_put(gen, s, &flow, direction, t, 0, 1);
+        const int64_t left = (target - s->position) * direction;
+        const int count = left < SOLVED ? (int)left : SOLVED;
+        for (int i = 0; i < count; i += FILL_BLOCK) {
+            const int n = count - i < FILL_BLOCK ? count - i : FILL_BLOCK;
+            const int64_t position = s->position + i * direction;
+            if (!p->linear || !solve_block(c, from, to, (double)(position * direction) + 0.5, n, t + i))
+                solve_one_by_one(s, p, from, to, direction, position, n, t + i);
+            from = t[i + n - 1];
+        }
+        const int status = step_put(gen, s, &flow, direction, 0, 1, count);
         if (status)
             return status;
-        guess = t + (t - last);
-        last = t;
     }
     return STEP_OK;
 }
@@ -163,10 +258,13 @@ static int play_span(struct step_gen *gen, struct stepper *s, const struct piece
     const double begin = evaluate(s, p, from, &v0), end = evaluate(s, p, to, &v1);
     if (!(fabs(begin) < FURTHEST_STEPS && fabs(end) < FURTHEST_STEPS))
         return step_fail(gen, STEP_BAD_MOVE, s, p->begin, end);
-    // Only where the stepper rests does rounding decide: on the way, and at a turn, a boundary is crossed or
+    const bool stands = p->still || fabs(end - begin) < NOISE_STEPS;
+    if (stands && !p->still && to - from < STANDS_S)
+        return STEP_OK;
+    // Only where the stepper stands does rounding decide: on the way, and at a turn, a boundary is crossed or
     // not.
-    const int64_t target = p->still ? step_nearest(end) : (int64_t)floor(end + 0.5);
-    const int direction = p->still ? (target > s->position ? 1 : -1) : end > begin ? 1 : -1;
+    const int64_t target = stands ? step_nearest(end) : (int64_t)floor(end + 0.5);
+    const int direction = stands ? (target > s->position ? 1 : -1) : end > begin ? 1 : -1;
     const int64_t count = (target - s->position) * direction;
     if (count <= 0)
         return STEP_OK;
@@ -208,7 +306,8 @@ static int play_piece(struct step_gen *gen, struct stepper *s, const struct piec
 
 int step_curve_advance(struct step_gen *gen, struct stepper *s, double until) {
     while (s->time < until - ROUNDING_S) {
-        const struct piece piece = make_piece(gen, s, until);
+        struct piece piece;
+        make_piece(gen, s, until, &piece);
         const int status = play_piece(gen, s, &piece);
         if (status)
             return status;

@@ -12,11 +12,19 @@ enum {
     SEGMENT_COUNT_MAX = 65535,
     PREFIX_MAX = 10,     // id and oid as VLQ
     RESET_GAP = 1 << 30, // ticks; longer rests are bridged by reset_step_clock, far from the 2^31 of the wire
+    FILL_BLOCK = 8,
     BUFFER_PAD = 16,     // the loops over steps work in blocks and may write behind the end
     STEP_STALLED = 1000, // internal status: no room for a segment now
     COMMANDS_PER_SEGMENT = 3,
     STEP_TAPS = 3 * STEP_IMPULSES + 1,
     USES_E = 1 << AXIS_E,
+};
+
+// What a stepper sees of a phase through a tap: its share of the position, powers of the time since TIME,
+// which hold before BORDER.
+struct seen {
+    double time, border, poly[3];
+    bool still;
 };
 
 // Ticks of a node: whole + part + (print time − time)·ticks_per_s.
@@ -57,6 +65,10 @@ struct stepper {
     double reach, lag;              // s: how far it sees ahead; how long it moves on
     double smooth_s, angle;         // angle: the last one, rad
     uint64_t cursor[STEP_TAPS + 3]; // moves; the last three are of the smoothing window
+    struct seen seen[STEP_TAPS + 3];
+    // Smoothed E: the last piece's polynomial and begin, and how many more pieces may go on from their last.
+    double smoothed[5], smoothed_time;
+    int trusted;
 
     // Steps that wait for compression: one direction, ticks relative to BASE. LOW and HIGH are their bands.
     double *ticks, *low, *high;
@@ -127,7 +139,16 @@ struct phase {
     double from, way;     // along the move
     double speed, accel;  // at the slow end; 0: cruise
     bool backwards;
+    const double *solved; // or s from TIME of each step, FILL_BLOCK readable behind the last; x counts them
 };
+
+// Loops over steps, compiled for what the processor has; the same arithmetic either way.
+#if defined(__x86_64__) && !defined(__clang__) && !defined(__SANITIZE_ADDRESS__) &&                          \
+    !defined(__SANITIZE_THREAD__)
+#define STEP_VECTOR __attribute__((target_clones("avx2", "default")))
+#else
+#define STEP_VECTOR
+#endif
 
 struct step_gen {
     int32_t stepper_count, node_count;
@@ -182,13 +203,15 @@ int step_put(struct step_gen *gen, struct stepper *stepper, const struct phase *
 
 // step_axes.c: the planned motion at TIME; CURSOR remembers the move and only goes forward.
 void step_locate(const struct step_gen *gen, uint64_t *cursor, double time, struct motion *out);
+void step_forget(struct stepper *stepper);
 void step_move_end_position(const struct trapezoid *move, double *position);
 void step_end_position(const struct step_gen *gen, double *position);
 void step_make_taps(struct step_gen *gen);
 void step_choose_way(struct step_gen *gen, struct stepper *stepper);
 bool step_settled(const struct step_gen *gen);
 
-// step_smooth.c: E of a smoothed stepper as a polynomial of the time since TIME, valid up to the result.
+// step_smooth.c: E of a smoothed stepper as a polynomial of the time since TIME, valid up to the result. TIME
+// is where the last polynomial still holds.
 double step_smooth(const struct step_gen *gen, struct stepper *stepper, double time, double poly[5]);
 
 // step_kinematics.c: position and speed of a stepper that is not linear, without distance and origin. ANGLE:

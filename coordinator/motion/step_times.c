@@ -22,16 +22,17 @@ static void split(const struct trapezoid *m, struct phase phase[3]) {
     const double accel_way = (m->start_v + 0.5 * m->accel * m->accel_s) * m->accel_s;
     const double cruise_way = m->cruise_v * m->cruise_s;
     const double end_v = fmax(m->cruise_v - m->accel * m->decel_s, 0);
-    phase[0] = (struct phase){m->print_time, m->accel_s, 0, accel_way, m->start_v, m->accel, false};
-    phase[1] =
-        (struct phase){m->print_time + m->accel_s, m->cruise_s, accel_way, cruise_way, m->cruise_v, 0, false};
+    phase[0] = (struct phase){m->print_time, m->accel_s, 0, accel_way, m->start_v, m->accel, false, NULL};
+    phase[1] = (struct phase){
+        m->print_time + m->accel_s, m->cruise_s, accel_way, cruise_way, m->cruise_v, 0, false, NULL};
     phase[2] = (struct phase){m->print_time + m->accel_s + m->cruise_s,
                               m->decel_s,
                               accel_way + cruise_way,
                               (m->cruise_v - 0.5 * m->accel * m->decel_s) * m->decel_s,
                               end_v,
                               m->accel,
-                              true};
+                              true,
+                              NULL};
 }
 
 static double way_at(const struct phase *p, double time) {
@@ -42,11 +43,19 @@ static double way_at(const struct phase *p, double time) {
 }
 
 // Ticks of COUNT steps, the first at X mm from the phase's begin, the others DX apart. Writes whole blocks.
+STEP_VECTOR
 static void fill(const struct phase *p, const struct clock_map *clock, int64_t base, double x, double dx,
                  size_t count, double *out) {
-    enum { BLOCK = 8 };
+    enum { BLOCK = FILL_BLOCK };
     const double rate = clock->ticks_per_s;
     const double origin = clock_relative(clock, p->backwards ? p->time + p->seconds : p->time, base);
+    if (p->solved) {
+        const double *t = p->solved + (size_t)x;
+        for (size_t i = 0; i < count; i += BLOCK)
+            for (size_t j = 0; j < BLOCK; j++)
+                out[i + j] = origin + t[i + j] * rate;
+        return;
+    }
     if (p->accel == 0) {
         const double scale = rate / p->speed;
         for (size_t i = 0; i < count; i += BLOCK)

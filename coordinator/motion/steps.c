@@ -195,7 +195,7 @@ int step_append(struct step_gen *gen, const struct trapezoid *moves, int n) {
         struct trapezoid m = moves[taken];
         if (!move_is_legal(&m))
             return -step_fail(gen, STEP_BAD_MOVE, NULL, m.print_time, taken);
-        const double earliest = fmax(fmax(gen->moves_end, gen->slice), gen->assumed);
+        const double earliest = step_next_move(gen);
         if (m.print_time < earliest - ROUNDING_S)
             return -step_fail(gen, STEP_BAD_ORDER, NULL, m.print_time, earliest);
         gen->moves[gen->moves_to++ % STEP_TRAPEZOIDS] = m;
@@ -285,6 +285,16 @@ static int run_slice(struct step_gen *gen, double force_s, bool flush) {
     }
 }
 
+// What is done up to the border took no other move into account: none may begin so early that it acts there.
+static void assume_rest(struct step_gen *gen) {
+    if (gen->until + step_look_ahead(gen) > gen->moves_end)
+        gen->assumed = fmax(gen->assumed, gen->until + step_look_ahead(gen));
+}
+
+double step_next_move(const struct step_gen *gen) {
+    return fmax(fmax(gen->moves_end, gen->slice), gen->assumed);
+}
+
 // The end of the next slice: a long rest is one slice.
 static double next_slice(const struct step_gen *gen, double until) {
     double end = gen->until + SLICE_S;
@@ -309,8 +319,8 @@ int step_generate(struct step_gen *gen, double until, int flush) {
         if (status)
             return status;
         finish_slice(gen);
-        if (last && flush && until + step_look_ahead(gen) > gen->moves_end)
-            gen->assumed = fmax(gen->assumed, until + step_look_ahead(gen));
+        if (last && flush)
+            assume_rest(gen);
         if (last)
             return jammed(gen) ? STEP_FULL : STEP_OK;
     }
@@ -384,6 +394,8 @@ int step_set_axis_position(struct step_gen *gen, const double *position) {
             s->origin += mix(s->config.weights, shift) / s->config.step_distance;
         else
             s->origin = absolute(s, position) - (double)s->position;
+    for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
+        step_forget(s);
     // Moves that still act are told as if they had led here.
     for (uint64_t i = gen->kept_from; i < gen->moves_to; i++)
         for (int j = 0; j < AXES; j++)
@@ -408,6 +420,7 @@ static void start_afresh(struct step_gen *gen) {
         s->time = s->border = fmax(gen->until, s->time);
         step_choose_way(gen, s);
     }
+    assume_rest(gen);
 }
 
 int step_set_shaper(struct step_gen *gen, int axis, int n, const double *amplitude, const double *time_s) {
@@ -447,7 +460,7 @@ int step_set_weights(struct step_gen *gen, int stepper, const double *weights) {
     const double before = absolute(s, gen->rest);
     memcpy(s->config.weights, weights, sizeof(s->config.weights));
     s->origin += absolute(s, gen->rest) - before;
-    step_choose_way(gen, s);
+    start_afresh(gen);
     return STEP_OK;
 }
 

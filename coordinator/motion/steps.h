@@ -5,9 +5,11 @@
 //
 // Where a stepper stands. With u = sum(weights·position)/step_distance − origin, a stepper whose axes rest at
 // u has done n = floor(snap(u) + ½) steps; snap rounds to 1/STEP_SNAP of a step, so that the noise of
-// floating point cannot decide a tie: a half goes up. A step is due when u crosses k + ½. Two opposite steps
-// closer than the stepper's pulses allow (a turn just behind a boundary) cancel out: neither is done. If the
-// first of them is already on its way (flushed), the second is put off until the pulses allow it.
+// floating point cannot decide a tie: a half goes up. A stepper that stands while its axes move (u changes by
+// less than 1e-7 steps for more than 1 ms) rests, too, and moves of unshaped linear steppers end snapped.
+// Elsewhere, also at a turn, nothing snaps: a step is due when u crosses k + ½. Two opposite steps closer
+// than the stepper's pulses allow (a turn just behind a boundary) cancel out: neither is done. If the first
+// of them is already on its way (flushed), the second is put off until the pulses allow it.
 //
 // Segments. Step i (from 1) of a segment happens interval·i + add·i(i−1)/2 ticks after the last step before
 // it, and not further from its true time than max_error and half the distance to either neighbour.
@@ -43,7 +45,7 @@ enum step_status {
     STEP_OK = 0,
     STEP_FULL,       // batches wait to be taken; take them and repeat the call
     STEP_BAD_MOVE,   // a trapezoid's numbers are no legal move
-    STEP_BAD_ORDER,  // a trapezoid begins before the last one ends, or in the time already generated
+    STEP_BAD_ORDER,  // a trapezoid begins before step_next_move
     STEP_JUMP,       // a trapezoid begins elsewhere than the stepper stands
     STEP_TOO_FAST,   // steps closer than the stepper's pulses allow
     STEP_TOO_DENSE,  // more segments at once than STEP_SEGMENTS
@@ -135,6 +137,10 @@ int step_generate(struct step_gen *gen, double until, int flush);
 
 // The time before which nothing more can be changed: UNTIL of the last complete step_generate.
 double step_generated_until(const struct step_gen *gen);
+
+// The earliest begin of the next move. After a flush, and after a change of a shaper or smoothing, that may
+// be later than step_generated_until: a move acts on step times up to step_look_ahead before it.
+double step_next_move(const struct step_gen *gen);
 
 // How a node's clock runs: ticks = ticks + (print time − time)·ticks_per_s. Only while no step waits.
 int step_set_clock_base(struct step_gen *gen, int node, double time, int64_t ticks, double ticks_per_s);

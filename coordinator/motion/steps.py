@@ -171,6 +171,14 @@ class StepGenerator:
         """Print time (s) before which nothing can be changed any more."""
         return float(lib.step_generated_until(self._gen))
 
+    @property
+    def next_move_s(self) -> float:
+        """Earliest print time (s) at which the next appended move may begin.
+
+        After a flush, and after a change of a shaper or smoothing, the planner has to begin there or later.
+        """
+        return float(lib.step_next_move(self._gen))
+
     def set_clock_base(self, node: int, print_time: float, ticks: int, ticks_per_s: float) -> None:
         """Say what NODE's 64-bit clock is at PRINT_TIME and how fast it runs; only while no step waits."""
         self._check_node(node)

@@ -26,6 +26,9 @@ SAMPLES = 7
 """Of the slope, per piece: a cubic has at most two turns inside."""
 HALVINGS = 60
 GRID = 64
+NOISE_STEPS = 1e-7
+"""A stepper whose place changes by less stands, if it lasts longer than STANDS_S."""
+STANDS_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,10 @@ class StepperPath:
             self._axes: list[AxisSignal] = _linear(spec.weights, phases, setting)
         else:
             self._axes = [_axis(axis, 1.0, phases, setting) for axis in range(3)]
+        self.curved = spec.kinematics != StepKinematics.LINEAR or any(
+            not isinstance(axis, Signal) for axis in self._axes
+        )
+        """Not one straight move after the other: then the end of a move is no rest."""
         self._origin = 0.0
         self._origin = float(self.u(np.array([REST_S]))[0]) - position
 
@@ -252,6 +259,26 @@ def turning_points(path: StepperPath) -> Floats:
     return np.unique(np.concatenate((breaks, low)))
 
 
+def standing(t: Floats, u: Floats) -> NDArray[np.bool_]:
+    """Return at which of the turning points T the stepper stands, before it or behind it."""
+    stretch = (np.abs(np.diff(u)) < NOISE_STEPS) & (np.diff(t) > STANDS_S)
+    ends = np.concatenate(([True], stretch, [True]))
+    both: NDArray[np.bool_] = ends[:-1] | ends[1:]
+    return both
+
+
+def between_rests(u: Floats, snapped: Floats) -> Floats:
+    """Return the steps done at each turning point where it does not rest: nothing snaps.
+
+    As close to a boundary as rounding reaches it is where it was before.
+    """
+    place = np.floor(u + 0.5)
+    for i in np.flatnonzero(np.abs(u - np.floor(u) - 0.5) < NOISE_STEPS):
+        before = place[i - 1] if i else snapped[i]
+        place[i] = min(max(before, math.floor(u[i])), math.floor(u[i]) + 1)
+    return place
+
+
 def crossings(path: StepperPath) -> tuple[int, int]:
     """Return how many steps the whole motion asks for, and where it ends."""
     t = turning_points(path)
@@ -259,4 +286,6 @@ def crossings(path: StepperPath) -> tuple[int, int]:
     if path.spec.kinematics == StepKinematics.POLAR_ANGLE:
         u = np.unwrap(u, period=math.tau / path.spec.step_distance)
     place = np.floor(np.round(u * SNAP) / SNAP + 0.5)
+    if path.curved:
+        place = np.where(standing(t, u), place, between_rests(u, place))
     return int(np.abs(np.diff(place)).sum()), resting(float(u[-1]))

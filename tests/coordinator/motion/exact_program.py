@@ -21,8 +21,6 @@ from tests.coordinator.motion.exact_shapers import impulses
 from tests.coordinator.motion.replay import Stream, replay_all
 
 MOVE_COUNT = 1024
-SETTLE_S = 1.0
-"""Longer than any shaper and window."""
 
 
 @dataclass
@@ -99,7 +97,14 @@ def _shape(steps: Any, description: MachineDescription, steppers: Sequence[Stepp
     return Setting(shapers, smooth_s)
 
 
+def _begin_late_enough(pipeline: Pipeline) -> None:
+    """Let the next move begin so late that it does not act on what is generated."""
+    if pipeline.steps.next_move_s > pipeline.planner.print_time_end_s:
+        pipeline.planner.begin_at(pipeline.steps.next_move_s)
+
+
 def _run(pipeline: Pipeline) -> End:
+    _begin_late_enough(pipeline)
     while True:
         event = pipeline.job.step()
         match event:
@@ -108,9 +113,7 @@ def _run(pipeline: Pipeline) -> End:
             case PositionSet():
                 pipeline.finish()
                 pipeline.declare(event.position)
-                # What is shaped or smoothed comes to rest a little later than the planner.
-                if pipeline.steps.generated_until > pipeline.planner.print_time_end_s:
-                    pipeline.planner.begin_at(pipeline.steps.generated_until + SETTLE_S)
+                _begin_late_enough(pipeline)
             case End():
                 pipeline.finish()
                 return event

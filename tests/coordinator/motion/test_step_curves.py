@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from coordinator.motion.shapers import SHAPER_KINDS, shaper_impulses
 from coordinator.motion.specs import StepKinematics, StepperSpec
 from coordinator.motion.steps import StepError
-from tests.coordinator.motion.steps_harness import MAX_ERROR_S, NOISE_S, Run, node_spec, stepper
+from tests.coordinator.motion.steps_harness import MAX_ERROR_S, NOISE_S, Run, node_spec, rows, stepper
 from tests.coordinator.motion.steps_oracle import LONG, Move, Position, make_move
 
 Floats = NDArray[np.float64]
@@ -190,6 +190,48 @@ def test_cuts_do_not_matter() -> None:
         play(run, square(), cuts)
         streams.append([d for _, d in run.steps(0)])
     assert streams[0] == streams[1]
+
+
+def test_a_move_after_a_flush_begins_late_enough_to_leave_the_past_alone() -> None:
+    impulses = shaper_impulses("mzv", 40.0, 0.1)
+    run = Run(
+        [stepper(0, (1.0, 0.0, 0.0, 0.0)), stepper(1, (0.0, 1.0, 0.0, 0.0))], [node_spec()], start=START
+    )
+    run.gen.set_shaper(0, impulses)
+    first, last = square()[0], square()[1]
+    assert run.gen.next_move_s == run.gen.look_ahead_s > 0
+    run.play([first], [(first.print_time + first.total_s + run.gen.lag_s, True)])
+    border = run.gen.next_move_s
+    assert border == run.gen.generated_until + run.gen.look_ahead_s
+    moves = [first, replace(last, print_time=border)]
+    run.play(moves[1:], [(border + last.total_s + run.gen.lag_s, True)])
+    check(run, lambda t: shaped(moves, t, 0, impulses), 0.00625, 1e-4)
+    early = replace(first, print_time=run.gen.next_move_s - 0.001)
+    with pytest.raises(StepError, match="the time lies before"):
+        run.gen.append(rows([early]), 1)
+
+
+def test_the_axes_of_a_delta_are_declared_elsewhere_without_a_step() -> None:
+    params, distance, formula = KINEMATICS[StepKinematics.DELTA]
+    spec = replace(stepper(0, (0.0,) * 4, distance), kinematics=StepKinematics.DELTA, params=params)
+    run = Run([spec], [node_spec()], start=(0.0, 0.0, 0.0, 0.0))
+    run.gen.set_axis_position(START)
+    play(run, square())
+    check(run, lambda t: formula(*(planned(square(), t, i) for i in range(3))), distance, 1e-3)
+
+
+def test_a_stepper_follows_another_axis_once_all_rests() -> None:
+    run = Run([stepper(0, (1.0, 0.0, 0.0, 0.0))], [node_spec()], start=START)
+    run.gen.set_shaper(0, shaper_impulses("zv", 40.0, 0.1))
+    first, last = square()[0], square()[1]  # X alone, then Y alone
+    run.play([first], [(first.print_time + first.total_s + run.gen.lag_s, True)])
+    before = run.gen.position(0)
+    run.gen.set_weights(0, (0.0, 1.0, 0.0, 0.0))
+    assert run.gen.position(0) == before
+    after = replace(last, print_time=run.gen.next_move_s)
+    run.play([after], [(after.print_time + after.total_s + run.gen.lag_s, True)])
+    assert run.gen.position(0) - before == round((last.end[1] - last.start[1]) / 0.00625)
+    assert sum(d for _, d in run.steps(0)) == run.gen.position(0)
 
 
 def test_nothing_changes_while_the_machine_moves() -> None:
