@@ -219,6 +219,14 @@ double step_smooth(const struct step_gen *gen, struct stepper *stepper, double t
 double step_kinematic(const struct step_stepper_config *config, double angle, const double *position,
                       const double *velocity, double *speed);
 
+// kin_*.c, for step_kinematics.c: the formulas, Q: the stepper's params.
+double kin_delta(const double *q, const double *p, const double *v, double *speed);
+double kin_deltesian(const double *q, const double *p, const double *v, double *speed);
+double kin_polar_radius(const double *p, const double *v, double *speed);
+double kin_polar_angle(double near, const double *p, const double *v, double *speed);
+double kin_rotary_delta(const double *q, const double *p, const double *v, double *speed);
+double kin_winch(const double *q, const double *p, const double *v, double *speed);
+
 // step_curve.c: as step_times_advance, for a stepper whose CURVE is set.
 int step_curve_advance(struct step_gen *gen, struct stepper *stepper, double until);
 

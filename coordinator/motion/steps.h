@@ -63,7 +63,7 @@ enum step_kinematics {
     STEP_DELTESIAN,    // z + √(arm² − (arm_x − x)²); params: arm², arm_x
     STEP_POLAR_RADIUS, // √(x² + y²)
     STEP_POLAR_ANGLE,  // atan2(y, x), unwrapped, rad
-    STEP_ROTARY_DELTA, // angle of the upper arm, rad; params: see step_kinematics.c
+    STEP_ROTARY_DELTA, // angle of the upper arm, rad; params: see kin_rotary_delta.c
     STEP_WINCH,        // distance to the anchor; params: x, y, z
     STEP_KINEMATICS,
 };

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: coordinator/motion/step*.c firmware/wire/vlq.c
+// sources: coordinator/motion/step*.c coordinator/motion/kin_*.c firmware/wire/vlq.c
 // Step generation under the sanitizers: memory of exactly the promised size, hostile numbers, random moves.
 #include "coordinator/motion/steps.h"
 #include "nodes/link/batch.h"
