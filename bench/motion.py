@@ -169,8 +169,6 @@ def generation_cases() -> Iterator[Generation]:
     yield Generation("cartesian x and y", linear(cartesian))
     yield Generation("corexy", linear(corexy))
     yield Generation("extruder", extruder)
-    if not hasattr(StepGenerator, "set_shaper"):
-        return
     yield Generation("cartesian x and y, mzv", linear(cartesian), shaped=True)
     yield Generation("corexy, mzv", linear(corexy), shaped=True)
     yield Generation("extruder, pressure advance", extruder, advanced=True)

@@ -4,12 +4,21 @@ The batch planner and the real-time streamer both drive this; it does no I/O bey
 program and keeps no clock. Not thread-safe: one thread at a time.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from coordinator.gcode.events import (
+    MachineChange,
+    PositionSet,
+    ShaperChange,
+    SmoothTimeChange,
+    WeightsChange,
+)
 from coordinator.gcode.interpreter import Job
+from coordinator.gcode.machine_state import SHAPER_AXES, Shaper
 from coordinator.motion.planner import Planner, Position
+from coordinator.motion.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps import StepGenerator
 
 if TYPE_CHECKING:
@@ -74,6 +83,7 @@ class Pipeline:
         self._appended_until = 0.0
         self.moves = 0
         """Trapezoids handed to step generation."""
+        self._begin()
 
     @property
     def planner(self) -> Planner:
@@ -85,8 +95,51 @@ class Pipeline:
         """Print time up to which step generation has all moves, in s."""
         return self._appended_until
 
-    def declare(self, position: Position) -> None:
-        """Take note that the machine stands at POSITION now (PositionSet); all moves are generated."""
+    def act(self, event: PositionSet | MachineChange) -> None:
+        """Carry out EVENT; all moves are generated, and all steps that they cause."""
+        match event:
+            case PositionSet():
+                self._declare(event.position)
+            case ShaperChange():
+                self._shape(event.axis, Shaper(event.kind, event.frequency_hz, event.damping_ratio))
+            case WeightsChange():
+                self._follow(event.weights)
+                self._smooth()
+            case SmoothTimeChange():
+                self._smooth()
+        self.planner.begin_at(self.steps.next_move_s)
+
+    def _begin(self) -> None:
+        """Let step generation begin as the job's machine is."""
+        machine = self.job.machine
+        for axis, shaper in machine.shapers.items():
+            self._shape(axis, shaper)
+        if machine.filament is not None:
+            self._follow(machine.filament.weights())
+        if machine.carriages is not None and machine.carriage_state is not None:
+            self._follow(machine.carriages.weights(machine.carriage_state))
+        self._smooth()
+
+    def _shape(self, axis: str, shaper: Shaper) -> None:
+        impulses: Impulses = ()
+        if shaper.frequency_hz:
+            impulses = shaper_impulses(shaper.kind, shaper.frequency_hz, shaper.damping_ratio)
+        self.steps.set_shaper(SHAPER_AXES.index(axis), impulses)
+
+    def _follow(self, weights: Mapping[str, Position]) -> None:
+        for name, axes in weights.items():
+            self.steps.set_weights(self.steps.index(name), axes)
+
+    def _smooth(self) -> None:
+        """Give every filament stepper the window of the extruder whose motion it follows."""
+        machine = self.job.machine
+        if machine.filament is None:
+            return
+        for stepper, extruder in machine.filament.followed.items():
+            window_s = machine.extruders[extruder].window_s if extruder else 0.0
+            self.steps.set_smooth_time(self.steps.index(stepper), window_s)
+
+    def _declare(self, position: Position) -> None:
         self.steps.set_axis_position(position)
         if self._record is not None:
             self._record.declared.append((self._record.count, position))
@@ -133,3 +186,4 @@ class Pipeline:
             self.run_through()
         self.run_through()
         self.generate(self._appended_until + self.steps.lag_s, flush=True)
+        self.planner.begin_at(self.steps.next_move_s)

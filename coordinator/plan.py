@@ -6,7 +6,17 @@ from pathlib import Path
 from typing import BinaryIO
 
 from coordinator.commands import PlanOptions
-from coordinator.gcode.events import Emergency, End, Full, Notice, PositionSet, Progress
+from coordinator.gcode.events import (
+    Emergency,
+    End,
+    Full,
+    Notice,
+    PositionSet,
+    Progress,
+    ShaperChange,
+    SmoothTimeChange,
+    WeightsChange,
+)
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.machine.description import MachineDescription, load_machine
@@ -17,6 +27,7 @@ from coordinator.pipeline import Pipeline
 from coordinator.plan_figures import PlanFigures
 from coordinator.plan_report import PlanReport
 from coordinator.plan_summary import Made, watched_nodes, write_files
+from coordinator.program_machine import machine_state
 from coordinator.progress import Progress as Shown
 from coordinator.progress import ProgressDisplay
 from nodes.dictionary import Dictionary
@@ -40,7 +51,9 @@ def plan_file(options: PlanOptions) -> PlanReport:
     with ExitStack() as stack:
         program = stack.enter_context(Program.open(options.gcode))
         files = [stack.enter_context(f) for f in _output_files(options, devices.moving_nodes)]
-        job = Job(program, Planner(description.limits), description.homed_position)
+        job = Job(
+            program, Planner(description.limits), description.homed_position, machine_state(description)
+        )
         pipeline = Pipeline(
             job,
             StepGenerator(specs, streams),
@@ -120,9 +133,9 @@ def _run(pipeline: Pipeline, display: ProgressDisplay) -> tuple[list[str], End]:
         match event:
             case Full():
                 pipeline.run_through()
-            case PositionSet():
+            case PositionSet() | ShaperChange() | WeightsChange() | SmoothTimeChange():
                 pipeline.finish()
-                pipeline.declare(event.position)
+                pipeline.act(event)
             case Progress():
                 display.update(
                     Shown(

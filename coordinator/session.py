@@ -12,6 +12,7 @@ from coordinator.host import Host, LinuxHost
 from coordinator.machine.description import MachineDescription
 from coordinator.motion.planner import Planner
 from coordinator.pipeline import PlanRecord
+from coordinator.program_machine import machine_state
 from coordinator.progress import NodeFigures, Progress
 from coordinator.streamer import JobState, Streamer, Told
 from coordinator.timebase import ClockMap
@@ -120,7 +121,8 @@ async def _print(
         )
 
     began_at = await machine.stepper_positions()
-    job = Job(program, Planner(machine.description.limits), machine.description.homed_position)
+    described = machine.description
+    job = Job(program, Planner(described.limits), described.homed_position, machine_state(described))
     streamer = Streamer(machine, job, record=record, on_told=on_told, on_state=show)
     await streamer.run()
     return await _outcome(machine, streamer, began_at)

@@ -17,6 +17,7 @@ from coordinator.gcode.events import (
     End,
     Event,
     Full,
+    MachineChange,
     Notice,
     PositionSet,
     Progress,
@@ -224,7 +225,7 @@ class Streamer:
     async def _settle(self, worker: ThreadPoolExecutor) -> None:
         """Bring what is left to the nodes and wait until the last step is executed."""
         loop = asyncio.get_running_loop()
-        while self.print_time_now() < self.ended_s + SETTLE_S:
+        while self.print_time_now() < self.ended_s + self.steps.lag_s + SETTLE_S:
             self._hand_over(await loop.run_in_executor(worker, self._rest))
             await asyncio.sleep(CYCLE_S)
         for node in self._nodes:
@@ -267,22 +268,22 @@ class Streamer:
     def _still_waiting(self, event: Event | None, now: float) -> bool:
         if isinstance(event, Wait):
             return now < event.print_time_s
-        if isinstance(event, PositionSet):
-            return not self._declared(event)
+        if isinstance(event, PositionSet | MachineChange):
+            return not self._acted(event)
         return False
 
-    def _declared(self, event: PositionSet) -> bool:
-        """Declare the position once every move before it is generated; return whether it was."""
+    def _acted(self, event: PositionSet | MachineChange) -> bool:
+        """Carry out EVENT once all moves before it are generated; return whether it was."""
         if not self._all_generated():
             return False
-        self.pipeline.declare(event.position)
+        self.pipeline.act(event)
         return True
 
     def _all_generated(self) -> bool:
         return (
             self._planner.at_standstill
             and self.pipeline.transfer()
-            and self.steps.generated_until >= self.pipeline.appended_until
+            and self.steps.generated_until >= self.pipeline.appended_until + self.steps.lag_s
         )
 
     def _advance(self, told: list[Told]) -> Event | None:
@@ -293,15 +294,15 @@ class Streamer:
                 told.append(event)
             elif isinstance(event, Progress):
                 self._done = event
-            elif isinstance(event, PositionSet) and self._declared(event):
+            elif isinstance(event, PositionSet | MachineChange) and self._acted(event):
                 continue
             else:
                 return event
         return None
 
     def _begin_anew(self, now: float) -> None:
-        """After a standstill the next move needs time to reach the nodes."""
-        begin = now + self._start_lead_s
+        """After a standstill the next move needs time to reach the nodes, and steps to look ahead to it."""
+        begin = max(now + self._start_lead_s, self.steps.next_move_s)
         if self._planner.at_standstill and self._planner.print_time_end_s < begin:
             self._planner.begin_at(begin)
 

@@ -101,16 +101,22 @@ def _extruder(job: Job, command: Command, name: str | None) -> Extruder:
 
 
 def set_pressure_advance(job: Job, command: Command) -> bool:
-    """ADVANCE holds for the moves to come; SMOOTH_TIME, where it changes, from a standstill on."""
+    """ADVANCE holds for the moves to come; SMOOTH_TIME, where it changes, from a standstill on.
+
+    So does the first ADVANCE above 0, which needs the window.
+    """
     values = _parameters(command, ("ADVANCE", "SMOOTH_TIME", "EXTRUDER"))
     extruder = _extruder(job, command, values.get("EXTRUDER"))
     advance = _number(command, values, "ADVANCE", MAX_ADVANCE_S)
     smooth = _number(command, values, "SMOOTH_TIME", MAX_SMOOTH_S)
-    if smooth is not None and smooth != extruder.smooth_s:
-        if not come_to_rest(job, smooth):
+    needed = smooth if smooth is not None else extruder.smooth_s
+    window = needed if advance or extruder.window_s else 0.0
+    if window != extruder.window_s:
+        if not come_to_rest(job, window):
             return False
-        extruder.smooth_s = smooth
-        job.emit(SmoothTimeChange(job.line, extruder.name, smooth, job.planner.print_time_end_s))
+        extruder.window_s = window
+        job.emit(SmoothTimeChange(job.line, extruder.name, window, job.planner.print_time_end_s))
+    extruder.smooth_s = needed
     if advance is not None:
         extruder.pressure_advance_s = advance
         if extruder is job.machine.active:

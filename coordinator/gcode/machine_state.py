@@ -40,6 +40,13 @@ class Extruder:
     limits: MotionLimits
     pressure_advance_s: float = 0.0
     smooth_s: float = 0.0
+    """The window over which its advance is spread."""
+    window_s: float = 0.0
+    """The window in effect: without any advance so far there is none."""
+
+    def __post_init__(self) -> None:
+        if self.pressure_advance_s:
+            self.window_s = self.smooth_s
 
 
 @dataclass(slots=True)
@@ -69,5 +76,5 @@ class MachineState:
     def settle_s(self, shapers: Mapping[str, Shaper] | None = None, smooth_s: float = 0.0) -> float:
         """Return for how long steps may go on after the last move, also with other SHAPERS and SMOOTH_S."""
         widths = [shaper.width_s for shaper in (*self.shapers.values(), *(shapers or {}).values())]
-        smooth = [extruder.smooth_s for extruder in self.extruders.values()]
+        smooth = [extruder.window_s for extruder in self.extruders.values()]
         return max([0.0, smooth_s, *widths, *smooth])

@@ -243,6 +243,13 @@ class StepGenerator:
         what = f"the smooth time of {self._steppers[stepper].name}"
         self._check_settled(status, what, f"a smooth time of {smooth_s} s")
 
+    def index(self, name: str) -> int:
+        """Return the number of the stepper called NAME; raises StepError when there is none."""
+        for number, spec in enumerate(self._steppers):
+            if spec.name == name:
+                return number
+        raise StepError(f"there is no stepper {name}; there is {', '.join(s.name for s in self._steppers)}")
+
     def _check_settled(self, status: int, what: str, value: str) -> None:
         if status == lib.STEP_NOT_IDLE:
             raise StepError(

@@ -9,8 +9,6 @@ import pytest
 from coordinator.commands import EXAMPLES, PlanOptions
 from coordinator.kinematics.base import Point
 from coordinator.machine.description import MachineDescription, load_machine
-from coordinator.motion import _steps
-from coordinator.motion.specs import StepKinematics
 from coordinator.plan import plan_file
 
 SAMPLES = 2000
@@ -51,11 +49,6 @@ def travelled(machine: MachineDescription, way: list[Point]) -> list[float]:
 @pytest.mark.parametrize("path", EXAMPLE_FILES, ids=lambda path: path.stem)
 def test_the_example_is_planned(tmp_path: Path, path: Path) -> None:
     machine = load_machine(str(path))
-    functions = [stepper.function for stepper in machine.motors]
-    if not hasattr(_steps.lib, "STEP_DELTA") and any(
-        f.kinematics is not StepKinematics.LINEAR for f in functions
-    ):
-        pytest.skip("this build generates steps of linear kinematics only")
     way = [machine.home, *corners(machine)]
     gcode = tmp_path / "way.gcode"
     lines = [f"G1 X{x:.9f} Y{y:.9f} Z{z:.9f} F6000" for x, y, z in way[1:]]

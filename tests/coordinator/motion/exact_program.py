@@ -1,9 +1,7 @@
 """Plans a program for a machine as ``canductor plan`` does, and keeps all that a proof needs."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from coordinator.gcode.events import End, Full, PositionSet
 from coordinator.gcode.interpreter import Job
@@ -14,6 +12,7 @@ from coordinator.motion.planner import Planner
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps import MAX_ERROR_S, StepGenerator, StepStats
 from coordinator.pipeline import Pipeline, PlanRecord
+from coordinator.program_machine import machine_state
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary
 from tests.coordinator.motion.exact import Setting
 from tests.coordinator.motion.exact_check import StepperProof, Verdict, check
@@ -68,14 +67,12 @@ def plan_program(config: Path, gcode: Path) -> Planned:
     nodes = stream_specs((name, dictionaries[name], MOVE_COUNT) for name in devices.moving_nodes)
     steppers = devices.stepper_specs()
     steps = StepGenerator(steppers, nodes)
-    setting = _shape(steps, description, steppers)
+    setting = _setting(description)
     batches = {i: bytearray() for i in range(len(nodes))}
     record = PlanRecord((0.0, 0.0, 0.0, 0.0))
     with Program.open(str(gcode)) as program:
-        planner: Any = Planner(description.limits)
-        if description.extruder and hasattr(Planner, "pressure_advance"):
-            planner.pressure_advance = description.extruder.pressure_advance
-        job = Job(program, planner, description.homed_position)
+        state = machine_state(description)
+        job = Job(program, Planner(description.limits), description.homed_position, state)
         pipeline = Pipeline(
             job, steps, lambda node, batch: batches[node].extend(batch), nodes=len(nodes), record=record
         )
@@ -83,28 +80,14 @@ def plan_program(config: Path, gcode: Path) -> Planned:
     return Planned(steppers, nodes, record, setting, steps.stats(), end.print_time_s, batches)
 
 
-def _shape(steps: Any, description: MachineDescription, steppers: Sequence[StepperSpec]) -> Setting:
-    """Have STEPS shape as DESCRIPTION says, with impulses of our own; return what that is."""
-    if not hasattr(steps, "set_shaper"):
-        return Setting()
+def _setting(description: MachineDescription) -> Setting:
+    """Return how DESCRIPTION shapes, with impulses of our own."""
     shapers = {s.axis.upper(): impulses(s.kind, s.frequency_hz, s.damping_ratio) for s in description.shapers}
-    for axis, found in shapers.items():
-        steps.set_shaper("XYZ".index(axis), found)
-    smooth_s = description.extruder.smooth_time_s if description.extruder else 0.0
-    for index, spec in enumerate(steppers):
-        if spec.weights[3]:
-            steps.set_smooth_time(index, smooth_s)
-    return Setting(shapers, smooth_s)
-
-
-def _begin_late_enough(pipeline: Pipeline) -> None:
-    """Let the next move begin so late that it does not act on what is generated."""
-    if pipeline.steps.next_move_s > pipeline.planner.print_time_end_s:
-        pipeline.planner.begin_at(pipeline.steps.next_move_s)
+    extruder = description.extruder
+    return Setting(shapers, extruder.smooth_time_s if extruder and extruder.pressure_advance else 0.0)
 
 
 def _run(pipeline: Pipeline) -> End:
-    _begin_late_enough(pipeline)
     while True:
         event = pipeline.job.step()
         match event:
@@ -112,8 +95,7 @@ def _run(pipeline: Pipeline) -> End:
                 pipeline.run_through()
             case PositionSet():
                 pipeline.finish()
-                pipeline.declare(event.position)
-                _begin_late_enough(pipeline)
+                pipeline.act(event)
             case End():
                 pipeline.finish()
                 return event

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.motion.specs import StepKinematics, StepperSpec
+from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps import MAX_ERROR_S, StepGenerator
 from tests.coordinator.motion.exact import Setting
 from tests.coordinator.motion.exact_cases import AWAY, LINEAR, PARAMS, SETTING, chain, spec_of, trapezoids
@@ -23,8 +23,6 @@ def generated(spec: StepperSpec, moves: Any, setting: Setting) -> Stream:
     node = node_spec(move_count=4096)
     gen: Any = StepGenerator([spec], [node], start=AWAY)
     if setting is not SETTINGS["plain"]:
-        if not hasattr(gen, "set_shaper"):
-            pytest.skip("step generation does not shape yet")
         for axis, impulses in setting.shapers.items():
             gen.set_shaper("XYZ".index(axis), impulses)
         gen.set_smooth_time(0, setting.smooth_s)
@@ -44,8 +42,6 @@ def generated(spec: StepperSpec, moves: Any, setting: Setting) -> Stream:
 @pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_every_step_is_where_the_exact_motion_has_it(kind: str, setting: str, seed: int) -> None:
-    if kind not in LINEAR and not hasattr(StepGenerator, "set_shaper"):
-        pytest.skip(f"step generation does not know {StepKinematics[kind].name} yet")
     moves = trapezoids(chain(seed, MOVES), 0.05 if setting == "shaped" else 0.0)
     moves["pressure_advance"][MOVES // 2 :] *= 0.4
     moves["start"] += AWAY
