@@ -17,10 +17,12 @@ from coordinator.demo.stage import Stage
 from coordinator.gcode.program import Program
 from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, StepperDescription, load_machine
+from coordinator.motion.specs import StepKinematics
 from coordinator.pipeline import PlanRecord
 from coordinator.progress import ProgressDisplay
 from coordinator.session import Outcome, run_job
 from coordinator.streamer import Told
+from nodes.errors import CanductorError
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import firmware_dictionary
 
@@ -28,6 +30,7 @@ from nodes.virtual.firmware import firmware_dictionary
 def run_demo(options: DemoOptions) -> DemoReport:
     """Run the demo; raises CanductorError when it cannot be brought to its end."""
     description = load_machine(str(options.machine))
+    check_provable(description)
     record = PlanRecord((0.0, 0.0, 0.0, 0.0))
     told: list[str] = []
     both_edges: dict[str, bool] = {}
@@ -54,6 +57,22 @@ def run_demo(options: DemoOptions) -> DemoReport:
         prover = _Prover(description, stage.edge_log, outcome, record, both_edges)
         notices = [*map(str, description.not_yet_acting), *description.notes, *told]
         return _report(prover, stage, figures, outcome, notices)
+
+
+def check_provable(description: MachineDescription) -> None:
+    """Raise CanductorError when the demo's witness (expected.py) does not know how a stepper moves."""
+    unknown = [f"the input shaper of axis {s.axis}" for s in description.shapers if s.frequency_hz]
+    unknown += [f"the pressure advance of [{e.name}]" for e in description.extruders if e.pressure_advance]
+    unknown += [
+        f"the motion of [{stepper.name}]"
+        for stepper in description.steppers
+        if stepper.function.kinematics is not StepKinematics.LINEAR
+    ]
+    if unknown:
+        raise CanductorError(
+            f"{description.path}: the demo cannot prove {', '.join(unknown)} yet; "
+            "use canductor plan, or a machine without"
+        )
 
 
 @contextmanager
