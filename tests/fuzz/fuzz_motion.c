@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // Fuzzes the way from G-code text to commands: gcode_lines, planner_queue and step generation in a row.
 //
-// Input: three bytes of options, then text. Lines that the hot path leaves to its caller stand for what the
-// caller does between lines: the first letter says what, the second byte how much (act). Whatever the text,
-// no sanitizer may report, no number may become NaN, trapezoids must join without gaps and jumps and keep all
-// limits, and the steps replayed from the emitted commands must stay in the machine.
+// Input: three bytes of options (limits; unshaped or shaped with pressure advance; cartesian or delta), then
+// text. Lines that the hot path leaves to its caller stand for what the caller does between lines: the first
+// letter says what, the second byte how much (act). Whatever the text, no sanitizer may report, no number may
+// become NaN, trapezoids must join without gaps and jumps and keep all limits, and the steps replayed from
+// the emitted commands must stay in the machine.
 #include "coordinator/motion/gcode_lines.h"
 #include "coordinator/motion/steps.h"
 #include "nodes/link/batch.h"
@@ -24,6 +25,7 @@
 
 enum { STEPPERS = 4, QUEUE_STEP = 11, SET_DIR = 12, RESET_CLOCK = 13, MAX_TEXT = 4096 };
 static const double SIZE = 100, STEP = 0.1, MAX_RADIUS = 95, HOLE = 5;
+static const double ARM = 400, TOWER = 150; // of a delta, mm
 static const double NEAR = 1 + 1e-9;
 static const double MAX_PRINT_TIME = 120; // s; step generation costs CPU for time, not only for steps
 
@@ -50,19 +52,51 @@ static struct run {
     struct step_gen *steps;
     double speed, print_time, position[4]; // where the last trapezoid left off
     int64_t replayed[STEPPERS];            // steps, from the commands
-    int64_t origin[STEPPERS];              // steps by which declared positions moved the count
+    double origin[STEPPERS];               // steps: where a stepper stands when it has done none
+    int delta, shaped;
     int direction[STEPPERS];
     uint64_t count;
     int over; // the text takes more print time than there is time to generate
 } run;
 
+// Place of a tower of a delta: 120 degrees apart.
+static void tower(int i, double at[2]) {
+    at[0] = TOWER * cos(i * 2 * M_PI / 3);
+    at[1] = TOWER * sin(i * 2 * M_PI / 3);
+}
+
+// Where a stepper has to stand, in steps.
+static double place(int i, const double p[4]) {
+    double at[2];
+    if (i == AXIS_E || !run.delta)
+        return p[i] / STEP;
+    tower(i, at);
+    double dx = at[0] - p[0], dy = at[1] - p[1];
+    return (p[2] + sqrt(ARM * ARM - dx * dx - dy * dy)) / STEP;
+}
+
+// X and Y shaped, E smoothed over 40 ms.
+static void shape(void) {
+    static const double AMPLITUDE[] = {0.25, 0.5, 0.25}, TIME_S[] = {-0.01, 0, 0.01};
+    MUST(step_set_shaper(run.steps, AXIS_X, 3, AMPLITUDE, TIME_S) == STEP_OK);
+    MUST(step_set_shaper(run.steps, AXIS_Y, 3, AMPLITUDE, TIME_S) == STEP_OK);
+    MUST(step_set_smooth_time(run.steps, AXIS_E, 0.04) == STEP_OK);
+    MUST(planner_begin_at(&run.planner, step_next_move(run.steps)) == 0);
+}
+
 static void begin(const uint8_t *options) {
     static void *memory;
     static const struct step_node_config NODE = {16e6, 1024, QUEUE_STEP, SET_DIR, RESET_CLOCK};
     struct step_stepper_config steppers[STEPPERS] = {0};
+    run.delta = options[0] >> 7 & 1;
     for (int i = 0; i < STEPPERS; i++) {
         steppers[i].oid = i;
         steppers[i].weights[i] = 1;
+        if (run.delta && i != AXIS_E) {
+            steppers[i].kinematics = STEP_DELTA;
+            steppers[i].params[0] = ARM * ARM;
+            tower(i, steppers[i].params + 1);
+        }
         steppers[i].step_distance = STEP;
         steppers[i].step_pulse_s = 2e-6;
         run.direction[i] = 1;
@@ -74,7 +108,8 @@ static void begin(const uint8_t *options) {
                                  .max_error_s = 12.5e-6};
     if (options[0] & 4) // beginning outside of the hole
         run.position[0] = config.start[0] = SIZE / 2;
-    run.origin[0] = (int64_t)(run.position[0] / STEP + 0.5);
+    for (int i = 0; i < STEPPERS; i++)
+        run.origin[i] = place(i, run.position);
     if (!memory)
         memory = malloc(step_gen_size(&config));
     run.steps = step_gen_init(memory, &config);
@@ -94,6 +129,8 @@ static void begin(const uint8_t *options) {
     run.gcode = (struct gcode_state){.unit = options[0] & 32 ? 25.4 : 1, .speed = 25};
     memcpy(run.gcode.position, run.position, sizeof run.position);
     run.gcode.speed_factor = run.gcode.extrude_factor = 1;
+    if (options[0] & 64)
+        shape();
 }
 
 // Distance of the way from BEFORE to AFTER from the Z axis.
@@ -152,8 +189,11 @@ static void replay(const struct batch_record *record) {
         return;
     MUST(words[2] > 0 && words[3] > 0 && words[3] <= 65535);
     run.replayed[oid] += run.direction[oid] * (int64_t)words[3];
-    if (oid < 3) // nobody limits the filament
-        MUST(fabs((double)(run.replayed[oid] + run.origin[oid]) * STEP) <= SIZE + STEP);
+    double stands = ((double)run.replayed[oid] + run.origin[oid]) * STEP;
+    if (run.delta && oid < 3)
+        MUST(stands >= -SIZE - STEP && stands <= SIZE + ARM + STEP);
+    else if (oid < 3) // nobody limits the filament
+        MUST(fabs(stands) <= SIZE + STEP);
 }
 
 static void take_commands(void) {
@@ -206,16 +246,14 @@ static void stand_still(void) {
     MUST(run.count == run.planner.moves_added);
     if (run.over)
         return;
-    double until = run.planner.print_time > step_generated_until(run.steps) ? run.planner.print_time
-                                                                            : step_generated_until(run.steps);
-    generate(until, 1);
+    generate(fmax(run.planner.print_time + step_lag(run.steps), step_generated_until(run.steps)), 1);
+    MUST(planner_begin_at(&run.planner, step_next_move(run.steps)) == 0);
     for (int i = 0; i < STEPPERS; i++) {
         struct step_stepper_stats stats;
         step_stepper_stats(run.steps, i, &stats);
         MUST(stats.issued == run.replayed[i] && stats.position == stats.issued);
         MUST(stats.worst_error_s <= 12.5e-6 * 1.001);
-        double rest = run.position[i] - (double)(run.replayed[i] + run.origin[i]) * STEP;
-        MUST(fabs(rest) <= STEP / 2 + 1e-6 * STEP);
+        MUST(fabs(place(i, run.position) - run.origin[i] - (double)run.replayed[i]) <= 0.5 + 1e-6);
     }
 }
 
@@ -227,8 +265,8 @@ static void declare(const double position[4]) {
     MUST(step_set_axis_position(run.steps, position) == STEP_OK);
     memcpy(run.position, position, sizeof run.position);
     memcpy(run.gcode.position, position, sizeof run.gcode.position);
-    for (int i = 0; i < STEPPERS; i++) // whole steps: where the rest is half a step is not at stake here
-        run.origin[i] = (int64_t)floor(position[i] / STEP + 0.5) - run.replayed[i];
+    for (int i = 0; i < STEPPERS; i++)
+        run.origin[i] = place(i, position) - (double)run.replayed[i];
 }
 
 // What a caller may do between lines. Positions are whole steps.
