@@ -43,6 +43,8 @@ class PlanRecord:
     declared: list[tuple[int, Position]] = field(default_factory=list)
     """Before trapezoid number N the machine was declared to stand at a position."""
     count: int = 0
+    changes: int = 0
+    """How often shapers, smoothing, carriages or extruders changed after the begin."""
 
     def add(self, trapezoids: "NDArray[np.void]") -> None:
         """Keep a copy."""
@@ -97,6 +99,8 @@ class Pipeline:
 
     def act(self, event: PositionSet | MachineChange) -> None:
         """Carry out EVENT; all moves are generated, and all steps that they cause."""
+        if self._record is not None and not isinstance(event, PositionSet):
+            self._record.changes += 1
         match event:
             case PositionSet():
                 self._declare(event.position)

@@ -10,14 +10,17 @@ import numpy as np
 
 from coordinator.app import Machine
 from coordinator.commands import DEMO_GCODE, DemoOptions
+from coordinator.demo.exact_path import Setting
+from coordinator.demo.exact_shapers import impulses
 from coordinator.demo.expected import ExpectedSteps, expected_steps
+from coordinator.demo.expected_curved import expected_curved
 from coordinator.demo.proof import ClockProof, PrimaryClock, StepperProof, prove_clock, prove_stepper
 from coordinator.demo.report import DemoReport, NodeReport
 from coordinator.demo.stage import Stage
 from coordinator.gcode.program import Program
 from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, StepperDescription, load_machine
-from coordinator.motion.specs import StepKinematics
+from coordinator.motion.specs import StepKinematics, StepperSpec
 from coordinator.pipeline import PlanRecord
 from coordinator.progress import ProgressDisplay
 from coordinator.session import Outcome, run_job
@@ -30,7 +33,6 @@ from nodes.virtual.firmware import firmware_dictionary
 def run_demo(options: DemoOptions) -> DemoReport:
     """Run the demo; raises CanductorError when it cannot be brought to its end."""
     description = load_machine(str(options.machine))
-    check_provable(description)
     record = PlanRecord((0.0, 0.0, 0.0, 0.0))
     told: list[str] = []
     both_edges: dict[str, bool] = {}
@@ -54,25 +56,14 @@ def run_demo(options: DemoOptions) -> DemoReport:
             )
         )
         figures = stage.stop_nodes()
+        if record.changes:
+            raise CanductorError(
+                f"{program.name} was printed, but it changes shapers, carriages or extruders on its way, "
+                "which the demo's proof does not follow yet; leave these commands out"
+            )
         prover = _Prover(description, stage.edge_log, outcome, record, both_edges)
         notices = [*map(str, description.not_yet_acting), *description.notes, *told]
         return _report(prover, stage, figures, outcome, notices)
-
-
-def check_provable(description: MachineDescription) -> None:
-    """Raise CanductorError when the demo's witness (expected.py) does not know how a stepper moves."""
-    unknown = [f"the input shaper of axis {s.axis}" for s in description.shapers if s.frequency_hz]
-    unknown += [f"the pressure advance of [{e.name}]" for e in description.extruders if e.pressure_advance]
-    unknown += [
-        f"the motion of [{stepper.name}]"
-        for stepper in description.steppers
-        if stepper.function.kinematics is not StepKinematics.LINEAR
-    ]
-    if unknown:
-        raise CanductorError(
-            f"{description.path}: the demo cannot prove {', '.join(unknown)} yet; "
-            "use canductor plan, or a machine without"
-        )
 
 
 @contextmanager
@@ -159,9 +150,39 @@ class _Prover:
         )
 
     def _expected(self, stepper: StepperDescription) -> Iterator[ExpectedSteps]:
+        spec, setting = self._spec(stepper), self._setting
+        if spec.kinematics is not StepKinematics.LINEAR or setting.acts_on(spec.weights):
+            freq = self._outcome.maps[stepper.node].clock_freq
+            yield from expected_curved(spec, self._record.epochs(), setting, freq)
+            return
         for position, moves in self._record.epochs():
             origin = float(np.dot(stepper.weights, position))
             yield from expected_steps(moves, stepper.weights, stepper.step_distance, origin)
+
+    def _spec(self, stepper: StepperDescription) -> StepperSpec:
+        function = stepper.function
+        return StepperSpec(
+            name=stepper.name,
+            node=0,
+            oid=0,
+            weights=stepper.weights,
+            step_distance=stepper.step_distance,
+            invert_dir=stepper.dir_pin.invert,
+            step_pulse_s=stepper.step_pulse_s,
+            kinematics=function.kinematics,
+            params=function.params,
+        )
+
+    @property
+    def _setting(self) -> Setting:
+        """What the configuration says of shapers and pressure advance."""
+        shapers = {
+            s.axis.upper(): impulses(s.kind, s.frequency_hz, s.damping_ratio)
+            for s in self._description.shapers
+            if s.frequency_hz
+        }
+        first = self._description.extruder
+        return Setting(shapers, first.smooth_time_s if first and first.pressure_advance else 0.0)
 
     def _executed(self, stepper: StepperDescription, log: EdgeLog) -> Iterator[tuple[Any, Any]]:
         sign = np.int8(-1 if stepper.dir_pin.invert else 1)

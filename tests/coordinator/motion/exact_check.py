@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from coordinator.demo.exact_path import SNAP, Position, Setting, StepperPath, crossings, solve
+from coordinator.demo.exact_signal import Floats
 from coordinator.motion.specs import StepperSpec
-from tests.coordinator.motion.exact import SNAP, Position, Setting, StepperPath, crossings, solve
-from tests.coordinator.motion.exact_signal import Floats
 from tests.coordinator.motion.replay import Stream
 
 CHUNK = 1 << 18

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from coordinator.demo.exact_path import Setting
+from coordinator.demo.exact_shapers import impulses
 from coordinator.gcode.events import End, Full, PositionSet
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
@@ -14,9 +16,7 @@ from coordinator.motion.steps import MAX_ERROR_S, StepGenerator, StepStats
 from coordinator.pipeline import Pipeline, PlanRecord
 from coordinator.program_machine import machine_state
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary
-from tests.coordinator.motion.exact import Setting
 from tests.coordinator.motion.exact_check import StepperProof, Verdict, check
-from tests.coordinator.motion.exact_shapers import impulses
 from tests.coordinator.motion.replay import Stream, replay_all
 
 MOVE_COUNT = 1024

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from coordinator.demo.exact_path import INVERSE, Setting, StepperPath, crossings, solve
+from coordinator.demo.exact_signal import Floats, Phases, Shaped, Smoothed
 from coordinator.motion.specs import StepKinematics
-from tests.coordinator.motion.exact import INVERSE, Setting, StepperPath, crossings, solve
 from tests.coordinator.motion.exact_cases import AWAY, LINEAR, PARAMS, SETTING, chain, spec_of, trapezoids
 from tests.coordinator.motion.exact_check import Epoch, StepperProof, check
-from tests.coordinator.motion.exact_signal import Floats, Phases, Shaped, Smoothed
 from tests.coordinator.motion.replay import Stream, replay, replay_all
 from tests.coordinator.motion.steps_harness import MACHINES, NODES, ORIGIN, Run, X, stepper
 from tests.coordinator.motion.steps_oracle import Move, make_move

@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from tests.coordinator.motion.exact_shapers import KINDS, TOLERANCE, impulses
+from coordinator.demo.exact_shapers import KINDS, TOLERANCE, impulses
 
 LEFT = {"zv": 0.0, "mzv": 0.0, "zvd": 0.0, "ei": TOLERANCE, "2hump_ei": 0.0, "3hump_ei": TOLERANCE}
 

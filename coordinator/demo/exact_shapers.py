@@ -6,7 +6,7 @@ for a residual vibration of 5 %. mzv: as zv, with three impulses over three quar
 
 import math
 
-from tests.coordinator.motion.exact import Impulses
+from coordinator.demo.exact_path import Impulses
 
 TOLERANCE = 0.05
 KINDS = ("zv", "mzv", "zvd", "ei", "2hump_ei", "3hump_ei")

@@ -93,20 +93,24 @@ class Signal:
     accel: Floats
 
     def at(self, t: Floats) -> Floats:
+        """Return the value at the times T."""
         i = np.searchsorted(self.time, t, side="right") - 1
         tau = t - self.time[i]
         result: Floats = self.value[i] + (self.speed[i] + self.accel[i] / 2 * tau) * tau
         return result
 
     def slope(self, t: Floats) -> Floats:
+        """Return the rate of change at the times T."""
         i = np.searchsorted(self.time, t, side="right") - 1
         result: Floats = self.speed[i] + self.accel[i] * (t - self.time[i])
         return result
 
     def breaks(self) -> Floats:
+        """Return the times between which it is smooth."""
         return self.time[1:]
 
     def scaled(self, factor: float) -> "Signal":
+        """Return it times FACTOR."""
         return Signal(self.time, factor * self.value, factor * self.speed, factor * self.accel)
 
 
@@ -118,18 +122,21 @@ class Shaped:
     impulses: tuple[tuple[float, float], ...]
 
     def at(self, t: Floats) -> Floats:
+        """Return the value at the times T."""
         total = np.zeros_like(t)
         for amplitude, delay in self.impulses:
             total += amplitude * self.signal.at(t - delay)
         return total
 
     def slope(self, t: Floats) -> Floats:
+        """Return the rate of change at the times T."""
         total = np.zeros_like(t)
         for amplitude, delay in self.impulses:
             total += amplitude * self.signal.slope(t - delay)
         return total
 
     def breaks(self) -> Floats:
+        """Return the times between which it is smooth."""
         return np.concatenate([self.signal.breaks() + delay for _, delay in self.impulses])
 
 
@@ -141,12 +148,15 @@ class Smoothed:
     half_s: float
 
     def at(self, t: Floats) -> Floats:
+        """Return the value at the times T."""
         return self._blocks(t, order=2)
 
     def slope(self, t: Floats) -> Floats:
+        """Return the rate of change at the times T."""
         return self._blocks(t, order=1)
 
     def breaks(self) -> Floats:
+        """Return the times between which it is smooth."""
         return np.concatenate([self.signal.breaks() + shift for shift in (-self.half_s, 0.0, self.half_s)])
 
     def _blocks(self, t: Floats, order: int) -> Floats:
@@ -190,6 +200,7 @@ class _Antiderivatives:
         self.second = np.concatenate(([0.0], np.cumsum(second)))
 
     def at(self, t: Floats, order: int) -> Floats:
+        """Return the value at the times T."""
         i = np.searchsorted(self.time, t, side="right") - 1
         np.maximum(i, 0, out=i)
         d = t - self.time[i]

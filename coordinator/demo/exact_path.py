@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from coordinator.demo.exact_signal import REST_S, Floats, Phases, Shaped, Signal, Smoothed
 from coordinator.motion.specs import StepKinematics, StepperSpec
-from tests.coordinator.motion.exact_signal import REST_S, Floats, Phases, Shaped, Signal, Smoothed
 
 Ints = NDArray[np.int64]
 Impulses = tuple[tuple[float, float], ...]
@@ -40,6 +40,11 @@ class Setting:
     smooth_s: float = 0.0
     """Full width of the window of pressure advance; 0: none."""
 
+    def acts_on(self, weights: Position) -> bool:
+        """Return whether a linear stepper of these WEIGHTS moves otherwise than its axes."""
+        shaped = any(weights["XYZ".index(axis)] for axis in self.shapers)
+        return bool(shaped or (self.smooth_s and weights[3]))
+
 
 # ---------------------------------------------------------------------------------------- kinematics
 
@@ -63,12 +68,12 @@ def _deltesian(params: Sequence[float], x: Floats, y: Floats, z: Floats) -> tupl
     return z + rise, (dx / rise, np.zeros_like(y), np.ones_like(z))
 
 
-def _radius(params: Sequence[float], x: Floats, y: Floats, z: Floats) -> tuple[Floats, Gradient]:
+def _radius(_params: Sequence[float], x: Floats, y: Floats, z: Floats) -> tuple[Floats, Gradient]:
     r = np.hypot(x, y)
     return r, (x / r, y / r, np.zeros_like(z))
 
 
-def _angle(params: Sequence[float], x: Floats, y: Floats, z: Floats) -> tuple[Floats, Gradient]:
+def _angle(_params: Sequence[float], x: Floats, y: Floats, z: Floats) -> tuple[Floats, Gradient]:
     rr = x * x + y * y
     return np.arctan2(y, x), (-y / rr, x / rr, np.zeros_like(z))
 
@@ -195,7 +200,7 @@ def solve(path: StepperPath, boundary: Floats, direction: Ints, near: Floats, re
 
     Of several crossings the nearest, as far as they are GRID-ths of REACH_S apart.
     """
-    found = _solve(path, boundary, direction, near - reach_s, near + reach_s)
+    found = crossing_times(path, boundary, direction, near - reach_s, near + reach_s)
     # Where it turns just behind the step (or just before), the ends of the reach lie on the same side.
     for i in np.flatnonzero(np.isnan(found)):
         at = near[i] + reach_s * np.linspace(-1, 1, 2 * GRID + 1)
@@ -205,11 +210,11 @@ def solve(path: StepperPath, boundary: Floats, direction: Ints, near: Floats, re
         if len(cells):
             cell = cells[np.argmin(np.abs(at[cells] - near[i]))]
             one = slice(cell, cell + 1)
-            found[i] = _solve(path, b[one], direction[i : i + 1], at[one], at[cell + 1 : cell + 2])[0]
+            found[i] = crossing_times(path, b[one], direction[i : i + 1], at[one], at[cell + 1 : cell + 2])[0]
     return found
 
 
-def _solve(path: StepperPath, boundary: Floats, direction: Ints, low: Floats, high: Floats) -> Floats:
+def crossing_times(path: StepperPath, boundary: Floats, direction: Ints, low: Floats, high: Floats) -> Floats:
     """Return when u crosses BOUNDARY between LOW and HIGH; NaN where it is not behind it and then beyond."""
 
     def ahead(t: Floats, which: Ints) -> Floats:
