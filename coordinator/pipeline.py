@@ -123,6 +123,7 @@ class Pipeline:
         if machine.carriages is not None and machine.carriage_state is not None:
             self._follow(machine.carriages.weights(machine.carriage_state))
         self._smooth()
+        self.planner.begin_at(self.steps.next_move_s)
 
     def _shape(self, axis: str, shaper: Shaper) -> None:
         impulses: Impulses = ()

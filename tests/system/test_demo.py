@@ -54,6 +54,42 @@ def test_the_proof_holds_with_wrong_clocks_a_rollover_and_lost_frames(tmp_path: 
     assert report["retransmitted_bytes"] > 0
 
 
+CONFIG = Path(__file__).resolve().parents[2] / "config"
+WAY = """\
+G28
+M83
+G91
+{first}
+G1 X-20 Y4 E0.5
+M400
+G1 X6 Y18 E0.6
+{second}
+SET_VELOCITY_LIMIT ACCEL=1500
+G1 X-9 Y-3 E0.3
+G1 X3 Y2 Z1 E0.1
+"""
+
+
+@pytest.mark.parametrize(
+    ("machine", "first", "second"),
+    [
+        ("delta", "G1 X12 Y-15 Z-60 F6000", "G4 P50"),
+        ("corexy", "G1 X40 Y40 Z6 F6000", "SET_PRESSURE_ADVANCE ADVANCE=0.1"),
+    ],
+)
+def test_non_linear_shaped_and_smoothed_steppers_are_proved(
+    tmp_path: Path, machine: str, first: str, second: str
+) -> None:
+    ended = canductor(
+        *("demo", "--json", "--no-web", "--machine", str(CONFIG / f"{machine}.cfg")),
+        *("--gcode", write_gcode(tmp_path, WAY.format(first=first, second=second))),
+    )
+    assert ended.status == 0, ended
+    assert ended.json["ok"] is True
+    assert ended.json["steps"] == ended.json["steps_planned"] > 10_000
+    assert ended.json["worst_band_error_us"] <= 12.5 * 1.001
+
+
 # ---------------------------------------------------------------------------------------------- it can fail
 
 FREQ = 1e6
