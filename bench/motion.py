@@ -213,6 +213,7 @@ def generation_cost(case: Generation, moves: Any) -> tuple[float, int, int]:
     printing = (moves["ratio"][:, 3] > 0) & (moves["ratio"][:, :2] != 0).any(axis=1)
     moves["pressure_advance"] = ADVANCE_S * printing * case.advanced
     gen = generator(case, [float(v) for v in moves["start"][0]])
+    moves["print_time"] += gen.next_move_s
     at, cpu, done, last = 0, 0.0, False, moves[-1]
     end = float(last["print_time"] + last["accel_s"] + last["cruise_s"] + last["decel_s"])
     while not done:

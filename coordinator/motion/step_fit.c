@@ -113,27 +113,6 @@ static inline void pairs(const struct grid *g, int32_t i, float low, float high,
     }
 }
 
-// Fills in gates until no line passes through them; returns how many a line does.
-VECTOR static int32_t pass(const struct fit_problem *p, struct grid *g) {
-    vector least = {0}, most = {0};
-    least -= FAR, most += FAR;
-    g->least[0] = least, g->most[0] = most;
-    for (int32_t i = 0; i < g->count;) {
-        const int32_t stop = i + WIDE < g->count ? i + WIDE : g->count;
-        put_gates(p, g, i, stop);
-        for (; i < stop; i++) {
-            pairs(g, i, g->low[i], g->high[i], &least, &most);
-            g->least[i + 1] = least, g->most[i + 1] = most;
-        }
-        if (largest(&least) > smallest(&most)) {
-            while (largest(&g->least[i]) > smallest(&g->most[i]))
-                i--;
-            return i;
-        }
-    }
-    return g->count;
-}
-
 struct range {
     float least, most;
 };
@@ -201,6 +180,31 @@ VECTOR static bool end_between(const struct grid *g, int32_t i, float from, floa
     return false;
 }
 
+// Fills in gates until no line passes through them; returns how many a line does.
+VECTOR static int32_t pass(const struct fit_problem *p, struct grid *g) {
+    struct fit_segment s;
+    vector least = {0}, most = {0};
+    least -= FAR, most += FAR;
+    g->least[0] = least, g->most[0] = most;
+    for (int32_t i = 0; i < g->count;) {
+        const int32_t stop = i + WIDE < g->count ? i + WIDE : g->count;
+        put_gates(p, g, i, stop);
+        for (; i < stop; i++) {
+            pairs(g, i, g->low[i], g->high[i], &least, &most);
+            g->least[i + 1] = least, g->most[i + 1] = most;
+        }
+        if (largest(&least) > smallest(&most)) {
+            while (largest(&g->least[i]) > smallest(&g->most[i]))
+                i--;
+            return i;
+        }
+        // A line passes further than any in whole ticks; behind the steps expected that is worth finding out.
+        if (i >= FINE && !end_between(g, i, -1, 1, &s))
+            return i;
+    }
+    return g->count;
+}
+
 // From where lines are measured, so that single precision suffices: about the segment over N steps.
 static void aim(const struct fit_problem *p, struct grid *g, uint32_t n) {
     const uint32_t half = n / 2;
@@ -217,18 +221,31 @@ static uint32_t between(uint32_t value, uint32_t low, uint32_t high) {
     return value < low ? low : value > high ? high : value;
 }
 
+// Of the first I gates, how many a line in whole ticks passes: on a long cruise far fewer than a line does.
+// Steps back by ever more, then halves.
+static int32_t last_in_whole_ticks(const struct grid *g, int32_t i) {
+    struct fit_segment s;
+    int32_t beyond = i + 1;
+    for (int32_t back = 1; i > 0 && !end_between(g, i, -1, 1, &s); back *= 2) {
+        beyond = i;
+        i = i > back ? i - back : 0;
+    }
+    while (beyond - i > 1) {
+        const int32_t middle = (i + beyond) / 2;
+        *(end_between(g, middle, -1, 1, &s) ? &i : &beyond) = middle;
+    }
+    return i;
+}
+
 // Lays out gates and finds how many of them a segment passes; coarser or finer ones when EXPECTED was wrong.
 static int32_t lay_out(const struct fit_problem *p, struct grid *g, uint32_t count) {
     uint32_t expected = between(p->expected, 1, count);
     for (int trial = 0;; trial++) {
-        struct fit_segment s;
         aim(p, g, expected);
         g->stride = (int32_t)((expected + FINE - 1) / FINE);
         const uint32_t gates = count / (uint32_t)g->stride;
         g->count = (int32_t)(gates < GATES ? gates : GATES);
-        int32_t top = pass(p, g);
-        while (top > 0 && !end_between(g, top, -1, 1, &s))
-            top--;
+        const int32_t top = last_in_whole_ticks(g, pass(p, g));
         const uint32_t reached = (uint32_t)(top * g->stride);
         if (trial < TRIALS && top == g->count && reached + (uint32_t)g->stride <= count)
             expected = between(reached * 3 / 2, 1, count);
@@ -249,7 +266,7 @@ void step_fit(const struct fit_problem *p, struct fit *out) {
     const int32_t top = lay_out(p, &g, count);
     out->open = p->count <= FIT_COUNT_MAX && (uint32_t)((top + 1) * g.stride) > count;
     for (int end = 0; end < FIT_ENDS; end++)
-        for (int32_t i = top; 2 * i > top; i--)
+        for (int32_t i = top; 2 * i > top; i -= 1 + (top - i) / 2)
             if (end_between(&g, i, EDGES[end], EDGES[end + 1], &out->end[end]))
                 break;
     if (!top)
