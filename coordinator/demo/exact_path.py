@@ -284,8 +284,8 @@ def between_rests(u: Floats, snapped: Floats) -> Floats:
     return place
 
 
-def crossings(path: StepperPath) -> tuple[int, int]:
-    """Return how many steps the whole motion asks for, and where it ends."""
+def places(path: StepperPath) -> tuple[Floats, Floats, Floats]:
+    """Return the turning points (s), u there, and how many steps are done at each."""
     t = turning_points(path)
     u = path.u(t)
     if path.spec.kinematics == StepKinematics.POLAR_ANGLE:
@@ -293,4 +293,10 @@ def crossings(path: StepperPath) -> tuple[int, int]:
     place = np.floor(np.round(u * SNAP) / SNAP + 0.5)
     if path.curved:
         place = np.where(standing(t, u), place, between_rests(u, place))
+    return t, u, place
+
+
+def crossings(path: StepperPath) -> tuple[int, int]:
+    """Return how many steps the whole motion asks for, and where it ends."""
+    _, u, place = places(path)
     return int(np.abs(np.diff(place)).sum()), resting(float(u[-1]))

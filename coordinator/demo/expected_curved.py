@@ -4,25 +4,15 @@ As ``expected.py``, nothing of the engine: the motion from its definition (``exa
 turns, and every boundary between two turns solved for its time.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.demo.exact_path import (
-    SNAP,
-    Ints,
-    Setting,
-    StepperPath,
-    between_rests,
-    crossing_times,
-    standing,
-    turning_points,
-)
+from coordinator.demo.exact_path import Ints, Setting, StepperPath, crossing_times, places
 from coordinator.demo.exact_signal import Floats
 from coordinator.demo.expected import ExpectedSteps
-from coordinator.motion.specs import StepKinematics, StepperSpec
+from coordinator.motion.specs import StepperSpec
 
 CHUNK = 50_000
 """Steps solved together."""
@@ -49,13 +39,7 @@ def expected_curved(
 
 
 def _steps(path: StepperPath) -> tuple[Floats, Ints]:
-    turns = turning_points(path)
-    u = path.u(turns)
-    if path.spec.kinematics == StepKinematics.POLAR_ANGLE:
-        u = np.unwrap(u, period=math.tau / path.spec.step_distance)
-    place = np.floor(np.round(u * SNAP) / SNAP + 0.5)
-    if path.curved:
-        place = np.where(standing(turns, u), place, between_rests(u, place))
+    turns, u, place = places(path)
     change = np.diff(place).astype(np.int64)
     count = np.abs(change)
     which = np.repeat(np.arange(len(count)), count)
