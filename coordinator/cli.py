@@ -10,9 +10,10 @@ import signal
 import sys
 from collections.abc import Mapping, Sequence
 
-from coordinator.command_line import Answered, UsageError, print_help, read_words, version
+from coordinator.command_line import Answered, print_help, read_words, version
 from coordinator.commands import Report, Terminated
 from nodes.errors import CanductorError
+from nodes.option_values import UsageError
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -75,8 +76,8 @@ def _run(words: list[str], as_json: bool) -> int:
 def _show(report: Report, as_json: bool) -> int:
     if as_json:
         _say_json({"ok": report.ok, **report.to_json()})
-    else:
-        _say(report.to_text())
+    elif text := report.to_text():
+        _say(text)
     return EXIT_OK if report.ok else EXIT_FAILED
 
 

@@ -5,11 +5,10 @@ argparse, because the start counts: a library that is nicer to write with cost m
 
 import argparse
 import importlib
-import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn, TypeVar, cast
+from typing import NoReturn, cast
 
 from coordinator.commands import (
     DemoOptions,
@@ -19,18 +18,18 @@ from coordinator.commands import (
     SimulateOptions,
     find_machine,
 )
-from nodes.errors import CanductorError
+from nodes.option_values import UsageError, assignments, existing_file, share, whole
 
 Job = Callable[[], Report]
-T = TypeVar("T")
 
 SEED_MAX = 2**32
 SEEDS_AT_ONCE_MAX = 10_000_000
 JOBS_MAX = 256
-
-
-class UsageError(Exception):
-    """The words make no command; the sentence says why."""
+TOOL_COMMANDS = {
+    "can": "Find, watch and debug nodes on a CAN bus.",
+    "console": "Talk to one node in its own words.",
+}
+"""Commands whose words are read by ``canbus_tools.command_line``."""
 
 
 class Answered(Exception):  # noqa: N818 (no failure: the words asked for help or the version, and got it)
@@ -55,6 +54,8 @@ def read_words(words: Sequence[str]) -> Job:
 
     Raises UsageError, Answered after --help or --version, CanductorError for a file that is not there.
     """
+    if words[0] in TOOL_COMMANDS:
+        return _tool(words)
     arguments = _parser().parse_args(list(words))
     if arguments.version:
         sys.stdout.write(f"canductor {version()}\n")
@@ -88,6 +89,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version")
     parser.set_defaults(make_job=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    for name, summary in TOOL_COMMANDS.items():
+        commands.add_parser(name, help=f"{summary[0].lower()}{summary[1:].rstrip('.')}")
     for name, summary, declare, make_job in (
         ("demo", "print on virtual nodes and compare every stepper with the plan", _declare_demo, _demo),
         ("run", "bring up the machine of a configuration file", _declare_run, _run),
@@ -104,6 +107,22 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--json", action="store_true", help="print one JSON object as the last line")
         command.set_defaults(make_job=make_job)
     return parser
+
+
+def _tool(words: Sequence[str]) -> Job:
+    """Read the words of a bus tool; those that only plan do not pay for the tools' start."""
+    from canbus_tools.command_line import add_tools, declare_tool  # noqa: PLC0415 (start-up time)
+
+    parser = _Parser(prog="canductor", allow_abbrev=False)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    if words[0] == "console":
+        declare_tool(commands, "console")
+    else:
+        add_tools(commands.add_parser("can", allow_abbrev=False, description=TOOL_COMMANDS["can"]), words)
+    arguments = parser.parse_args(list(words))
+    if "make_job" not in arguments:
+        raise UsageError("the CAN tool is missing; 'canductor can --help' lists them")
+    return cast("Job", arguments.make_job(arguments))
 
 
 def _runner(module: str, function: str) -> Callable[[object], Report]:
@@ -129,13 +148,13 @@ def _declare_demo(command: argparse.ArgumentParser) -> None:
 def _demo(given: argparse.Namespace) -> Job:
     options = DemoOptions(
         machine=find_machine(given.machine),
-        gcode=_existing_file(given.gcode),
+        gcode=existing_file(given.gcode),
         json=given.json,
         web=not given.no_web,
-        loss=_share(given.loss),
-        seed=_whole("--seed", given.seed),
-        rate_ppm=_assignments("--rate-ppm", given.rate_ppm, _ppm),
-        start_clock=_assignments("--start-clock", given.start_clock, _ticks),
+        loss=share("--loss", given.loss),
+        seed=whole("--seed", given.seed),
+        rate_ppm=assignments("--rate-ppm", given.rate_ppm, _ppm),
+        start_clock=assignments("--start-clock", given.start_clock, _ticks),
         keep=given.keep,
     )
     return lambda: _runner("coordinator.demo", "run_demo")(options)
@@ -147,8 +166,8 @@ def _declare_run(command: argparse.ArgumentParser) -> None:
 
 
 def _run(given: argparse.Namespace) -> Job:
-    _existing_file(given.config)
-    options = RunOptions(config=given.config, gcode=_existing_file(given.gcode), json=given.json)
+    existing_file(given.config)
+    options = RunOptions(config=given.config, gcode=existing_file(given.gcode), json=given.json)
     return lambda: _runner("coordinator.run", "run_machine")(options)
 
 
@@ -163,14 +182,14 @@ def _declare_plan(command: argparse.ArgumentParser) -> None:
 
 
 def _plan(given: argparse.Namespace) -> Job:
-    _existing_file(given.config)
+    existing_file(given.config)
     if str(given.gcode) != "-":
-        _existing_file(given.gcode)
+        existing_file(given.gcode)
     if given.plot is not None and given.plot.suffix.lower() != ".svg":
         raise UsageError(f"--plot is '{given.plot}', must be a file that ends in .svg")
-    dictionaries = _assignments("--dictionary", given.dictionary, Path)
+    dictionaries = assignments("--dictionary", given.dictionary, Path)
     for path in dictionaries.values():
-        _existing_file(path)
+        existing_file(path)
     options = PlanOptions(
         config=given.config,
         gcode=given.gcode,
@@ -178,7 +197,7 @@ def _plan(given: argparse.Namespace) -> Job:
         plot=given.plot,
         json=given.json,
         dictionaries=dictionaries,
-        can_bitrate=_whole("--bitrate", given.bitrate, 10_000, 8_000_000),
+        can_bitrate=whole("--bitrate", given.bitrate, 10_000, 8_000_000),
     )
     return lambda: _runner("coordinator.plan", "plan_file")(options)
 
@@ -195,11 +214,11 @@ def _declare_simulate(command: argparse.ArgumentParser) -> None:
 def _simulate(given: argparse.Namespace) -> Job:
     if given.seed is not None and given.seeds is not None:
         raise UsageError("--seed and --seeds exclude each other; give one of them")
-    seed = 1 if given.seed is None else _whole("--seed", given.seed, 0, SEED_MAX)
+    seed = 1 if given.seed is None else whole("--seed", given.seed, 0, SEED_MAX)
     options = SimulateOptions(
         scenarios=tuple(dict.fromkeys(given.scenario)),
         seeds=_one_seed(seed) if given.seeds is None else _seeds(given.seeds),
-        jobs=_whole("--jobs", given.jobs, 0, JOBS_MAX),
+        jobs=whole("--jobs", given.jobs, 0, JOBS_MAX),
         list=given.list,
         json=given.json,
     )
@@ -207,15 +226,6 @@ def _simulate(given: argparse.Namespace) -> Job:
 
 
 # -------------------------------------------------------------------------------------------------- values
-
-
-def _whole(option: str, text: str, low: int = 0, high: int | None = None) -> int:
-    digits = text.strip()
-    number = int(digits) if digits.isascii() and digits.isdecimal() and len(digits) <= 20 else -1
-    if number < low or (high is not None and number > high):
-        bounds = f"of at least {low}" if high is None else f"from {low} to {high}"
-        raise UsageError(f"{option} is '{text}', must be a whole number {bounds}")
-    return number
 
 
 def _one_seed(seed: int) -> range:
@@ -234,45 +244,12 @@ def _seeds(text: str) -> range:
     return seeds
 
 
-def _existing_file(path: Path | None) -> Path | None:
-    """Return the path; raises CanductorError early when nothing can be read there."""
-    if path is None:
-        return None
-    if not path.exists():
-        raise CanductorError(f"there is no file '{path}'")
-    if path.is_dir():
-        raise CanductorError(f"'{path}' is a folder, not a file")
-    if not os.access(path, os.R_OK):
-        raise CanductorError(f"'{path}' may not be read; check its permissions")
-    return path
-
-
-def _assignments(option: str, pairs: list[str] | None, convert: Callable[[str], T]) -> Mapping[str, T]:
-    """Return the values of repeated NAME=VALUE options by name."""
-    result: dict[str, T] = {}
-    for pair in pairs or ():
-        name, equals, value = pair.partition("=")
-        if not name or not equals or not value:
-            raise UsageError(f"{option} takes NAME=VALUE, not '{pair}'")
-        if name in result:
-            raise UsageError(f"{option} is given twice for '{name}'")
-        try:
-            result[name] = convert(value)
-        except ValueError as error:
-            raise UsageError(f"{option} for '{name}' is '{value}', must be {error}") from None
-    return result
-
-
-def _number(text: str, rule: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(rule) from None
-
-
 def _ppm(text: str) -> float:
     rule = "a number in ppm, from -10000 to 10000"
-    value = _number(text, rule)
+    try:
+        value = float(text)
+    except ValueError:
+        raise ValueError(rule) from None
     if not -10_000 <= value <= 10_000:
         raise ValueError(rule)
     return value
@@ -282,14 +259,3 @@ def _ticks(text: str) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= 20 and int(text) < 2**64):
         raise ValueError("a whole number of ticks, from 0 to 2^64 - 1")
     return int(text)
-
-
-def _share(text: str) -> float:
-    rule = "a share from 0 to 0.5, or a percentage such as 1%"
-    try:
-        value = _number(text.removesuffix("%"), rule) / (100 if text.endswith("%") else 1)
-    except ValueError as error:
-        raise UsageError(f"--loss is '{text}', must be {error}") from None
-    if not 0 <= value <= 0.5:
-        raise UsageError(f"--loss is '{text}', must be {rule}")
-    return value
