@@ -185,7 +185,8 @@ class NodeProcess(ChildProcess):
     FLAVOUR is the board it plays. Exactly one of ``can`` (a virtual bus's socket), ``socketcan`` (an
     interface) and ``uart`` (where to put the link to the node's pseudo-terminal) says how it is reached.
     ``rate_ppm``: by how much its clock is too fast; ``start_clock``: where its clock starts. ``jitter_us``,
-    ``slice_us`` and ``seed``: see the firmware.
+    ``slice_us`` and ``seed``: see the firmware. ``legacy``: it plays a board with Klipper firmware, which
+    knows none of this project's extensions of the CAN protocol.
     """
 
     def __init__(
@@ -202,6 +203,7 @@ class NodeProcess(ChildProcess):
         slice_us: int | None = None,
         seed: int | None = None,
         edge_log: Path | None = None,
+        legacy: bool = False,
         name: str | None = None,
         bin_dir: Path = BIN_DIR,
     ) -> None:
@@ -223,6 +225,7 @@ class NodeProcess(ChildProcess):
             "--slice-us": slice_us,
             "--seed": seed,
             "--edge-log": edge_log,
+            "--legacy": 1 if legacy else None,
         }
         command: list[str | Path] = [executable]
         for option, value in options.items():
