@@ -1,0 +1,126 @@
+"""Talking to one node from a tool."""
+
+import asyncio
+import dataclasses
+import threading
+from collections.abc import Callable, Coroutine
+from contextlib import closing
+from typing import Any
+
+import can
+import pytest
+
+from canbus_tools.open_bus import BusOptions
+from canbus_tools.talk import NodeTalk, TalkError
+from nodes.message_format import Message
+from nodes.transport import CanFrame
+from tests.canbus_tools.stage import MAIN, MAIN_ID, PATIENCE_S, TOOL_ID, Place, Stage
+
+QUIET_S = 0.05
+"""Nobody else is on these buses."""
+
+
+def run(test: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    async def bounded() -> None:
+        async with asyncio.timeout(PATIENCE_S):
+            await test()
+
+    asyncio.run(bounded())
+
+
+def test_a_node_is_asked_and_told_things_and_everything_it_says_is_seen(stage: Stage) -> None:
+    async def talk() -> None:
+        async with NodeTalk.open(stage.place.options, MAIN_ID, listen_s=QUIET_S) as node:
+            assert node.dictionary.str_constant("MCU") == "virtual-mainboard"
+            answer = await node.ask("get_canbus_id", "canbus_id")
+            assert answer.message.data("canbus_uuid") == MAIN.raw
+            assert 0 < answer.sent_ns < answer.received_ns
+            seen: list[Message] = []
+            came = asyncio.Event()
+
+            def note(message: Message, received_ns: int) -> None:
+                assert received_ns > answer.received_ns
+                if message.name == "pong":
+                    seen.append(message)
+                    came.set()
+
+            end = node.on_message(note)
+            node.send_text('debug_ping data="hello"')
+            await came.wait()
+            assert [message.data("data") for message in seen] == [b"hello"]
+            end()
+            assert node.knows("get_canbus_status", "canbus_status")
+            assert not node.knows("get_canbus_status", "nonsense")
+            await node.drained()
+            assert node.stats.bytes_invalid == 0
+
+    run(talk)
+    run(talk)  # a node that was talked to before expects another block number
+
+
+def test_a_node_in_shutdown_still_answers(stage: Stage) -> None:
+    async def talk() -> None:
+        async with NodeTalk.open(stage.place.options, TOOL_ID, listen_s=QUIET_S) as node:
+            assert (await node.ask("get_config", "config")).message.integer("is_shutdown") == 1
+
+    run(talk)
+
+
+def test_nobody_there_is_one_sentence(place: Place) -> None:
+    async def talk() -> None:
+        async with NodeTalk.open(place.options, 77, listen_s=QUIET_S):
+            raise AssertionError("there is no node 77")
+
+    with pytest.raises(TalkError, match=r"no node answers on id 77 of bus .*canductor can nodes"):
+        run(talk)
+
+
+class OtherHost:
+    """Sends a frame to a node again and again, as a host that prints with it does."""
+
+    def __init__(self, place: Place, nodeid: int, data: bytes = b"\x7e") -> None:
+        self._frame = CanFrame(nodeid * 2 + 0x100, data)
+        self._transport = place.open()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        with closing(self._transport):
+            while not self._ending.wait(0.01):
+                self._transport.send(self._frame)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._ending.set()
+        self._thread.join()
+
+
+def test_a_node_that_another_host_uses_is_left_alone_unless_forced(stage: Stage) -> None:
+    async def talk(*, force: bool) -> None:
+        async with NodeTalk.open(stage.place.options, MAIN_ID, force=force) as node:
+            await node.ask("get_uptime", "uptime")
+
+    with OtherHost(stage.place, MAIN_ID):
+        with pytest.raises(TalkError, match=f"node {MAIN_ID} on bus .* is in use: another program"):
+            run(lambda: talk(force=False))
+        run(lambda: talk(force=True))
+
+
+def test_any_backend_of_python_can_serves(stage: Stage) -> None:
+    """Its own virtual bus, on which the stage is heard through two forwarders."""
+    options = BusOptions(interface="virtual", channel="forwarded stage")
+
+    async def talk() -> None:
+        async with NodeTalk.open(options, MAIN_ID, listen_s=QUIET_S) as node:
+            answer = await node.ask("get_canbus_id", "canbus_id")
+            assert answer.message.data("canbus_uuid") == MAIN.raw
+
+    with can.Bus(**dataclasses.asdict(stage.place)) as here, can.Bus("forwarded stage", "virtual") as there:
+        forwarders = [can.Notifier(here, [there.send], 0.05), can.Notifier(there, [here.send], 0.05)]
+        try:
+            run(talk)
+        finally:
+            for forwarder in forwarders:
+                forwarder.stop()
