@@ -1,0 +1,132 @@
+"""Asking who is on a bus: rounds, merging, twins, other hosts; without a bus."""
+
+import random
+from collections.abc import Callable
+
+from canbus_tools.census import MAX_UUIDS, ROUNDS, ROUNDS_MAX, Application, Census, CensusResult
+from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, QUERY_UNASSIGNED, WHO_IS_HERE, Uuid
+
+A, B = Uuid(b"\x01" * 6), Uuid(b"\x02" * 6)
+Answers = Callable[[int, int], list[bytes]]
+"""What the nodes say in a round (from 1) to a question."""
+
+
+def needs(uuid: Uuid, command: int = 1) -> bytes:
+    return bytes([0x20, *uuid.raw, command])
+
+
+def here(uuid: Uuid, nodeid: int) -> bytes:
+    return bytes([0x21, *uuid.raw, nodeid])
+
+
+def ask(answers: Answers, rounds: int = ROUNDS) -> tuple[CensusResult, list[list[int]]]:
+    """Run a census; return its result and the questions of each round."""
+    census = Census(rounds)
+    census.start(0)
+    asked: list[list[int]] = []
+    while census.deadline_ns is not None:
+        frames = census.frames_to_send()
+        assert {frame.can_id for frame in frames} == {ADMIN_ID}
+        asked.append([frame.data[0] for frame in frames])
+        for frame in frames:
+            for said in answers(len(asked), frame.data[0]):
+                census.frame(ADMIN_RESPONSE_ID, said)
+        at_ns = census.deadline_ns
+        census.timer(at_ns - 1)
+        assert census.frames_to_send() == []
+        census.timer(at_ns)
+    return census.result(), asked
+
+
+def to_query(*said: bytes) -> Answers:
+    return lambda _, question: list(said) if question == QUERY_UNASSIGNED else []
+
+
+def test_the_question_that_is_answered_at_once_is_the_last_of_each_of_five_rounds() -> None:
+    result, asked = ask(to_query())
+    assert asked == [[WHO_IS_HERE, QUERY_UNASSIGNED]] * 5
+    assert (result.waiting, result.here, result.rounds) == ((), (), 5)
+
+
+def test_what_a_board_is_shows_in_the_command_it_understands() -> None:
+    result, _ = ask(to_query(needs(B, 0x11), needs(A), needs(Uuid(b"\x03" * 6), 0x55)))
+    assert [(node.uuid.raw[0], node.application, node.answers) for node in result.waiting] == [
+        (1, Application.KLIPPER, 5),
+        (2, Application.KATAPULT, 5),
+        (3, Application.UNKNOWN, 5),
+    ]
+    assert result.twins == ()
+
+
+def test_a_board_heard_once_in_five_rounds_is_found_and_gets_three_more_rounds_for_others() -> None:
+    result, asked = ask(lambda n, question: [needs(A)] if n == 5 and question == QUERY_UNASSIGNED else [])
+    assert [(node.uuid, node.answers) for node in result.waiting] == [(A, 1)]
+    assert len(asked) == 8
+
+
+def test_twins_show_by_one_answer_too_many() -> None:
+    def said(n: int, question: int) -> list[bytes]:
+        return [needs(A)] * (2 if n == 3 else 1) + [needs(B)] if question == QUERY_UNASSIGNED else []
+
+    result, _ = ask(said)
+    assert result.twins == (A,)
+
+
+def test_twins_of_which_one_waits_or_with_different_ids_or_one_in_its_bootloader() -> None:
+    one_waits, _ = ask(lambda _, question: [here(A, 4) if question == WHO_IS_HERE else needs(A)])
+    two_ids, _ = ask(lambda n, question: [here(A, 4 + n % 2)] if question == WHO_IS_HERE else [])
+    same_id, _ = ask(lambda _, question: [here(A, 4)] * 2 if question == WHO_IS_HERE else [])
+    bootloader, _ = ask(lambda n, question: to_query(needs(A, 0x11 if n % 2 else 1))(n, question))
+    for result in (one_waits, two_ids, same_id, bootloader):
+        assert result.twins == (A,)
+    assert [node.nodeid for node in two_ids.here] == [4, 5]
+
+
+def test_a_board_that_gets_its_id_meanwhile_is_no_twin() -> None:
+    def said(n: int, question: int) -> list[bytes]:
+        return (
+            [here(A, 4)] if n > 2 and question == WHO_IS_HERE else to_query(needs(A))(n, question) * (n < 3)
+        )
+
+    result, _ = ask(said)
+    assert (result.waiting[0].answers, result.here[0].answers, result.twins) == (2, 3, ())
+
+
+def test_a_host_that_asks_too_makes_no_twins() -> None:
+    census = Census()
+    census.start(0)
+    census.frame(ADMIN_ID, bytes([QUERY_UNASSIGNED]))
+    census.frame(ADMIN_ID, bytes([WHO_IS_HERE]))
+    census.frame(ADMIN_ID, b"")
+    for said in (needs(A), here(B, 4)):
+        census.frame(ADMIN_RESPONSE_ID, said)
+        census.frame(ADMIN_RESPONSE_ID, said)
+    assert census.result().twins == ()
+    census.frame(ADMIN_RESPONSE_ID, needs(A))
+    assert census.result().twins == (A,)
+
+
+def test_traffic_is_told_by_who_sent_it() -> None:
+    census = Census()
+    for can_id in (0x108, 0x10B, 0x2FE, 0x2FF, 0x010, 0x101, 0x300, 0x7FF, 0x2000_0040):
+        census.frame(can_id, b"\x05")
+    result = census.result()
+    assert (set(result.hosted), set(result.talking), result.foreign_frames) == ({4, 255}, {5, 255}, 5)
+
+
+def test_garbage_is_counted_and_nothing_grows_without_end() -> None:
+    source = random.Random(1)
+    census = Census()
+    census.start(0)
+    for size in (0, 1, 7):
+        census.frame(ADMIN_RESPONSE_ID, b"\x20" * size)
+    census.frame(ADMIN_RESPONSE_ID, b"\x22" * 8)
+    assert census.ignored == 4
+    rounds = 1
+    while census.deadline_ns is not None:
+        for _ in range(10):
+            census.frame(ADMIN_RESPONSE_ID, needs(Uuid(source.randbytes(6))))
+        census.timer(census.deadline_ns)
+        rounds += 1
+    assert len(census.result().waiting) == MAX_UUIDS
+    assert rounds < ROUNDS_MAX
