@@ -1,5 +1,7 @@
 """``canductor can query``: on the stage, on an empty bus, on one where all have their ids."""
 
+from contextlib import closing
+
 from tests.canbus_tools.command import Command
 from tests.canbus_tools.stage import BED, BOOT, MAIN, MAIN_ID, TWIN, Place, Stage, set_nodeid
 
@@ -47,10 +49,9 @@ def test_nobody_on_the_bus_is_explained(place: Place, can_tool: Command) -> None
 def test_nobody_waits_because_all_have_ids(place: Place, can_tool: Command) -> None:
     with place.start_node("mainboard", MAIN) as node:
         node.wait_ready()
-        with_id = place.open()
-        set_nodeid(with_id, MAIN, 9)
+        with closing(place.open()) as host:
+            set_nodeid(host, MAIN, 9)
         said = can_tool("query")
-        with_id.close()
     assert "The bus works: 1 node with an id was heard (9)" in said.words
     assert "120 ohm" not in said.out
 
