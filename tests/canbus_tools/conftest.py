@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.canbus_tools.command import Command
 from tests.canbus_tools.stage import Place, Stage, any_place, six_nodes
 
 
@@ -26,3 +27,9 @@ def stage(place: Place) -> Iterator[Stage]:
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the user's cache of dictionaries out of it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def can_tool(place: Place, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Return what runs ``canductor can`` on the bus of the test."""
+    return Command(place, capsys)

@@ -96,15 +96,12 @@ class Stage:
     bed: NodeProcess
     twins: tuple[NodeProcess, NodeProcess]
     boot: Katapult
-    host: CanTransport
-    """A host's access to the bus, for whoever sets the scene."""
 
 
 @contextmanager
 def six_nodes(place: Place) -> Iterator[Stage]:
     """Start the six nodes on PLACE and bring them into their states."""
     with ExitStack() as stack:
-        host = stack.enter_context(closing(place.open()))
         main, tool, bed, *twins = [
             stack.enter_context(process)
             for process in (
@@ -118,10 +115,11 @@ def six_nodes(place: Place) -> Iterator[Stage]:
         boot = stack.enter_context(Katapult(stack.enter_context(closing(place.open())), BOOT))
         for process in (main, tool, bed, *twins):
             process.wait_ready()
-        set_nodeid(host, MAIN, MAIN_ID)
-        set_nodeid(host, TOOL, TOOL_ID)
-        shut_down(host, TOOL_ID)
-        yield Stage(place, main, tool, bed, (twins[0], twins[1]), boot, host)
+        with closing(place.open()) as host:  # not for longer: the virtual bus waits for who does not read
+            set_nodeid(host, MAIN, MAIN_ID)
+            set_nodeid(host, TOOL, TOOL_ID)
+            shut_down(host, TOOL_ID)
+        yield Stage(place, main, tool, bed, (twins[0], twins[1]), boot)
 
 
 def set_nodeid(host: CanTransport, uuid: Uuid, nodeid: int) -> None:

@@ -1,6 +1,7 @@
 """The stage itself: six nodes, each in the state that the tools are to find it in."""
 
 from collections import Counter
+from contextlib import closing
 
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.transport import CanFrame
@@ -9,13 +10,14 @@ from tests.canbus_tools.stage import BED, BOOT, MAIN, MAIN_ID, PATIENCE_S, TOOL_
 
 def answers(stage: Stage, question: int, count: int) -> Counter[str]:
     """Return what the first COUNT answers to an admin question say."""
-    stage.host.send(CanFrame(ADMIN_ID, bytes([question])))
     said: Counter[str] = Counter()
-    while said.total() < count:
-        frame = stage.host.receive(PATIENCE_S)
-        assert frame is not None, f"only {said} answered"
-        if frame.id == ADMIN_RESPONSE_ID:
-            said[frame.data.hex()] += 1
+    with closing(stage.place.open()) as host:
+        host.send(CanFrame(ADMIN_ID, bytes([question])))
+        while said.total() < count:
+            frame = host.receive(PATIENCE_S)
+            assert frame is not None, f"only {said} answered"
+            if frame.id == ADMIN_RESPONSE_ID:
+                said[frame.data.hex()] += 1
     return said
 
 
@@ -28,8 +30,9 @@ def test_only_ours_say_that_they_are_here(stage: Stage) -> None:
 
 
 def test_one_is_in_shutdown(stage: Stage) -> None:
-    set_nodeid(stage.host, BED, TOOL_ID + 1)
-    stage.host.send(CanFrame(0x010, b"\x00\x00"))  # which Klipper-type boards do not know
+    with closing(stage.place.open()) as host:
+        set_nodeid(host, BED, TOOL_ID + 1)
+        host.send(CanFrame(0x010, b"\x00\x00"))  # which Klipper-type boards do not know
     ends = {name: getattr(stage, name).stop()["is_shutdown"] for name in ("main", "tool", "bed")}
     assert ends["tool"]
     assert not ends["bed"]

@@ -1,0 +1,55 @@
+"""Asking a live bus who is there: drives the census on an open bus."""
+
+import asyncio
+
+from canbus_tools.census import ROUNDS, Census, CensusResult
+from canbus_tools.open_bus import BusOptions
+from canbus_tools.talk import BusTalk
+from nodes.can_bus import BUS_OFF
+from nodes.errors import CanductorError
+from nodes.link import Frame
+
+
+async def take_census(bus: BusTalk, rounds: int = ROUNDS) -> CensusResult:
+    """Ask who is on BUS, ROUNDS times or more; raises CanductorError when the bus cannot be used."""
+    census = Census(rounds)
+
+    def came(frame: Frame) -> None:
+        if frame.can_id == BUS_OFF:
+            raise_later.append(bus_off(bus.name))
+        census.frame(frame.can_id, frame.data)
+
+    raise_later: list[CanductorError] = []
+    loop = asyncio.get_running_loop()
+    end = bus.on_frame(came)
+    try:
+        census.start(_ns(loop.time()))
+        while census.deadline_ns is not None and not raise_later:
+            for frame in census.frames_to_send():
+                bus.send_frame(frame.can_id, frame.data)
+            await bus.wait(max(0.0, census.deadline_ns * 1e-9 - loop.time()))
+            census.timer(max(_ns(loop.time()), census.deadline_ns))
+    finally:
+        end()
+    if raise_later:
+        raise raise_later[0]
+    return census.result()
+
+
+def bus_off(bus: str) -> CanductorError:
+    """Return what to say when the adapter took itself off the bus."""
+    return CanductorError(
+        f"the controller of {bus} met too many errors and went off the bus (bus-off): most often the bit "
+        f"rate is not the nodes', or a cable or the termination is at fault; 'canductor can doctor -c {bus}' "
+        f"checks, 'ip link set {bus} down' and 'ip link set {bus} up' bring it back"
+    )
+
+
+def where(options: BusOptions) -> str:
+    """Return the options of a command line that name the bus."""
+    interface = "" if options.interface == "socketcan" else f"-i {options.interface} "
+    return f"{interface}-c {options.channel}"
+
+
+def _ns(loop_time_s: float) -> int:
+    return round(loop_time_s * 1e9)

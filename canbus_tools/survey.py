@@ -1,0 +1,242 @@
+"""Everything alive on a bus, with an id or without, and what it is.
+
+First only listened: ids to which another host sends something belong to that host, and nothing is sent there.
+The nodes on all other ids are found by a damaged block: by the protocol a node answers one with its number of
+the next block, executes nothing and changes nothing. Those that answer are asked who they are.
+"""
+
+import asyncio
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import replace
+from enum import Enum
+from typing import Final
+
+from canbus_tools.census import DATA_IDS, ROUNDS, Application, CensusResult, NodeHere, WaitingNode
+from canbus_tools.discovery import take_census
+from canbus_tools.interview import Facts, interview
+from canbus_tools.talk import LISTEN_S, BusTalk, data_ids
+from nodes.assign import FIRST_NODEID, Uuid
+from nodes.errors import CanductorError
+from nodes.link import Frame
+from nodes.records import record
+
+PROBED: Final = range(FIRST_NODEID, 68)
+"""Hosts hand out 4, 5, 6, …; ids beyond are tried when something was heard from them, or when asked for."""
+DAMAGED_BLOCK: Final = b"\x05\x10\x00\x00\x7e\x7e"
+"""An empty block with a wrong checksum; the second sync byte ends it for parsers that look for one behind."""
+PROBE_PASSES: Final = 2
+"""Frames get lost."""
+PROBES_AT_ONCE: Final = 4
+PROBE_PAUSE_S: Final = 0.002
+"""Between so many: a fifth of the bus at 1 Mbit/s, all of it for 40 ms at 250 kbit/s."""
+PROBE_ANSWER_S: Final = 0.05
+"""For the last answers; adapters on USB may hold frames back for 16 ms."""
+INTERVIEWS_AT_ONCE: Final = 8
+
+
+class State(Enum):
+    """What a node is doing, as far as can be told."""
+
+    WAITING = "waiting"
+    BOOTLOADER = "bootloader"
+    IN_USE = "in use"
+    """Another host talks to it, so it was not asked."""
+    IDLE = "idle"
+    """It has an id and no configuration."""
+    CONFIGURED = "configured"
+    """It has a configuration, and no host that talks to it."""
+    SHUTDOWN = "shutdown"
+    UNCLEAR = "unclear"
+    """``trouble`` says why."""
+
+
+@record(kw_only=True)
+class Entry:
+    """One node."""
+
+    nodeid: int | None
+    uuid: Uuid | None
+    application: Application
+    state: State
+    facts: Facts | None = None
+    twins: bool = False
+    """Another board has the same uuid."""
+    trouble: str = ""
+
+
+@record
+class SurveyResult:
+    """All nodes that were found: by id, then those that wait."""
+
+    entries: tuple[Entry, ...]
+    census: CensusResult
+    probed: tuple[int, ...]
+    """Ids to which a damaged block was sent."""
+
+    def by_uuid(self, uuid: Uuid) -> list[Entry]:
+        """Return the nodes that have a uuid."""
+        return [entry for entry in self.entries if entry.uuid == uuid]
+
+    def by_nodeid(self, nodeid: int) -> list[Entry]:
+        """Return the nodes that have an id."""
+        return [entry for entry in self.entries if entry.nodeid == nodeid]
+
+
+class Traffic:
+    """Which node ids frames go to and come from, from now on."""
+
+    def __init__(self, bus: BusTalk) -> None:
+        self.hosted: set[int] = set()
+        self.talking: set[int] = set()
+        self.close = bus.on_frame(self._came)
+
+    def _came(self, frame: Frame) -> None:
+        if frame.can_id in DATA_IDS:
+            (self.talking if frame.can_id % 2 else self.hosted).add((frame.can_id - 0x100) // 2)
+
+
+async def survey(
+    bus: BusTalk, *, probed: Iterable[int] = PROBED, listen_s: float = LISTEN_S, rounds: int = ROUNDS
+) -> SurveyResult:
+    """Find all nodes on BUS, after listening for LISTEN_S; raises CanductorError when the bus fails."""
+    started_s = asyncio.get_running_loop().time()
+    traffic = Traffic(bus)
+    try:
+        census = await take_census(bus, rounds)
+        await bus.wait(max(0.0, started_s + listen_s - asyncio.get_running_loop().time()))
+        here = {node.nodeid for node in census.here}
+        candidates = tuple(sorted({*probed, *here, *traffic.talking} - traffic.hosted))
+        answering = await probe(bus, candidates, traffic)
+        hosted = frozenset(traffic.hosted)
+    finally:
+        traffic.close()
+    shared = _shared_ids(census)
+    asked = sorted(answering - hosted - shared)
+    facts = dict(zip(asked, await _interview_all(bus, asked), strict=True))
+    entries = [_assigned(nodeid, facts[nodeid], census) for nodeid in asked]
+    entries += [_not_asked(node, hosted, shared) for node in census.here if node.nodeid not in facts]
+    entries += [_hosted(nodeid, answers=nodeid in traffic.talking) for nodeid in sorted(hosted - here)]
+    entries.sort(key=lambda entry: (entry.nodeid or 0, entry.uuid.raw if entry.uuid else b""))
+    entries += [_waiting(node) for node in census.waiting]
+    return SurveyResult(_mark_twins(entries), census, candidates)
+
+
+async def probe(bus: BusTalk, nodeids: Iterable[int], traffic: Traffic) -> set[int]:
+    """Send a damaged block to each of NODEIDS to whom no other host talks; return those that answered."""
+    wanted = set(nodeids)
+    answered: set[int] = set()
+
+    def came(frame: Frame) -> None:
+        if frame.can_id in DATA_IDS and frame.can_id % 2:
+            answered.add((frame.can_id - 0x101) // 2)
+
+    end = bus.on_frame(came)
+    try:
+        for _ in range(PROBE_PASSES):
+            for number, nodeid in enumerate(sorted(wanted - answered)):
+                if number % PROBES_AT_ONCE == 0:
+                    await bus.wait(PROBE_PAUSE_S)
+                if nodeid not in traffic.hosted:
+                    bus.send_frame(data_ids(nodeid)[0], DAMAGED_BLOCK)
+            await bus.wait(PROBE_ANSWER_S)
+    finally:
+        end()
+    return answered & wanted
+
+
+async def _interview_all(bus: BusTalk, nodeids: list[int]) -> list[Facts | CanductorError]:
+    """Ask them all, a few at a time; what went wrong with one is its result."""
+    room = asyncio.Semaphore(INTERVIEWS_AT_ONCE)
+
+    async def one(nodeid: int) -> Facts | CanductorError:
+        async with room:
+            try:
+                return await interview(bus, nodeid)
+            except CanductorError as error:
+                return error
+
+    return list(await asyncio.gather(*(one(nodeid) for nodeid in nodeids)))
+
+
+# --------------------------------------------------------------------------------------------------- entries
+
+
+def _shared_ids(census: CensusResult) -> frozenset[int]:
+    """Return the ids that more than one board has: their answers would be a mixture."""
+    boards = Counter(node.nodeid for node in census.here)
+    twins = {node.nodeid for node in census.here if node.twins}
+    return frozenset(twins | {nodeid for nodeid, count in boards.items() if count > 1})
+
+
+def _assigned(nodeid: int, said: Facts | CanductorError, census: CensusResult) -> Entry:
+    ours = next((node for node in census.here if node.nodeid == nodeid), None)
+    application = Application.CANDUCTOR if ours else Application.KLIPPER
+    if isinstance(said, CanductorError):
+        uuid = ours.uuid if ours else None
+        return Entry(
+            nodeid=nodeid, uuid=uuid, application=application, state=State.UNCLEAR, trouble=str(said)
+        )
+    uuid = said.uuid or (ours.uuid if ours else None)
+    trouble = ""
+    if said.believed_nodeid not in (None, nodeid):
+        trouble = f"it answers on id {nodeid}, but says that it has id {said.believed_nodeid}"
+    elif ours and uuid != ours.uuid:
+        trouble = (
+            f"two boards answer on this id: {ours.uuid} and {uuid}; power both off, and let one host assign"
+        )
+    return Entry(
+        nodeid=nodeid, uuid=uuid, application=application, state=_state(said), facts=said, trouble=trouble
+    )
+
+
+def _state(facts: Facts) -> State:
+    if facts.shut_down:
+        return State.SHUTDOWN
+    if facts.configured is None:
+        return State.UNCLEAR
+    return State.CONFIGURED if facts.configured else State.IDLE
+
+
+def _not_asked(node: NodeHere, hosted: frozenset[int], shared: frozenset[int]) -> Entry:
+    """Our firmware that said that it is here, and was not talked to or did not answer."""
+    state, trouble = State.UNCLEAR, ""
+    if node.nodeid in shared:
+        trouble = "more than one board has this id; switch them off and on, and let only one host assign ids"
+    elif node.nodeid in hosted:
+        state = State.IN_USE
+    else:
+        trouble = "it says that it is here, but does not answer on its id"
+    return Entry(
+        nodeid=node.nodeid,
+        uuid=node.uuid,
+        application=Application.CANDUCTOR,
+        state=state,
+        twins=node.twins,
+        trouble=trouble,
+    )
+
+
+def _hosted(nodeid: int, *, answers: bool) -> Entry:
+    """Return what is known of a node by its traffic alone. A host that could be asked would know more."""
+    silent = "another program sends to this id, and nobody answers"
+    return Entry(
+        nodeid=nodeid,
+        uuid=None,
+        application=Application.KLIPPER if answers else Application.UNKNOWN,
+        state=State.IN_USE if answers else State.UNCLEAR,
+        trouble="" if answers else silent,
+    )
+
+
+def _waiting(node: WaitingNode) -> Entry:
+    state = State.BOOTLOADER if node.application is Application.KATAPULT else State.WAITING
+    return Entry(nodeid=None, uuid=node.uuid, application=node.application, state=state, twins=node.twins)
+
+
+def _mark_twins(entries: list[Entry]) -> tuple[Entry, ...]:
+    boards = Counter(entry.uuid for entry in entries if entry.uuid is not None)
+    return tuple(
+        replace(entry, twins=entry.twins or (entry.uuid is not None and boards[entry.uuid] > 1))
+        for entry in entries
+    )

@@ -1,0 +1,25 @@
+"""Plain tables: columns lined up by spaces, so that they read in any terminal, log or issue."""
+
+import textwrap
+from collections.abc import Sequence
+
+
+def table(headings: Sequence[str], rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
+    """Return the lines of a table; a column in which every row is empty is left out."""
+    kept = [n for n in range(len(headings)) if any(row[n] for row in rows)]
+    lines = [[row[n] for n in kept] for row in (headings, *rows)]
+    widths = [max(len(line[n]) for line in lines) for n in range(len(kept))]
+    return [
+        (indent + "  ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True))).rstrip()
+        for line in lines
+    ]
+
+
+def count(number: int, what: str, several: str = "") -> str:
+    """Return ``1 node``, ``2 nodes``; SEVERAL when the plural is no mere ``s``."""
+    return f"{number} {what if number == 1 else several or what + 's'}"
+
+
+def paragraph(text: str) -> list[str]:
+    """Return TEXT as lines that a terminal shows whole."""
+    return textwrap.wrap(text, 98, break_long_words=False, break_on_hyphens=False)
