@@ -11,7 +11,7 @@ from nodes.dictionary import Dictionary
 from nodes.dictionary_parts import Enumeration, OutputFormat
 from nodes.message_format import MessageFormat, Value
 
-_WORD: Final = re.compile(r"[\w.+-]+\Z")
+_WORD: Final = re.compile(r"[\w.+/:-]+\Z")
 
 
 class Kind(Enum):

@@ -21,6 +21,8 @@ def test_the_recorded_session_is_read_completely() -> None:
         for param, value in item.params.items():
             wanted = params[param]
             if isinstance(wanted, str):
-                assert f" {param}={wanted}" in item.text
+                names = decoder.dictionaries.known[recorded.NODEID].enumeration_for(param)
+                assert names is not None
+                assert names.value_of(wanted) == value
             else:
                 assert (value & 0xFFFFFFFF if isinstance(value, int) else value) == wanted
