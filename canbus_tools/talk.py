@@ -9,10 +9,10 @@ every node for its clock about once a second.
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from canbus_tools.open_bus import BusOptions, open_bus
-from nodes.conversation import Answer, Conversation
+from nodes.conversation import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, Conversation
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
 from nodes.dictionary_parts import DictionaryError
@@ -154,13 +154,27 @@ class BusTalk:
             talk.lost(sentence)
 
 
-class NodeTalk:
-    """A conversation with one node whose dictionary is known; from ``NodeTalk.open`` or ``BusTalk.node``."""
+class Line(Protocol):
+    """What a conversation has to know of what carries it: a bus, or a UART."""
 
-    def __init__(self, bus: BusTalk, nodeid: int) -> None:
+    closed_because: str | None
+    """One sentence, once it has ended."""
+
+    @property
+    def name(self) -> str:
+        """How messages call it."""
+
+
+class NodeTalk:
+    """A conversation with one node whose dictionary is known; from ``NodeTalk.open`` or ``BusTalk.node``.
+
+    NODEID is None on a UART, which has one node.
+    """
+
+    def __init__(self, bus: Line, nodeid: int | None) -> None:
         self.bus = bus
         self.nodeid = nodeid
-        self.name = f"{nodeid} on {bus.name}"
+        self.name = f"on {bus.name}" if nodeid is None else f"{nodeid} on {bus.name}"
         self._talk = Conversation(self.name)
         self._observers: list[MessageCallback] = []
         self._lost: str | None = None
@@ -200,9 +214,23 @@ class NodeTalk:
         """Send a command written as ``name parameter=value …``; MessageError, LinkError."""
         self._talk.send_text(command)
 
-    async def ask(self, name: str, response: str, args: Mapping[str, Value | str] | None = None) -> Answer:
+    def send(self, name: str, args: Mapping[str, Value | str]) -> None:
+        """Send a command with ARGS; MessageError, LinkError."""
+        self._talk.link.send(self._talk.encode(name, **args))
+
+    async def ask(
+        self,
+        name: str,
+        response: str,
+        args: Mapping[str, Value | str] | None = None,
+        *,
+        timeout_s: float = QUERY_TIMEOUT_S,
+        tries: int = QUERY_TRIES,
+    ) -> Answer:
         """Send a command until its RESPONSE comes (``Conversation.ask``); raises CanductorError."""
-        return await self._talk.ask(name, response, args, survives_shutdown=True)
+        return await self._talk.ask(
+            name, response, args, timeout_s=timeout_s, tries=tries, survives_shutdown=True
+        )
 
     def knows(self, command: str, response: str) -> bool:
         """Tell whether the node's firmware has COMMAND and its RESPONSE."""
@@ -256,6 +284,11 @@ class NodeTalk:
     def _why_silent(self) -> Exception | None:
         if self.bus.closed_because is not None or self._talk.heard:
             return None
+        if self.nodeid is None:
+            return TalkError(
+                f"no answer on {self.bus.name}; check its wiring and power, the baud rate, that the firmware "
+                "is built for this port, and that no other program uses it"
+            )
         return TalkError(
             f"no node answers on id {self.nodeid} of bus {self.bus.name}; 'canductor can nodes' lists those "
             "that are there, and 'canductor can assign' gives one that waits its id"

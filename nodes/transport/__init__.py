@@ -18,6 +18,7 @@ from nodes.transport.uart import BAUD_DEFAULT, UartTransport
 from nodes.transport.virtual import VirtualTransport
 
 __all__ = [
+    "BAUD_DEFAULT",
     "ByteTransport",
     "CanFrame",
     "CanTransport",
