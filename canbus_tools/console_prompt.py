@@ -11,8 +11,6 @@ from prompt_toolkit.auto_suggest import AutoSuggestFromHistory
 from prompt_toolkit.completion import CompleteEvent, Completer, Completion
 from prompt_toolkit.document import Document
 from prompt_toolkit.history import FileHistory, History, InMemoryHistory
-from prompt_toolkit.input import Input
-from prompt_toolkit.output import Output
 from prompt_toolkit.patch_stdout import patch_stdout
 from prompt_toolkit.shortcuts import print_formatted_text
 
@@ -38,20 +36,16 @@ class SessionCompleter(Completer):
             yield Completion(found.text, -found.replaces, display_meta=found.note)
 
 
-async def prompt(
-    session: Session, history_file: Path, *, input_: Input | None = None, output: Output | None = None
-) -> None:
+async def prompt(session: Session, history_file: Path) -> None:
     """Read and carry out lines until /quit or Ctrl-D."""
     asked: PromptSession[str] = PromptSession(
         history=_history(history_file),
         completer=SessionCompleter(session),
         complete_while_typing=True,
         auto_suggest=AutoSuggestFromHistory(),
-        input=input_,
-        output=output,
     )
     with patch_stdout():
-        print_formatted_text(_banner(session), output=output)
+        print_formatted_text(_banner(session))
         while True:
             try:
                 line = await asked.prompt_async(f"{session.talk.nodeid or 'uart'}> ")
@@ -61,7 +55,7 @@ async def prompt(
             except (EOFError, Quit):
                 return
             except CanductorError as error:
-                print_formatted_text(f"! {error}", output=output)
+                print_formatted_text(f"! {error}")
 
 
 async def _run(session: Session, line: str) -> None:
