@@ -7,11 +7,11 @@ from dataclasses import asdict
 from typing import Final
 
 from canbus_tools.census import Application, CensusResult
-from canbus_tools.discovery import take_census, where
+from canbus_tools.discovery import declare_listen, listen_option, take_census, where
 from canbus_tools.interview import Facts, interview
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.survey import PROBED, State, Traffic, probe, survey
-from canbus_tools.talk import BusTalk
+from canbus_tools.talk import LISTEN_S, BusTalk
 from nodes.assign import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID, AssignError, Uuid
 from nodes.option_values import UsageError, whole
 from nodes.records import record
@@ -25,6 +25,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     command.add_argument("uuid", metavar="UUID", help="12 hex digits, as 'canductor can query' prints them")
     command.add_argument("nodeid", metavar="NODEID", help=f"{FIRST_NODEID} to {LAST_NODEID}")
     declare_bus(command)
+    declare_listen(command)
 
 
 def make_job(given: argparse.Namespace) -> Callable[[], "AssignReport"]:
@@ -32,7 +33,8 @@ def make_job(given: argparse.Namespace) -> Callable[[], "AssignReport"]:
     bus = bus_options(given)
     uuid = uuid_option("UUID", given.uuid)
     nodeid = whole("NODEID", given.nodeid, FIRST_NODEID, LAST_NODEID)
-    return lambda: assign(bus, uuid, nodeid)
+    listen_s = listen_option(given)
+    return lambda: assign(bus, uuid, nodeid, listen_s=listen_s)
 
 
 def uuid_option(option: str, text: str) -> Uuid:
@@ -45,12 +47,15 @@ def uuid_option(option: str, text: str) -> Uuid:
         ) from None
 
 
-def assign(options: BusOptions, uuid: Uuid, nodeid: int) -> "AssignReport":
-    """Give UUID the id NODEID; raises CanductorError with what to do."""
+def assign(options: BusOptions, uuid: Uuid, nodeid: int, *, listen_s: float = LISTEN_S) -> "AssignReport":
+    """Give UUID the id NODEID; raises CanductorError with what to do.
+
+    LISTEN_S is for the case that UUID does not wait: whether a node with an id has it.
+    """
 
     async def run() -> AssignReport:
         async with BusTalk.open(options) as bus:
-            return await _assign(bus, uuid, nodeid)
+            return await _assign(bus, uuid, nodeid, listen_s)
 
     return asyncio.run(run())
 
@@ -83,13 +88,13 @@ class AssignReport:
         return f"{self.uuid} {has.format(self.nodeid)}: {firmware.mcu}, {firmware.app} {firmware.version}"
 
 
-async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int) -> AssignReport:
+async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int, listen_s: float) -> AssignReport:
     traffic = Traffic(bus)
     try:
         census = await take_census(bus)
         had_it = any((node.uuid, node.nodeid) == (uuid, nodeid) for node in census.here)
         if not had_it:
-            await _check_node(bus, uuid, census)
+            await _check_node(bus, uuid, census, listen_s)
             await _check_id(bus, nodeid, census, traffic)
             await _tell(bus, uuid, nodeid)
         elif nodeid in traffic.hosted:
@@ -104,7 +109,7 @@ async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int) -> AssignReport:
     return AssignReport(bus=bus.options, uuid=uuid, nodeid=nodeid, facts=facts, had_it=had_it)
 
 
-async def _check_node(bus: BusTalk, uuid: Uuid, census: CensusResult) -> None:
+async def _check_node(bus: BusTalk, uuid: Uuid, census: CensusResult, listen_s: float) -> None:
     """Raise AssignError unless UUID waits, alone, with firmware that runs."""
     if uuid in census.twins:
         raise AssignError(
@@ -122,7 +127,7 @@ async def _check_node(bus: BusTalk, uuid: Uuid, census: CensusResult) -> None:
     for here in census.here:
         if here.uuid == uuid:
             raise _has_another(bus, uuid, here.nodeid)
-    for entry in (await survey(bus)).by_uuid(uuid):
+    for entry in (await survey(bus, listen_s=listen_s)).by_uuid(uuid):
         if entry.nodeid is not None:
             raise _has_another(bus, uuid, entry.nodeid)
         if entry.state is State.WAITING:
