@@ -46,20 +46,15 @@ def test_a_node_gets_its_id_and_gives_it_back(stage: Stage, can_tool: Command) -
 
 
 def test_told_in_words(stage: Stage, can_tool: Command) -> None:
-    assert (
-        can_tool("assign", str(MAIN), "4", *QUICK).out
-        == f"{MAIN} had id 4 before: virtual-mainboard, canductor 0.1.0\n"
-    )
-    assert (
-        can_tool("assign", str(BED), "17", *QUICK).out
-        == f"{BED} has id 17 now: virtual-mainboard, canductor 0.1.0\n"
-    )
-    released = f"{BED} had id 17, was reset and waits for an id now (Klipper-type firmware)\n"
-    assert can_tool("release", "17", *QUICK).out == released
-    assert (
-        can_tool("release", str(BED), *QUICK).out
-        == f"{BED} waits for an id already (Klipper-type firmware)\n"
-    )
+    def said(*words: str) -> str:
+        return can_tool(*words, *QUICK).out.strip()
+
+    board = "virtual-mainboard, canductor 0.1.0"
+    kind = "(Klipper-type firmware)"
+    assert said("assign", str(MAIN), "4") == f"{MAIN} had id 4 before: {board}"
+    assert said("assign", str(BED), "17") == f"{BED} has id 17 now: {board}"
+    assert said("release", "17") == f"{BED} had id 17, was reset and waits for an id now {kind}"
+    assert said("release", str(BED)) == f"{BED} waits for an id already {kind}"
 
 
 @pytest.mark.parametrize(("node", "uuid"), [(str(MAIN), MAIN), (str(TOOL_ID), TOOL), (str(TOOL), TOOL)])
@@ -132,9 +127,8 @@ def test_release_refuses_what_another_host_uses_unless_forced(stage: Stage, can_
 
 def test_release_of_nobody(stage: Stage, can_tool: Command) -> None:
     assert "no node answers on id 66 of bus " in can_tool("release", "66", *QUICK).sentence
-    assert (
-        "that can be asked has the uuid 0123456789ab" in can_tool("release", "0123456789ab", *QUICK).sentence
-    )
+    stranger = "0123456789ab"
+    assert f"that can be asked has the uuid {stranger}" in can_tool("release", stranger, *QUICK).sentence
 
 
 def test_release_of_twins_wants_one_named_by_its_id(place: Place, can_tool: Command) -> None:
