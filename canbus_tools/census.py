@@ -30,7 +30,7 @@ from nodes.assign import (
 from nodes.records import record
 
 ROUNDS: Final = 5
-ROUND_NS: Final = 40_000_000
+ROUND_NS: Final = 25_000_000
 """Nodes answer within milliseconds; adapters on USB may hold frames back for 16 ms."""
 QUIET_ROUNDS: Final = 3
 """It goes on until so many rounds brought nobody new …"""

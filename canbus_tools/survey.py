@@ -30,7 +30,7 @@ PROBE_PASSES: Final = 2
 PROBES_AT_ONCE: Final = 4
 PROBE_PAUSE_S: Final = 0.002
 """Between so many: a fifth of the bus at 1 Mbit/s, all of it for 40 ms at 250 kbit/s."""
-PROBE_ANSWER_S: Final = 0.05
+PROBE_ANSWER_S: Final = 0.03
 """For the last answers; adapters on USB may hold frames back for 16 ms."""
 INTERVIEWS_AT_ONCE: Final = 8
 

@@ -1,7 +1,12 @@
 """Plain tables: columns lined up by spaces, so that they read in any terminal, log or issue."""
 
+import re
 import textwrap
 from collections.abc import Sequence
+from typing import Final
+
+WIDTH: Final = 98
+_HARD_SPACE: Final = "\0"
 
 
 def table(headings: Sequence[str], rows: Sequence[Sequence[str]], indent: str = "  ") -> list[str]:
@@ -21,5 +26,7 @@ def count(number: int, what: str, several: str = "") -> str:
 
 
 def paragraph(text: str) -> list[str]:
-    """Return TEXT as lines that a terminal shows whole."""
-    return textwrap.wrap(text, 98, break_long_words=False, break_on_hyphens=False)
+    """Return TEXT as lines that a terminal shows whole; a command in quotes is kept in one, to be copied."""
+    kept = re.sub(r"'canductor [^']*'", lambda command: command[0].replace(" ", _HARD_SPACE), text)
+    lines = textwrap.wrap(kept, WIDTH, break_long_words=False, break_on_hyphens=False)
+    return [line.replace(_HARD_SPACE, " ") for line in lines]

@@ -1,0 +1,172 @@
+"""``canductor can assign UUID NODEID``: gives a node that waits its id, and makes sure that it has it."""
+
+import argparse
+import asyncio
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Final
+
+from canbus_tools.census import Application, CensusResult
+from canbus_tools.discovery import declare_listen, listen_option, take_census, where
+from canbus_tools.interview import Facts, interview
+from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
+from canbus_tools.survey import PROBED, State, Traffic, probe, survey
+from canbus_tools.talk import LISTEN_S, BusTalk
+from nodes.assign import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID, AssignError, Uuid
+from nodes.option_values import UsageError, whole
+from nodes.records import record
+
+TRIES: Final = 3
+"""Nobody acknowledges an id, and frames get lost."""
+
+
+def declare(command: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    command.add_argument("uuid", metavar="UUID", help="12 hex digits, as 'canductor can query' prints them")
+    command.add_argument("nodeid", metavar="NODEID", help=f"{FIRST_NODEID} to {LAST_NODEID}")
+    declare_bus(command)
+    declare_listen(command)
+
+
+def make_job(given: argparse.Namespace) -> Callable[[], "AssignReport"]:
+    """Return the job; raises UsageError."""
+    bus = bus_options(given)
+    uuid = uuid_option("UUID", given.uuid)
+    nodeid = whole("NODEID", given.nodeid, FIRST_NODEID, LAST_NODEID)
+    listen_s = listen_option(given)
+    return lambda: assign(bus, uuid, nodeid, listen_s=listen_s)
+
+
+def uuid_option(option: str, text: str) -> Uuid:
+    """Read a uuid; raises UsageError."""
+    try:
+        return Uuid.parse(text)
+    except AssignError:
+        raise UsageError(
+            f"{option} is '{text}', must be the 12 hex digits that 'canductor can query' prints"
+        ) from None
+
+
+def assign(options: BusOptions, uuid: Uuid, nodeid: int, *, listen_s: float = LISTEN_S) -> "AssignReport":
+    """Give UUID the id NODEID; raises CanductorError with what to do.
+
+    LISTEN_S is for the case that UUID does not wait: whether a node with an id has it.
+    """
+
+    async def run() -> AssignReport:
+        async with BusTalk.open(options) as bus:
+            return await _assign(bus, uuid, nodeid, listen_s)
+
+    return asyncio.run(run())
+
+
+@record(kw_only=True)
+class AssignReport:
+    """The node has its id."""
+
+    bus: BusOptions
+    uuid: Uuid
+    nodeid: int
+    facts: Facts
+    had_it: bool
+    ok: bool = True
+
+    def to_json(self) -> Mapping[str, object]:
+        """Return all of it."""
+        return {
+            "bus": self.bus.name,
+            "uuid": str(self.uuid),
+            "nodeid": self.nodeid,
+            "had_it_before": self.had_it,
+            "firmware": asdict(self.facts.firmware),
+        }
+
+    def to_text(self) -> str:
+        """Say it in one line."""
+        firmware = self.facts.firmware
+        has = "had id {} before" if self.had_it else "has id {} now"
+        return f"{self.uuid} {has.format(self.nodeid)}: {firmware.mcu}, {firmware.app} {firmware.version}"
+
+
+async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int, listen_s: float) -> AssignReport:
+    traffic = Traffic(bus)
+    try:
+        census = await take_census(bus)
+        had_it = any((node.uuid, node.nodeid) == (uuid, nodeid) for node in census.here)
+        if not had_it:
+            await _check_node(bus, uuid, census, listen_s)
+            await _check_id(bus, nodeid, census, traffic)
+            await _tell(bus, uuid, nodeid)
+        elif nodeid in traffic.hosted:
+            raise AssignError(f"node {uuid} has id {nodeid} already, and another program uses it")
+    finally:
+        traffic.close()
+    facts = await interview(bus, nodeid)
+    if facts.uuid not in (None, uuid):
+        raise AssignError(
+            f"{uuid} was given id {nodeid}, but {facts.uuid} answers on it; switch both off and on"
+        )
+    return AssignReport(bus=bus.options, uuid=uuid, nodeid=nodeid, facts=facts, had_it=had_it)
+
+
+async def _check_node(bus: BusTalk, uuid: Uuid, census: CensusResult, listen_s: float) -> None:
+    """Raise AssignError unless UUID waits, alone, with firmware that runs."""
+    if uuid in census.twins:
+        raise AssignError(
+            f"two boards on {bus.name} have the uuid {uuid} (cloned chips?), and both would take the id; "
+            "take one of them off the bus"
+        )
+    for node in census.waiting:
+        if node.uuid == uuid:
+            if node.application is Application.KATAPULT:
+                raise AssignError(
+                    f"node {uuid} is in its bootloader (Katapult) and runs no firmware that could take an "
+                    "id; flash it, or reset it to start the firmware that it has"
+                )
+            return
+    for here in census.here:
+        if here.uuid == uuid:
+            raise _has_another(bus, uuid, here.nodeid)
+    for entry in (await survey(bus, listen_s=listen_s)).by_uuid(uuid):
+        if entry.nodeid is not None:
+            raise _has_another(bus, uuid, entry.nodeid)
+        if entry.state is State.WAITING:
+            return
+    waiting = ", ".join(str(node.uuid) for node in census.waiting) or "none"
+    raise AssignError(
+        f"node {uuid} does not wait for an id on {bus.name} (those that do: {waiting}); compare the uuid, "
+        f"and check the node's power, cable and bit rate: 'canductor can query {where(bus.options)}' says how"
+    )
+
+
+def _has_another(bus: BusTalk, uuid: Uuid, nodeid: int) -> AssignError:
+    return AssignError(
+        f"node {uuid} has id {nodeid} already; 'canductor can release {nodeid} {where(bus.options)}' makes "
+        "it wait for another"
+    )
+
+
+async def _check_id(bus: BusTalk, nodeid: int, census: CensusResult, traffic: Traffic) -> None:
+    """Raise AssignError when another node has the id: it would shut down."""
+    owners = {node.nodeid: str(node.uuid) for node in census.here}
+    taken = set(owners) | traffic.hosted | traffic.talking
+    taken |= await probe(bus, {*PROBED, nodeid} - taken, traffic)
+    if nodeid in taken:
+        free = next(n for n in range(FIRST_NODEID, LAST_NODEID + 1) if n not in taken)
+        owner = owners.get(nodeid, "another node")
+        raise AssignError(
+            f"id {nodeid} on {bus.name} belongs to {owner}, which would shut down; {free} is free"
+        )
+
+
+async def _tell(bus: BusTalk, uuid: Uuid, nodeid: int) -> None:
+    """Tell the node its id until it waits no more."""
+    for _ in range(TRIES):
+        bus.send_frame(ADMIN_ID, bytes((SET_NODEID, *uuid.raw, nodeid)))
+        found = await take_census(bus, rounds=2)
+        if all(node.uuid != uuid for node in found.waiting):
+            return
+    raise AssignError(
+        f"node {uuid} on {bus.name} was told id {nodeid} {TRIES} times and still waits for one; the bus may "
+        f"lose frames ('canductor can doctor {where(bus.options)}'), or two boards have this uuid"
+    )
