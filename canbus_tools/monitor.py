@@ -1,0 +1,205 @@
+"""``canductor can monitor``: live traffic by names, as lines or on a screen, with figures of every node."""
+
+import argparse
+import asyncio
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final
+
+from canbus_tools.bus_load import BITRATE_MAX, LoadMeter
+from canbus_tools.bus_watch import BusWatch
+from canbus_tools.decoded import Decoded
+from canbus_tools.decoder import BusDecoder
+from canbus_tools.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
+from canbus_tools.filters import Filter, declare_filter, given_filter
+from canbus_tools.frame_queue import FrameQueue
+from canbus_tools.lines import line_of
+from canbus_tools.mcap_file import json_of
+from canbus_tools.open_bus import BusOptions, bus_options, declare_bus, open_bus
+from canbus_tools.protocol import DATA_NODEID_MAX
+from canbus_tools.survey import survey
+from canbus_tools.talk import BusTalk, refuse_if_in_use
+from nodes.dictionary import Dictionary
+from nodes.dictionary_cache import DictionaryCache
+from nodes.option_values import UsageError, number, whole
+from nodes.records import record
+
+FETCHED: Final = "fetched from the node"
+EVERY_NODE: Final = "all"
+DURATION_MAX_S: Final = 86_400.0
+_WAIT_S: Final = 0.1
+
+
+@record(kw_only=True)
+class MonitorOptions:
+    """Which bus, and what to show of it."""
+
+    bus: BusOptions
+    bitrate: int
+    """That the load is reckoned with."""
+    bitrate_is_known: bool
+    filter_: Filter
+    dictionaries: Mapping[int, Dictionary]
+    fetch: tuple[str, ...] = ()
+    lines: bool = True
+    as_json: bool = False
+    duration_s: float | None = None
+
+
+def declare(command: argparse.ArgumentParser) -> None:
+    """Add the options of the tool."""
+    declare_bus(command)
+    declare_dictionaries(command)
+    command.add_argument(
+        "--fetch",
+        metavar="NODE",
+        action="append",
+        help="ask this node for its dictionary first, or all nodes that no host uses; it talks on the bus",
+    )
+    declare_filter(command)
+    add = command.add_argument
+    add("--lines", action="store_true", help="plain lines; so it is anyway when the output is no terminal")
+    add("--duration", metavar="S", help="end after so long; else at Ctrl-C")
+
+
+def make_job(given: argparse.Namespace) -> "Callable[[], MonitorReport]":
+    """Check what was given; raises UsageError, CanductorError."""
+    for node in given.fetch or ():
+        if node != EVERY_NODE:
+            whole("--fetch NODE", node, 1, DATA_NODEID_MAX)
+    bus = bus_options(given)
+    bitrate, is_known = _bitrate(bus)
+    options = MonitorOptions(
+        bus=bus,
+        bitrate=bitrate,
+        bitrate_is_known=is_known,
+        filter_=given_filter(given),
+        dictionaries=given_dictionaries(given),
+        fetch=tuple(given.fetch or ()),
+        lines=given.lines or given.json or not sys.stdout.isatty(),
+        as_json=given.json,
+        duration_s=given.duration and number("--duration", given.duration, 0.1, DURATION_MAX_S, "s"),
+    )
+    if not options.lines and not sys.stdin.isatty():
+        raise UsageError("the screen takes keys, and standard input is no terminal; give --lines")
+    return lambda: run_monitor(options)
+
+
+def run_monitor(options: MonitorOptions) -> "MonitorReport":
+    """Show the bus until the user has seen enough; raises CanductorError."""
+    source = DictionarySource(options.dictionaries, DictionaryCache.of_user())
+    if options.fetch:
+        for nodeid, dictionary in asyncio.run(fetch(options.bus, options.fetch)).items():
+            source.put(nodeid, dictionary, FETCHED)
+    watch = BusWatch(BusDecoder(source), LoadMeter(options.bitrate), time.monotonic())
+    with FrameQueue(open_bus(options.bus), options.bus.name) as queue:
+        if options.lines:
+            shown = Lines(options, watch, queue).run()
+        else:
+            from canbus_tools.monitor_screen import MonitorScreen  # noqa: PLC0415 (only where there is one)
+
+            screen = MonitorScreen(options, watch, queue)
+            screen.run()
+            if screen.failure is not None:
+                raise screen.failure
+            shown = screen.shown
+        return MonitorReport(options, watch, shown, queue.dropped)
+
+
+async def fetch(options: BusOptions, nodes: tuple[str, ...]) -> dict[int, Dictionary]:
+    """Ask nodes for their dictionaries; raises CanductorError when one is in use, or does not answer."""
+    found: dict[int, Dictionary] = {}
+    async with BusTalk.open(options) as bus:
+        if EVERY_NODE in nodes:
+            # Those that another host talks to were not asked, and have no facts.
+            entries = (await survey(bus)).entries
+            wanted = [entry.nodeid for entry in entries if entry.facts is not None]
+        else:
+            wanted = [int(node) for node in nodes]
+            for nodeid in wanted:
+                await refuse_if_in_use(bus, nodeid)
+        for nodeid in wanted:
+            if nodeid is not None:
+                async with bus.node(nodeid) as talk:
+                    found[nodeid] = talk.dictionary
+    return found
+
+
+class Lines:
+    """Writes what is said as lines, each at once."""
+
+    def __init__(self, options: MonitorOptions, watch: BusWatch, queue: FrameQueue) -> None:
+        self._options = options
+        self._watch = watch
+        self._queue = queue
+        self._form = json_line if options.as_json else line_of
+
+    def run(self) -> int:
+        """Write until the duration is over, or Ctrl-C; returns how many lines. BrokenPipeError, CanductorError."""
+        shown = told_dropped = 0
+        try:
+            for said in self._said():
+                sys.stdout.write(self._form(said) + "\n")
+                sys.stdout.flush()
+                shown += 1
+                if self._queue.dropped > told_dropped:
+                    told_dropped = self._queue.dropped
+                    sys.stderr.write(
+                        f"canductor: {told_dropped} frames were dropped: lines are read too slowly\n"
+                    )
+        except KeyboardInterrupt:
+            pass  # the end of the tool, not of its report
+        return shown
+
+    def _said(self) -> Iterator[Decoded]:
+        passes = self._options.filter_.passes
+        duration_s = self._options.duration_s
+        end_s = None if duration_s is None else time.monotonic() + duration_s
+        while end_s is None or time.monotonic() < end_s:
+            for frame in self._queue.take(_WAIT_S):
+                for said in self._watch.feed(frame):
+                    if passes(said):
+                        yield said
+
+
+def json_line(said: Decoded) -> str:
+    """Return one thing as a JSON object."""
+    return json.dumps({"time_s": said.time_s, **json_of(said)}, separators=(",", ":"))
+
+
+@record
+class MonitorReport:
+    """What was seen, in numbers."""
+
+    options: MonitorOptions
+    watch: BusWatch
+    shown: int
+    dropped: int
+    ok: bool = True
+
+    def to_json(self) -> Mapping[str, object]:
+        """Return the counters of the bus and of every node."""
+        decoder, load = self.watch.decoder, self.watch.meter.load()
+        return {
+            "bus": self.options.bus.name,
+            "lines": self.shown,
+            "frames": self.watch.frames,
+            "dropped_frames": self.dropped,
+            "other_frames": decoder.other_frames,
+            "error_frames": decoder.error_frames,
+            "bitrate": self.options.bitrate,
+            "bitrate_is_known": self.options.bitrate_is_known,
+            "load": {"mean": round(load.mean, 6), "peak": round(load.peak, 6)},
+            "nodes": [decoder.nodes[nodeid].to_json() for nodeid in sorted(decoder.nodes)],
+        }
+
+    def to_text(self) -> str:
+        """Return nothing: all has been shown."""
+        return ""
+
+
+def _bitrate(bus: BusOptions) -> tuple[int, bool]:
+    """Return the bit rate to reckon with, and whether anybody said it."""
+    return (bus.bitrate, True) if bus.bitrate is not None else (BITRATE_MAX, False)
