@@ -21,8 +21,9 @@ _POLL_S: Final = 0.1
 
 
 class FrameQueue:
-    """Receives from BUS, which becomes its own; NAME is for messages. A context manager.
+    """Receives from BUS, which becomes its own. NAME is for messages, and what frames say they came by.
 
+    A context manager.
     When LIMIT frames wait, the oldest ones give way and are counted in ``dropped``.
     """
 
@@ -68,7 +69,7 @@ class FrameQueue:
             while not self._ending:
                 message = self._bus.recv(_POLL_S)
                 if message is not None:
-                    self._put(Frame.from_message(message))
+                    self._put(Frame.from_message(message)._replace(channel=self._name))
         # Whatever a backend raises ends the reception, and the user is told.
         except Exception as error:  # noqa: BLE001
             said = " ".join(str(error).split()) or type(error).__name__

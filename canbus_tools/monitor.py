@@ -41,6 +41,8 @@ class MonitorOptions:
     """That the load is reckoned with."""
     bitrate_is_known: bool
     filter_: Filter
+    filter_text: str = "none"
+    """For people."""
     dictionaries: Mapping[int, Dictionary]
     fetch: tuple[str, ...] = ()
     lines: bool = True
@@ -76,6 +78,7 @@ def make_job(given: argparse.Namespace) -> "Callable[[], MonitorReport]":
         bitrate=bitrate,
         bitrate_is_known=is_known,
         filter_=given_filter(given),
+        filter_text=_filter_text(given),
         dictionaries=given_dictionaries(given),
         fetch=tuple(given.fetch or ()),
         lines=given.lines or given.json or not sys.stdout.isatty(),
@@ -94,7 +97,7 @@ def run_monitor(options: MonitorOptions) -> "MonitorReport":
         for nodeid, dictionary in asyncio.run(fetch(options.bus, options.fetch)).items():
             source.put(nodeid, dictionary, FETCHED)
     watch = BusWatch(BusDecoder(source), LoadMeter(options.bitrate), time.monotonic())
-    with FrameQueue(open_bus(options.bus), options.bus.name) as queue:
+    with FrameQueue(open_bus(options.bus), short_name(options.bus)) as queue:
         if options.lines:
             shown = Lines(options, watch, queue).run()
         else:
@@ -115,15 +118,14 @@ async def fetch(options: BusOptions, nodes: tuple[str, ...]) -> dict[int, Dictio
         if EVERY_NODE in nodes:
             # Those that another host talks to were not asked, and have no facts.
             entries = (await survey(bus)).entries
-            wanted = [entry.nodeid for entry in entries if entry.facts is not None]
+            wanted = [e.nodeid for e in entries if e.facts is not None and e.nodeid is not None]
         else:
             wanted = [int(node) for node in nodes]
             for nodeid in wanted:
                 await refuse_if_in_use(bus, nodeid)
         for nodeid in wanted:
-            if nodeid is not None:
-                async with bus.node(nodeid) as talk:
-                    found[nodeid] = talk.dictionary
+            async with bus.node(nodeid) as talk:
+                found[nodeid] = talk.dictionary
     return found
 
 
@@ -137,7 +139,7 @@ class Lines:
         self._form = json_line if options.as_json else line_of
 
     def run(self) -> int:
-        """Write until the duration is over, or Ctrl-C; returns how many lines. BrokenPipeError, CanductorError."""
+        """Write until the duration is over, or Ctrl-C; returns how many lines."""
         shown = told_dropped = 0
         try:
             for said in self._said():
@@ -198,6 +200,19 @@ class MonitorReport:
     def to_text(self) -> str:
         """Return nothing: all has been shown."""
         return ""
+
+
+def _filter_text(given: argparse.Namespace) -> str:
+    """Return what ``declare_filter`` declared in the words that the screen's filter takes."""
+    words = [f"node={','.join(given.node)}"] if given.node else []
+    words += [f"kind={','.join(given.kind)}"] if given.kind else []
+    words += [f"dir={given.direction}"] if given.direction else []
+    return " ".join([*words, *(given.message or ())]) or "none"
+
+
+def short_name(bus: BusOptions) -> str:
+    """Return how a bus is called where room is short: of a path, the last part."""
+    return bus.channel.rpartition("/")[2] or bus.channel
 
 
 def _bitrate(bus: BusOptions) -> tuple[int, bool]:

@@ -65,7 +65,7 @@ class MonitorScreen(App[None]):
         self._watch = watch
         self._queue = queue
         self._filter = options.filter_
-        self._filter_text = "as on the command line"
+        self._filter_text = options.filter_text
         self._acks = False
         self._paused = False
         self._said: deque[Decoded] = deque(maxlen=KEPT)
@@ -140,7 +140,7 @@ class MonitorScreen(App[None]):
         self.shown += min(len(said), LINES_AT_ONCE)
 
     def _show(self, rates: BusRates) -> None:
-        if not self.is_mounted or not self._columns:
+        if not self._columns:
             return
         width = self.size.width
         self.query_one("#load", Static).update(
@@ -155,18 +155,17 @@ class MonitorScreen(App[None]):
                 table.add_row(*row, key=key)
             return
         for key, row in rows.items():
-            for column, cell in zip(self._columns, row, strict=True):
-                table.update_cell(key, column, cell)
+            for name, cell in zip(self._columns, row, strict=True):
+                table.update_cell(key, name, cell)
 
     def _choose_columns(self, width: int) -> None:
-        chosen: list[str] = []
+        chosen: set[str] = set()
         left = width - 1
-        for column in sorted(COLUMNS, key=lambda name: COLUMNS[name].importance):
-            need = COLUMNS[column].width + 2
-            if need <= left:
-                chosen.append(column)
-                left -= need
-        columns = tuple(column for column in COLUMNS if column in chosen)
+        for name, column in sorted(COLUMNS.items(), key=lambda item: item[1].importance):
+            if column.width + 2 <= left:
+                chosen.add(name)
+                left -= column.width + 2
+        columns = tuple(name for name in COLUMNS if name in chosen)
         if columns == self._columns:
             return
         self._columns = columns
@@ -183,6 +182,10 @@ class MonitorScreen(App[None]):
             text.append(f", {self._unshown} since   ")
         text.append(f"filter: {self._filter_text}")
         text.append("   acks shown" if self._acks else "")
+        strangers = [str(n.nodeid) for n in self._watch.decoder.nodes.values() if not n.dictionary_origin]
+        if strangers:
+            text.append(f"   no dictionary of {', '.join(sorted(strangers, key=int))}", "yellow")
+            text.append(f" (--fetch {strangers[0]})")
         if not self._watch.frames:
             text.append("   nothing heard yet: is anybody talking on this bus?", "yellow")
         return text

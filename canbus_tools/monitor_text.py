@@ -38,19 +38,16 @@ _STYLES: Final[Mapping[Kind, str]] = {
 def bar_line(options: "MonitorOptions", watch: BusWatch, rates: BusRates, dropped: int, width: int) -> Text:
     """Return the two lines of the head, WIDTH characters wide."""
     load = watch.meter.load()
-    known = "" if options.bitrate_is_known else "?"
     right = f" {rates.load:5.1%}  mean {load.mean:.1%}  peak {load.peak:.1%}"
-    room = max(4, width - len(right) - 6)
+    room = max(4, width - len(right) - 5)
     text = Text("load ", no_wrap=True, overflow="ellipsis")
     text.append(_bar(rates.load, room), _load_style(rates.load))
     text.append(right + "\n")
-    text.append(options.bus.name[-30:], "bold")
-    text.append(f"  {options.bitrate / 1000:g}{known} kbit/s  {rates.frames_per_s:.0f} frames/s")
-    for count, what in (
-        (watch.decoder.error_frames, "errors"),
-        (watch.decoder.other_frames, "foreign"),
-        (dropped, "DROPPED"),
-    ):
+    known = "" if options.bitrate_is_known else " assumed"
+    text.append(options.bus.name if len(options.bus.name) <= 16 else "…" + options.bus.name[-15:], "bold")
+    text.append(f"  {options.bitrate / 1000:g} kbit/s{known}  {rates.frames_per_s:.0f} frames/s")
+    counts = ((watch.decoder.error_frames, "errors"), (watch.decoder.other_frames, "foreign"))
+    for count, what in (*counts, (dropped, "dropped")):
         text.append(f"  {count} {what}", "bold yellow" if count else "")
     left = width - len(text.plain.splitlines()[-1]) - 2
     if left >= 10:
@@ -104,7 +101,7 @@ def _silence(rates: NodeRates) -> str:
 
 COLUMNS: Final[Mapping[str, Column]] = {
     "node": Column("node", 4, 0, lambda r: str(r.node.nodeid)),
-    "mcu": Column("MCU", 16, 8, lambda r: r.node.mcu or "?", "left"),
+    "mcu": Column("MCU", 17, 8, lambda r: r.node.mcu or "?", "left"),
     "uuid": Column("uuid", 12, 10, lambda r: r.node.uuid or "-", "left"),
     "to": Column("to/s", 5, 2, lambda r: f"{r.messages_to:.0f}"),
     "from": Column("from/s", 6, 1, lambda r: f"{r.messages_from:.0f}"),

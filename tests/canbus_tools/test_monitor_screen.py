@@ -1,0 +1,202 @@
+"""The monitor's screen, with keys pressed and a real node talking."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager, closing
+from typing import TYPE_CHECKING
+
+import pytest
+from textual.widgets import DataTable, Input, RichLog, Static
+
+from canbus_tools.bus_load import LoadMeter
+from canbus_tools.bus_watch import BusWatch
+from canbus_tools.decoder import BusDecoder
+from canbus_tools.filters import Filter
+from canbus_tools.frame import Frame
+from canbus_tools.frame_queue import FrameQueue
+from canbus_tools.monitor import MonitorOptions
+from canbus_tools.monitor_screen import KEPT, LINES_AT_ONCE, LOG_LINES, MonitorScreen
+from canbus_tools.monitor_text import read_filter
+from canbus_tools.open_bus import open_bus
+from canbus_tools.talk import NodeTalk
+from nodes.option_values import UsageError
+from tests.canbus_tools.stage import MAIN, MAIN_ID, PATIENCE_S, Place, set_nodeid
+
+if TYPE_CHECKING:
+    from textual.pilot import Pilot
+
+SMALL, WIDE = (80, 24), (160, 40)
+
+
+@pytest.fixture
+def node(place: Place) -> Iterator[Place]:
+    """One node of our firmware with id 4."""
+    with place.start_node("mainboard", MAIN) as process:
+        process.wait_ready()
+        with closing(place.open()) as host:
+            set_nodeid(host, MAIN, MAIN_ID)
+        yield place
+
+
+class Stand:
+    """The screen with a way to the node."""
+
+    def __init__(self, screen: MonitorScreen, pilot: "Pilot[None]", talk: NodeTalk) -> None:
+        self.screen = screen
+        self.pilot = pilot
+        self.talk = talk
+
+    def log(self) -> list[str]:
+        return [line.text.rstrip() for line in self.screen.query_one("#log", RichLog).lines]
+
+    def text(self, widget: str) -> str:
+        return str(self.screen.query_one(widget, Static).render())
+
+    def row(self, nodeid: int) -> dict[str, str]:
+        table = self.screen.query_one("#nodes", DataTable)
+        cells = table.get_row(str(nodeid))
+        return {str(key.value): str(cell) for key, cell in zip(table.columns, cells, strict=True)}
+
+    async def until(self, told: Callable[[], bool]) -> None:
+        async with asyncio.timeout(PATIENCE_S):
+            while not told():
+                await self.pilot.pause(0.01)
+
+
+def on_screen(
+    place: Place, size: tuple[int, int], test: Callable[[Stand], Awaitable[None]], nodes: Filter | None = None
+) -> None:
+    @asynccontextmanager
+    async def stand(queue: FrameQueue) -> AsyncIterator[Stand]:
+        watch = BusWatch(BusDecoder(), LoadMeter(1_000_000), asyncio.get_running_loop().time())
+        options = MonitorOptions(
+            bus=place.options,
+            bitrate=1_000_000,
+            bitrate_is_known=True,
+            filter_=nodes or Filter(),
+            dictionaries={},
+        )
+        screen = MonitorScreen(options, watch, queue)
+        async with (
+            screen.run_test(size=size) as pilot,
+            NodeTalk.open(place.options, MAIN_ID, force=True) as talk,
+        ):
+            yield Stand(screen, pilot, talk)
+
+    async def run() -> None:
+        with FrameQueue(open_bus(place.options), "bus") as queue:
+            async with stand(queue) as ready:
+                await test(ready)
+
+    asyncio.run(run())
+
+
+def test_traffic_is_shown_by_names(node: Place) -> None:
+    async def test(stand: Stand) -> None:
+        await stand.talk.ask("get_canbus_id", "canbus_id")
+        await stand.until(lambda: any("canbus_id canbus_uuid" in line for line in stand.log()))
+        (line,) = [line for line in stand.log() if "canbus_id canbus_uuid" in line]
+        assert line.endswith(f"4 ← canbus_id canbus_uuid={MAIN} canbus_nodeid=4")
+        assert any(line.endswith("4 → get_canbus_id") for line in stand.log())
+        assert not any("ack next" in line for line in stand.log())
+        await stand.until(lambda: stand.row(MAIN_ID)["mcu"] == "virtual-mainboard")
+        row = stand.row(MAIN_ID)
+        assert row["node"] == "4"
+        assert row["repeated"] == row["bad"] == "0"
+        assert float(row["rtt"]) > 0
+        assert "uuid" not in row  # no room at 80 columns
+        assert "frames/s" in stand.text("#load")
+        assert "0 dropped" in stand.text("#load")
+        assert all(len(line) <= SMALL[0] - 2 for line in stand.text("#load").splitlines())
+
+    on_screen(node, SMALL, test)
+
+
+def test_a_wide_screen_has_more_columns(node: Place) -> None:
+    async def test(stand: Stand) -> None:
+        await stand.talk.ask("get_canbus_id", "canbus_id")
+        await stand.until(lambda: MAIN_ID in stand.screen._watch.decoder.nodes)
+        await stand.until(lambda: stand.row(MAIN_ID)["uuid"] == str(MAIN))
+        await stand.pilot.resize_terminal(*SMALL)
+        await stand.until(lambda: "uuid" not in stand.row(MAIN_ID))
+
+    on_screen(node, WIDE, test)
+
+
+def test_pause_filter_acks_and_clear(node: Place) -> None:
+    async def test(stand: Stand) -> None:
+        await stand.talk.ask("get_uptime", "uptime")
+        await stand.until(lambda: any("uptime high" in line for line in stand.log()))
+        await stand.pilot.press("space")
+        before = stand.log()
+        await stand.talk.ask("get_canbus_status", "canbus_status")
+        await stand.until(
+            lambda: "PAUSED" in stand.text("#state") and ", 0 since" not in stand.text("#state")
+        )
+        assert stand.log() == before
+        await stand.pilot.press("space")
+        await stand.until(lambda: any("canbus_status rx_error" in line for line in stand.log()))
+
+        await stand.pilot.press("a")
+        assert any("ack next=" in line for line in stand.log())
+        await stand.pilot.press("a")
+        assert not any("ack next=" in line for line in stand.log())
+
+        await stand.pilot.press("slash", *"dir=from uptime", "enter")
+        assert stand.log()
+        assert all("← uptime" in line for line in stand.log())
+        assert "filter: dir=from uptime" in stand.text("#state")
+        assert not stand.screen.query_one("#filter", Input).has_class("asked")
+
+        await stand.pilot.press("c")
+        assert stand.log() == []
+        await stand.talk.ask("get_uptime", "uptime")
+        await stand.until(lambda: len(stand.log()) == 1)
+
+    on_screen(node, SMALL, test)
+
+
+def test_a_bad_filter_is_told_and_changes_nothing(node: Place) -> None:
+    async def test(stand: Stand) -> None:
+        await stand.pilot.press("slash", *"colour=red", "enter")
+        assert [n.message for n in stand.screen._notifications] == [
+            "'colour=red' is no filter; write node=4 kind=nak dir=to (or from) get_*"
+        ]
+        assert "filter: none" in stand.text("#state")
+        await stand.pilot.press("escape")
+        assert not stand.screen.query_one("#filter", Input).has_class("asked")
+
+    on_screen(node, SMALL, test)
+
+
+def test_memory_is_bounded_and_what_is_left_out_is_said(node: Place) -> None:
+    async def test(stand: Stand) -> None:
+        many = [Frame(n / 8000, 0x700, b"12345678") for n in range(KEPT + 5000)]
+        screen = stand.screen
+        screen._queue._waiting.extend(many)
+        screen.refresh_now()
+        assert len(screen._said) == KEPT
+        assert screen.shown >= LINES_AT_ONCE
+        await stand.until(lambda: any("more, too fast to show" in line for line in stand.log()))
+        for _ in range(LOG_LINES // LINES_AT_ONCE + 2):
+            screen._queue._waiting.extend(many[:100])
+            screen.refresh_now()
+        await stand.pilot.pause()
+        assert len(stand.log()) <= LOG_LINES
+
+    on_screen(node, SMALL, test)
+
+
+def test_quit(node: Place) -> None:
+    async def test(stand: Stand) -> None:
+        await stand.pilot.press("q")
+        assert stand.screen._exit
+        assert stand.screen.failure is None
+
+    on_screen(node, SMALL, test)
+
+
+@pytest.mark.parametrize("text", ["node=0", "node=x", "kind=foo", "dir=up", "a=b"])
+def test_filters_that_are_none(text: str) -> None:
+    with pytest.raises(UsageError):
+        read_filter(text)
