@@ -74,7 +74,7 @@ def record_bus(
     report = RecordReport(path, options.name)
     with (
         stop_flag() as flag,
-        contextlib.closing(_Closing(open_bus(options))) as bus,
+        contextlib.closing(_LiveBus(open_bus(options))) as bus,
         _writing(path, report) as file,
     ):
         recorder = _recorder(path, file, dictionaries or {})
@@ -91,7 +91,7 @@ def record_bus(
     return report
 
 
-class _Closing:
+class _LiveBus:
     """The bus, with frames instead of python-can's messages."""
 
     def __init__(self, bus: can.BusABC) -> None:

@@ -23,7 +23,7 @@ def stop_flag() -> Iterator[StopFlag]:
     before = {number: signal.getsignal(number) for number in _SIGNALS}
 
     def set_flag(number: int, frame: FrameType | None) -> None:
-        handler = before[number]
+        handler = before[signal.Signals(number)]
         if flag.stopped and callable(handler):
             handler(number, frame)
         flag.stopped = True
