@@ -254,8 +254,8 @@ class NodeTalk:
         self._talk.receive(responses)
 
     def _why_silent(self) -> Exception | None:
-        if self.bus.closed_because is not None or self._talk.heard:
-            return None
+        if self.bus.closed_because is not None or self.stats.blocks_received:
+            return None  # what the link says of it tells more
         return TalkError(
             f"no node answers on id {self.nodeid} of bus {self.bus.name}; 'canductor can nodes' lists those "
             "that are there, and 'canductor can assign' gives one that waits its id"

@@ -2,12 +2,14 @@
 
 import time
 from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from canbus_tools.survey import DAMAGED_BLOCK
 from nodes.transport import CanFrame
+from nodes.virtual.hub import VirtualBus
 from tests import wire_twin
 from tests.canbus_tools.command import Command, Said
 from tests.canbus_tools.other_host import OtherHost, Witness
@@ -23,6 +25,7 @@ from tests.canbus_tools.stage import (
     Place,
     Stage,
     set_nodeid,
+    six_nodes,
 )
 
 QUICK = ("--listen", "0.2")
@@ -178,3 +181,42 @@ def test_bad_ids_are_refused(place: Place, can_tool: Command, ids: str) -> None:
     said = can_tool("nodes", "--probe", ids)
     assert said.status == 2
     assert "--probe" in said.err
+
+
+class Refusing(OtherHost):
+    """A node that answers every block, and accepts none."""
+
+    def _run(self) -> None:
+        with closing(self._transport):
+            while not self._ending.is_set():
+                frame = self._transport.receive(0.02)
+                if frame is not None and frame.id == self._frame.id:
+                    self._transport.send(CanFrame(frame.id + 1, wire_twin.block(3)))
+
+
+def test_a_node_that_cannot_be_read_is_listed_with_the_reason(place: Place, can_tool: Command) -> None:
+    with Refusing(place, 20):
+        (node,) = can_tool("nodes", "--json", *QUICK).json["nodes"]
+        text = can_tool("nodes", *QUICK)
+    assert (node["nodeid"], node["uuid"], node["state"], node["firmware"]) == (20, None, "unclear", None)
+    assert "node 20" in node["trouble"]
+    assert "answers, but accepts nothing" in node["trouble"]
+    assert "Node 20: " in text.out
+
+
+@pytest.mark.parametrize(
+    "bus", [{"bitrate": 250_000}, {"loss": 0.01, "seed": 3}], ids=["250 kbit/s", "1 % of frames lost"]
+)
+def test_the_whole_stage_on_a_bad_bus(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], bus: dict[str, Any]
+) -> None:
+    with VirtualBus(tmp_path / "bad", **bus) as hub:
+        place = Place("canductor", str(hub.path))
+        with six_nodes(place):
+            nodes = by_uuid(Command(place, capsys)("nodes", "--json", "--listen", "0.3"))
+    assert nodes.keys() == {str(uuid) for uuid in (MAIN, TOOL, BED, TWIN, BOOT)}
+    assert {node["trouble"] for node in nodes.values()} == {None}
+    assert [nodes[str(uuid)]["firmware"]["mcu"] for uuid in (MAIN, TOOL)] == [
+        "virtual-mainboard",
+        "virtual-toolhead",
+    ]
