@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from canbus_tools.survey import DAMAGED_BLOCK
+from nodes.assign import ADMIN_ID, QUERY_UNASSIGNED
 from nodes.transport import CanFrame
 from nodes.virtual.hub import VirtualBus
 from tests import wire_twin
@@ -219,4 +220,37 @@ def test_the_whole_stage_on_a_bad_bus(
     assert [nodes[str(uuid)]["firmware"]["mcu"] for uuid in (MAIN, TOOL)] == [
         "virtual-mainboard",
         "virtual-toolhead",
+    ]
+
+
+class Assigning(OtherHost):
+    """A host that gives BED the id 6 as soon as somebody asks who waits a second time."""
+
+    def _run(self) -> None:
+        questions = 0
+        with closing(self._transport):
+            while not self._ending.is_set():
+                frame = self._transport.receive(0.02)
+                if frame == CanFrame(ADMIN_ID, bytes([QUERY_UNASSIGNED])):
+                    questions += 1
+                    if questions == 2:
+                        set_nodeid(self._transport, BED, 6)
+
+
+def test_a_board_that_gets_its_id_meanwhile_is_one_board(stage: Stage, can_tool: Command) -> None:
+    with Assigning(stage.place, 6):
+        nodes = by_uuid(can_tool("nodes", "--json", *QUICK))
+    assert (nodes[str(BED)]["nodeid"], nodes[str(BED)]["several_boards"]) == (6, False)
+
+
+def test_twins_of_which_one_has_an_id(place: Place, can_tool: Command) -> None:
+    with ExitStack() as stack:
+        stack.enter_context(place.start_node("toolhead", TWIN, legacy=True)).wait_ready()
+        with closing(place.open()) as host:
+            set_nodeid(host, TWIN, 5)
+        stack.enter_context(place.start_node("toolhead", TWIN, legacy=True)).wait_ready()
+        nodes = can_tool("nodes", "--json", *QUICK).json["nodes"]
+    assert [(n["uuid"], n["nodeid"], n["state"], n["several_boards"]) for n in nodes] == [
+        (str(TWIN), 5, "idle", True),
+        (str(TWIN), None, "waiting", True),
     ]
