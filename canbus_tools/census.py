@@ -175,11 +175,17 @@ class Census:
 
     def result(self) -> CensusResult:
         """Return what is known so far."""
-        waiting = [self._waiting(uuid, heard) for uuid, heard in self._heard.items() if heard.answers]
+        # A board that was given its id meanwhile, or lost it, is what it said last; of twins all is told.
+        waiting = [
+            self._waiting(uuid, heard)
+            for uuid, heard in self._heard.items()
+            if heard.answers and (heard.last == NEED_NODEID or self._has_twin(heard))
+        ]
         here = [
             NodeHere(uuid, nodeid, answers, self._has_twin(heard))
             for uuid, heard in self._heard.items()
             for nodeid, answers in heard.here.items()
+            if heard.last == NODE_IS_HERE or self._has_twin(heard)
         ]
         return CensusResult(
             waiting=tuple(sorted(waiting, key=lambda node: node.uuid.raw)),

@@ -16,6 +16,7 @@ from canbus_tools.dictionaries import DictionarySource, declare_dictionaries, gi
 from canbus_tools.filters import Filter, declare_filter, given_filter
 from canbus_tools.frame_queue import FrameQueue
 from canbus_tools.lines import line_of
+from canbus_tools.load import find_bitrate
 from canbus_tools.mcap_file import json_of
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus, open_bus
 from canbus_tools.protocol import DATA_NODEID_MAX
@@ -23,6 +24,7 @@ from canbus_tools.survey import survey
 from canbus_tools.talk import BusTalk, refuse_if_in_use
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
+from nodes.errors import CanductorError
 from nodes.option_values import UsageError, number, whole
 from nodes.records import record
 
@@ -217,4 +219,7 @@ def short_name(bus: BusOptions) -> str:
 
 def _bitrate(bus: BusOptions) -> tuple[int, bool]:
     """Return the bit rate to reckon with, and whether anybody said it."""
-    return (bus.bitrate, True) if bus.bitrate is not None else (BITRATE_MAX, False)
+    try:
+        return find_bitrate(bus), True
+    except CanductorError:
+        return BITRATE_MAX, False  # the usual one, and the screen says that it is assumed

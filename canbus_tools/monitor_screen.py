@@ -182,9 +182,10 @@ class MonitorScreen(App[None]):
             text.append(f", {self._unshown} since   ")
         text.append(f"filter: {self._filter_text}")
         text.append("   acks shown" if self._acks else "")
-        strangers = [str(n.nodeid) for n in self._watch.decoder.nodes.values() if not n.dictionary_origin]
+        nodes = self._watch.decoder.nodes.values()
+        strangers = sorted(node.nodeid for node in nodes if not node.dictionary_origin)
         if strangers:
-            text.append(f"   no dictionary of {', '.join(sorted(strangers, key=int))}", "yellow")
+            text.append(f"   no dictionary of {', '.join(map(str, strangers))}", "yellow")
             text.append(f" (--fetch {strangers[0]})")
         if not self._watch.frames:
             text.append("   nothing heard yet: is anybody talking on this bus?", "yellow")

@@ -7,7 +7,7 @@ the next block, executes nothing and changes nothing. Those that answer are aske
 
 import asyncio
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from enum import Enum
 from typing import Final
@@ -118,8 +118,21 @@ async def survey(
     entries += [_not_asked(node, hosted, shared) for node in census.here if node.nodeid not in facts]
     entries += [_hosted(nodeid, answers=nodeid in traffic.talking) for nodeid in sorted(hosted - here)]
     entries.sort(key=lambda entry: (entry.nodeid or 0, entry.uuid.raw if entry.uuid else b""))
-    entries += [_waiting(node) for node in census.waiting]
+    entries += [_waiting(node) for node in await _still_waiting(bus, census, {e.uuid for e in entries})]
     return SurveyResult(_mark_twins(entries), census, candidates)
+
+
+async def _still_waiting(
+    bus: BusTalk, census: CensusResult, with_id: Collection[Uuid | None]
+) -> Iterable[WaitingNode]:
+    """Return who waits; of a uuid that was found with an id as well, only when it still does: a second board.
+
+    Else another host gave the board its id meanwhile.
+    """
+    if not any(node.uuid in with_id for node in census.waiting):
+        return census.waiting
+    now = {node.uuid for node in (await take_census(bus, rounds=2)).waiting}
+    return [node for node in census.waiting if node.uuid not in with_id or node.uuid in now]
 
 
 async def probe(bus: BusTalk, nodeids: Iterable[int], traffic: Traffic) -> set[int]:

@@ -282,8 +282,8 @@ class NodeTalk:
         self._talk.receive(responses)
 
     def _why_silent(self) -> Exception | None:
-        if self.bus.closed_because is not None or self._talk.heard:
-            return None
+        if self.bus.closed_because is not None or self.stats.blocks_received:
+            return None  # what the link says of it tells more
         if self.nodeid is None:
             return TalkError(
                 f"no answer on {self.bus.name}; check its wiring and power, the baud rate, that the firmware "

@@ -45,14 +45,26 @@ static void put(struct bit_writer *writer, uint32_t value, uint32_t width) {
     }
 }
 
-static uint32_t write(uint32_t id, uint32_t length, const uint8_t *data, uint8_t *levels) {
+static void put_id(struct bit_writer *writer, uint32_t id, uint32_t kind) {
+    uint32_t remote = kind & CAN_BITS_REMOTE ? 1 : 0;
+    if (kind & CAN_BITS_EXTENDED) {
+        put(writer, id >> 18 & 0x7ff, 11);
+        put(writer, 3, 2); // substitute remote request, extended format
+        put(writer, id & 0x3ffff, 18);
+        put(writer, remote << 2, 3); // remote request, two reserved
+    } else {
+        put(writer, id & 0x7ff, 11);
+        put(writer, remote << 2, 3); // remote request, base format, reserved
+    }
+}
+
+static uint32_t write(uint32_t id, uint32_t kind, uint32_t length, const uint8_t *data, uint8_t *levels) {
     struct bit_writer writer = {.level = 1,
                                 .levels = levels}; // the idle bus is recessive, its run does not count
     put(&writer, 0, 1);                            // start of frame
-    put(&writer, id, 11);
-    put(&writer, 0, 3); // data frame, base format, reserved
+    put_id(&writer, id, kind);
     put(&writer, length, 4);
-    for (uint32_t i = 0; i < length; i++)
+    for (uint32_t i = 0; i < length && !(kind & CAN_BITS_REMOTE); i++)
         put(&writer, data[i], 8);
     for (uint32_t crc = writer.crc, left = CRC_BITS; left-- > 0;)
         put_bit(&writer, crc >> left & 1);
@@ -60,9 +72,13 @@ static uint32_t write(uint32_t id, uint32_t length, const uint8_t *data, uint8_t
 }
 
 uint32_t can_frame_bits(uint32_t id, uint32_t length, const uint8_t *data) {
-    return write(id, length, data, 0) + UNSTUFFED_BITS;
+    return write(id, 0, length, data, 0) + UNSTUFFED_BITS;
+}
+
+uint32_t can_any_frame_bits(uint32_t id, uint32_t kind, uint32_t length, const uint8_t *data) {
+    return write(id, kind, length, data, 0) + UNSTUFFED_BITS;
 }
 
 uint32_t can_frame_levels(uint32_t id, uint32_t length, const uint8_t *data, uint8_t *levels) {
-    return write(id, length, data, levels);
+    return write(id, 0, length, data, levels);
 }

@@ -11,6 +11,11 @@
 // more.
 uint32_t can_frame_bits(uint32_t id, uint32_t length, const uint8_t *data);
 
+enum { CAN_BITS_EXTENDED = 1, CAN_BITS_REMOTE = 2 };
+// The same for any frame of classical CAN. KIND: CAN_BITS_EXTENDED for a 29-bit ID, CAN_BITS_REMOTE for a
+// remote frame, which has no DATA whatever LENGTH it asks for; or'd, 0 for a plain data frame.
+uint32_t can_any_frame_bits(uint32_t id, uint32_t kind, uint32_t length, const uint8_t *data);
+
 enum { CAN_LEVELS_MAX = 98 + 24 };
 // The levels (0 dominant, 1 recessive) of the stuffed part of a frame, from the start bit to the checksum's
 // last bit and a stuff bit behind it; returns how many there are. Behind them come 13 bits that are never

@@ -1,4 +1,4 @@
-"""``canductor can monitor`` on a real bus: lines, filters, dictionaries, how it ends, what it keeps up with."""
+"""``canductor can monitor`` on a real bus: lines, filters, dictionaries, how it ends, a full bus."""
 
 import asyncio
 import contextlib

@@ -2,12 +2,15 @@
 
 import time
 from contextlib import ExitStack, closing
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from canbus_tools.survey import DAMAGED_BLOCK
+from nodes.assign import ADMIN_ID, QUERY_UNASSIGNED
 from nodes.transport import CanFrame
+from nodes.virtual.hub import VirtualBus
 from tests import wire_twin
 from tests.canbus_tools.command import Command, Said
 from tests.canbus_tools.other_host import OtherHost, Witness
@@ -23,6 +26,7 @@ from tests.canbus_tools.stage import (
     Place,
     Stage,
     set_nodeid,
+    six_nodes,
 )
 
 QUICK = ("--listen", "0.2")
@@ -178,3 +182,75 @@ def test_bad_ids_are_refused(place: Place, can_tool: Command, ids: str) -> None:
     said = can_tool("nodes", "--probe", ids)
     assert said.status == 2
     assert "--probe" in said.err
+
+
+class Refusing(OtherHost):
+    """A node that answers every block, and accepts none."""
+
+    def _run(self) -> None:
+        with closing(self._transport):
+            while not self._ending.is_set():
+                frame = self._transport.receive(0.02)
+                if frame is not None and frame.id == self._frame.id:
+                    self._transport.send(CanFrame(frame.id + 1, wire_twin.block(3)))
+
+
+def test_a_node_that_cannot_be_read_is_listed_with_the_reason(place: Place, can_tool: Command) -> None:
+    with Refusing(place, 20):
+        (node,) = can_tool("nodes", "--json", *QUICK).json["nodes"]
+        text = can_tool("nodes", *QUICK)
+    assert (node["nodeid"], node["uuid"], node["state"], node["firmware"]) == (20, None, "unclear", None)
+    assert "node 20" in node["trouble"]
+    assert "answers, but accepts nothing" in node["trouble"]
+    assert "Node 20: " in text.out
+
+
+@pytest.mark.parametrize(
+    "bus", [{"bitrate": 250_000}, {"loss": 0.01, "seed": 3}], ids=["250 kbit/s", "1 % of frames lost"]
+)
+def test_the_whole_stage_on_a_bad_bus(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], bus: dict[str, Any]
+) -> None:
+    with VirtualBus(tmp_path / "bad", **bus) as hub:
+        place = Place("canductor", str(hub.path))
+        with six_nodes(place):
+            nodes = by_uuid(Command(place, capsys)("nodes", "--json", "--listen", "0.3"))
+    assert nodes.keys() == {str(uuid) for uuid in (MAIN, TOOL, BED, TWIN, BOOT)}
+    assert {node["trouble"] for node in nodes.values()} == {None}
+    assert [nodes[str(uuid)]["firmware"]["mcu"] for uuid in (MAIN, TOOL)] == [
+        "virtual-mainboard",
+        "virtual-toolhead",
+    ]
+
+
+class Assigning(OtherHost):
+    """A host that gives BED the id 6 as soon as somebody asks who waits a second time."""
+
+    def _run(self) -> None:
+        questions = 0
+        with closing(self._transport):
+            while not self._ending.is_set():
+                frame = self._transport.receive(0.02)
+                if frame == CanFrame(ADMIN_ID, bytes([QUERY_UNASSIGNED])):
+                    questions += 1
+                    if questions == 2:
+                        set_nodeid(self._transport, BED, 6)
+
+
+def test_a_board_that_gets_its_id_meanwhile_is_one_board(stage: Stage, can_tool: Command) -> None:
+    with Assigning(stage.place, 6):
+        nodes = by_uuid(can_tool("nodes", "--json", *QUICK))
+    assert (nodes[str(BED)]["nodeid"], nodes[str(BED)]["several_boards"]) == (6, False)
+
+
+def test_twins_of_which_one_has_an_id(place: Place, can_tool: Command) -> None:
+    with ExitStack() as stack:
+        stack.enter_context(place.start_node("toolhead", TWIN, legacy=True)).wait_ready()
+        with closing(place.open()) as host:
+            set_nodeid(host, TWIN, 5)
+        stack.enter_context(place.start_node("toolhead", TWIN, legacy=True)).wait_ready()
+        nodes = can_tool("nodes", "--json", *QUICK).json["nodes"]
+    assert [(n["uuid"], n["nodeid"], n["state"], n["several_boards"]) for n in nodes] == [
+        (str(TWIN), 5, "idle", True),
+        (str(TWIN), None, "waiting", True),
+    ]
