@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import json
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -100,17 +101,27 @@ def run_monitor(options: MonitorOptions) -> "MonitorReport":
             source.put(nodeid, dictionary, FETCHED)
     watch = BusWatch(BusDecoder(source), LoadMeter(options.bitrate), time.monotonic())
     with FrameQueue(open_bus(options.bus), short_name(options.bus)) as queue:
-        if options.lines:
-            shown = Lines(options, watch, queue).run()
-        else:
-            from canbus_tools.monitor_screen import MonitorScreen  # noqa: PLC0415 (only where there is one)
-
-            screen = MonitorScreen(options, watch, queue)
-            screen.run()
-            if screen.failure is not None:
-                raise screen.failure
-            shown = screen.shown
+        run = _run_lines if options.lines else _run_screen
+        shown = run(options, watch, queue)
         return MonitorReport(options, watch, shown, queue.dropped)
+
+
+def _run_lines(options: MonitorOptions, watch: BusWatch, queue: FrameQueue) -> int:
+    return Lines(options, watch, queue).run()
+
+
+def _run_screen(options: MonitorOptions, watch: BusWatch, queue: FrameQueue) -> int:
+    from canbus_tools.monitor_screen import MonitorScreen  # noqa: PLC0415 (only where there is one)
+
+    before = signal.getsignal(signal.SIGTERM)
+    screen = MonitorScreen(options, watch, queue)
+    screen.run()
+    signal.signal(signal.SIGTERM, before)
+    if screen.terminated:
+        signal.raise_signal(signal.SIGTERM)
+    if screen.failure is not None:
+        raise screen.failure
+    return screen.shown
 
 
 async def fetch(options: BusOptions, nodes: tuple[str, ...]) -> dict[int, Dictionary]:
@@ -118,9 +129,12 @@ async def fetch(options: BusOptions, nodes: tuple[str, ...]) -> dict[int, Dictio
     found: dict[int, Dictionary] = {}
     async with BusTalk.open(options) as bus:
         if EVERY_NODE in nodes:
-            # Those that another host talks to were not asked, and have no facts.
             entries = (await survey(bus)).entries
             wanted = [e.nodeid for e in entries if e.facts is not None and e.nodeid is not None]
+            for entry in entries:
+                if entry.facts is None and entry.nodeid is not None:
+                    why = entry.trouble or "another host uses it"
+                    sys.stderr.write(f"canductor: node {entry.nodeid} was not asked: {why}\n")
         else:
             wanted = [int(node) for node in nodes]
             for nodeid in wanted:

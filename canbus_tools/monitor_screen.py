@@ -1,5 +1,7 @@
 """The monitor's screen: load, a table of the nodes, and a log of what is said."""
 
+import asyncio
+import signal
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -59,6 +61,8 @@ class MonitorScreen(App[None]):
     def __init__(self, options: "MonitorOptions", watch: BusWatch, queue: FrameQueue) -> None:
         super().__init__()
         self.failure: CanductorError | None = None
+        self.terminated = False
+        """SIGTERM came."""
         self.shown = 0
         """Lines put into the log."""
         self._options = options
@@ -92,6 +96,12 @@ class MonitorScreen(App[None]):
         log.can_focus = True
         log.focus()
         self.set_interval(REFRESH_S, self.refresh_now)
+        # Left to the command line, it would end the program before the terminal is as it was.
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, self._terminate)
+
+    def _terminate(self) -> None:
+        self.terminated = True
+        self.exit()
 
     def on_resize(self, event: events.Resize) -> None:
         """Show as many columns as fit."""

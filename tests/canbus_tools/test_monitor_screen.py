@@ -1,8 +1,16 @@
 """The monitor's screen, with keys pressed and a real node talking."""
 
 import asyncio
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, closing
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -194,6 +202,69 @@ def test_quit(node: Place) -> None:
         assert stand.screen.failure is None
 
     on_screen(node, SMALL, test)
+
+
+class Terminal:
+    """A terminal of 80x24 with a shell, played by tmux."""
+
+    def __init__(self, folder: Path) -> None:
+        self._tmux = ("tmux", "-L", f"canductor-{os.getpid()}", "-f", "/dev/null")
+        self._environment = {**os.environ, "TMUX_TMPDIR": str(folder), "PS1": "$ ", "TERM": "xterm-256color"}
+        self("new-session", "-d", "-s", "test", "-x", "80", "-y", "24", "sh")
+
+    def __call__(self, *words: str) -> str:
+        command = (*self._tmux, *words)
+        done = subprocess.run(
+            command, env=self._environment, capture_output=True, text=True, timeout=PATIENCE_S, check=True
+        )
+        return done.stdout
+
+    def type(self, *keys: str) -> None:
+        self("send-keys", "-t", "test", *keys)
+
+    def until(self, wanted: str, meanwhile: Callable[[], object]) -> str:
+        """Return the screen once WANTED is on it."""
+        end_s = time.monotonic() + PATIENCE_S
+        shown = ""
+        while wanted not in shown:
+            assert time.monotonic() < end_s, f"{wanted!r} did not come:\n{shown}"
+            meanwhile()
+            shown = self("capture-pane", "-p", "-t", "test")
+        return shown
+
+
+@pytest.mark.skipif(shutil.which("tmux") is None, reason="tmux is not installed")
+@pytest.mark.parametrize("ending", ["q", "SIGTERM"])
+def test_in_a_terminal_which_is_left_as_it_was(node: Place, tmp_path: Path, ending: str) -> None:
+    terminal = Terminal(tmp_path)
+    try:
+        entry = "import sys; from coordinator.entry import main; sys.exit(main())"
+        words = shlex.join([sys.executable, "-c", entry, "can", "monitor", *node.words, "-b", "1000000"])
+        (tmp_path / "run").write_text(f"echo $$ > {tmp_path}/pid; exec {words}\n")
+        terminal.type("-l", f"sh {tmp_path}/run; echo ended $?")
+        terminal.type("Enter")
+
+        def talk() -> None:
+            asyncio.run(_ask(node))
+
+        lines = terminal.until("uptime high=", talk).splitlines()
+        assert lines[0].startswith(" load ")
+        assert lines[2].split()[:2] == ["node", "MCU"]
+        assert lines[-1].split()[:2] == ["q", "Quit"]
+        if ending == "q":
+            terminal.type("q")
+        else:
+            os.kill(int((tmp_path / "pid").read_text()), signal.SIGTERM)
+        left = terminal.until("\nended ", lambda: None)
+        assert f"\nended {0 if ending == 'q' else 143}" in left
+        assert " load " not in left
+    finally:
+        terminal("kill-server")
+
+
+async def _ask(place: Place) -> None:
+    async with NodeTalk.open(place.options, MAIN_ID, force=True) as talk:
+        await talk.ask("get_uptime", "uptime")
 
 
 @pytest.mark.parametrize("text", ["node=0", "node=x", "kind=foo", "dir=up", "a=b"])
