@@ -29,6 +29,8 @@ REFRESH_S: Final = 0.25
 KEPT: Final = 20_000
 """Things said that are kept, for another filter to look at."""
 LOG_LINES: Final = 2_000
+LOG_FRAME: Final = 3
+"""Columns of padding and scroll bar."""
 LINES_AT_ONCE: Final = 60
 """Lines added at one refresh: a screenful. Nobody reads more in REFRESH_S; how many were left out is said."""
 
@@ -77,6 +79,7 @@ class MonitorScreen(App[None]):
         """Came while the log was paused."""
         self._left_out = 0
         self._columns: tuple[str, ...] = ()
+        self._width = 80
         self._end_s = None if options.duration_s is None else time.monotonic() + options.duration_s
 
     def compose(self) -> ComposeResult:
@@ -105,8 +108,10 @@ class MonitorScreen(App[None]):
 
     def on_resize(self, event: events.Resize) -> None:
         """Show as many columns as fit."""
-        self._choose_columns(event.size.width)
+        self._width = event.size.width
+        self._choose_columns(self._width)
         self._show(self._watch.update(time.monotonic()))
+        self._rewrite()
 
     # --------------------------------------------------------------------------------------------- refreshing
 
@@ -146,13 +151,13 @@ class MonitorScreen(App[None]):
                 Text(f"… {left_out} more, too fast to show: filter with /, or use --lines", "dim italic")
             )
         for item in said[-LINES_AT_ONCE:]:
-            log.write(log_line(item))
+            log.write(log_line(item, self._width - LOG_FRAME))
         self.shown += min(len(said), LINES_AT_ONCE)
 
     def _show(self, rates: BusRates) -> None:
         if not self._columns:
             return
-        width = self.size.width
+        width = self._width
         self.query_one("#load", Static).update(
             bar_line(self._options, self._watch, rates, self._queue.dropped, width - 2)
         )
@@ -251,4 +256,4 @@ class MonitorScreen(App[None]):
         log = self.query_one("#log", RichLog)
         log.clear()
         for item in [said for said in self._said if self._passes(said)][-LOG_LINES:]:
-            log.write(log_line(item))
+            log.write(log_line(item, self._width - LOG_FRAME))

@@ -1,6 +1,7 @@
 """What the monitor's screen writes: the lines of its head, table and log, and the words of its filter."""
 
 import math
+import textwrap
 import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final, Literal
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 BUSY, FULL = 0.5, 0.8
 """Loads from which the bar is yellow, and red."""
+ROOM_MIN: Final = 20
+"""Characters of a line that the text has on the narrowest screen."""
 _EIGHTHS: Final = " ▏▎▍▌▋▊▉"
 _SPARKS: Final = "▁▂▃▄▅▆▇█"
 _STYLES: Final[Mapping[Kind, str]] = {
@@ -146,15 +149,17 @@ def cells(rates: NodeRates, columns: tuple[str, ...]) -> list[Text]:
 # ------------------------------------------------------------------------------------------------------ log
 
 
-def log_line(said: Decoded) -> Text:
-    """Return a line of the log: local time, node and way, text."""
+def log_line(said: Decoded, width: int) -> Text:
+    """Return an entry of the log, WIDTH wide: local time, node and way, and text in lines enough."""
     text = Text(no_wrap=True)
     seconds = said.time_s % 60
     clock = time.strftime("%H:%M", time.localtime(said.time_s)) if 0 <= said.time_s < 1 << 33 else "--:--"
     text.append(f"{clock}:{seconds:09.6f} ", "dim")
     arrow = {Direction.TO_NODE: "→", Direction.FROM_NODE: "←"}.get(said.direction, " ")
     text.append(f"{'' if said.nodeid is None else said.nodeid:>3} {arrow} ", _way_style(said))
-    text.append(said.text, _STYLES.get(said.kind, ""))
+    room = max(ROOM_MIN, width - len(text))
+    pieces = textwrap.wrap(said.text, room, break_on_hyphens=False) or [""]
+    text.append(("\n" + " " * len(text)).join(pieces), _STYLES.get(said.kind, ""))
     if said.repeated:
         text.append("  repeated", "yellow")
     return text

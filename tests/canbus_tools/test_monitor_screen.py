@@ -120,6 +120,22 @@ def test_traffic_is_shown_by_names(node: Place) -> None:
     on_screen(node, SMALL, test)
 
 
+def test_a_long_message_is_shown_whole(node: Place) -> None:
+    async def test(stand: Stand) -> None:
+        await stand.talk.ask("get_canbus_status", "canbus_status")
+        await stand.until(lambda: any("canbus_status rx_error" in line for line in stand.log()))
+        lines = stand.log()
+        (at,) = [n for n, line in enumerate(lines) if "canbus_status rx_error" in line]
+        assert lines[at + 1].strip() == "canbus_bus_state=active"
+        assert lines[at + 1].index("canbus") == lines[at].index("canbus")
+        await stand.pilot.resize_terminal(*WIDE)
+        await stand.until(
+            lambda: any("rx_error" in line and line.endswith("=active") for line in stand.log())
+        )
+
+    on_screen(node, SMALL, test)
+
+
 def test_a_wide_screen_has_more_columns(node: Place) -> None:
     async def test(stand: Stand) -> None:
         await stand.talk.ask("get_canbus_id", "canbus_id")
