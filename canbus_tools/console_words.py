@@ -61,11 +61,11 @@ Command = NodeCommand | OwnCommand
 
 def read_line(text: str) -> Command | None:
     """Return what a line says, None when it is empty or a comment; ConsoleError."""
-    line = text.strip()
-    if not line or line.startswith("#"):
+    if len(text) > LINE_MAX:
+        raise ConsoleError(f"the line has {len(text)} characters; at most {LINE_MAX} are read")
+    line = _without_comment(text).strip()
+    if not line:
         return None
-    if len(line) > LINE_MAX:
-        raise ConsoleError(f"the line has {len(line)} characters; at most {LINE_MAX} are read")
     name, _, rest = line.partition(" ")
     rest = rest.strip()
     if name.startswith("/"):
@@ -74,6 +74,16 @@ def read_line(text: str) -> Command | None:
             return OwnCommand(name if name in OWN else found[0], rest)
         raise ConsoleError(f"the console has no command '{name}'; /help lists those it has")
     return NodeCommand(name, _arguments(name, rest))
+
+
+def _without_comment(text: str) -> str:
+    quoted = False
+    for at, letter in enumerate(text):
+        if letter == '"' and text[at - 1 : at] != "\\":
+            quoted = not quoted
+        elif letter == "#" and not quoted and (at == 0 or text[at - 1].isspace()):
+            return text[:at]
+    return text
 
 
 def _arguments(name: str, text: str) -> dict[str, str]:

@@ -108,10 +108,12 @@ class MonitorScreen(App[None]):
 
     def on_resize(self, event: events.Resize) -> None:
         """Show as many columns as fit."""
+        changed = event.size.width != self._width
         self._width = event.size.width
         self._choose_columns(self._width)
         self._show(self._watch.update(time.monotonic()))
-        self._rewrite()
+        if changed:
+            self._rewrite()
 
     # --------------------------------------------------------------------------------------------- refreshing
 

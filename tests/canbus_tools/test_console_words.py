@@ -34,6 +34,8 @@ def values(line: str) -> dict[str, int | bytes | str]:
 def test_lines() -> None:
     assert read_line("  # a comment") is None
     assert read_line("") is None
+    assert read_line('a b="x # y" c=1 # so') == NodeCommand("a", {"b": '"x # y"', "c": "1"})
+    assert read_line("get_uptime  # a question") == NodeCommand("get_uptime", {})
     assert read_line("get_uptime ") == NodeCommand("get_uptime", {})
     assert read_line('a b=1 + 2  c = max(x, 3) d="x y=2" e=a==b') == NodeCommand(
         "a", {"b": "1 + 2", "c": "max(x, 3)", "d": '"x y=2"', "e": "a==b"}

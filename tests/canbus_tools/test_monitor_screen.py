@@ -66,9 +66,10 @@ class Stand:
         return {str(key.value): str(cell) for key, cell in zip(table.columns, cells, strict=True)}
 
     async def until(self, told: Callable[[], bool]) -> None:
-        async with asyncio.timeout(PATIENCE_S):
-            while not told():
-                await self.pilot.pause(0.01)
+        end_s = time.monotonic() + PATIENCE_S
+        while not told():
+            assert time.monotonic() < end_s, (self.text("#state"), self.text("#load"), self.log()[-20:])
+            await self.pilot.pause(0.01)
 
 
 def on_screen(
@@ -169,7 +170,7 @@ def test_pause_filter_acks_and_clear(node: Place) -> None:
         await stand.pilot.press("slash", *"dir=from uptime", "enter")
         assert stand.log()
         assert all("← uptime" in line for line in stand.log())
-        assert "filter: dir=from uptime" in stand.text("#state")
+        await stand.until(lambda: "filter: dir=from uptime" in stand.text("#state"))
         assert not stand.screen.query_one("#filter", Input).has_class("asked")
 
         await stand.pilot.press("c")
