@@ -10,8 +10,8 @@ from canbus_tools.census import Application, CensusResult
 from canbus_tools.discovery import declare_listen, listen_option, take_census, where
 from canbus_tools.interview import Facts, interview
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.survey import PROBED, State, Traffic, probe, survey
-from canbus_tools.talk import LISTEN_S, BusTalk
+from canbus_tools.survey import PROBED, State, probe, survey
+from canbus_tools.talk import LISTEN_S, BusTalk, refuse_if_in_use
 from nodes.assign import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID, AssignError, Uuid
 from nodes.option_values import UsageError, whole
 from nodes.records import record
@@ -50,7 +50,7 @@ def uuid_option(option: str, text: str) -> Uuid:
 def assign(options: BusOptions, uuid: Uuid, nodeid: int, *, listen_s: float = LISTEN_S) -> "AssignReport":
     """Give UUID the id NODEID; raises CanductorError with what to do.
 
-    LISTEN_S is for the case that UUID does not wait: whether a node with an id has it.
+    LISTEN_S is for the case that UUID does not wait: who has it, and whether a host talks to it.
     """
 
     async def run() -> AssignReport:
@@ -89,18 +89,14 @@ class AssignReport:
 
 
 async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int, listen_s: float) -> AssignReport:
-    traffic = Traffic(bus)
-    try:
-        census = await take_census(bus)
-        had_it = any((node.uuid, node.nodeid) == (uuid, nodeid) for node in census.here)
-        if not had_it:
-            await _check_node(bus, uuid, census, listen_s)
-            await _check_id(bus, nodeid, census, traffic)
-            await _tell(bus, uuid, nodeid)
-        elif nodeid in traffic.hosted:
-            raise AssignError(f"node {uuid} has id {nodeid} already, and another program uses it")
-    finally:
-        traffic.close()
+    census = await take_census(bus)
+    had_it = any((node.uuid, node.nodeid) == (uuid, nodeid) for node in census.here)
+    if not had_it:
+        await _check_node(bus, uuid, census, listen_s)
+        await _check_id(bus, nodeid, census)
+        await _tell(bus, uuid, nodeid)
+    else:
+        await refuse_if_in_use(bus, nodeid, listen_s)
     facts = await interview(bus, nodeid)
     if facts.uuid not in (None, uuid):
         raise AssignError(
@@ -146,11 +142,11 @@ def _has_another(bus: BusTalk, uuid: Uuid, nodeid: int) -> AssignError:
     )
 
 
-async def _check_id(bus: BusTalk, nodeid: int, census: CensusResult, traffic: Traffic) -> None:
+async def _check_id(bus: BusTalk, nodeid: int, census: CensusResult) -> None:
     """Raise AssignError when another node has the id: it would shut down."""
     owners = {node.nodeid: str(node.uuid) for node in census.here}
-    taken = set(owners) | traffic.hosted | traffic.talking
-    taken |= await probe(bus, {*PROBED, nodeid} - taken, traffic)
+    taken = set(owners) | bus.hosted | bus.talking
+    taken |= await probe(bus, {*PROBED, nodeid} - taken)
     if nodeid in taken:
         free = next(n for n in range(FIRST_NODEID, LAST_NODEID + 1) if n not in taken)
         owner = owners.get(nodeid, "another node")

@@ -103,6 +103,7 @@ def test_a_node_that_does_not_take_its_id_is_told_of(place: Place, can_tool: Com
     class Deaf(OtherHost):
         def _run(self) -> None:
             with closing(self._transport):
+                self._began.set()
                 while not self._ending.is_set():
                     frame = self._transport.receive(0.02)
                     if frame == CanFrame(ADMIN_ID, bytes([QUERY_UNASSIGNED])):

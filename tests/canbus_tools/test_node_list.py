@@ -189,6 +189,7 @@ class Refusing(OtherHost):
 
     def _run(self) -> None:
         with closing(self._transport):
+            self._began.set()
             while not self._ending.is_set():
                 frame = self._transport.receive(0.02)
                 if frame is not None and frame.id == self._frame.id:
@@ -229,6 +230,7 @@ class Assigning(OtherHost):
     def _run(self) -> None:
         questions = 0
         with closing(self._transport):
+            self._began.set()
             while not self._ending.is_set():
                 frame = self._transport.receive(0.02)
                 if frame == CanFrame(ADMIN_ID, bytes([QUERY_UNASSIGNED])):
