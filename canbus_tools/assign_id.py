@@ -11,7 +11,7 @@ from canbus_tools.discovery import declare_listen, listen_option, take_census, w
 from canbus_tools.interview import Facts, interview
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.survey import PROBED, State, probe, survey
-from canbus_tools.talk import LISTEN_S, BusTalk, refuse_if_in_use
+from canbus_tools.talk import LISTEN_S, BusTalk
 from nodes.assign import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID, AssignError, Uuid
 from nodes.option_values import UsageError, whole
 from nodes.records import record
@@ -95,8 +95,8 @@ async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int, listen_s: float) -> Ass
         await _check_node(bus, uuid, census, listen_s)
         await _check_id(bus, nodeid, census)
         await _tell(bus, uuid, nodeid)
-    else:
-        await refuse_if_in_use(bus, nodeid, listen_s)
+    elif await bus.has_host(nodeid, listen_s):
+        raise AssignError(f"node {uuid} on {bus.name} has id {nodeid} already, and another program uses it")
     facts = await interview(bus, nodeid)
     if facts.uuid not in (None, uuid):
         raise AssignError(

@@ -74,6 +74,12 @@ class SurveyResult:
     probed: tuple[int, ...]
     """Ids to which a damaged block was sent."""
 
+    @property
+    def boards(self) -> int:
+        """How many there are at least: twins that answer alike are one entry."""
+        rows = Counter(entry.uuid for entry in self.entries)
+        return len(self.entries) + sum(entry.twins and rows[entry.uuid] == 1 for entry in self.entries)
+
     def by_uuid(self, uuid: Uuid) -> list[Entry]:
         """Return the nodes that have a uuid."""
         return [entry for entry in self.entries if entry.uuid == uuid]

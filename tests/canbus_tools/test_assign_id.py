@@ -92,6 +92,12 @@ def test_refused_and_nothing_was_sent(
     assert not stage.boot.told_as_application.is_set()
 
 
+def test_a_node_that_has_the_id_already_and_a_host(stage: Stage, can_tool: Command) -> None:
+    with OtherHost(stage.place, MAIN_ID):
+        said = can_tool("assign", str(MAIN), str(MAIN_ID), *QUICK)
+    assert f"has id {MAIN_ID} already, and another program uses it" in said.sentence
+
+
 def test_an_id_that_only_a_host_uses_is_taken(stage: Stage, can_tool: Command) -> None:
     with OtherHost(stage.place, 6):
         assert "id 6 on" in can_tool("assign", str(BED), "6", *QUICK).sentence
