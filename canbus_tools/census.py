@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
+from canbus_tools.talk import DATA_IDS
 from nodes.assign import (
     ADMIN_ID,
     ADMIN_RESPONSE_ID,
@@ -38,8 +39,6 @@ ROUNDS_MAX: Final = 200
 """… but ends even if new ones appear for ever."""
 MAX_UUIDS: Final = 512
 """Remembered; a bus has at most 252 ids to give."""
-DATA_IDS: Final = range(0x102, 0x300)
-"""Data ids of the node ids 1..255."""
 
 
 class Application(Enum):

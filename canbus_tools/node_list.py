@@ -110,7 +110,7 @@ class NodesReport:
     def to_text(self) -> str:
         """Return the table, and what to know about it."""
         entries = self.found.entries
-        lines = [f"{count(len(entries), 'node')} on {self.bus.name}", ""]
+        lines = [f"{count(self.found.boards, 'node')} on {self.bus.name}", ""]
         if not entries:
             return "\n".join(lines + _nobody(self.bus, self.found))
         lines += [*table(HEADINGS, [_row(entry) for entry in entries]), ""]

@@ -105,7 +105,7 @@ async def _release(bus: BusTalk, node: Uuid | int, *, force: bool, listen_s: flo
 
 
 def _report(bus: BusTalk, node: WaitingNode, nodeid: int | None) -> ReleaseReport:
-    what = f"{application_name(node)}"
+    what = application_name(node)
     if nodeid is None:
         text = f"{node.uuid} waits for an id already ({what})"
     else:

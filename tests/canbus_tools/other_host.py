@@ -1,11 +1,12 @@
 """Another program on the bus, and a witness of everything on it."""
 
 import threading
+import time
 from contextlib import closing
 from typing import Self
 
 from nodes.transport import CanFrame
-from tests.canbus_tools.stage import Place
+from tests.canbus_tools.stage import PATIENCE_S, Place
 
 _POLL_S = 0.02
 
@@ -17,18 +18,23 @@ class OtherHost:
         self._frame = CanFrame(nodeid * 2 + 0x100, data)
         self._transport = place.open()
         self._ending = threading.Event()
+        self._began = threading.Event()
         self._thread = threading.Thread(target=self._run)
 
     def _run(self) -> None:
         with closing(self._transport):
+            due_s = 0.0
             while not self._ending.is_set():
-                self._transport.send(self._frame)
+                if time.monotonic() >= due_s:
+                    due_s = time.monotonic() + _POLL_S
+                    self._transport.send(self._frame)
+                    self._began.set()
                 # What comes has to be read: the virtual bus waits for who does not.
-                while self._transport.receive(_POLL_S) is not None and not self._ending.is_set():
-                    pass
+                self._transport.receive(_POLL_S)
 
     def __enter__(self) -> Self:
         self._thread.start()
+        assert self._began.wait(PATIENCE_S)
         return self
 
     def __exit__(self, *_: object) -> None:

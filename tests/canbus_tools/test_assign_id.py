@@ -71,7 +71,7 @@ def test_release_by_uuid_or_id_also_from_shutdown(
         ((str(TWIN), "9"), f"two boards on .* have the uuid {TWIN} .*take one of them off"),
         ((str(BOOT), "9"), f"node {BOOT} is in its bootloader .*flash it, or reset it"),
         ((str(BED), "4"), f"id {MAIN_ID} on .* belongs to {MAIN}, which would shut down; 6 is free"),
-        ((str(BED), "5"), f"id {TOOL_ID} on .* belongs to another node, which would shut down; 6 is free"),
+        ((str(BED), "5"), f"id {TOOL_ID} on .* belongs to {TOOL}, which would shut down; 6 is free"),
         ((str(MAIN), "9"), f"node {MAIN} has id 4 already; 'canductor can release 4 "),
         ((str(TOOL), "9"), f"node {TOOL} has id 5 already; 'canductor can release 5 "),
         (
@@ -92,6 +92,23 @@ def test_refused_and_nothing_was_sent(
     assert not stage.boot.told_as_application.is_set()
 
 
+def test_a_twin_that_has_an_id_is_not_given_another_one_beside_its_brother(
+    place: Place, can_tool: Command
+) -> None:
+    with ExitStack() as stack:
+        stack.enter_context(place.start_node("toolhead", TWIN, legacy=True)).wait_ready()
+        with closing(place.open()) as host:
+            set_nodeid(host, TWIN, 5)
+        stack.enter_context(place.start_node("toolhead", TWIN, legacy=True)).wait_ready()
+        assert "two boards" in can_tool("assign", str(TWIN), "9", *QUICK).sentence
+
+
+def test_a_node_that_has_the_id_already_and_a_host(stage: Stage, can_tool: Command) -> None:
+    with OtherHost(stage.place, MAIN_ID):
+        said = can_tool("assign", str(MAIN), str(MAIN_ID), *QUICK)
+    assert f"has id {MAIN_ID} already, and another program uses it" in said.sentence
+
+
 def test_an_id_that_only_a_host_uses_is_taken(stage: Stage, can_tool: Command) -> None:
     with OtherHost(stage.place, 6):
         assert "id 6 on" in can_tool("assign", str(BED), "6", *QUICK).sentence
@@ -103,6 +120,7 @@ def test_a_node_that_does_not_take_its_id_is_told_of(place: Place, can_tool: Com
     class Deaf(OtherHost):
         def _run(self) -> None:
             with closing(self._transport):
+                self._began.set()
                 while not self._ending.is_set():
                     frame = self._transport.receive(0.02)
                     if frame == CanFrame(ADMIN_ID, bytes([QUERY_UNASSIGNED])):

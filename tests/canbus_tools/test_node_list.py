@@ -74,7 +74,7 @@ def test_again_and_as_a_table(stage: Stage, can_tool: Command) -> None:
     said = can_tool("nodes", *QUICK)  # with the dictionaries in the cache, and nodes that were talked to
     assert said.status == 0
     lines = said.out.splitlines()
-    assert lines[0] == f"5 nodes on {stage.place.options.name}"
+    assert lines[0] == f"6 nodes on {stage.place.options.name}"
     rows = {line.split()[1]: " ".join(line.split()) for line in lines if line.startswith("  ")}
     assert rows[str(MAIN)].startswith(
         f"{MAIN_ID} {MAIN} canductor idle virtual-mainboard 168 MHz canductor 0.1.0"
@@ -189,6 +189,7 @@ class Refusing(OtherHost):
 
     def _run(self) -> None:
         with closing(self._transport):
+            self._began.set()
             while not self._ending.is_set():
                 frame = self._transport.receive(0.02)
                 if frame is not None and frame.id == self._frame.id:
@@ -229,6 +230,7 @@ class Assigning(OtherHost):
     def _run(self) -> None:
         questions = 0
         with closing(self._transport):
+            self._began.set()
             while not self._ending.is_set():
                 frame = self._transport.receive(0.02)
                 if frame == CanFrame(ADMIN_ID, bytes([QUERY_UNASSIGNED])):

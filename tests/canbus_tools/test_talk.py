@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+import time
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -9,7 +10,8 @@ import can
 import pytest
 
 from canbus_tools.open_bus import BusOptions
-from canbus_tools.talk import NodeTalk, TalkError
+from canbus_tools.talk import BusTalk, NodeTalk, TalkError
+from nodes.dictionary_cache import DictionaryCache
 from nodes.message_format import Message
 from tests.canbus_tools.other_host import OtherHost
 from tests.canbus_tools.stage import MAIN, MAIN_ID, PATIENCE_S, TOOL_ID, Place, Stage
@@ -100,3 +102,17 @@ def test_any_backend_of_python_can_serves(stage: Stage) -> None:
         finally:
             for forwarder in forwarders:
                 forwarder.stop()
+
+
+def test_beside_a_host_a_dictionary_is_read_with_pauses(stage: Stage) -> None:
+    async def read_dictionary_s() -> float:
+        async with BusTalk.open(stage.place.options, DictionaryCache()) as bus:
+            assert not await bus.has_host(MAIN_ID, QUIET_S)
+            began_s = time.monotonic()
+            async with bus.node(MAIN_ID):
+                return time.monotonic() - began_s
+
+    alone_s = asyncio.run(read_dictionary_s())
+    with OtherHost(stage.place, 200):
+        beside_s = asyncio.run(read_dictionary_s())
+    assert beside_s > 2.5 * alone_s  # 5 times, less what does not depend on it: opening, first contact
