@@ -105,26 +105,41 @@ class Flow:
         """Take a block from the node; tells whether it refuses one (nak) that was sent."""
         following = block[1] & SEQUENCE_MASK
         last = (following - 1) & SEQUENCE_MASK
-        first_answer, self._answered = self._answered is None, following
+        before, self._answered = self._answered, following
         progress = last in self._flight
         if progress:
             sent_s = self._flight[last]
             self._acknowledge(last)
             if sent_s is not None:
                 self.round_trips.add(now_s - sent_s)
+        elif self._flight and following not in self._flight and following != before:
+            return self._lose_count(first=before is None, following=following, empty=len(block) == EMPTY_SIZE)
         if len(block) > EMPTY_SIZE:
             return False
-        # A second empty block with the same number refuses what is under way. So does a first one that names
-        # no block that is: the node had another number in mind than a host that just came.
+        # A second empty block with the same number refuses what is under way.
         again, self._empty = self._empty == following, following
-        refused = bool(self._flight) and (again or (first_answer and following not in self._flight))
-        if progress or not refused:
+        if progress or not again or not self._flight:
             return False
         self.naks += 1
         self._gaps.clear()
         if following not in self._flight:
-            self._next = None  # the host will go on with the number it was told
+            self._next = None
+            self._flight.clear()
         return True
+
+    def _lose_count(self, *, first: bool, following: int, empty: bool) -> bool:
+        """Take an answer that names no block under way; tells whether it is a nak.
+
+        Either the node had another number in mind than a host that just came, which will go on with the one
+        it is told, or much is missing from the recording.
+        """
+        self._next = None
+        self._flight.clear()
+        self._gaps.clear()
+        if empty:
+            self._empty = following
+        self.naks += first
+        return first
 
     def _acknowledge(self, last: int) -> None:
         """Everything up to number LAST was taken."""

@@ -285,6 +285,15 @@ def test_a_host_that_comes_anew_leaves_nothing_out() -> None:
     assert (decoder.nodes[4].flow.missed_blocks, decoder.nodes[4].flow.naks) == (0, 1)
 
 
+def test_a_node_that_was_reset_leaves_nothing_out() -> None:
+    talk = Talk().command(8, "get_clock").ack(9)
+    talk.command(1, "get_uptime").ack(0).command(0, "get_uptime").ack(1).command(1, "get_clock").ack(2)
+    decoder = knowing()
+    said = decode(decoder, talk.frames)
+    assert decoder.nodes[4].flow.missed_blocks == 0
+    assert not any(item.repeated for item in said)
+
+
 def test_the_same_command_for_ever_is_no_repeat() -> None:
     talk = Talk(step_s=0.05)
     for n in range(64):
