@@ -14,7 +14,7 @@ from canbus_tools.decoder import BusDecoder
 from canbus_tools.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
 from canbus_tools.filters import Filter, declare_filter, given_filter
 from canbus_tools.frame import Frame
-from canbus_tools.lines import line_of, table_of
+from canbus_tools.lines import line_of, printable, table_of
 from canbus_tools.mcap_file import json_of
 from canbus_tools.recordings import STANDARD_INPUT, read_batches
 from canbus_tools.until_stopped import StopFlag, stop_flag
@@ -256,7 +256,7 @@ class DecodeReport:
         for name, bus in self._decoding.buses.items():
             table = table_of(bus.nodes[nodeid] for nodeid in sorted(bus.nodes))
             others = f"{bus.other_frames} frames of other protocols, {bus.error_frames} error frames"
-            parts.append(f"\nbus {name or '-'}: {others}\n{table}")
+            parts.append(f"\nbus {printable(name)}: {others}\n{table}")
         return "\n".join(parts)
 
     def _hints(self) -> list[str]:

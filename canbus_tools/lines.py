@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from functools import lru_cache
 
 from canbus_tools.decoded import Decoded
 from canbus_tools.protocol import Direction
@@ -20,7 +21,13 @@ def line_of(said: Decoded) -> str:
     """Return time, bus, whom it goes to or comes from, and the text; without the line's end."""
     whom = _WORDS[said.nodeid, said.direction]
     again = "  (repeated)" if said.repeated else ""
-    return f"{said.time_s:.6f}  {said.channel or '-'}  {whom:<8}  {said.text}{again}"
+    return f"{said.time_s:.6f}  {printable(said.channel)}  {whom:<8}  {said.text}{again}"
+
+
+@lru_cache(maxsize=256)
+def printable(name: str) -> str:
+    """Return a bus's name without what a terminal would obey: recordings come from anywhere."""
+    return "".join(c if c.isprintable() else "?" for c in name) or "-"
 
 
 _HEADINGS = ("node", "uuid", "mcu", "frames", "to", "from", "repeated", "missed", "naks", "invalid", "unread")
@@ -34,7 +41,7 @@ def table_of(nodes: Iterable[NodeTraffic]) -> str:
         cells = (
             node.nodeid,
             node.uuid or "-",
-            node.mcu or "-",
+            printable(node.mcu),
             sum(way.frames for way in ways),
             *(way.messages for way in ways),
             node.flow.repeated_blocks,
