@@ -11,7 +11,7 @@ from canbus_tools.traffic import NodeTraffic
 _ENDS = {Direction.TO_NODE: "to", Direction.FROM_NODE: "from", Direction.ANY: "from"}
 _NOBODY = {Direction.TO_NODE: "to all", Direction.FROM_NODE: "from ?", Direction.ANY: "-"}
 _WORDS = {
-    (nodeid, direction): f"{word} {nodeid}" if nodeid is not None else _NOBODY[direction]
+    (nodeid, direction): (f"{word} {nodeid}" if nodeid is not None else _NOBODY[direction]).ljust(8)
     for nodeid in (None, *range(256))
     for direction, word in _ENDS.items()
 }
@@ -19,9 +19,9 @@ _WORDS = {
 
 def line_of(said: Decoded) -> str:
     """Return time, bus, whom it goes to or comes from, and the text; without the line's end."""
-    whom = _WORDS[said.nodeid, said.direction]
-    again = "  (repeated)" if said.repeated else ""
-    return f"{said.time_s:.6f}  {printable(said.channel)}  {whom:<8}  {said.text}{again}"
+    time_s, channel, nodeid, direction, _, _, repeated, shape, values = said
+    again = "  (repeated)" if repeated else ""
+    return f"{time_s:.6f}  {printable(channel)}  {_WORDS[nodeid, direction]}  {shape.text(values)}{again}"
 
 
 @lru_cache(maxsize=256)
