@@ -33,7 +33,7 @@ def read_candump(
 ) -> Iterator[list[Frame]]:
     """Yield the frames of SOURCE, called NAME, as they come, many at once where there are many.
 
-    BEFORE_READ is called whenever more input is waited for. Raises CanductorError at the end when there were
+    BEFORE_READ is called whenever more input is to be read. Raises CanductorError at the end when there were
     lines that are no frames.
     """
     read = getattr(source, "read1", source.read)  # does not wait for a whole chunk

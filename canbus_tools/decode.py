@@ -3,19 +3,21 @@
 import argparse
 import json
 import re
+import select
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 from canbus_tools.decoded import Decoded
 from canbus_tools.decoder import BusDecoder
 from canbus_tools.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
 from canbus_tools.filters import Filter, declare_filter, given_filter
 from canbus_tools.frame import Frame
-from canbus_tools.lines import line_of, table_of
+from canbus_tools.lines import line_of, printable, table_of
 from canbus_tools.mcap_file import json_of
 from canbus_tools.recordings import STANDARD_INPUT, read_batches
+from canbus_tools.until_stopped import StopFlag, stop_flag
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
@@ -24,6 +26,8 @@ from nodes.records import record
 
 LINES_HELD: Final = 500
 """Lines written at once."""
+LOOK_S: Final = 0.1
+"""How soon Ctrl-C is noticed while nothing comes in."""
 BUSES_MAX: Final = 64
 """Names of buses that are told apart; a recording with more is no recording."""
 _MOMENT: Final = re.compile(r"(\+?)(\d{1,12}(?:\.\d{1,9})?)\Z")
@@ -86,6 +90,18 @@ def _moment(option: str, text: str | None) -> Moment | None:
     return Moment(float(match[2]), bool(match[1]))
 
 
+class _StoppedError(Exception):
+    """The user stopped it while it waited for input."""
+
+
+def _readable(file: BinaryIO) -> bool:
+    """Wait LOOK_S at most; true where nobody can wait for it."""
+    try:
+        return bool(select.select([file], [], [], LOOK_S)[0])
+    except (OSError, ValueError):
+        return True
+
+
 class Decoding:
     """Decodes recordings one after the other, as one: blocks may begin in one and end in the next."""
 
@@ -111,29 +127,38 @@ class Decoding:
         self._shows = lines
         self._form = _json_line if as_json else line_of
         self._held: list[str] = []
+        self._flag = StopFlag()
 
     def run(self, files: list[Path]) -> "DecodeReport":
         """Decode FILES; lines go to standard output, sentences about what is broken to the report."""
-        stopped = False
-        try:
+        with stop_flag() as self._flag:
             for file in files:
-                self._decode(file)
-        except KeyboardInterrupt:
-            stopped = True
-        for bus in self.buses.values():
-            self._take(bus.flush())
-        self._write()
-        return DecodeReport(self, stopped=stopped, lines=self._shows)
+                if not self._flag.stopped:
+                    self._decode(file)
+            for bus in self.buses.values():
+                self._take(bus.flush())
+            self._write()
+        return DecodeReport(self, stopped=self._flag.stopped, lines=self._shows)
 
     def _decode(self, file: Path) -> None:
         try:
-            for frames in read_batches(file, self._write):
+            for frames in read_batches(file, self._wait_for_input if file == STANDARD_INPUT else None):
                 if not self.frames:
                     self._set_limits(frames[0].time_s)
-                if self._feed(frames):
+                if self._flag.stopped or self._feed(frames):
                     break
+        except _StoppedError:
+            pass
         except CanductorError as error:
             self.problems.append(str(error))
+
+    def _wait_for_input(self) -> None:
+        """Show what there is, and wait for a pipe so that Ctrl-C ends that and nothing else."""
+        self._write()
+        while not (self._flag.stopped or _readable(sys.stdin.buffer)):
+            pass
+        if self._flag.stopped:
+            raise _StoppedError
 
     def _feed(self, frames: Sequence[Frame]) -> bool:
         """Decode FRAMES; tells whether the end was reached.
@@ -231,7 +256,7 @@ class DecodeReport:
         for name, bus in self._decoding.buses.items():
             table = table_of(bus.nodes[nodeid] for nodeid in sorted(bus.nodes))
             others = f"{bus.other_frames} frames of other protocols, {bus.error_frames} error frames"
-            parts.append(f"\nbus {name or '-'}: {others}\n{table}")
+            parts.append(f"\nbus {printable(name)}: {others}\n{table}")
         return "\n".join(parts)
 
     def _hints(self) -> list[str]:

@@ -106,7 +106,7 @@ class MessageShape:
     def text(self, values: Sequence[Value]) -> str:
         """Return the text; buffers as hex digits, enumerated values by name."""
         if not self._special:
-            return self._template % (*values,)
+            return self._template % tuple(values)
         words: list[object] = [*values]
         for i, enumeration in self._special:
             value = words[i]
@@ -114,7 +114,7 @@ class MessageShape:
                 words[i] = value.hex()
             elif enumeration is not None and isinstance(value, int):
                 words[i] = _quoted(enumeration.name_of(value)) or value
-        return self._template % (*words,)
+        return self._template % tuple(words)
 
 
 def _quoted(name: str | None) -> str | None:

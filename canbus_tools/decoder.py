@@ -207,7 +207,7 @@ class _CommandStream(_Stream):
 
     def _block(self, out: list[Decoded], block: bytes, frame: Frame) -> None:
         node = self._node
-        time_s, channel = frame.time_s, frame.channel
+        time_s, channel = frame[0], frame[4]
         node.last_sent_s = time_s
         seq = block[1] & SEQUENCE_MASK
         repeated = node.flow.sent(block, time_s)
@@ -238,7 +238,7 @@ class _ResponseStream(_Stream):
 
     def _block(self, out: list[Decoded], block: bytes, frame: Frame) -> None:
         node = self._node
-        time_s, channel = frame.time_s, frame.channel
+        time_s, channel = frame[0], frame[4]
         node.last_heard_s = time_s
         seq = block[1] & SEQUENCE_MASK
         refused = node.flow.answered(block, time_s)

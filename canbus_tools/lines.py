@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from functools import lru_cache
 
 from canbus_tools.decoded import Decoded
 from canbus_tools.protocol import Direction
@@ -10,7 +11,7 @@ from canbus_tools.traffic import NodeTraffic
 _ENDS = {Direction.TO_NODE: "to", Direction.FROM_NODE: "from", Direction.ANY: "from"}
 _NOBODY = {Direction.TO_NODE: "to all", Direction.FROM_NODE: "from ?", Direction.ANY: "-"}
 _WORDS = {
-    (nodeid, direction): f"{word} {nodeid}" if nodeid is not None else _NOBODY[direction]
+    (nodeid, direction): (f"{word} {nodeid}" if nodeid is not None else _NOBODY[direction]).ljust(8)
     for nodeid in (None, *range(256))
     for direction, word in _ENDS.items()
 }
@@ -18,9 +19,15 @@ _WORDS = {
 
 def line_of(said: Decoded) -> str:
     """Return time, bus, whom it goes to or comes from, and the text; without the line's end."""
-    whom = _WORDS[said.nodeid, said.direction]
-    again = "  (repeated)" if said.repeated else ""
-    return f"{said.time_s:.6f}  {said.channel or '-'}  {whom:<8}  {said.text}{again}"
+    time_s, channel, nodeid, direction, _, _, repeated, shape, values = said
+    again = "  (repeated)" if repeated else ""
+    return f"{time_s:.6f}  {printable(channel)}  {_WORDS[nodeid, direction]}  {shape.text(values)}{again}"
+
+
+@lru_cache(maxsize=256)
+def printable(name: str) -> str:
+    """Return a bus's name without what a terminal would obey: recordings come from anywhere."""
+    return "".join(c if c.isprintable() else "?" for c in name) or "-"
 
 
 _HEADINGS = ("node", "uuid", "mcu", "frames", "to", "from", "repeated", "missed", "naks", "invalid", "unread")
@@ -34,7 +41,7 @@ def table_of(nodes: Iterable[NodeTraffic]) -> str:
         cells = (
             node.nodeid,
             node.uuid or "-",
-            node.mcu or "-",
+            printable(node.mcu),
             sum(way.frames for way in ways),
             *(way.messages for way in ways),
             node.flow.repeated_blocks,

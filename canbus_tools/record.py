@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import errno
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -16,7 +17,7 @@ from canbus_tools.dictionaries import DictionarySource, declare_dictionaries, gi
 from canbus_tools.frame import Frame
 from canbus_tools.mcap_file import McapWriter
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus, open_bus
-from canbus_tools.until_stopped import stop_flag
+from canbus_tools.until_stopped import StopFlag, stop_flag
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
@@ -24,6 +25,9 @@ from nodes.option_values import UsageError, number
 
 LOOK_S: Final = 0.1
 """How soon Ctrl-C and the end of the time are noticed on a silent bus."""
+DRAIN_S: Final = 1.0
+"""At the end, frames that had arrived are still recorded: so long at most, on a bus that is never quiet."""
+QUIET_S: Final = 0.02
 COUNTERS_S: Final = 1.0
 """Between two entries of the counters, in the time of the frames."""
 DURATION_MAX_S: Final = 1e7
@@ -74,40 +78,55 @@ def record_bus(
     report = RecordReport(path, options.name)
     with (
         stop_flag() as flag,
-        contextlib.closing(_LiveBus(open_bus(options))) as bus,
+        contextlib.closing(_LiveBus(options)) as bus,
         _writing(path, report) as file,
     ):
         recorder = _recorder(path, file, dictionaries or {})
-        end_s = None if duration_s is None else time.monotonic() + duration_s
-        while not flag.stopped:
-            left_s = LOOK_S if end_s is None else min(LOOK_S, end_s - time.monotonic())
-            if left_s <= 0:
-                break
-            frame = bus.receive(left_s, options)
-            if frame is not None:
+        sys.stderr.write(f"recording {options.name} to '{path}'; Ctrl-C ends it\n")
+        sys.stderr.flush()
+        try:
+            for frame in _until_end(bus, flag, duration_s):
                 recorder.frame(frame)
                 report.frames += 1
-        recorder.finish()
+        finally:  # whatever ends it, the file is complete up to there
+            recorder.finish()
     return report
+
+
+def _until_end(bus: "_LiveBus", flag: StopFlag, duration_s: float | None) -> Iterator[Frame]:
+    """Yield frames until the time is over or the user stops it, and then those that are on their way."""
+    end_s = None if duration_s is None else time.monotonic() + duration_s
+    while not flag.stopped:
+        left_s = LOOK_S if end_s is None else min(LOOK_S, end_s - time.monotonic())
+        if left_s <= 0:
+            break
+        frame = bus.receive(left_s)
+        if frame is not None:
+            yield frame
+    last_s = time.monotonic() + DRAIN_S
+    while time.monotonic() < last_s and (frame := bus.receive(QUIET_S)) is not None:
+        yield frame
 
 
 class _LiveBus:
     """The bus, with frames instead of python-can's messages."""
 
-    def __init__(self, bus: can.BusABC) -> None:
-        self._bus = bus
+    def __init__(self, options: BusOptions) -> None:
+        self._bus = open_bus(options)
+        self._name = options.name
+        self._channel = Path(options.channel).name
 
-    def receive(self, timeout_s: float, options: BusOptions) -> Frame | None:
+    def receive(self, timeout_s: float) -> Frame | None:
         try:
             message = self._bus.recv(timeout_s)
         except (can.CanError, OSError) as error:
             raise CanductorError(
-                f"CAN bus {options.name}: receiving failed ({error}); 'canductor can doctor' may say why"
+                f"CAN bus {self._name}: receiving failed ({error}); 'canductor can doctor' may say why"
             ) from None
         if message is None:
             return None
         frame = Frame.from_message(message)
-        return frame if frame.channel else frame._replace(channel=Path(options.channel).name)
+        return frame if frame.channel else frame._replace(channel=self._channel)
 
     def close(self) -> None:
         self._bus.shutdown()

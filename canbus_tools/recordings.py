@@ -38,7 +38,7 @@ def read_frames(path: Path) -> Iterator[Frame]:
 def read_batches(path: Path, before_read: Callable[[], object] | None = None) -> Iterator[list[Frame]]:
     """Yield the frames as read_frames does, many at once: the quickest way to work on them.
 
-    BEFORE_READ is called whenever more of a log is waited for.
+    BEFORE_READ is called whenever more of a log is to be read.
     """
     if path == STANDARD_INPUT:
         yield from read_candump(sys.stdin.buffer, "standard input", before_read)

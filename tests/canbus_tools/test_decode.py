@@ -138,6 +138,13 @@ def test_summary(capsys: Output, log: Path, dictionary: Path) -> None:
     assert lines[4].split()[:8] == ["4", "90a4ae022dfc", "twin", "7", "2", "1", "1", "0"]
 
 
+def test_names_in_a_recording_do_not_reach_the_terminal_as_they_are(capsys: Output, tmp_path: Path) -> None:
+    path = tmp_path / "some.log"
+    path.write_text("(1.0) can\x1b[2J0 3F0#00\n")
+    assert decode(capsys, path)[0] == ["1.000000  can?[2J0  to all    query_unassigned"]
+    assert "\x1b" not in "".join(decode(capsys, path, "--summary")[0])
+
+
 def test_several_files_are_one_recording(capsys: Output, tmp_path: Path) -> None:
     talk = Talk()
     for n, (offset, data) in enumerate(identify_pieces()):

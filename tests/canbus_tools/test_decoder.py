@@ -269,10 +269,29 @@ def test_repeats_naks_and_their_round_trips() -> None:
 
 
 def test_blocks_missing_from_a_recording_are_counted() -> None:
-    talk = Talk().command(3, "get_clock").command(7, "get_uptime").command(8, "get_clock")
+    talk = (
+        Talk().command(3, "get_clock").ack(4).ack(7).command(7, "get_uptime").command(8, "get_clock").ack(9)
+    )
     decoder = knowing()
     decode(decoder, talk.frames)
-    assert decoder.nodes[4].flow.missed_blocks == 3
+    assert (decoder.nodes[4].flow.missed_blocks, decoder.nodes[4].flow.naks) == (3, 0)
+
+
+def test_a_host_that_comes_anew_leaves_nothing_out() -> None:
+    talk = Talk().command(8, "get_clock").ack(9)
+    talk.command(1, "get_uptime").ack(9).command(9, "get_uptime").ack(10)
+    decoder = knowing()
+    decode(decoder, talk.frames)
+    assert (decoder.nodes[4].flow.missed_blocks, decoder.nodes[4].flow.naks) == (0, 1)
+
+
+def test_a_node_that_was_reset_leaves_nothing_out() -> None:
+    talk = Talk().command(8, "get_clock").ack(9)
+    talk.command(1, "get_uptime").ack(0).command(0, "get_uptime").ack(1).command(1, "get_clock").ack(2)
+    decoder = knowing()
+    said = decode(decoder, talk.frames)
+    assert decoder.nodes[4].flow.missed_blocks == 0
+    assert not any(item.repeated for item in said)
 
 
 def test_the_same_command_for_ever_is_no_repeat() -> None:
