@@ -211,10 +211,9 @@ class Diagnosis:
     def _figures(self) -> list[str]:
         lines = []
         if self.traffic is not None:
-            load = "" if self.traffic.load is None else f", {self.traffic.load.mean:.1%} busy"
-            lines.append(
-                f"listened {self.traffic.listened_s:.1f} s: {count(self.traffic.frames, 'frame')}{load}"
-            )
+            load = self.traffic.load
+            busy = "how busy it is needs --bitrate" if load is None else f"{load.mean:.1%} busy"
+            lines.append(f"listened {self.traffic.listened_s:.1f} s: {busy}")
         pings = () if self.nodes is None else self.nodes.pings
         return lines + [
             f"node {ping.nodeid}: {ping.asked} questions, {ping.repeats} repeated; round trip"

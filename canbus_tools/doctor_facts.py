@@ -29,7 +29,7 @@ from canbus_tools.open_bus import BusOptions, open_bus
 from canbus_tools.protocol import Direction, owner_of
 from canbus_tools.survey import PROBED, State, SurveyResult, survey
 from canbus_tools.talk import BusTalk
-from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, WHO_IS_HERE
+from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.errors import CanductorError
 
 ASKED: Final = 100
@@ -41,6 +41,8 @@ _SYS_NET: Final = Path("/sys/class/net")
 _ARPHRD_CAN: Final = "280"
 _RECV_S: Final = 0.1
 _BURST: Final = 8
+NO_COMMAND: Final = 0xFF
+"""An admin command that does not exist: nodes ignore it, so no late answer disturbs the questions behind it."""
 _QUESTIONS: Final = (("get_uptime", "uptime"), ("get_clock", "clock"), ("get_config", "config"))
 
 
@@ -110,7 +112,6 @@ class Listener:
     def __exit__(self, *_: object) -> None:
         self._end.set()
         self._thread.join()
-        self._ended_s = time.time()
         self._bus.shutdown()
 
     def wait(self, seconds: float) -> None:
@@ -126,6 +127,7 @@ class Listener:
             if self._meter is not None:
                 self._meter.advance(now_s)
             load = None if self._meter is None else self._meter.load()
+            self._ended_s = now_s
             self._calm = (load, self._decoder.other_frames, tuple(self._ways()))
 
     def _run(self) -> None:
@@ -211,12 +213,12 @@ def error_kinds(frame: Frame) -> set[str]:
 
 
 def fill_queue(options: BusOptions) -> bool:
-    """Tell whether a burst of short questions overflows the send queue; raises CanductorError."""
+    """Tell whether a burst of short frames overflows the send queue; raises CanductorError."""
     bus = open_bus(options)
-    question = can.Message(arbitration_id=ADMIN_ID, data=bytes([WHO_IS_HERE]), is_extended_id=False)
+    nothing = can.Message(arbitration_id=ADMIN_ID, data=bytes([NO_COMMAND]), is_extended_id=False)
     try:
         for _ in range(_BURST):
-            bus.send(question)
+            bus.send(nothing)
     except can.CanOperationError as error:
         if error.error_code == errno.ENOBUFS:
             return True
