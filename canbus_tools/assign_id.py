@@ -6,12 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Final
 
-from canbus_tools.census import Application, CensusResult
-from canbus_tools.discovery import take_census, where
+from canbus_tools.discovery import declare_listen, listen_option, take_census, where
 from canbus_tools.interview import Facts, interview
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.survey import PROBED, State, Traffic, probe, survey
-from canbus_tools.talk import BusTalk
+from canbus_tools.survey import PROBED, State, SurveyResult, survey
+from canbus_tools.talk import LISTEN_S, BusTalk
 from nodes.assign import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID, AssignError, Uuid
 from nodes.option_values import UsageError, whole
 from nodes.records import record
@@ -25,6 +24,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     command.add_argument("uuid", metavar="UUID", help="12 hex digits, as 'canductor can query' prints them")
     command.add_argument("nodeid", metavar="NODEID", help=f"{FIRST_NODEID} to {LAST_NODEID}")
     declare_bus(command)
+    declare_listen(command)
 
 
 def make_job(given: argparse.Namespace) -> Callable[[], "AssignReport"]:
@@ -32,7 +32,8 @@ def make_job(given: argparse.Namespace) -> Callable[[], "AssignReport"]:
     bus = bus_options(given)
     uuid = uuid_option("UUID", given.uuid)
     nodeid = whole("NODEID", given.nodeid, FIRST_NODEID, LAST_NODEID)
-    return lambda: assign(bus, uuid, nodeid)
+    listen_s = listen_option(given)
+    return lambda: assign(bus, uuid, nodeid, listen_s=listen_s)
 
 
 def uuid_option(option: str, text: str) -> Uuid:
@@ -45,12 +46,15 @@ def uuid_option(option: str, text: str) -> Uuid:
         ) from None
 
 
-def assign(options: BusOptions, uuid: Uuid, nodeid: int) -> "AssignReport":
-    """Give UUID the id NODEID; raises CanductorError with what to do."""
+def assign(options: BusOptions, uuid: Uuid, nodeid: int, *, listen_s: float = LISTEN_S) -> "AssignReport":
+    """Give UUID the id NODEID; raises CanductorError with what to do.
+
+    LISTEN_S: how long to listen for other hosts first.
+    """
 
     async def run() -> AssignReport:
         async with BusTalk.open(options) as bus:
-            return await _assign(bus, uuid, nodeid)
+            return await _assign(bus, uuid, nodeid, listen_s)
 
     return asyncio.run(run())
 
@@ -83,19 +87,14 @@ class AssignReport:
         return f"{self.uuid} {has.format(self.nodeid)}: {firmware.mcu}, {firmware.app} {firmware.version}"
 
 
-async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int) -> AssignReport:
-    traffic = Traffic(bus)
-    try:
-        census = await take_census(bus)
-        had_it = any((node.uuid, node.nodeid) == (uuid, nodeid) for node in census.here)
-        if not had_it:
-            await _check_node(bus, uuid, census)
-            await _check_id(bus, nodeid, census, traffic)
-            await _tell(bus, uuid, nodeid)
-        elif nodeid in traffic.hosted:
-            raise AssignError(f"node {uuid} has id {nodeid} already, and another program uses it")
-    finally:
-        traffic.close()
+async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int, listen_s: float) -> AssignReport:
+    # Of a node that has an id, only the survey learns the uuid; a second board with this one would take the
+    # id as well.
+    found = await survey(bus, probed={*PROBED, nodeid}, listen_s=listen_s)
+    had_it = _check_node(bus, uuid, nodeid, found)
+    if not had_it:
+        _check_id(bus, nodeid, found)
+        await _tell(bus, uuid, nodeid)
     facts = await interview(bus, nodeid)
     if facts.uuid not in (None, uuid):
         raise AssignError(
@@ -104,51 +103,44 @@ async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int) -> AssignReport:
     return AssignReport(bus=bus.options, uuid=uuid, nodeid=nodeid, facts=facts, had_it=had_it)
 
 
-async def _check_node(bus: BusTalk, uuid: Uuid, census: CensusResult) -> None:
-    """Raise AssignError unless UUID waits, alone, with firmware that runs."""
-    if uuid in census.twins:
+def _check_node(bus: BusTalk, uuid: Uuid, nodeid: int, found: SurveyResult) -> bool:
+    """Return whether UUID has the id already; raise AssignError unless it can be given it."""
+    boards = found.by_uuid(uuid)
+    if not boards:
+        waiting = ", ".join(str(node.uuid) for node in found.census.waiting) or "none"
+        raise AssignError(
+            f"node {uuid} does not wait for an id on {bus.name} (those that do: {waiting}), nor has one that "
+            "answered; compare the uuid, and check the node's power, cable and bit rate: "
+            f"'canductor can query {where(bus.options)}' says how"
+        )
+    board = boards[0]
+    if len(boards) > 1 or board.twins:
         raise AssignError(
             f"two boards on {bus.name} have the uuid {uuid} (cloned chips?), and both would take the id; "
             "take one of them off the bus"
         )
-    for node in census.waiting:
-        if node.uuid == uuid:
-            if node.application is Application.KATAPULT:
-                raise AssignError(
-                    f"node {uuid} is in its bootloader (Katapult) and runs no firmware that could take an "
-                    "id; flash it, or reset it to start the firmware that it has"
-                )
-            return
-    for here in census.here:
-        if here.uuid == uuid:
-            raise _has_another(bus, uuid, here.nodeid)
-    for entry in (await survey(bus)).by_uuid(uuid):
-        if entry.nodeid is not None:
-            raise _has_another(bus, uuid, entry.nodeid)
-        if entry.state is State.WAITING:
-            return
-    waiting = ", ".join(str(node.uuid) for node in census.waiting) or "none"
-    raise AssignError(
-        f"node {uuid} does not wait for an id on {bus.name} (those that do: {waiting}); compare the uuid, "
-        f"and check the node's power, cable and bit rate: 'canductor can query {where(bus.options)}' says how"
-    )
+    if board.state is State.BOOTLOADER:
+        raise AssignError(
+            f"node {uuid} is in its bootloader (Katapult) and runs no firmware that could take an id; flash "
+            "it, or reset it to start the firmware that it has"
+        )
+    if board.nodeid not in (None, nodeid):
+        raise AssignError(
+            f"node {uuid} has id {board.nodeid} already; 'canductor can release {board.nodeid} "
+            f"{where(bus.options)}' makes it wait for another"
+        )
+    if board.state is State.IN_USE:
+        raise AssignError(f"node {uuid} on {bus.name} has id {nodeid} already, and another program uses it")
+    return board.nodeid == nodeid
 
 
-def _has_another(bus: BusTalk, uuid: Uuid, nodeid: int) -> AssignError:
-    return AssignError(
-        f"node {uuid} has id {nodeid} already; 'canductor can release {nodeid} {where(bus.options)}' makes "
-        "it wait for another"
-    )
-
-
-async def _check_id(bus: BusTalk, nodeid: int, census: CensusResult, traffic: Traffic) -> None:
+def _check_id(bus: BusTalk, nodeid: int, found: SurveyResult) -> None:
     """Raise AssignError when another node has the id: it would shut down."""
-    owners = {node.nodeid: str(node.uuid) for node in census.here}
-    taken = set(owners) | traffic.hosted | traffic.talking
-    taken |= await probe(bus, {*PROBED, nodeid} - taken, traffic)
+    owners = {entry.nodeid: entry.uuid for entry in found.entries if entry.nodeid is not None}
+    taken = set(owners) | bus.hosted | bus.talking
     if nodeid in taken:
-        free = next(n for n in range(FIRST_NODEID, LAST_NODEID + 1) if n not in taken)
-        owner = owners.get(nodeid, "another node")
+        free = next((str(n) for n in range(FIRST_NODEID, LAST_NODEID + 1) if n not in taken), "none")
+        owner = owners.get(nodeid) or "another node"
         raise AssignError(
             f"id {nodeid} on {bus.name} belongs to {owner}, which would shut down; {free} is free"
         )

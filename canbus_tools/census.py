@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
+from canbus_tools.talk import DATA_IDS
 from nodes.assign import (
     ADMIN_ID,
     ADMIN_RESPONSE_ID,
@@ -30,7 +31,7 @@ from nodes.assign import (
 from nodes.records import record
 
 ROUNDS: Final = 5
-ROUND_NS: Final = 40_000_000
+ROUND_NS: Final = 25_000_000
 """Nodes answer within milliseconds; adapters on USB may hold frames back for 16 ms."""
 QUIET_ROUNDS: Final = 3
 """It goes on until so many rounds brought nobody new …"""
@@ -38,8 +39,6 @@ ROUNDS_MAX: Final = 200
 """… but ends even if new ones appear for ever."""
 MAX_UUIDS: Final = 512
 """Remembered; a bus has at most 252 ids to give."""
-DATA_IDS: Final = range(0x102, 0x300)
-"""Data ids of the node ids 1..255."""
 
 
 class Application(Enum):
@@ -175,11 +174,17 @@ class Census:
 
     def result(self) -> CensusResult:
         """Return what is known so far."""
-        waiting = [self._waiting(uuid, heard) for uuid, heard in self._heard.items() if heard.answers]
+        # A board that was given its id meanwhile, or lost it, is what it said last; of twins all is told.
+        waiting = [
+            self._waiting(uuid, heard)
+            for uuid, heard in self._heard.items()
+            if heard.answers and (heard.last == NEED_NODEID or self._has_twin(heard))
+        ]
         here = [
             NodeHere(uuid, nodeid, answers, self._has_twin(heard))
             for uuid, heard in self._heard.items()
             for nodeid, answers in heard.here.items()
+            if heard.last == NODE_IS_HERE or self._has_twin(heard)
         ]
         return CensusResult(
             waiting=tuple(sorted(waiting, key=lambda node: node.uuid.raw)),

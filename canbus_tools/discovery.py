@@ -1,13 +1,19 @@
-"""Asking a live bus who is there: drives the census on an open bus."""
+"""Asking a live bus who is there: drives the census on an open bus, and options common to those who ask."""
 
+import argparse
 import asyncio
+from typing import Final
 
 from canbus_tools.census import ROUNDS, Census, CensusResult
 from canbus_tools.open_bus import BusOptions
-from canbus_tools.talk import BusTalk
+from canbus_tools.talk import LISTEN_S, BusTalk
 from nodes.can_bus import BUS_OFF
 from nodes.errors import CanductorError
 from nodes.link import Frame
+from nodes.option_values import number
+
+_LISTEN_MIN_S: Final = 0.1
+_LISTEN_MAX_S: Final = 60.0
 
 
 async def take_census(bus: BusTalk, rounds: int = ROUNDS) -> CensusResult:
@@ -43,6 +49,21 @@ def bus_off(bus: str) -> CanductorError:
         f"rate is not the nodes', or a cable or the termination is at fault; 'canductor can doctor -c {bus}' "
         f"checks, 'ip link set {bus} down' and 'ip link set {bus} up' bring it back"
     )
+
+
+def declare_listen(command: argparse.ArgumentParser) -> None:
+    """Add the option that says how long to listen for other hosts."""
+    command.add_argument(
+        "--listen",
+        metavar="S",
+        default=str(LISTEN_S),
+        help=f"listen so many seconds for other hosts first, {LISTEN_S:g} if not given",
+    )
+
+
+def listen_option(given: argparse.Namespace) -> float:
+    """Read what ``declare_listen`` declared; raises UsageError."""
+    return number("--listen", given.listen, _LISTEN_MIN_S, _LISTEN_MAX_S, "s")
 
 
 def where(options: BusOptions) -> str:

@@ -7,13 +7,13 @@ from dataclasses import asdict
 from typing import Final
 
 from canbus_tools.census import Application
-from canbus_tools.discovery import where
+from canbus_tools.discovery import declare_listen, listen_option, where
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.survey import PROBED, Entry, State, SurveyResult, survey
 from canbus_tools.table import count, paragraph, table
 from canbus_tools.talk import LISTEN_S, BusTalk
 from nodes.assign import LAST_NODEID
-from nodes.option_values import UsageError, number, whole
+from nodes.option_values import UsageError, whole
 from nodes.records import record
 
 HEADINGS: Final = (
@@ -44,7 +44,6 @@ STATES: Final[Mapping[State, str]] = {
     State.SHUTDOWN: "SHUT DOWN",
     State.UNCLEAR: "unclear",
 }
-_LISTEN_MIN_S, _LISTEN_MAX_S = 0.1, 60.0
 
 
 def declare(command: argparse.ArgumentParser) -> None:
@@ -58,19 +57,14 @@ def declare(command: argparse.ArgumentParser) -> None:
         help=f"node ids to try, {PROBED.start}-{PROBED[-1]} if not given; 'none' only listens and asks by"
         " uuid, for a bus that devices of other protocols share",
     )
-    add(
-        "--listen",
-        metavar="S",
-        default=str(LISTEN_S),
-        help=f"listen so many seconds for other hosts first, {LISTEN_S:g} if not given",
-    )
+    declare_listen(command)
 
 
 def make_job(given: argparse.Namespace) -> Callable[[], "NodesReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
     probed = _ids("--probe", given.probe)
-    listen_s = number("--listen", given.listen, _LISTEN_MIN_S, _LISTEN_MAX_S, "s")
+    listen_s = listen_option(given)
     return lambda: list_nodes(bus, probed=probed, listen_s=listen_s)
 
 
@@ -116,7 +110,7 @@ class NodesReport:
     def to_text(self) -> str:
         """Return the table, and what to know about it."""
         entries = self.found.entries
-        lines = [f"{count(len(entries), 'node')} on {self.bus.name}", ""]
+        lines = [f"{count(self.found.boards, 'node')} on {self.bus.name}", ""]
         if not entries:
             return "\n".join(lines + _nobody(self.bus, self.found))
         lines += [*table(HEADINGS, [_row(entry) for entry in entries]), ""]

@@ -8,11 +8,11 @@ from typing import Final
 
 from canbus_tools.assign_id import uuid_option
 from canbus_tools.census import Application, CensusResult, WaitingNode
-from canbus_tools.discovery import take_census, where
+from canbus_tools.discovery import declare_listen, listen_option, take_census, where
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.query import application_name
 from canbus_tools.survey import State, survey
-from canbus_tools.talk import BusTalk, TalkError, in_use, refuse_if_in_use
+from canbus_tools.talk import LISTEN_S, BusTalk, TalkError, in_use, refuse_if_in_use
 from nodes.assign import LAST_NODEID, UUID_SIZE, AssignError, Uuid
 from nodes.errors import CanductorError
 from nodes.option_values import whole
@@ -29,6 +29,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     """Add the options."""
     command.add_argument("node", metavar="UUID|NODEID", help="the node's uuid, or the id that it has")
     declare_bus(command)
+    declare_listen(command)
     command.add_argument(
         "--force", action="store_true", help="even if another program talks to the node, which will lose it"
     )
@@ -37,21 +38,24 @@ def declare(command: argparse.ArgumentParser) -> None:
 def make_job(given: argparse.Namespace) -> Callable[[], "ReleaseReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
+    listen_s = listen_option(given)
     text = given.node.strip()
     # A uuid has 12 digits, an id at most 3; what is neither is most likely a uuid with a digit amiss.
     if text.isascii() and text.isdecimal() and len(text) < 2 * UUID_SIZE:
         nodeid = whole("NODEID", text, 1, LAST_NODEID)
-        return lambda: release(bus, nodeid, force=given.force)
+        return lambda: release(bus, nodeid, force=given.force, listen_s=listen_s)
     uuid = uuid_option("UUID", text)
-    return lambda: release(bus, uuid, force=given.force)
+    return lambda: release(bus, uuid, force=given.force, listen_s=listen_s)
 
 
-def release(options: BusOptions, node: Uuid | int, *, force: bool = False) -> "ReleaseReport":
+def release(
+    options: BusOptions, node: Uuid | int, *, force: bool = False, listen_s: float = LISTEN_S
+) -> "ReleaseReport":
     """Reset NODE and wait until it asks for an id again; raises CanductorError with what to do."""
 
     async def run() -> ReleaseReport:
         async with BusTalk.open(options) as bus:
-            return await _release(bus, node, force=force)
+            return await _release(bus, node, force=force, listen_s=listen_s)
 
     return asyncio.run(run())
 
@@ -83,17 +87,17 @@ class ReleaseReport:
         return self.text
 
 
-async def _release(bus: BusTalk, node: Uuid | int, *, force: bool) -> ReleaseReport:
+async def _release(bus: BusTalk, node: Uuid | int, *, force: bool, listen_s: float) -> ReleaseReport:
     before = await take_census(bus)
     if isinstance(node, int):
         nodeid = node
         if not force:
-            await refuse_if_in_use(bus, nodeid)
+            await refuse_if_in_use(bus, nodeid, listen_s)
     else:
         waits = _waiting(before, node)
         if waits is not None and node not in before.twins:
             return _report(bus, waits, None)
-        nodeid = await _find(bus, node, before, force=force)
+        nodeid = await _find(bus, node, before, force=force, listen_s=listen_s)
     uuid = await _reset(bus, nodeid)
     expected = uuid or (node if isinstance(node, Uuid) else None)
     returned = await _returned(bus, nodeid, expected, before)
@@ -115,12 +119,14 @@ def _waiting(census: CensusResult, uuid: Uuid) -> WaitingNode | None:
     return next((node for node in census.waiting if node.uuid == uuid), None)
 
 
-async def _find(bus: BusTalk, uuid: Uuid, census: CensusResult, *, force: bool) -> int:
+async def _find(bus: BusTalk, uuid: Uuid, census: CensusResult, *, force: bool, listen_s: float) -> int:
     """Return the id that UUID has, and that nobody else uses; raises CanductorError."""
     ours = {node.nodeid for node in census.here if node.uuid == uuid}
     if force and len(ours) == 1:
         return ours.pop()
-    found = [entry for entry in (await survey(bus)).by_uuid(uuid) if entry.nodeid is not None]
+    found = [
+        entry for entry in (await survey(bus, listen_s=listen_s)).by_uuid(uuid) if entry.nodeid is not None
+    ]
     if len(found) > 1 or any(entry.twins for entry in found):
         raise AssignError(
             f"two boards on {bus.name} have the uuid {uuid} (cloned chips?); take one of them off, or name "

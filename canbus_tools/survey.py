@@ -7,15 +7,15 @@ the next block, executes nothing and changes nothing. Those that answer are aske
 
 import asyncio
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from enum import Enum
 from typing import Final
 
-from canbus_tools.census import DATA_IDS, ROUNDS, Application, CensusResult, NodeHere, WaitingNode
+from canbus_tools.census import ROUNDS, Application, CensusResult, NodeHere, WaitingNode
 from canbus_tools.discovery import take_census
 from canbus_tools.interview import Facts, interview
-from canbus_tools.talk import LISTEN_S, BusTalk, data_ids
+from canbus_tools.talk import DATA_IDS, LISTEN_S, BusTalk, data_ids
 from nodes.assign import FIRST_NODEID, Uuid
 from nodes.errors import CanductorError
 from nodes.link import Frame
@@ -30,7 +30,7 @@ PROBE_PASSES: Final = 2
 PROBES_AT_ONCE: Final = 4
 PROBE_PAUSE_S: Final = 0.002
 """Between so many: a fifth of the bus at 1 Mbit/s, all of it for 40 ms at 250 kbit/s."""
-PROBE_ANSWER_S: Final = 0.05
+PROBE_ANSWER_S: Final = 0.03
 """For the last answers; adapters on USB may hold frames back for 16 ms."""
 INTERVIEWS_AT_ONCE: Final = 8
 
@@ -74,6 +74,12 @@ class SurveyResult:
     probed: tuple[int, ...]
     """Ids to which a damaged block was sent."""
 
+    @property
+    def boards(self) -> int:
+        """How many there are at least: twins that answer alike are one entry."""
+        rows = Counter(entry.uuid for entry in self.entries)
+        return len(self.entries) + sum(entry.twins and rows[entry.uuid] == 1 for entry in self.entries)
+
     def by_uuid(self, uuid: Uuid) -> list[Entry]:
         """Return the nodes that have a uuid."""
         return [entry for entry in self.entries if entry.uuid == uuid]
@@ -83,46 +89,42 @@ class SurveyResult:
         return [entry for entry in self.entries if entry.nodeid == nodeid]
 
 
-class Traffic:
-    """Which node ids frames go to and come from, from now on."""
-
-    def __init__(self, bus: BusTalk) -> None:
-        self.hosted: set[int] = set()
-        self.talking: set[int] = set()
-        self.close = bus.on_frame(self._came)
-
-    def _came(self, frame: Frame) -> None:
-        if frame.can_id in DATA_IDS:
-            (self.talking if frame.can_id % 2 else self.hosted).add((frame.can_id - 0x100) // 2)
-
-
 async def survey(
     bus: BusTalk, *, probed: Iterable[int] = PROBED, listen_s: float = LISTEN_S, rounds: int = ROUNDS
 ) -> SurveyResult:
     """Find all nodes on BUS, after listening for LISTEN_S; raises CanductorError when the bus fails."""
     started_s = asyncio.get_running_loop().time()
-    traffic = Traffic(bus)
-    try:
-        census = await take_census(bus, rounds)
-        await bus.wait(max(0.0, started_s + listen_s - asyncio.get_running_loop().time()))
-        here = {node.nodeid for node in census.here}
-        candidates = tuple(sorted({*probed, *here, *traffic.talking} - traffic.hosted))
-        answering = await probe(bus, candidates, traffic)
-        hosted = frozenset(traffic.hosted)
-    finally:
-        traffic.close()
+    census = await take_census(bus, rounds)
+    await bus.wait(max(0.0, started_s + listen_s - asyncio.get_running_loop().time()))
+    here = {node.nodeid for node in census.here}
+    candidates = tuple(sorted({*probed, *here, *bus.talking} - bus.hosted))
+    answering = await probe(bus, candidates)
+    hosted = frozenset(bus.hosted)
     shared = _shared_ids(census)
     asked = sorted(answering - hosted - shared)
     facts = dict(zip(asked, await _interview_all(bus, asked), strict=True))
     entries = [_assigned(nodeid, facts[nodeid], census) for nodeid in asked]
     entries += [_not_asked(node, hosted, shared) for node in census.here if node.nodeid not in facts]
-    entries += [_hosted(nodeid, answers=nodeid in traffic.talking) for nodeid in sorted(hosted - here)]
+    entries += [_hosted(nodeid, answers=nodeid in bus.talking) for nodeid in sorted(hosted - here)]
     entries.sort(key=lambda entry: (entry.nodeid or 0, entry.uuid.raw if entry.uuid else b""))
-    entries += [_waiting(node) for node in census.waiting]
+    entries += [_waiting(node) for node in await _still_waiting(bus, census, {e.uuid for e in entries})]
     return SurveyResult(_mark_twins(entries), census, candidates)
 
 
-async def probe(bus: BusTalk, nodeids: Iterable[int], traffic: Traffic) -> set[int]:
+async def _still_waiting(
+    bus: BusTalk, census: CensusResult, with_id: Collection[Uuid | None]
+) -> Iterable[WaitingNode]:
+    """Return who waits; of a uuid that was found with an id as well, only when it still does: a second board.
+
+    Else another host gave the board its id meanwhile.
+    """
+    if not any(node.uuid in with_id for node in census.waiting):
+        return census.waiting
+    now = {node.uuid for node in (await take_census(bus, rounds=2)).waiting}
+    return [node for node in census.waiting if node.uuid not in with_id or node.uuid in now]
+
+
+async def probe(bus: BusTalk, nodeids: Iterable[int]) -> set[int]:
     """Send a damaged block to each of NODEIDS to whom no other host talks; return those that answered."""
     wanted = set(nodeids)
     answered: set[int] = set()
@@ -137,7 +139,7 @@ async def probe(bus: BusTalk, nodeids: Iterable[int], traffic: Traffic) -> set[i
             for number, nodeid in enumerate(sorted(wanted - answered)):
                 if number % PROBES_AT_ONCE == 0:
                     await bus.wait(PROBE_PAUSE_S)
-                if nodeid not in traffic.hosted:
+                if nodeid not in bus.hosted:
                     bus.send_frame(data_ids(nodeid)[0], DAMAGED_BLOCK)
             await bus.wait(PROBE_ANSWER_S)
     finally:
@@ -146,8 +148,8 @@ async def probe(bus: BusTalk, nodeids: Iterable[int], traffic: Traffic) -> set[i
 
 
 async def _interview_all(bus: BusTalk, nodeids: list[int]) -> list[Facts | CanductorError]:
-    """Ask them all, a few at a time; what went wrong with one is its result."""
-    room = asyncio.Semaphore(INTERVIEWS_AT_ONCE)
+    """Ask them all, a few at a time, beside a host one at a time; what went wrong with one is its result."""
+    room = asyncio.Semaphore(1 if bus.hosted else INTERVIEWS_AT_ONCE)
 
     async def one(nodeid: int) -> Facts | CanductorError:
         async with room:
@@ -178,7 +180,7 @@ def _assigned(nodeid: int, said: Facts | CanductorError, census: CensusResult) -
             nodeid=nodeid, uuid=uuid, application=application, state=State.UNCLEAR, trouble=str(said)
         )
     uuid = said.uuid or (ours.uuid if ours else None)
-    trouble = ""
+    trouble = "" if said.configured is not None else "its firmware does not tell whether it is configured"
     if said.believed_nodeid not in (None, nodeid):
         trouble = f"it answers on id {nodeid}, but says that it has id {said.believed_nodeid}"
     elif ours and uuid != ours.uuid:

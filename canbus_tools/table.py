@@ -26,7 +26,7 @@ def count(number: int, what: str, several: str = "") -> str:
 
 
 def paragraph(text: str) -> list[str]:
-    """Return TEXT as lines that a terminal shows whole. A command in quotes is not broken: it is to be copied."""
+    """Return TEXT as lines that a terminal shows whole; a command in quotes is kept in one, to be copied."""
     kept = re.sub(r"'canductor [^']*'", lambda command: command[0].replace(" ", _HARD_SPACE), text)
     lines = textwrap.wrap(kept, WIDTH, break_long_words=False, break_on_hyphens=False)
     return [line.replace(_HARD_SPACE, " ") for line in lines]

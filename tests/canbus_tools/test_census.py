@@ -89,7 +89,11 @@ def test_a_board_that_gets_its_id_meanwhile_is_no_twin() -> None:
         )
 
     result, _ = ask(said)
-    assert (result.waiting[0].answers, result.here[0].answers, result.twins) == (2, 3, ())
+    assert (result.waiting, result.here[0].answers, result.twins) == ((), 3, ())
+    released, _ = ask(
+        lambda n, question: [] if n < 3 and question == QUERY_UNASSIGNED else said(6 - n, question)
+    )
+    assert (released.waiting[0].uuid, released.here, released.twins) == (A, (), ())
 
 
 def test_a_host_that_asks_too_makes_no_twins() -> None:

@@ -2,18 +2,18 @@
 
 import asyncio
 import dataclasses
-import threading
+import time
 from collections.abc import Callable, Coroutine
-from contextlib import closing
 from typing import Any
 
 import can
 import pytest
 
 from canbus_tools.open_bus import BusOptions
-from canbus_tools.talk import NodeTalk, TalkError
+from canbus_tools.talk import BusTalk, NodeTalk, TalkError
+from nodes.dictionary_cache import DictionaryCache
 from nodes.message_format import Message
-from nodes.transport import CanFrame
+from tests.canbus_tools.other_host import OtherHost
 from tests.canbus_tools.stage import MAIN, MAIN_ID, PATIENCE_S, TOOL_ID, Place, Stage
 
 QUIET_S = 0.05
@@ -34,7 +34,7 @@ def test_a_node_is_asked_and_told_things_and_everything_it_says_is_seen(stage: S
             assert node.dictionary.str_constant("MCU") == "virtual-mainboard"
             answer = await node.ask("get_canbus_id", "canbus_id")
             assert answer.message.data("canbus_uuid") == MAIN.raw
-            assert 0 < answer.sent_ns < answer.received_ns
+            assert answer.sent_ns < answer.received_ns  # 0 if it had to be asked again
             seen: list[Message] = []
             came = asyncio.Event()
 
@@ -75,28 +75,6 @@ def test_nobody_there_is_one_sentence(place: Place) -> None:
         run(talk)
 
 
-class OtherHost:
-    """Sends a frame to a node again and again, as a host that prints with it does."""
-
-    def __init__(self, place: Place, nodeid: int, data: bytes = b"\x7e") -> None:
-        self._frame = CanFrame(nodeid * 2 + 0x100, data)
-        self._transport = place.open()
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def _run(self) -> None:
-        with closing(self._transport):
-            while not self._ending.wait(0.01):
-                self._transport.send(self._frame)
-
-    def __enter__(self) -> None:
-        self._thread.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._ending.set()
-        self._thread.join()
-
-
 def test_a_node_that_another_host_uses_is_left_alone_unless_forced(stage: Stage) -> None:
     async def talk(*, force: bool) -> None:
         async with NodeTalk.open(stage.place.options, MAIN_ID, force=force) as node:
@@ -124,3 +102,17 @@ def test_any_backend_of_python_can_serves(stage: Stage) -> None:
         finally:
             for forwarder in forwarders:
                 forwarder.stop()
+
+
+def test_beside_a_host_a_dictionary_is_read_with_pauses(stage: Stage) -> None:
+    async def read_dictionary_s() -> float:
+        async with BusTalk.open(stage.place.options, DictionaryCache()) as bus:
+            assert not await bus.has_host(MAIN_ID, QUIET_S)
+            began_s = time.monotonic()
+            async with bus.node(MAIN_ID):
+                return time.monotonic() - began_s
+
+    alone_s = asyncio.run(read_dictionary_s())
+    with OtherHost(stage.place, 200):
+        beside_s = asyncio.run(read_dictionary_s())
+    assert beside_s > 2.5 * alone_s  # 5 times, less what does not depend on it: opening, first contact
