@@ -182,6 +182,8 @@ class Diagnosis:
                     "nodeid": ping.nodeid,
                     "asked": ping.asked,
                     "repeats": ping.repeats,
+                    "lost": ping.lost,
+                    "invalid_bytes": ping.invalid_bytes,
                     "rtt_median_s": round(ping.rtt_median_s, 6),
                     "rtt_p99_s": round(ping.rtt_p99_s, 6),
                 }

@@ -40,9 +40,9 @@ TRIED_BITRATES: Final = (1_000_000, 500_000, 250_000, 125_000)
 _SYS_NET: Final = Path("/sys/class/net")
 _ARPHRD_CAN: Final = "280"
 _RECV_S: Final = 0.1
-_BURST: Final = 8
+_BURST: Final = 16
 NO_COMMAND: Final = 0xFF
-"""An admin command that does not exist: nodes ignore it, so no late answer disturbs the questions behind it."""
+"""An admin command that does not exist: nodes ignore it, and no late answer disturbs what is asked next."""
 _QUESTIONS: Final = (("get_uptime", "uptime"), ("get_clock", "clock"), ("get_config", "config"))
 
 
@@ -260,8 +260,10 @@ async def _ping(bus: BusTalk, nodeid: int) -> PingFacts:
             await talk.ask(*question)
             trips.add(loop.time() - asked_s)
         stats = talk.stats
+    late = stats.acks_duplicate - before.acks_duplicate + stats.naks - before.naks
     return PingFacts(
         nodeid=nodeid,
+        lost=max(0, stats.timeouts - before.timeouts - late),
         asked=trips.count,
         repeats=stats.blocks_repeated - before.blocks_repeated,
         invalid_bytes=stats.bytes_invalid - before.bytes_invalid,

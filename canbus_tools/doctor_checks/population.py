@@ -133,14 +133,13 @@ def _node(entry: Entry, place: Place) -> Iterator[Finding]:
 
 
 def _ping(ping: PingFacts, place: Place) -> Iterator[Finding]:
-    if ping.repeats or ping.invalid_bytes:
-        share = ping.repeats / ping.asked
-        found = problem if share > LOSS_MANY else warning
+    if ping.lost or ping.invalid_bytes:
+        found = problem if ping.lost > LOSS_MANY * ping.asked else warning
         yield found(
             "frames-lost",
-            f"of {ping.asked} questions to node {ping.nodeid}, {ping.repeats} blocks had to be sent again,"
-            " and"
-            f" {ping.invalid_bytes} bytes of its answers were no valid block",
+            f"of {ping.asked} questions to node {ping.nodeid}, {ping.lost} got lost with no trace, and"
+            f" {ping.invalid_bytes} bytes of its answers were no valid block ({ping.repeats} blocks were"
+            " repeated)",
             "frames get lost between this program and the node. On the wire controllers repeat what was"
             " damaged,"
             " so it is the adapter, the kernel, or the node's receive buffer",

@@ -79,9 +79,9 @@ def test_a_good_bus_has_nothing_wrong(place: Place, can_tool: Command) -> None:
         with closing(place.open()) as host:
             set_nodeid(host, MAIN, MAIN_ID)
         said = run(can_tool)
-    assert problems(said) == set()
+    assert problems(said) == set(), said.out
     ping = said.json["pings"][0]
-    assert (ping["nodeid"], ping["asked"], ping["repeats"]) == (MAIN_ID, 100, 0)
+    assert (ping["nodeid"], ping["asked"], ping["lost"]) == (MAIN_ID, 100, 0)
     assert 0 < ping["rtt_median_s"] <= ping["rtt_p99_s"]
 
 
@@ -100,7 +100,7 @@ def test_the_stage(stage: Stage, can_tool: Command) -> None:
 def test_as_text(stage: Stage, can_tool: Command) -> None:
     said = can_tool("doctor", "--listen", "0.2")
     assert said.status == 1
-    assert "1 problem, 2 warnings" in said.out
+    assert "1 problem" in said.out.splitlines()[0]
     for words in ("PROBLEM duplicate-uuid", "seen", "means", "do", "WARNING node-shutdown", "p99"):
         assert words in said.out
     assert said.out.index("PROBLEM") < said.out.index("WARNING") < said.out.index("NOTE")
@@ -162,7 +162,7 @@ def test_a_node_that_another_host_lost(place: Place, can_tool: Command) -> None:
 
 
 def test_loss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with VirtualBus(tmp_path / "bus", loss=0.05, seed=3) as bus:
+    with VirtualBus(tmp_path / "bus", loss=0.03, seed=3) as bus:
         place = Place("canductor", str(bus.path))
         with place.start_node("mainboard", MAIN) as node:
             node.wait_ready()
@@ -172,7 +172,8 @@ def test_loss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
             said = run(Command(place, capsys))
     assert said.status == 1
     assert "frames-lost" in problems(said)
-    assert said.json["pings"][0]["repeats"] > 0
+    ping = said.json["pings"][0]
+    assert ping["lost"] + ping["invalid_bytes"] > 0
 
 
 def test_overload_by_a_babbler(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
