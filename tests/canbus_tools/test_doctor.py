@@ -31,6 +31,7 @@ from tests.canbus_tools.stage import (
     Stage,
     set_nodeid,
 )
+from tests.vcan.kernel import why_no_socketcan
 
 BITRATE = "1000000"
 
@@ -47,7 +48,7 @@ def problems(said: Said) -> set[str]:
 
 
 def run(can_tool: Command, *words: str) -> Said:
-    return can_tool("doctor", "--bitrate", BITRATE, "--listen", "1", "--json", *words)
+    return can_tool("doctor", "--bitrate", BITRATE, "--listen", "0.5", "--json", *words)
 
 
 class Babbler:
@@ -162,6 +163,8 @@ def test_a_node_that_another_host_lost(place: Place, can_tool: Command) -> None:
 
 
 def test_loss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if not why_no_socketcan():
+        pytest.skip("a kernel in a process is too slow for a bus that loses frames; tested outside of it")
     with VirtualBus(tmp_path / "bus", loss=0.03, seed=3) as bus:
         place = Place("canductor", str(bus.path))
         with place.start_node("mainboard", MAIN) as node:

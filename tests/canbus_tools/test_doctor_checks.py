@@ -6,14 +6,28 @@ from pathlib import Path
 
 import pytest
 
-from canbus_tools.doctor_checks.facts import AdapterFacts, InterfaceFacts, Place, TrafficFacts, WayFacts
+from canbus_tools.bus_load import LoadMeter
+from canbus_tools.census import Application, Census
+from canbus_tools.doctor_checks.facts import (
+    AdapterFacts,
+    InterfaceFacts,
+    NodeFacts,
+    PingFacts,
+    Place,
+    TrafficFacts,
+    WayFacts,
+)
 from canbus_tools.doctor_checks.finding import Finding, Severity
 from canbus_tools.doctor_checks.interface import check_link, check_presence
 from canbus_tools.doctor_checks.known_faults import faults_of, kernel_version
+from canbus_tools.doctor_checks.population import check_nodes
 from canbus_tools.doctor_checks.traffic import check_traffic
 from canbus_tools.doctor_facts import error_kinds, read_adapter
 from canbus_tools.frame import Frame, FrameKind
+from canbus_tools.interview import CanStatus, Facts, Firmware
 from canbus_tools.link_facts import LinkFacts, parse_link
+from canbus_tools.survey import Entry, State, SurveyResult
+from nodes.assign import Uuid
 from nodes.errors import CanductorError
 
 DATA = Path(__file__).parents[1] / "data" / "can"
@@ -215,3 +229,44 @@ def test_counters_that_grew_meanwhile() -> None:
 def test_answers_of_ip_that_make_no_sense(text: str) -> None:
     with pytest.raises(CanductorError, match="cannot read"):
         parse_link(text)
+
+
+@pytest.mark.parametrize(("frames_per_s", "name"), [(100, None), (750, "bus-busy"), (1000, "bus-overloaded")])
+def test_busy_and_too_busy(frames_per_s: int, name: str | None) -> None:
+    meter = LoadMeter(bitrate=112_000)
+    for i in range(frames_per_s):
+        assert meter.feed(Frame(i / frames_per_s, 0x109, b"\x55" * 8)) == 112  # with its one stuff bit
+    found = judge_traffic(TrafficFacts(listened_s=1.0, load=meter.load(), frames=frames_per_s))
+    assert list(found) == ([] if name is None else [name])
+    assert all("'from nodes'" in finding.seen for finding in found.values())
+
+
+def test_a_node_that_counts_errors() -> None:
+    firmware = Firmware(mcu="x", version="", app="", build="", clock_hz=None, bitrate=None)
+    status = CanStatus(rx_errors=3, tx_errors=120, tx_retries=900, state="warn")
+    entry = Entry(
+        nodeid=5,
+        uuid=Uuid.parse("90a4ae022dfc"),
+        application=Application.KLIPPER,
+        state=State.IDLE,
+        facts=Facts(firmware=firmware, can=status),
+    )
+    well = replace(entry, facts=Facts(firmware=firmware, can=replace(status, tx_errors=0, state="active")))
+    survey = SurveyResult((entry, well), Census().result(), ())
+    (finding,) = check_nodes(NodeFacts(survey=survey), PLACE)
+    assert finding.name == "node-can-errors"
+    assert "120 sending, 900 retries, bus state warn" in finding.seen
+
+
+@pytest.mark.parametrize(("lost", "severity"), [(1, Severity.WARNING), (5, Severity.PROBLEM)])
+def test_lost_frames_by_their_number(lost: int, severity: Severity) -> None:
+    ping = PingFacts(
+        nodeid=4, asked=100, repeats=9, lost=lost, invalid_bytes=0, rtt_median_s=0.001, rtt_p99_s=0.002
+    )
+    anyone = Entry(nodeid=4, uuid=None, application=Application.KLIPPER, state=State.IDLE)
+    survey = SurveyResult((anyone,), Census().result(), ())
+    (finding,) = check_nodes(NodeFacts(survey=survey, pings=(ping,)), PLACE)
+    assert (finding.name, finding.severity) == ("frames-lost", severity)
+    slow = replace(ping, lost=0, rtt_p99_s=0.03)
+    (finding,) = check_nodes(NodeFacts(survey=survey, pings=(slow,)), PLACE)
+    assert finding.name == "round-trip-spread"
