@@ -70,6 +70,8 @@ def examine(
     if nodes is not None:
         done.append("nodes")
         findings += check_nodes(nodes, place)
+        if try_others and place.socketcan and not nodes.survey.entries:
+            findings.append(_try_by_hand(place.name))
     if place.bitrate is None:
         findings.append(
             note(
@@ -102,9 +104,7 @@ def _use_bus(
     if not shared and not quiet:
         nodes = asyncio.run(ask_nodes(opened))
     traffic = listener.facts(before, _counters(options), queue_full=queue_full)
-    if nodes is not None and not nodes.survey.entries and try_others:
-        if place.socketcan:
-            raise CanductorError(_how_to_try(place.name))
+    if nodes is not None and not nodes.survey.entries and try_others and not place.socketcan:
         nodes = NodeFacts(survey=nodes.survey, heard_at=try_bitrates(options, listen_s))
     return traffic, nodes
 
@@ -113,14 +113,15 @@ def _counters(options: BusOptions) -> LinkFacts | None:
     return read_link(options.channel) if options.interface == "socketcan" else None
 
 
-def _how_to_try(name: str) -> str:
-    return (
-        "no node answers, and the bit rate of a SocketCAN interface is the system's to change: for 500000,"
-        " 250000"
-        f" and 1000000 in turn: 'sudo ip link set {name} down; sudo ip link set {name} up type can bitrate"
-        " 500000"
-        f" listen-only on', then 'canductor can load -c {name} --duration 5': at the right one there are"
-        " frames"
+def _try_by_hand(name: str) -> Finding:
+    return note(
+        "bitrates-by-hand",
+        "other bit rates were not tried",
+        "the bit rate of a SocketCAN interface is the system's to change",
+        f"for 500000, 250000 and 1000000 in turn: sudo ip link set {name} down; sudo ip link set {name} up"
+        " type can"
+        f" bitrate 500000 listen-only on; then 'canductor can load -c {name}': at the right one there are"
+        " frames. At the end: listen-only off",
     )
 
 

@@ -233,9 +233,9 @@ def test_answers_of_ip_that_make_no_sense(text: str) -> None:
 
 @pytest.mark.parametrize(("frames_per_s", "name"), [(100, None), (750, "bus-busy"), (1000, "bus-overloaded")])
 def test_busy_and_too_busy(frames_per_s: int, name: str | None) -> None:
-    meter = LoadMeter(bitrate=112_000)
+    meter = LoadMeter(bitrate=111_000)
     for i in range(frames_per_s):
-        assert meter.feed(Frame(i / frames_per_s, 0x109, b"\x55" * 8)) == 112  # with its one stuff bit
+        assert meter.feed(Frame(i / frames_per_s, 0x109, b"\x55" * 8)) == 111  # no stuff bit at all
     found = judge_traffic(TrafficFacts(listened_s=1.0, load=meter.load(), frames=frames_per_s))
     assert list(found) == ([] if name is None else [name])
     assert all("'from nodes'" in finding.seen for finding in found.values())

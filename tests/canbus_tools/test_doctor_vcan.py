@@ -64,6 +64,13 @@ def test_a_vcan_with_a_node_is_well(doctor: Command) -> None:
 
 
 @controls_interface
+def test_bit_rates_are_the_systems_to_change(doctor: Command) -> None:
+    said = run(doctor, "--try-bitrates")
+    the_finding(said, "no-nodes")
+    assert "listen-only on" in findings(said)["bitrates-by-hand"]["do"]
+
+
+@controls_interface
 def test_interface_down(doctor: Command) -> None:
     with set_down():
         said = run(doctor)
