@@ -21,8 +21,8 @@ from nodes.records import record
 
 LISTEN_S: Final = 3.0
 LISTEN_S_MIN, LISTEN_S_MAX = 0.2, 600.0
-SHARED_HANDLES: Final = ("socketcan", "canductor")
-"""Backends that more than one handle may have open."""
+SYSTEMS_BITRATE: Final = ("socketcan", "canductor")
+"""Backends that have the bit rate they have."""
 
 
 def declare(command: argparse.ArgumentParser) -> None:
@@ -88,20 +88,19 @@ def _use_bus(
     options: BusOptions, place: Place, listen_s: float, *, quiet: bool, try_others: bool
 ) -> tuple[TrafficFacts, NodeFacts | None]:
     opened = options
-    if options.interface in SHARED_HANDLES:
+    if options.interface in SYSTEMS_BITRATE:
         opened = BusOptions(interface=options.interface, channel=options.channel)
     nodes: NodeFacts | None = None
     queue_full = False
     before = _counters(options)
-    shared = options.interface in SHARED_HANDLES
     with Listener(opened, place.bitrate) as listener:
         listener.wait(listen_s)
         listener.end_of_calm()
-        if shared and not quiet:
+        if place.socketcan and not quiet:
             queue_full = fill_queue(opened)
-            # Error reports of what we send are the most telling.
+            # Error reports of what we send are the most telling; others have none, or but one handle.
             nodes = asyncio.run(ask_nodes(opened))
-    if not shared and not quiet:
+    if not place.socketcan and not quiet:
         nodes = asyncio.run(ask_nodes(opened))
     traffic = listener.facts(before, _counters(options), queue_full=queue_full)
     if nodes is not None and not nodes.survey.entries and try_others and not place.socketcan:

@@ -26,7 +26,6 @@ from canbus_tools.flow import RoundTrips
 from canbus_tools.frame import Frame, FrameKind
 from canbus_tools.link_facts import LinkFacts, NoInterface, read_link
 from canbus_tools.open_bus import BusOptions, open_bus
-from canbus_tools.protocol import Direction, owner_of
 from canbus_tools.survey import PROBED, State, SurveyResult, survey
 from canbus_tools.talk import BusTalk
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID
@@ -121,14 +120,22 @@ class Listener:
             raise CanductorError(f"the bus failed: {' '.join(str(self._failure).split())}") from self._failure
 
     def end_of_calm(self) -> None:
-        """From now on this program sends, too: its own frames are not judged."""
+        """From now on this program sends, too: only answers and error reports are still taken.
+
+        The others are not even read, where the kernel filters: that would slow down what sends and asks.
+        """
+        self._bus.set_filters(
+            [can.typechecking.CanFilter(can_id=ADMIN_RESPONSE_ID, can_mask=0x7FF, extended=False)]
+        )
         with self._lock:
-            now_s = time.time()
-            if self._meter is not None:
-                self._meter.advance(now_s)
-            load = None if self._meter is None else self._meter.load()
-            self._ended_s = now_s
-            self._calm = (load, self._decoder.other_frames, tuple(self._ways()))
+            self._calm = self._figures()
+
+    def _figures(self) -> tuple[BusLoad | None, int, tuple[WayFacts, ...]]:
+        self._ended_s = time.time()
+        if self._meter is not None:
+            self._meter.advance(self._ended_s)
+        load = None if self._meter is None else self._meter.load()
+        return load, self._decoder.other_frames, tuple(self._ways())
 
     def _run(self) -> None:
         try:
@@ -147,7 +154,7 @@ class Listener:
             self._meter.feed(frame._replace(time_s=time.time()))
         if frame.kind is FrameKind.ERROR:
             self._errors.update(error_kinds(frame))
-        elif self._calm is None or _is_answer(frame):
+        else:
             self._frames += 1
         self._decoder.feed(frame)
 
@@ -155,10 +162,7 @@ class Listener:
         self, before: LinkFacts | None = None, after: LinkFacts | None = None, *, queue_full: bool = False
     ) -> TrafficFacts:
         """Return what was heard until ``with`` ended; error reports also while this program sent."""
-        if self._calm is None:
-            self.end_of_calm()
-        assert self._calm is not None
-        load, other_frames, ways = self._calm
+        load, other_frames, ways = self._calm or self._figures()
         return TrafficFacts(
             listened_s=self._ended_s - self._started_s,
             load=load,
@@ -190,11 +194,6 @@ class Listener:
                 )
             )
         return found
-
-
-def _is_answer(frame: Frame) -> bool:
-    owner = owner_of(frame.can_id)
-    return frame.can_id == ADMIN_RESPONSE_ID or (owner is not None and owner[1] is Direction.FROM_NODE)
 
 
 def error_kinds(frame: Frame) -> set[str]:

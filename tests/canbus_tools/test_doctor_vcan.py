@@ -89,7 +89,7 @@ def test_txqueuelen(doctor: Command, length: int, name: str) -> None:
 def test_a_send_queue_that_is_full(doctor: Command) -> None:
     with KERNEL.start_node("mainboard", MAIN) as node:
         node.wait_ready()
-        with tiny_queue():
+        with tiny_queue(rate_kbit=16):
             said = run(doctor)
     assert said.status == 1
     assert "ENOBUFS" in findings(said)["send-queue-full"]["seen"]
