@@ -208,15 +208,17 @@ class LoadMeter:
         def part(tally: list[int]) -> Part:
             return Part(tally[0], tally[1], tally[1] / carried if carried > 0 else 0.0)
 
-        # A shorter measurement than a window has no other peak than its mean.
+        # A shorter measurement than a window has no other peak than its mean, and the last window may be too
+        # short to show what the mean already does.
         peak_s = min(self._window_s, duration_s)
+        mean = bits / carried if carried > 0 else 0.0
         return BusLoad(
             bitrate=self.bitrate,
             duration_s=duration_s,
             frames=frames,
             bits=bits,
-            mean=bits / carried if carried > 0 else 0.0,
-            peak=peak_bits / (peak_s * self.bitrate) if peak_s > 0 else 0.0,
+            mean=mean,
+            peak=max(mean, peak_bits / (peak_s * self.bitrate)) if peak_s > 0 else 0.0,
             peak_at_s=peak_window * self._window_s,
             window_s=self._window_s,
             frames_per_s=frames / duration_s if duration_s > 0 else 0.0,

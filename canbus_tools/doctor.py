@@ -21,8 +21,8 @@ from nodes.records import record
 
 LISTEN_S: Final = 3.0
 LISTEN_S_MIN, LISTEN_S_MAX = 0.2, 600.0
-SHARED_HANDLES: Final = ("socketcan", "canductor")
-"""Backends that more than one handle may have open."""
+SYSTEMS_BITRATE: Final = ("socketcan", "canductor")
+"""Backends that have the bit rate they have."""
 
 
 def declare(command: argparse.ArgumentParser) -> None:
@@ -70,6 +70,8 @@ def examine(
     if nodes is not None:
         done.append("nodes")
         findings += check_nodes(nodes, place)
+        if try_others and place.socketcan and not nodes.survey.entries:
+            findings.append(_try_by_hand(place.name))
     if place.bitrate is None:
         findings.append(
             note(
@@ -86,25 +88,22 @@ def _use_bus(
     options: BusOptions, place: Place, listen_s: float, *, quiet: bool, try_others: bool
 ) -> tuple[TrafficFacts, NodeFacts | None]:
     opened = options
-    if options.interface in SHARED_HANDLES:
+    if options.interface in SYSTEMS_BITRATE:
         opened = BusOptions(interface=options.interface, channel=options.channel)
     nodes: NodeFacts | None = None
     queue_full = False
     before = _counters(options)
-    shared = options.interface in SHARED_HANDLES
     with Listener(opened, place.bitrate) as listener:
         listener.wait(listen_s)
         listener.end_of_calm()
-        if shared and not quiet:
+        if place.socketcan and not quiet:
             queue_full = fill_queue(opened)
-            # Error reports of what we send are the most telling.
+            # Error reports of what we send are the most telling; others have none, or but one handle.
             nodes = asyncio.run(ask_nodes(opened))
-    if not shared and not quiet:
+    if not place.socketcan and not quiet:
         nodes = asyncio.run(ask_nodes(opened))
     traffic = listener.facts(before, _counters(options), queue_full=queue_full)
-    if nodes is not None and not nodes.survey.entries and try_others:
-        if place.socketcan:
-            raise CanductorError(_how_to_try(place.name))
+    if nodes is not None and not nodes.survey.entries and try_others and not place.socketcan:
         nodes = NodeFacts(survey=nodes.survey, heard_at=try_bitrates(options, listen_s))
     return traffic, nodes
 
@@ -113,14 +112,15 @@ def _counters(options: BusOptions) -> LinkFacts | None:
     return read_link(options.channel) if options.interface == "socketcan" else None
 
 
-def _how_to_try(name: str) -> str:
-    return (
-        "no node answers, and the bit rate of a SocketCAN interface is the system's to change: for 500000,"
-        " 250000"
-        f" and 1000000 in turn: 'sudo ip link set {name} down; sudo ip link set {name} up type can bitrate"
-        " 500000"
-        f" listen-only on', then 'canductor can load -c {name} --duration 5': at the right one there are"
-        " frames"
+def _try_by_hand(name: str) -> Finding:
+    return note(
+        "bitrates-by-hand",
+        "other bit rates were not tried",
+        "the bit rate of a SocketCAN interface is the system's to change",
+        f"for 500000, 250000 and 1000000 in turn: sudo ip link set {name} down; sudo ip link set {name} up"
+        " type can"
+        f" bitrate 500000 listen-only on; then 'canductor can load -c {name}': at the right one there are"
+        " frames. At the end: listen-only off",
     )
 
 
@@ -182,6 +182,8 @@ class Diagnosis:
                     "nodeid": ping.nodeid,
                     "asked": ping.asked,
                     "repeats": ping.repeats,
+                    "lost": ping.lost,
+                    "invalid_bytes": ping.invalid_bytes,
                     "rtt_median_s": round(ping.rtt_median_s, 6),
                     "rtt_p99_s": round(ping.rtt_p99_s, 6),
                 }
@@ -211,10 +213,9 @@ class Diagnosis:
     def _figures(self) -> list[str]:
         lines = []
         if self.traffic is not None:
-            load = "" if self.traffic.load is None else f", {self.traffic.load.mean:.1%} busy"
-            lines.append(
-                f"listened {self.traffic.listened_s:.1f} s: {count(self.traffic.frames, 'frame')}{load}"
-            )
+            load = self.traffic.load
+            busy = "how busy it is needs --bitrate" if load is None else f"{load.mean:.1%} busy"
+            lines.append(f"listened {self.traffic.listened_s:.1f} s: {busy}")
         pings = () if self.nodes is None else self.nodes.pings
         return lines + [
             f"node {ping.nodeid}: {ping.asked} questions, {ping.repeats} repeated; round trip"

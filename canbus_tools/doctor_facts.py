@@ -26,10 +26,9 @@ from canbus_tools.flow import RoundTrips
 from canbus_tools.frame import Frame, FrameKind
 from canbus_tools.link_facts import LinkFacts, NoInterface, read_link
 from canbus_tools.open_bus import BusOptions, open_bus
-from canbus_tools.protocol import Direction, owner_of
 from canbus_tools.survey import PROBED, State, SurveyResult, survey
 from canbus_tools.talk import BusTalk
-from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, WHO_IS_HERE
+from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.errors import CanductorError
 
 ASKED: Final = 100
@@ -40,7 +39,9 @@ TRIED_BITRATES: Final = (1_000_000, 500_000, 250_000, 125_000)
 _SYS_NET: Final = Path("/sys/class/net")
 _ARPHRD_CAN: Final = "280"
 _RECV_S: Final = 0.1
-_BURST: Final = 8
+_BURST: Final = 16
+NO_COMMAND: Final = 0xFF
+"""An admin command that does not exist: nodes ignore it, and no late answer disturbs what is asked next."""
 _QUESTIONS: Final = (("get_uptime", "uptime"), ("get_clock", "clock"), ("get_config", "config"))
 
 
@@ -110,7 +111,6 @@ class Listener:
     def __exit__(self, *_: object) -> None:
         self._end.set()
         self._thread.join()
-        self._ended_s = time.time()
         self._bus.shutdown()
 
     def wait(self, seconds: float) -> None:
@@ -120,13 +120,22 @@ class Listener:
             raise CanductorError(f"the bus failed: {' '.join(str(self._failure).split())}") from self._failure
 
     def end_of_calm(self) -> None:
-        """From now on this program sends, too: its own frames are not judged."""
+        """From now on this program sends, too: only answers and error reports are still taken.
+
+        The others are not even read, where the kernel filters: that would slow down what sends and asks.
+        """
+        self._bus.set_filters(
+            [can.typechecking.CanFilter(can_id=ADMIN_RESPONSE_ID, can_mask=0x7FF, extended=False)]
+        )
         with self._lock:
-            now_s = time.time()
-            if self._meter is not None:
-                self._meter.advance(now_s)
-            load = None if self._meter is None else self._meter.load()
-            self._calm = (load, self._decoder.other_frames, tuple(self._ways()))
+            self._calm = self._figures()
+
+    def _figures(self) -> tuple[BusLoad | None, int, tuple[WayFacts, ...]]:
+        self._ended_s = time.time()
+        if self._meter is not None:
+            self._meter.advance(self._ended_s)
+        load = None if self._meter is None else self._meter.load()
+        return load, self._decoder.other_frames, tuple(self._ways())
 
     def _run(self) -> None:
         try:
@@ -145,7 +154,7 @@ class Listener:
             self._meter.feed(frame._replace(time_s=time.time()))
         if frame.kind is FrameKind.ERROR:
             self._errors.update(error_kinds(frame))
-        elif self._calm is None or _is_answer(frame):
+        else:
             self._frames += 1
         self._decoder.feed(frame)
 
@@ -153,10 +162,7 @@ class Listener:
         self, before: LinkFacts | None = None, after: LinkFacts | None = None, *, queue_full: bool = False
     ) -> TrafficFacts:
         """Return what was heard until ``with`` ended; error reports also while this program sent."""
-        if self._calm is None:
-            self.end_of_calm()
-        assert self._calm is not None
-        load, other_frames, ways = self._calm
+        load, other_frames, ways = self._calm or self._figures()
         return TrafficFacts(
             listened_s=self._ended_s - self._started_s,
             load=load,
@@ -190,11 +196,6 @@ class Listener:
         return found
 
 
-def _is_answer(frame: Frame) -> bool:
-    owner = owner_of(frame.can_id)
-    return frame.can_id == ADMIN_RESPONSE_ID or (owner is not None and owner[1] is Direction.FROM_NODE)
-
-
 def error_kinds(frame: Frame) -> set[str]:
     """Tell what an error frame of linux/can/error.h reports."""
     kinds = set()
@@ -211,12 +212,12 @@ def error_kinds(frame: Frame) -> set[str]:
 
 
 def fill_queue(options: BusOptions) -> bool:
-    """Tell whether a burst of short questions overflows the send queue; raises CanductorError."""
+    """Tell whether a burst of short frames overflows the send queue; raises CanductorError."""
     bus = open_bus(options)
-    question = can.Message(arbitration_id=ADMIN_ID, data=bytes([WHO_IS_HERE]), is_extended_id=False)
+    nothing = can.Message(arbitration_id=ADMIN_ID, data=bytes([NO_COMMAND]), is_extended_id=False)
     try:
         for _ in range(_BURST):
-            bus.send(question)
+            bus.send(nothing)
     except can.CanOperationError as error:
         if error.error_code == errno.ENOBUFS:
             return True
@@ -258,8 +259,10 @@ async def _ping(bus: BusTalk, nodeid: int) -> PingFacts:
             await talk.ask(*question)
             trips.add(loop.time() - asked_s)
         stats = talk.stats
+    late = stats.acks_duplicate - before.acks_duplicate + stats.naks - before.naks
     return PingFacts(
         nodeid=nodeid,
+        lost=max(0, stats.timeouts - before.timeouts - late),
         asked=trips.count,
         repeats=stats.blocks_repeated - before.blocks_repeated,
         invalid_bytes=stats.bytes_invalid - before.bytes_invalid,

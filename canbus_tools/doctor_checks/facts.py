@@ -76,6 +76,8 @@ class PingFacts:
     asked: int
     repeats: int
     """Blocks that the link had to send again."""
+    lost: int
+    """Time-outs without a late answer: a slow computer repeats blocks, too, and then hears two answers."""
     invalid_bytes: int
     rtt_median_s: float
     rtt_p99_s: float

@@ -30,7 +30,7 @@ def check_presence(facts: InterfaceFacts) -> Iterator[Finding]:
             "interface-missing",
             f"there is no network interface {name}; CAN interfaces here: {there or 'none'}",
             "the adapter is not plugged in, its driver is not loaded, or the interface has another name",
-            f"use one that is there: canductor can doctor -c {facts.others[0]}"
+            f"use one that is there: 'canductor can doctor -c {facts.others[0]}'"
             if there
             else "plug the adapter in and look what the kernel says: dmesg | grep -i can",
         )

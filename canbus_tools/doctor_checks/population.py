@@ -52,7 +52,7 @@ def _nobody(facts: NodeFacts, place: Place) -> Finding:
         " run no firmware at all",
         "check power, CANH and CANL, two terminators of 120 ohm (60 between the wires), and the bit rate in"
         " the"
-        f" nodes' firmware settings; then ask again: canductor can query {place.words}",
+        f" nodes' firmware settings; then ask again: 'canductor can query {place.words}'",
     )
 
 
@@ -96,8 +96,8 @@ def _node(entry: Entry, place: Place) -> Iterator[Finding]:
             "node-shutdown",
             f"{name} is in shutdown",
             "it met an error or was told to stop, and does nothing until it is reset",
-            "restart its host (FIRMWARE_RESTART in Klipper), or: canductor console"
-            f" {place.words} --node {entry.nodeid}, and there: reset",
+            f"restart its host (FIRMWARE_RESTART in Klipper), or talk to it: 'canductor console {place.words}"
+            f" --node {entry.nodeid}', and there: reset",
         )
     elif entry.state is State.BOOTLOADER:
         yield warning(
@@ -106,13 +106,13 @@ def _node(entry: Entry, place: Place) -> Iterator[Finding]:
             "it has no firmware that runs, or somebody asked for the bootloader: no host can use it",
             f"flash it (flashtool.py -u {entry.uuid}), or press reset once",
         )
-    elif entry.state is State.WAITING:
+    elif entry.state is State.WAITING and not entry.twins:
         yield note(
             "node-waits",
             f"{name} waits for an id",
             "that is normal as long as no host runs that has it in its configuration",
-            f"put its uuid into the host's configuration; to try it: canductor can assign {entry.uuid}"
-            f" {place.words}",
+            "put its uuid into the host's configuration; to try it:"
+            f" 'canductor can assign {entry.uuid} 4 {place.words}'",
         )
     elif entry.state is State.UNCLEAR and entry.trouble and "more than one board" not in entry.trouble:
         yield warning(
@@ -133,14 +133,13 @@ def _node(entry: Entry, place: Place) -> Iterator[Finding]:
 
 
 def _ping(ping: PingFacts, place: Place) -> Iterator[Finding]:
-    if ping.repeats or ping.invalid_bytes:
-        share = ping.repeats / ping.asked
-        found = problem if share > LOSS_MANY else warning
+    if ping.lost or ping.invalid_bytes:
+        found = problem if ping.lost > LOSS_MANY * ping.asked else warning
         yield found(
             "frames-lost",
-            f"of {ping.asked} questions to node {ping.nodeid}, {ping.repeats} blocks had to be sent again,"
-            " and"
-            f" {ping.invalid_bytes} bytes of its answers were no valid block",
+            f"of {ping.asked} questions to node {ping.nodeid}, {ping.lost} got lost with no trace, and"
+            f" {ping.invalid_bytes} bytes of its answers were no valid block ({ping.repeats} blocks were"
+            " repeated)",
             "frames get lost between this program and the node. On the wire controllers repeat what was"
             " damaged,"
             " so it is the adapter, the kernel, or the node's receive buffer",

@@ -29,7 +29,7 @@ def check_traffic(facts: TrafficFacts, interface: InterfaceFacts | None, place: 
             "other-protocol",
             f"{facts.other_frames} of {facts.frames} frames belong to no node of this protocol",
             "another protocol shares the bus; that works, but takes its part of the time",
-            f"see who: canductor can load {place.words}",
+            f"see who: 'canductor can load {place.words}'",
         )
 
 
@@ -40,7 +40,7 @@ def _load(facts: TrafficFacts, place: Place) -> Iterator[Finding]:
     busiest = max(load.classes.items(), key=lambda item: item[1].bits)
     seen = f"the bus is {load.mean:.0%} busy, most of it by frames of the class '{busiest[0].value}'"
     do = (
-        f"see who sends so much: canductor can load {place.words} --watch; a higher bit rate (all nodes"
+        f"see who sends so much: 'canductor can load {place.words} --watch'; a higher bit rate (all nodes"
         " have to be"
         " flashed for it), or a second bus for some of the nodes, makes room"
     )
@@ -101,7 +101,7 @@ def _lost(facts: TrafficFacts, place: Place) -> Iterator[Finding]:
             "the queue is very short, or full because nothing leaves it: nobody acknowledges, or the bus is"
             " busy with frames that win arbitration",
             f"sudo ip link set {place.name} txqueuelen 128; if it persists, see who is there:"
-            f" canductor can load {place.words}",
+            f" 'canductor can load {place.words}'",
         )
     if facts.errors.get("overflow"):
         yield warning(
@@ -167,7 +167,7 @@ def slow(nodeid: int, median_s: float, p99_s: float, how: str) -> Finding:
         "commands sent shortly before they are due come too late, and the node's clock is known less well:"
         " a busy"
         " bus or host, a long send queue, or USB power saving",
-        "compare under load and without: canductor can load; turn power saving of the USB port off"
+        "compare under load and without: 'canductor can load'; turn power saving of the USB port off"
         " (echo on | sudo tee /sys/bus/usb/devices/*/power/control)",
     )
 

@@ -1,0 +1,106 @@
+"""``canductor can doctor`` on a kernel's interface, whose settings are the faults."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from canbus_tools.link_facts import NoInterface, read_link
+from tests.canbus_tools.command import Command, Said
+from tests.canbus_tools.stage import MAIN, Place
+from tests.canbus_tools.test_doctor import findings, problems, run
+from tests.vcan.kernel import INTERFACE, control, set_down, tiny_queue, why_no_control
+
+controls_interface = pytest.mark.skipif(bool(why_no_control()), reason=why_no_control())
+has_ip = pytest.mark.skipif(shutil.which("ip") is None, reason="needs the package iproute2")
+
+KERNEL = Place("socketcan", INTERFACE)
+
+
+@pytest.fixture
+def doctor(capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(KERNEL, capsys)
+
+
+@contextmanager
+def queue_of(length: int) -> Iterator[None]:
+    before = read_link(INTERFACE).txqueuelen
+    control("ip", "link", "set", INTERFACE, "txqueuelen", str(length))
+    try:
+        yield
+    finally:
+        control("ip", "link", "set", INTERFACE, "txqueuelen", str(before))
+
+
+def the_finding(said: Said, name: str) -> dict[str, str]:
+    assert (said.status, problems(said)) == (1, {name})
+    return findings(said)[name]
+
+
+@has_ip
+def test_no_such_interface(capsys: pytest.CaptureFixture[str]) -> None:
+    said = run(Command(Place("socketcan", "can7"), capsys))
+    assert "there is no network interface can7" in the_finding(said, "interface-missing")["seen"]
+    with pytest.raises(NoInterface):
+        read_link("can7")
+
+
+@has_ip
+def test_an_interface_of_another_kind(capsys: pytest.CaptureFixture[str]) -> None:
+    if not os.path.exists("/sys/class/net/lo"):  # noqa: PTH110 (a name of the kernel's)
+        pytest.skip("no interface lo here")
+    the_finding(run(Command(Place("socketcan", "lo"), capsys)), "not-can")
+
+
+@controls_interface
+def test_a_vcan_with_a_node_is_well(doctor: Command) -> None:
+    with KERNEL.start_node("mainboard", MAIN) as node:
+        node.wait_ready()
+        said = run(doctor)
+    assert problems(said) == set()
+    assert said.json["checked"] == ["interface", "traffic", "nodes"]
+
+
+@controls_interface
+def test_bit_rates_are_the_systems_to_change(doctor: Command) -> None:
+    said = run(doctor, "--try-bitrates")
+    the_finding(said, "no-nodes")
+    assert "listen-only on" in findings(said)["bitrates-by-hand"]["do"]
+
+
+@controls_interface
+def test_interface_down(doctor: Command) -> None:
+    with set_down():
+        said = run(doctor)
+    assert f"sudo ip link set {INTERFACE} up" in the_finding(said, "interface-down")["do"]
+
+
+@controls_interface
+@pytest.mark.parametrize(("length", "name"), [(2, "txqueuelen-small"), (10_000, "txqueuelen-large")])
+def test_txqueuelen(doctor: Command, length: int, name: str) -> None:
+    with queue_of(length):
+        said = run(doctor, "--quiet-bus")
+    assert f"holds {length} frames" in the_finding(said, name)["seen"]
+
+
+@controls_interface
+def test_a_send_queue_that_is_full(doctor: Command) -> None:
+    with KERNEL.start_node("mainboard", MAIN) as node:
+        node.wait_ready()
+        with tiny_queue(rate_kbit=16):
+            said = run(doctor)
+    assert said.status == 1
+    assert "ENOBUFS" in findings(said)["send-queue-full"]["seen"]
+
+
+@controls_interface
+def test_no_permission(doctor: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sandbox may forbid sockets of CAN: the kernel's refusal is put in place of its socket."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr("can.interfaces.socketcan.socketcan.create_socket", refuse)
+    assert "sudo" in the_finding(run(doctor), "no-permission")["do"]
