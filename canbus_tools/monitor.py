@@ -153,23 +153,29 @@ class Lines:
         self._watch = watch
         self._queue = queue
         self._form = json_line if options.as_json else line_of
+        self._told_dropped = 0
 
     def run(self) -> int:
         """Write until the duration is over, or Ctrl-C; returns how many lines."""
-        shown = told_dropped = 0
+        shown = 0
         try:
             for said in self._said():
                 sys.stdout.write(self._form(said) + "\n")
                 sys.stdout.flush()
                 shown += 1
-                if self._queue.dropped > told_dropped:
-                    told_dropped = self._queue.dropped
-                    sys.stderr.write(
-                        f"canductor: {told_dropped} frames were dropped: lines are read too slowly\n"
-                    )
+                if self._queue.dropped > 2 * self._told_dropped:
+                    self._tell_dropped()
         except KeyboardInterrupt:
             pass  # the end of the tool, not of its report
+        if self._queue.dropped > self._told_dropped:
+            self._tell_dropped()
         return shown
+
+    def _tell_dropped(self) -> None:
+        self._told_dropped = self._queue.dropped
+        sys.stderr.write(
+            f"canductor: {self._told_dropped} frames were dropped until now: lines are read too slowly\n"
+        )
 
     def _said(self) -> Iterator[Decoded]:
         passes = self._options.filter_.passes

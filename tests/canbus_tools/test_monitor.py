@@ -18,9 +18,10 @@ import pytest
 from canbus_tools.bus_load import LoadMeter
 from canbus_tools.bus_watch import SPAN_S, BusWatch
 from canbus_tools.decoder import BusDecoder
+from canbus_tools.filters import Filter
 from canbus_tools.frame import Frame
 from canbus_tools.frame_queue import FrameQueue
-from canbus_tools.monitor import fetch
+from canbus_tools.monitor import Lines, MonitorOptions, fetch
 from canbus_tools.open_bus import BusOptions, open_bus
 from coordinator.cli import main
 from nodes.errors import CanductorError
@@ -244,3 +245,28 @@ def test_rates_are_of_the_last_seconds() -> None:
     assert watch.update(5.0 + 2 * SPAN_S + 1).frames_per_s == 0
     assert later.frames_per_s < 100
     assert len(watch.loads) == 7
+
+
+def test_dropped_frames_are_told_now_and_then(tmp_path: Path, capsys: Captured) -> None:
+    with (
+        VirtualBus(tmp_path / "bus", bitrate=None) as bus,
+        FrameQueue(open_bus(opened(bus)), "bus", limit=5) as queue,
+        closing(Place("canductor", str(bus.path)).open()) as host,
+    ):
+        for _ in range(50):
+            set_nodeid(host, MAIN, MAIN_ID)
+        while queue.dropped < 45:
+            time.sleep(0.001)
+        options = MonitorOptions(
+            bus=opened(bus),
+            bitrate=1_000_000,
+            bitrate_is_known=False,
+            filter_=Filter(),
+            dictionaries={},
+            duration_s=0.2,
+        )
+        watch = BusWatch(BusDecoder(), LoadMeter(1_000_000), time.monotonic())
+        assert Lines(options, watch, queue).run() == 5
+    said = capsys.readouterr()
+    assert said.out.count("set_nodeid") == 5
+    assert said.err == "canductor: 45 frames were dropped until now: lines are read too slowly\n"
