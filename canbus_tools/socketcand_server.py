@@ -80,16 +80,18 @@ class SocketcandServer:
         await asyncio.gather(*self._clients, return_exceptions=True)
         await self._server.wait_closed()
 
-    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        # Its own task: one made by asyncio would be reported as failed when it is cancelled.
+        task = asyncio.get_running_loop().create_task(self._serve_one(reader, writer))
         self._clients.add(task)
-        try:
-            with contextlib.suppress(OSError):  # either side may go at any time
+        task.add_done_callback(self._clients.discard)
+
+    async def _serve_one(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError):  # either side may go at any time
+            try:
                 await self._serve(reader, writer)
-        finally:
-            self._clients.discard(task)
-            writer.close()
+            finally:
+                writer.close()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if self.stats.connected == CLIENTS_MAX:
