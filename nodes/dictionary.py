@@ -9,7 +9,7 @@ import json
 import re
 import zlib
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, TypeVar
 
 from nodes.dictionary_parts import (
     DictionaryError,
@@ -50,6 +50,7 @@ class Dictionary:
         )
         self.outputs = OutputFormat.parse_all(source.get("output", {}), taken)
         self._commands_by_id = {f.message_id: f for f in self.commands.values()}
+        self._commands_by_prefix = {f.prefix: f for f in self.commands.values()}
         self._responses_by_id: dict[int, MessageFormat | OutputFormat] = {
             f.message_id: f for f in self.responses.values()
         }
@@ -181,17 +182,17 @@ class Dictionary:
 
         None when its id is unknown, it is cut short, or something follows it.
         """
-        found = self._by_prefix.get(content[:1]) or self._by_prefix.get(content[:2])
-        if found is not None:
-            start = len(found.prefix)
-        else:  # an id in more bytes than it needs is legal
-            number = vlq_read(content, 0)
-            found = self._responses_by_id.get(_signed(number[0])) if number else None
-            if found is None or number is None:
-                return None
-            start = number[1]
-        decoded = found.decode(content, start)
+        found = self.response_at(content)
+        decoded = found[0].decode(content, found[1]) if found else None
         return decoded[0] if decoded and decoded[1] == len(content) else None
+
+    def response_at(self, content: bytes) -> "tuple[MessageFormat | OutputFormat, int] | None":
+        """Return the format of the response in CONTENT and where its parameters begin; None: unknown id."""
+        return _format_at(self._by_prefix, self._responses_by_id, content, 0)
+
+    def command_at(self, content: bytes, at: int) -> tuple[MessageFormat, int] | None:
+        """Return the format of the command at AT of CONTENT and where its parameters begin, or None."""
+        return _format_at(self._commands_by_prefix, self._commands_by_id, content, at)
 
     def decode_commands(self, content: bytes, *, as_sent: bool = False) -> list[Message] | None:
         """Decode all commands of a block; None when any of them is unknown or cut short.
@@ -201,11 +202,10 @@ class Dictionary:
         messages: list[Message] = []
         at = 0
         while at < len(content):
-            number = vlq_read(content, at)
-            command = self._commands_by_id.get(_signed(number[0])) if number else None
-            if command is None or number is None:
+            found = self.command_at(content, at)
+            if found is None:
                 return None
-            start = number[1]
+            command, start = found
             decoded = (command.decode_as_sent if as_sent else command.decode)(content, start)
             if decoded is None:
                 return None
@@ -246,6 +246,24 @@ def _text_value(command: MessageFormat, param: str, text: str) -> Value | str:
     if digits is None:
         raise MessageError(f'{command.name}: {param} takes hex digits or "text", not {text!r}')
     return bytes.fromhex(digits[1])
+
+
+F = TypeVar("F")
+
+
+def _format_at(
+    by_prefix: Mapping[bytes, F], by_id: Mapping[int, F], content: bytes, at: int
+) -> tuple[F, int] | None:
+    """Look up the id at AT of CONTENT; return what has it and what stands behind it, or None."""
+    found = by_prefix.get(content[at : at + 1])
+    if found is not None:
+        return found, at + 1
+    found = by_prefix.get(content[at : at + 2])
+    if found is not None:
+        return found, at + 2
+    number = vlq_read(content, at)  # an id in more bytes than it needs is legal
+    found = by_id.get(_signed(number[0])) if number else None
+    return None if found is None or number is None else (found, number[1])
 
 
 def _signed(value: int) -> int:

@@ -189,18 +189,27 @@ class MessageFormat:
 
         Returns the message and where it ends, or None when it is cut short.
         """
+        found = self.read_values(content, start)
+        if found is None:
+            return None
+        return Message(self.name, dict(zip(self.names, found[0], strict=True))), found[1]
+
+    def read_values(self, content: bytes, start: int) -> tuple[Sequence[Value], int] | None:
+        """Decode like ``decode``, but give only the parameters' values, in the order of ``names``."""
         if not self._count:
-            return Message(self.name, {}), start
+            return (), start
         held = _from_buffer("uint8_t[]", content)
         cursor = self._cursor
         cursor[0] = held + start
         if _unpack(self._types, self._count, cursor, held + len(content), self._args):
             return None
-        values: list[Value] = list(self._numbers.unpack_from(self._view))
-        for i, size in [(i, values[i]) for i in self._buffers]:
-            at = self._args[i].data - held
-            values[i] = content[at : at + size]
-        return Message(self.name, dict(zip(self.names, values, strict=True))), cursor[0] - held
+        values: Sequence[Value] = self._numbers.unpack_from(self._view)
+        if self._buffers:
+            values = list(values)
+            for i in self._buffers:
+                at = self._args[i].data - held
+                values[i] = content[at : at + values[i]]
+        return values, cursor[0] - held
 
     # ------------------------------------------------------------------------------------- numbers as sent
 

@@ -1,0 +1,110 @@
+"""Blocks out of the payloads of one data id, as an onlooker wants them: every sound one, whatever precedes.
+
+A node discards up to the next sync byte after an error, so that a lost frame costs it a whole sound block.
+An onlooker need not: it tries every place in the damaged stretch.
+"""
+
+from typing import Any, Final
+
+from nodes._wire import ffi, lib
+
+GAP_S: Final = 0.1
+"""A block whose bytes stop coming for so long was cut off; hosts and nodes give it up then too."""
+NOISE_SHOWN: Final = 64
+"""Bytes of noise that are told at once."""
+_MIN: Final[int] = lib.WIRE_BLOCK_MIN
+_MAX: Final[int] = lib.WIRE_BLOCK_MAX
+_MARK: Final[int] = lib.WIRE_SEQ_MARK >> 4
+_BLOCK: Final[int] = lib.WIRE_BLOCK
+_MORE: Final[int] = lib.WIRE_MORE
+_SYNC: Final = bytes((lib.WIRE_SYNC,))
+_scan: Final = lib.wire_scan
+
+
+class Noise(bytes):
+    """Bytes that made no block."""
+
+
+class BlockStream:
+    """One direction's bytes. Holds less than one block, and up to NOISE_SHOWN bytes of noise."""
+
+    def __init__(self) -> None:
+        self._noise = bytearray()  # not told yet
+        self._held = b""
+        self._held_s = 0.0
+        self._scanner: Any = ffi.new("struct wire_scanner *")
+        self._skip = ffi.new("size_t *")
+        self._length = ffi.new("size_t *")
+
+    def feed(self, data: bytes, now_s: float) -> list[bytes] | None:
+        """Take the payload of a frame. Returns whole blocks and, where it stood between them, Noise.
+
+        None, the common case: nothing is complete yet.
+        """
+        held = self._held
+        if held:
+            if now_s - self._held_s > GAP_S:
+                found = self.flush()
+                return found + (self.feed(data, now_s) or [])
+            data = held + data
+        self._held_s = now_s
+        size = len(data)
+        if size < _MAX and size > 1 and size < data[0] <= _MAX and data[1] >> 4 == _MARK:
+            self._held = data
+            return None
+        return self._cut(data, last=False)
+
+    def flush(self) -> list[bytes]:
+        """Give up waiting: return the blocks and the noise in what is held."""
+        found = self._cut(self._held, last=True)
+        if self._noise:
+            self._tell_noise(found)
+        return found
+
+    def _cut(self, data: bytes, *, last: bool) -> list[bytes]:
+        found: list[bytes] = []
+        while data:
+            outcome = _scan(self._scanner, data, len(data), self._skip, self._length)
+            if outcome == _BLOCK:
+                if self._noise:
+                    self._tell_noise(found)
+                start = self._skip[0]
+                end = start + self._length[0]
+                found.append(data[start:end])
+                data = data[end:]
+                continue
+            self._scanner.hunting = 0  # it would drop sound blocks in the damaged stretch
+            data = data.lstrip(_SYNC)
+            drop = 1
+            if outcome == _MORE and not last:
+                drop = self._sound_block_at(data) if self._noise else 0
+                if not drop:
+                    break
+            self._drop(found, data[:drop])
+            data = data[drop:]
+        self._held = data
+        return found
+
+    def _drop(self, found: list[bytes], noise: bytes) -> None:
+        self._noise += noise
+        if len(self._noise) >= NOISE_SHOWN:
+            self._tell_noise(found)
+
+    def _tell_noise(self, found: list[bytes]) -> None:
+        found.append(Noise(self._noise))
+        self._noise.clear()
+
+    def _sound_block_at(self, data: bytes) -> int:
+        """Return where a sound block begins behind the first byte, 0: nowhere.
+
+        What looks like the beginning of a block after noise may be more noise, and then nobody wants to wait
+        for the rest of it with the next block in hand.
+        """
+        for at in range(1, len(data) - _MIN + 1):
+            if data[at + 1] >> 4 != _MARK or not _MIN <= data[at] <= len(data) - at:
+                continue
+            outcome = _scan(self._scanner, data[at:], len(data) - at, self._skip, self._length)
+            self._scanner.hunting = 0
+            if outcome == _BLOCK:
+                return at
+        return 0

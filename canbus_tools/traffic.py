@@ -1,0 +1,71 @@
+"""Counters of one node's traffic, as an onlooker counts it."""
+
+import math
+
+from canbus_tools.dictionaries import DictionarySource
+from canbus_tools.flow import Flow
+
+
+class Way:
+    """Counters of one direction."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.bytes = 0
+        """Of payload."""
+        self.blocks = 0
+        self.messages = 0
+        """Commands or responses; repeated ones count once."""
+        self.unknown_messages = 0
+        """Blocks with a message that could not be read: no dictionary, or another firmware's."""
+        self.invalid_bytes = 0
+        """Payload that made no block."""
+        self.noises = 0
+        """Stretches of such bytes."""
+
+    def to_json(self) -> dict[str, int]:
+        """Return all counters."""
+        return dict(vars(self))
+
+
+class NodeTraffic:
+    """What is known of one node by listening."""
+
+    def __init__(self, nodeid: int) -> None:
+        self.nodeid = nodeid
+        self.uuid: str | None = None
+        """As admin frames or the node itself said; None: nobody did."""
+        self.mcu = ""
+        self.version = ""
+        self.dictionary_origin = ""
+        """Empty: there is no dictionary."""
+        self.to_node = Way()
+        self.from_node = Way()
+        self.flow = Flow()
+        self.last_heard_s = math.nan
+        """When the node's last frame came."""
+        self.last_sent_s = math.nan
+
+    def take_dictionary(self, dictionaries: DictionarySource) -> None:
+        """Take over what the node's dictionary says about it."""
+        dictionary = dictionaries.known.get(self.nodeid)
+        self.dictionary_origin = dictionaries.origins.get(self.nodeid, "")
+        self.mcu = "" if dictionary is None else str(dictionary.constants.get("MCU", ""))[:80]
+        self.version = "" if dictionary is None else dictionary.version
+
+    def to_json(self) -> dict[str, object]:
+        """Return it as ``--json`` shows it."""
+        return {
+            "nodeid": self.nodeid,
+            "uuid": self.uuid,
+            "mcu": self.mcu or None,
+            "version": self.version or None,
+            "dictionary": self.dictionary_origin or None,
+            "to_node": self.to_node.to_json(),
+            "from_node": self.from_node.to_json(),
+            "repeated_blocks": self.flow.repeated_blocks,
+            "missed_blocks": self.flow.missed_blocks,
+            "naks": self.flow.naks,
+            "rtt": self.flow.round_trips.to_json(),
+            "last_heard_s": None if math.isnan(self.last_heard_s) else self.last_heard_s,
+        }
