@@ -291,7 +291,12 @@ local function feed(stream, data, now_s)
     end
   end
   stream.held_s = now_s
-  for _, item in ipairs(cut(stream, stream.held .. data, false)) do
+  data = stream.held .. data
+  if #data > 1 and data:byte(1) ~= D.block.sync and scan(data) == "more" then
+    stream.held = data -- as the decoder: what begins like a block is waited for
+    return found
+  end
+  for _, item in ipairs(cut(stream, data, false)) do
     found[#found + 1] = item
   end
   return found

@@ -40,9 +40,24 @@ class Tshark:
         self._script.write_text(dissector(dictionaries), encoding="utf-8")
         self._capture = folder / "capture.pcap"
 
+    def use(self, script: Path) -> None:
+        """Take another dissector."""
+        self._script = script
+
     def load(self, frames: Iterable[Frame]) -> None:
         """Take these frames."""
         write_pcap(self._capture, frames)
+
+    def load_buses(self, buses: Iterable[Iterable[Frame]]) -> None:
+        """Take the frames of several buses, in the order of time."""
+        if shutil.which("mergecap") is None:
+            pytest.skip("mergecap is not installed (apt-get install wireshark-common)")
+        paths = []
+        for number, frames in enumerate(buses):
+            paths.append(self._capture.with_name(f"bus{number}.pcap"))
+            write_pcap(paths[-1], frames)
+        command = ["mergecap", "-w", str(self._capture), *map(str, paths)]
+        subprocess.run(command, check=True, timeout=TIMEOUT_S)
 
     def run(self, *words: str) -> str:
         """Return what tshark prints; fails when the Lua code does."""
