@@ -5,6 +5,7 @@ import random
 from collections.abc import Sequence
 from pathlib import Path
 
+import can
 import pytest
 
 from canbus_tools.decoded import Kind
@@ -12,14 +13,19 @@ from canbus_tools.decoder import BusDecoder
 from canbus_tools.dictionaries import DictionarySource, read_dictionary
 from canbus_tools.dissector import ANY, lua
 from canbus_tools.frame import Frame, FrameKind
-from canbus_tools.protocol import ADMIN_FRAMES, SIGNAL_FRAMES, Direction, data_id
+from canbus_tools.protocol import ADMIN_FRAMES, BLOCK, SIGNAL_FRAMES, Direction, data_id
 from coordinator import cli
+from nodes._wire import lib
+from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.dictionary import Dictionary
 from nodes.virtual.firmware import TOOLHEAD, firmware_dictionary, firmware_path
+from nodes.virtual.hub import VirtualBus
+from nodes.virtual.processes import NodeProcess
 from tests.canbus_tools import recorded
 from tests.canbus_tools.tshark import Tshark
 
 NODEID = recorded.NODEID
+WAIT_S = 10.0
 TOOLHEAD_JSON = firmware_path(TOOLHEAD).with_suffix(".json")
 
 
@@ -238,3 +244,103 @@ def test_any_text_is_a_lua_string() -> None:
     assert lua({"a": [1, True, 0.5], 3: None}) == '{["a"]={1,true,0.5}}'
     with pytest.raises(TypeError, match="has no form in Lua"):
         lua(object())
+
+
+# ----------------------------------------------------------------------------- real firmware on a virtual bus
+
+
+class SmallHost:
+    """Says things to node 4 and waits until the bus has been quiet for its answers."""
+
+    def __init__(self, bus: can.BusABC, dictionary: Dictionary) -> None:
+        self._bus = bus
+        self._dictionary = dictionary
+        self._seq = 0
+
+    def send(self, can_id: int, data: bytes) -> None:
+        self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False), timeout=WAIT_S)
+
+    def wait_for(self, can_id: int, end: bytes) -> None:
+        """Until a frame with CAN_ID ends with END."""
+        while (message := self._bus.recv(WAIT_S)) is not None:
+            if message.arbitration_id == can_id and bytes(message.data).endswith(end):
+                return
+        raise AssertionError(f"no frame {can_id:03x} came that ends with {end.hex()}")
+
+    def block(self, *commands: str) -> bytes:
+        content = b"".join(self._dictionary.encode_text(command) for command in commands)
+        head = bytes([len(content) + 5, BLOCK.sequence_mark | self._seq]) + content
+        crc: int = lib.wire_crc16(head, len(head))
+        return head + crc.to_bytes(2) + bytes([BLOCK.sync])
+
+    def say(self, block: bytes) -> None:
+        for at in range(0, len(block), 8):
+            self.send(data_id(NODEID, Direction.TO_NODE), block[at : at + 8])
+
+    def ask(self, *commands: str) -> None:
+        """Send one block and wait for the empty block that acknowledges it."""
+        self.say(self.block(*commands))
+        self._seq = (self._seq + 1) % 16
+        ack = bytes([5, BLOCK.sequence_mark | self._seq])
+        crc: int = lib.wire_crc16(ack, len(ack))
+        self.wait_for_bytes(ack + crc.to_bytes(2) + bytes([BLOCK.sync]))
+
+    def wait_for_bytes(self, wanted: bytes) -> None:
+        """Until the node's stream has WANTED, wherever its frames cut it."""
+        stream = b""
+        while wanted not in stream:
+            message = self._bus.recv(WAIT_S)
+            assert message is not None, f"the node never said {wanted.hex()}"
+            if message.arbitration_id == data_id(NODEID, Direction.FROM_NODE):
+                stream += message.data
+
+
+def talk(folder: Path, dictionary: Dictionary) -> list[Frame]:
+    """All frames of a host's talk with a node of our firmware."""
+    uuid = "90a4ae022dfc"
+    with (
+        VirtualBus(folder / "bus") as bus,
+        NodeProcess("toolhead", uuid=uuid, can=bus.path) as node,
+        can.Bus(interface="canductor", channel=str(bus.path)) as recorder,
+        can.Bus(interface="canductor", channel=str(bus.path)) as own,
+    ):
+        node.wait_ready()
+        host = SmallHost(own, dictionary)
+        host.send(ADMIN_ID, b"\x00")
+        host.wait_for(ADMIN_RESPONSE_ID, bytes.fromhex(uuid) + b"\x01")
+        host.send(ADMIN_ID, b"\x01" + bytes.fromhex(uuid) + bytes([NODEID]))
+        host.send(ADMIN_ID, b"\x41")
+        host.wait_for(ADMIN_RESPONSE_ID, bytes.fromhex(uuid) + bytes([NODEID]))
+        host.send(ADMIN_ID, b"\x40\x07")
+        for offset in range(0, 400, 40):
+            host.ask(f"identify offset={offset} count=40")
+        repeated = host.block("get_config")
+        host.ask("get_config")
+        host.say(repeated)
+        host.wait_for_bytes(b"\x7e")
+        for _ in range(10):
+            host.ask("get_clock", "get_uptime", "get_canbus_id")
+            host.ask("get_sync_pulse")
+        host.send(0x7FF, b"")
+        frames = []
+        while (message := recorder.recv(WAIT_S)) is not None and message.arbitration_id != 0x7FF:
+            frames.append(Frame.from_message(message))
+        return frames
+
+
+def test_the_traffic_of_our_firmware_reads_as_our_decoder_reads_it(tmp_path: Path) -> None:
+    dictionary = firmware_dictionary(TOOLHEAD)
+    tshark = Tshark(tmp_path, {NODEID: dictionary})
+    frames = talk(tmp_path, dictionary)
+    tshark.load(frames)
+    expected = said_by_decoder(frames, {NODEID: dictionary})
+    names = {text.split()[0] for _, texts in expected for text in texts}
+    assert {"need_nodeid", "node_is_here", "sync_pulse", "identify_response", "config", "clock"} <= names
+    assert "unknown" not in names
+    assert said_by_tshark(tshark) == expected
+    (found,) = tshark.layers(
+        ["canductor.text"], "-Y", 'canductor.repeated == 1 && canductor.direction == "to"'
+    )
+    assert found["canductor.text"] == ["get_config"]
+    read = tshark.run("-T", "fields", "-e", "_ws.col.Protocol", "-e", "_ws.col.Info", "-Y", "canductor.uuid")
+    assert read.splitlines()[0] == "CANDUCTOR\tneed_nodeid uuid=90a4ae022dfc set_command=application"
