@@ -26,6 +26,7 @@ local f = {
   repeated = ProtoField.bool("canductor.repeated", "Repeated"),
   extension = ProtoField.bool("canductor.extension", "Extension of canductor's firmware"),
   meaning = ProtoField.string("canductor.meaning", "Meaning"),
+  payload = ProtoField.bytes("canductor.payload", "Part of the byte stream"),
   length = ProtoField.uint8("canductor.block.length", "Length"),
   content = ProtoField.bytes("canductor.block.content", "Content"),
   crc = ProtoField.uint16("canductor.block.crc", "Checksum", base.HEX),
@@ -508,6 +509,9 @@ end
 local function show_data(tvb, pinfo, tree, nodeid, direction, items)
   tree:add(f.nodeid, nodeid):set_generated()
   tree:add(f.direction, direction):set_generated()
+  if tvb:len() > 0 then
+    tree:add(f.payload, tvb())
+  end
   local texts = {}
   for _, item in ipairs(items) do
     show_item(tree, pinfo, item)

@@ -1,5 +1,6 @@
 """What a virtual bus with faults shows: a line while it runs, figures at its end."""
 
+import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -41,7 +42,8 @@ class StatusLine:
         text = status(self._before, stats, now_s - self._last_s, now_s - self._begin_s)
         if socketcand_clients:
             text += f"  socketcand {socketcand_clients}"
-        self._stream.write(f"\r\x1b[K{text}")
+        width = shutil.get_terminal_size().columns - 1  # a line that wraps could not be written over
+        self._stream.write(f"\r\x1b[K{text[:width]}")
         self._stream.flush()
         self._last_s, self._before = now_s, stats
 
