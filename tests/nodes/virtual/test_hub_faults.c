@@ -94,7 +94,7 @@ static void rules_pick_by_id_sender_time_and_number(void) {
     CHECK_EQUAL(hub.faults.counters[3].hits, 1);
 }
 
-static void one_receiver_alone_may_lose(void) {
+static void one_receiver_alone_may_be_hit(void) {
     struct hub_rule rule = any(HUB_LOSE, 1);
     rule.receiver = 1;
     begin(0, &rule, 1);
@@ -104,6 +104,13 @@ static void one_receiver_alone_may_lose(void) {
     CHECK_EQUAL(get(listener), 77);
     CHECK_EQUAL(hub.counters.lost, 0);
     CHECK_EQUAL(hub.counters.lost_copies, 1);
+    rule.kind = HUB_CORRUPT;
+    begin(0, &rule, 1);
+    put(a, 5, 77, 1000);
+    hub_run(&hub, 1000);
+    CHECK(get(b) != 77);
+    CHECK_EQUAL(get(listener), 77);
+    CHECK_EQUAL(hub.counters.corrupted, 1);
 }
 
 static void corruption_changes_one_bit_of_the_data(void) {
@@ -179,6 +186,11 @@ static void errors_without_end_are_bus_off(void) {
     CHECK_EQUAL(hub.counters.unsent, 2);
     CHECK_EQUAL(get(listener), 3);
     CHECK_EQUAL(hub.clients[a].off_ns, end_ns - bits_of(0x200, 3) * BIT_NS + 1408 * BIT_NS);
+    uint64_t back_ns = hub.clients[a].off_ns;
+    put(a, 0x100, 4, back_ns); // it starts from nothing again
+    finish(back_ns);
+    CHECK_EQUAL(hub.counters.errors, 64);
+    CHECK_EQUAL(hub.counters.bus_offs, 2);
     begin(0, &rule, 1); // where frames take no time, this ends too
     put(a, 0x100, 1, 1000);
     hub_run(&hub, 1000);
@@ -234,24 +246,30 @@ static void timed_bus_off_and_recovery(void) {
     put(b, 0x200, 4, 60000);                 // another's is sent, the one off does not hear it
     hub_run(&hub, 99999);
     CHECK(hub.on_wire == a);
+    CHECK_EQUAL(hub_deadline(&hub), 100000);
     hub_run(&hub, 400000);
     CHECK_EQUAL(get(listener), 1);
     CHECK_EQUAL(get(listener), 4);
     CHECK_EQUAL(get(listener), UINT32_MAX);
     CHECK_EQUAL(get(a), UINT32_MAX);
     CHECK_EQUAL(get(b), 1);
+    uint64_t duration_ns = bits_of(0x200, 8) * (uint64_t)BIT_NS;
+    put(b, 0x200, 8, 600000 - duration_ns); // ends when it is back
+    hub_run(&hub, 599998);
     put(a, 0x100, 5, 599999); // still off
     put(a, 0x100, 6, 600000); // back
     uint64_t end_ns = finish(600000);
     put(b, 0x200, 7, end_ns);
     finish(end_ns);
+    CHECK_EQUAL(get(listener), 8);
     CHECK_EQUAL(get(listener), 6);
     CHECK_EQUAL(get(listener), 7);
+    CHECK_EQUAL(get(a), 8);
     CHECK_EQUAL(get(a), 7);
     CHECK_EQUAL(hub.counters.bus_offs, 1);
     CHECK_EQUAL(hub.counters.unsent, 3);
     CHECK_EQUAL(hub.counters.unheard, 1);
-    CHECK_EQUAL(hub.counters.frames, 4);
+    CHECK_EQUAL(hub.counters.frames, 5);
     CHECK_EQUAL(hub.faults.counters[0].hits, 1);
 }
 
@@ -294,6 +312,26 @@ static void a_frame_can_send_its_sender_off(void) {
     put(a, 0x100, 6, hub.clients[a].off_ns);
     finish(hub.clients[a].off_ns);
     CHECK_EQUAL(get(listener), 6);
+}
+
+static void of_two_bus_offs_the_longer_counts(void) {
+    struct hub_rule rules[] = {any(HUB_BUS_OFF, 1), any(HUB_BUS_OFF, 1)};
+    for (int i = 0; i < 2; i++)
+        rules[i].timed = true, rules[i].sender = 0;
+    rules[0].from_ns = 1000, rules[0].time_ns = 900000;
+    rules[1].from_ns = 2000, rules[1].time_ns = 100000;
+    begin(1000000, rules, 2);
+    finish(0);
+    CHECK_EQUAL(hub.counters.bus_offs, 2);
+    CHECK_EQUAL(hub.clients[a].off_ns, 901000);
+}
+
+static void delays_add_up(void) {
+    struct hub_rule rules[] = {any(HUB_DELAY, 1), any(HUB_DELAY, 1)};
+    rules[0].time_ns = 1000, rules[1].time_ns = 30000;
+    begin(0, rules, 2);
+    put(a, 1, 1, 5000);
+    CHECK_EQUAL(hub_deadline(&hub), 36000);
 }
 
 static void a_bus_that_stands_still_does_not_hold_up_time(void) {
@@ -339,8 +377,8 @@ static void hits_of_a_sender_do_not_depend_on_others(void) {
     CHECK(count > 800 && count < 1000);
 }
 
-static void other_seeds_and_rules_hit_others(void) {
-    static uint8_t hits[3][2000];
+static void other_seeds_rules_and_senders_hit_others(void) {
+    static uint8_t hits[4][2000];
     struct hub_rule rules[] = {any(HUB_LOSE, 0.5), any(HUB_CORRUPT, 0.5)};
     for (uint64_t seed = 0; seed < 2; seed++) {
         static struct hub_faults faults;
@@ -348,11 +386,13 @@ static void other_seeds_and_rules_hit_others(void) {
         for (size_t i = 0; i < 2000; i++) {
             struct hub_verdict verdict = hub_faults_judge(&faults, ~0u, 3, 1, 8, 0);
             hits[seed][i] = verdict.lost_to != 0;
-            if (seed == 0)
-                hits[2][i] = verdict.corrupt_to != 0;
+            if (seed > 0)
+                continue;
+            hits[2][i] = verdict.corrupt_to != 0;
+            hits[3][i] = hub_faults_judge(&faults, ~0u, 4, 1, 8, 0).lost_to != 0;
         }
     }
-    for (int k = 1; k < 3; k++) {
+    for (int k = 1; k < 4; k++) {
         int same = 0;
         for (size_t i = 0; i < 2000; i++)
             same += hits[0][i] == hits[k][i];
@@ -397,7 +437,7 @@ static void nothing_is_unaccounted_for(void) {
 
 int main(void) {
     rules_pick_by_id_sender_time_and_number();
-    one_receiver_alone_may_lose();
+    one_receiver_alone_may_be_hit();
     corruption_changes_one_bit_of_the_data();
     a_duplicate_costs_bus_time_and_comes_once();
     an_error_frame_costs_time_and_the_frame_comes_later();
@@ -407,9 +447,11 @@ int main(void) {
     timed_bus_off_and_recovery();
     a_late_caller_finds_the_same();
     a_frame_can_send_its_sender_off();
+    of_two_bus_offs_the_longer_counts();
+    delays_add_up();
     a_bus_that_stands_still_does_not_hold_up_time();
     hits_of_a_sender_do_not_depend_on_others();
-    other_seeds_and_rules_hit_others();
+    other_seeds_rules_and_senders_hit_others();
     nothing_is_unaccounted_for();
     return 0;
 }
