@@ -4,8 +4,12 @@ A node discards up to the next sync byte after an error, so that a lost frame co
 An onlooker need not: it tries every place in the damaged stretch.
 """
 
+from collections.abc import Sequence
 from typing import Any, Final
 
+from canbus_tools.decoded import Decoded
+from canbus_tools.frame import Frame
+from canbus_tools.traffic import Way
 from nodes._wire import ffi, lib
 
 GAP_S: Final = 0.1
@@ -26,40 +30,54 @@ class Noise(bytes):
 
 
 class BlockStream:
-    """One direction's bytes. Holds less than one block, and up to NOISE_SHOWN bytes of noise."""
+    """One direction's frames. Holds less than one block, and up to NOISE_SHOWN bytes of noise.
 
-    def __init__(self) -> None:
+    ``feed`` runs for every frame of a bus: that is why it counts as well.
+    """
+
+    def __init__(self, way: Way) -> None:
+        self._way = way
         self._noise = bytearray()  # not told yet
         self._held = b""
-        self._held_s = 0.0
+        self._last = Frame(0.0, 0, b"")
         self._scanner: Any = ffi.new("struct wire_scanner *")
         self._skip = ffi.new("size_t *")
         self._length = ffi.new("size_t *")
 
-    def feed(self, data: bytes, now_s: float) -> list[bytes] | None:
-        """Take the payload of a frame. Returns whole blocks and, where it stood between them, Noise.
-
-        None, the common case: nothing is complete yet.
-        """
+    def feed(self, frame: Frame) -> Sequence[Decoded]:
+        """Take the next frame; returns what it completed, usually nothing."""
+        data = frame[2]
+        way = self._way
+        way.frames += 1
+        way.bytes += len(data)
         held = self._held
         if held:
-            if now_s - self._held_s > GAP_S:
-                found = self.flush()
-                return found + (self.feed(data, now_s) or [])
+            if frame[0] - self._last[0] > GAP_S:
+                return self._feed_behind_gap(frame)
             data = held + data
-        self._held_s = now_s
-        size = len(data)
-        if size < _MAX and size > 1 and size < data[0] <= _MAX and data[1] >> 4 == _MARK:
+        self._last = frame
+        if 1 < len(data) < data[0] <= _MAX and data[1] >> 4 == _MARK:
             self._held = data
-            return None
-        return self._cut(data, last=False)
+            return ()
+        found = self._cut(data, last=False)
+        return self._take(found, frame) if found else ()
 
-    def flush(self) -> list[bytes]:
-        """Give up waiting: return the blocks and the noise in what is held."""
+    def flush(self) -> Sequence[Decoded]:
+        """Give up waiting: return what can be read of what is held."""
         found = self._cut(self._held, last=True)
         if self._noise:
             self._tell_noise(found)
-        return found
+        return self._take(found, self._last)
+
+    def _take(self, found: Sequence[bytes], frame: Frame) -> Sequence[Decoded]:
+        """Make something of whole blocks and, where it stood between them, Noise; FRAME ended them."""
+        raise NotImplementedError
+
+    def _feed_behind_gap(self, frame: Frame) -> Sequence[Decoded]:
+        given_up = self.flush()
+        self._way.frames -= 1  # feed counts it again
+        self._way.bytes -= len(frame.data)
+        return [*given_up, *self.feed(frame)]
 
     def _cut(self, data: bytes, *, last: bool) -> list[bytes]:
         found: list[bytes] = []

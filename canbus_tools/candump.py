@@ -4,7 +4,7 @@ Any bytes may come; a file is read as fast as a live pipe is followed.
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import BinaryIO, Final
 
 from canbus_tools.frame import Frame, FrameKind
@@ -30,13 +30,16 @@ _new: Final = tuple.__new__
 
 def read_candump(
     source: BinaryIO, name: str, before_read: Callable[[], object] | None = None
-) -> Iterator[Frame]:
-    """Yield the frames of SOURCE, called NAME; BEFORE_READ is called whenever more input is waited for.
+) -> Iterator[list[Frame]]:
+    """Yield the frames of SOURCE, called NAME, as they come, many at once where there are many.
 
-    Raises CanductorError at the end when there were lines that are no frames.
+    BEFORE_READ is called whenever more input is to be read. Raises CanductorError at the end when there were
+    lines that are no frames.
     """
     read = getattr(source, "read1", source.read)  # does not wait for a whole chunk
-    tail, line_number, bad, first_bad = "", 0, 0, ""
+    tail, lines_before = "", 0
+    bad: list[str] = []
+    bad_count = 0
     while True:
         if before_read is not None:
             before_read()
@@ -45,32 +48,40 @@ def read_candump(
         tail = lines.pop() if chunk else ""
         if len(tail) > LINE_MAX:
             tail = tail[:LINE_MAX]  # no frame: it is told with the line's end
-        for line in lines:
-            line_number += 1
-            frame = _frame(line)
-            if frame is not None:
-                yield frame
-            elif line and not line.isspace():
-                bad += 1
-                first_bad = first_bad or f"line {line_number} {line[:60]!a}"
+        frames: list[Frame] = []
+        for number in _parse(lines, frames):
+            bad_count += 1
+            if not bad:
+                bad.append(f"line {lines_before + number} {lines[number - 1][:60]!a}")
+        lines_before += len(lines)
+        if frames:
+            yield frames
         if not chunk:
             break
     if bad:
-        others = f", nor are {bad - 1} others" if bad > 1 else ""
-        raise CanductorError(f"{name}: {first_bad} is no frame of a candump log{others}; the rest was read")
+        others = f", nor are {bad_count - 1} others" if bad_count > 1 else ""
+        raise CanductorError(f"{name}: {bad[0]} is no frame of a candump log{others}; the rest was read")
 
 
-def _frame(line: str) -> Frame | None:
-    try:
-        words = line.split()
-        can_id, mark, digits = words[2].partition("#")
-        if mark and words[0][0] == "(" and len(digits) <= 16:
-            time_s = float(words[0][1:-1])
-            if 0 <= time_s < 1e12:
-                return _new(Frame, (time_s, _IDS[can_id], bytes.fromhex(digits), _DATA, words[1]))
-    except (ValueError, LookupError):
-        pass
-    return _rare_frame(line[:LINE_MAX])
+def _parse(lines: Iterable[str], frames: list[Frame]) -> list[int]:
+    """Append what LINES hold to FRAMES; return the numbers of those that hold no frame, from 1."""
+    bad: list[int] = []
+    for number, line in enumerate(lines, 1):
+        try:  # the usual line, without a call
+            stamp, channel, said = line.split()
+            can_id, mark, digits = said.partition("#")
+            time_s = float(stamp[1:-1])
+            if mark and stamp[0] == "(" and len(digits) <= 16 and 0 <= time_s < 1e12:
+                frames.append(_new(Frame, (time_s, _IDS[can_id], bytes.fromhex(digits), _DATA, channel)))
+                continue
+        except (ValueError, LookupError):
+            pass
+        frame = _rare_frame(line[:LINE_MAX])
+        if frame is not None:
+            frames.append(frame)
+        elif line and not line.isspace():
+            bad.append(number)
+    return bad
 
 
 def _rare_frame(line: str) -> Frame | None:

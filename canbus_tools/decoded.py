@@ -32,6 +32,8 @@ class Kind(Enum):
     OTHER = "other"
     """A frame of another protocol."""
 
+    __hash__ = object.__hash__  # as of Direction
+
 
 class Shape(Protocol):
     """Names and text of values."""

@@ -23,7 +23,7 @@ from canbus_tools.protocol import (
     frame_format,
     owner_of,
 )
-from canbus_tools.traffic import NodeTraffic, Way
+from canbus_tools.traffic import NodeTraffic
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, UUID_SIZE
 from nodes.dictionary import BOOTSTRAP, Dictionary
 from nodes.dictionary_parts import OutputFormat
@@ -143,32 +143,18 @@ def _whole(
 # ---------------------------------------------------------------------------------------------------- streams
 
 
-class _Stream:
+class _Stream(BlockStream):
     """One direction of one node's data."""
 
     direction: Direction
 
     def __init__(self, node: NodeTraffic, dictionaries: DictionarySource) -> None:
+        super().__init__(node.to_node if self.direction is Direction.TO_NODE else node.from_node)
         self._node = node
-        self._way: Way = node.to_node if self.direction is Direction.TO_NODE else node.from_node
-        self._blocks = BlockStream()
         self._dictionaries = dictionaries
         self._known = dictionaries.known
         self._dictionary: Dictionary | None = None
         self._shapes: dict[MessageFormat | OutputFormat, AnyShape] = {}
-        self._last = Frame(0.0, 0, b"")
-
-    def feed(self, frame: Frame) -> Sequence[Decoded]:
-        """Take the next frame."""
-        self._way.frames += 1
-        self._way.bytes += len(frame[2])
-        self._last = frame
-        found = self._blocks.feed(frame[2], frame[0])
-        return () if found is None else self._take(found, frame)
-
-    def flush(self) -> Sequence[Decoded]:
-        """End."""
-        return self._take(self._blocks.flush(), self._last)
 
     def _take(self, found: Sequence[bytes], frame: Frame) -> Sequence[Decoded]:
         out: list[Decoded] = []

@@ -67,7 +67,7 @@ class Flow:
         self.repeated_blocks = 0
         """To the node, sent once more."""
         self.missed_blocks = 0
-        """To the node, not seen: numbers that were left out. Multiples of 16 go unnoticed."""
+        """To the node, not seen by the onlooker and yet taken. Multiples of 16 go unnoticed."""
         self.naks = 0
         self.round_trips = RoundTrips()
         self.restart()
@@ -76,6 +76,7 @@ class Flow:
         """Forget where the numbers stand: the node begins anew."""
         self._next: int | None = None
         self._flight: dict[int, float | None] = {}  # in order of sending; None: repeated, tells no round trip
+        self._gaps: dict[int, int] = {}  # by number: how many before it were not seen, if the node takes it
         self._before: list[tuple[bytes, float] | None] = [None] * (SEQUENCE_MASK + 1)
         self._answered: int | None = None
         self._empty: int | None = None
@@ -91,10 +92,10 @@ class Flow:
                 if number in self._flight:
                     self._flight[number] = None
                 return True
-            # An empty block asks a node for its number, and a host takes over the one it is told.
-            known = self._next is not None and number != self._answered and len(block) > EMPTY_SIZE
-            if known and self._next is not None:
-                self.missed_blocks += (number - self._next) & SEQUENCE_MASK
+            if self._next is not None:
+                self._gaps[number] = (number - self._next) & SEQUENCE_MASK
+        elif self._gaps:
+            self._gaps.pop(number, None)
         self._next = (number + 1) & SEQUENCE_MASK
         self._flight.pop(number, None)
         self._flight[number] = now_s
@@ -104,22 +105,46 @@ class Flow:
         """Take a block from the node; tells whether it refuses one (nak) that was sent."""
         following = block[1] & SEQUENCE_MASK
         last = (following - 1) & SEQUENCE_MASK
-        first_answer, self._answered = self._answered is None, following
+        before, self._answered = self._answered, following
         progress = last in self._flight
         if progress:
             sent_s = self._flight[last]
-            while next(iter(self._flight)) != last:
-                del self._flight[next(iter(self._flight))]
-            del self._flight[last]
+            self._acknowledge(last)
             if sent_s is not None:
                 self.round_trips.add(now_s - sent_s)
+        elif self._flight and following not in self._flight and following != before:
+            return self._lose_count(first=before is None, following=following, empty=len(block) == EMPTY_SIZE)
         if len(block) > EMPTY_SIZE:
             return False
-        # A second empty block with the same number refuses what is under way. So does a first one that names
-        # no block that is: the node had another number in mind than a host that just came.
+        # A second empty block with the same number refuses what is under way.
         again, self._empty = self._empty == following, following
-        refused = bool(self._flight) and (again or (first_answer and following not in self._flight))
-        if progress or not refused:
+        if progress or not again or not self._flight:
             return False
         self.naks += 1
+        self._gaps.clear()
+        if following not in self._flight:
+            self._next = None
+            self._flight.clear()
         return True
+
+    def _lose_count(self, *, first: bool, following: int, empty: bool) -> bool:
+        """Take an answer that names no block under way; tells whether it is a nak.
+
+        Either the node had another number in mind than a host that just came, which will go on with the one
+        it is told, or much is missing from the recording.
+        """
+        self._next = None
+        self._flight.clear()
+        self._gaps.clear()
+        if empty:
+            self._empty = following
+        self.naks += first
+        return first
+
+    def _acknowledge(self, last: int) -> None:
+        """Everything up to number LAST was taken."""
+        for number in list(self._flight):
+            del self._flight[number]
+            self.missed_blocks += self._gaps.pop(number, 0)
+            if number == last:
+                break

@@ -20,10 +20,8 @@ from nodes.assign import (
     UUID_SIZE,
     WHO_IS_HERE,
 )
-from nodes.can_bus import BUS_STOP_ID
 from nodes.message_format import CONTENT_MAX
 from nodes.records import record
-from nodes.sync_pulse import SYNC_PULSE
 
 
 class Direction(Enum):
@@ -34,6 +32,8 @@ class Direction(Enum):
     ANY = "any"
     """The host and every node may send it."""
 
+    __hash__ = object.__hash__  # Enum's own is a Python function, and runs thousands of times a second
+
 
 # -------------------------------------------------------------------------------------------------------- ids
 
@@ -42,6 +42,10 @@ DATA_NODEID_MAX: Final = 255
 TRIGGER_ID: Final = 0x020
 TRIGGER_GROUPS: Final = 16
 REQUEST_BOOTLOADER: Final = 0x02
+BUS_STOP_ID: Final = 0x010
+"""As in nodes.can_bus; imported from there it would cost every tool that module's numpy at its start."""
+SYNC_PULSE: Final = 0x40
+"""As in nodes.sync_pulse."""
 
 
 def data_id(nodeid: int, direction: Direction) -> int:
