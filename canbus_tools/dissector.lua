@@ -306,7 +306,16 @@ end
 -- -------------------------------------------------------------------------------------------- flow control
 
 local function new_flow()
-  return { before = {}, flight = {}, order = {} }
+  return { before = {}, order = {} } -- order: numbers under way
+end
+
+local function place_of(list, wanted)
+  for i, value in ipairs(list) do
+    if value == wanted then
+      return i
+    end
+  end
+  return nil
 end
 
 -- Whether a block to the node is a repeat.
@@ -320,39 +329,47 @@ local function sent(flow, block, seq, now_s)
     end
   end
   flow.next = (seq + 1) % 16
-  for i, other in ipairs(flow.order) do
-    if other == seq then
-      table.remove(flow.order, i)
-      break
-    end
+  local flies = place_of(flow.order, seq)
+  if flies then
+    table.remove(flow.order, flies)
   end
   flow.order[#flow.order + 1] = seq
   return false
 end
 
--- Whether a block from the node refuses one that was sent.
+local function lose_count(flow)
+  flow.next = nil
+  flow.order = {}
+end
+
+-- Whether a block from the node refuses one that was sent: an empty block with the number of the one before,
+-- or a first answer that names no block under way, to a host that just came and has to learn the number.
 local function answered(flow, block, seq)
-  local first = flow.answered == nil
+  local before, is_empty = flow.answered, #block == BLOCK_MIN
   flow.answered = seq
-  local progress, expected_flies = false, false
-  for i, other in ipairs(flow.order) do
-    if other == (seq - 1) % 16 then
-      for _ = 1, i do
-        table.remove(flow.order, 1)
-      end
-      progress = true
-      break
+  local acknowledged = place_of(flow.order, (seq - 1) % 16)
+  local flies = place_of(flow.order, seq)
+  if acknowledged then
+    for _ = 1, acknowledged do
+      table.remove(flow.order, 1)
     end
+  elseif #flow.order > 0 and not flies and seq ~= before then
+    lose_count(flow)
+    flow.empty = is_empty and seq or flow.empty
+    return before == nil
   end
-  for _, other in ipairs(flow.order) do
-    expected_flies = expected_flies or other == seq
-  end
-  if #block > BLOCK_MIN then
+  if not is_empty then
     return false
   end
   local again = flow.empty == seq
   flow.empty = seq
-  return #flow.order > 0 and (again or (first and not expected_flies)) and not progress
+  if acknowledged or not again or #flow.order == 0 then
+    return false
+  end
+  if not flies then
+    lose_count(flow)
+  end
+  return true
 end
 
 -- ------------------------------------------------------------------------------------------ what is said

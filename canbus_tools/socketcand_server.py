@@ -100,9 +100,9 @@ class SocketcandServer:
             await writer.drain()
             return
         writer.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        bus_reader, bus_writer = await asyncio.open_unix_connection(self._bus_path)
         self.stats.clients += 1
         self.stats.connected += 1
-        bus_reader, bus_writer = await asyncio.open_unix_connection(self._bus_path)
         client = _Client(SocketcandSession((self.name,)), writer, bus_writer)
         try:
             await client.run(reader, bus_reader)

@@ -174,7 +174,10 @@ def test_parameters_and_frames_of_a_block_can_be_filtered(tmp_path: Path) -> Non
 
 def test_two_buses_in_one_capture_are_kept_apart(tmp_path: Path) -> None:
     """Both have a node with this id, and their frames alternate."""
-    buses = [recorded.frames(start_s=start_s)[:400] for start_s in (1000.0, 1000.00001)]
+    buses = [
+        [frame._replace(time_s=start_s + i * 0.001) for i, frame in enumerate(recorded.frames()[:400])]
+        for start_s in (1000.0, 1000.0005)
+    ]
     dictionary = linux_dictionary()
     tshark = Tshark(tmp_path, {ANY: dictionary})
     tshark.load_buses(buses)

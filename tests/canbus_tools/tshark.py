@@ -56,7 +56,7 @@ class Tshark:
         for number, frames in enumerate(buses):
             paths.append(self._capture.with_name(f"bus{number}.pcap"))
             write_pcap(paths[-1], frames)
-        command = ["mergecap", "-w", str(self._capture), *map(str, paths)]
+        command = ["mergecap", "-I", "none", "-w", str(self._capture), *map(str, paths)]
         subprocess.run(command, check=True, timeout=TIMEOUT_S)
 
     def run(self, *words: str) -> str:
