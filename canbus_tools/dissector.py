@@ -1,7 +1,7 @@
 """``canductor can dissector``: writes a Wireshark dissector of the protocol, in Lua.
 
 Its tables come from ``protocol`` and from the dictionaries given, as the project's own decoder has them; the
-code behind them is ``dissector.lua``. The result is one file that needs nothing else.
+code behind them is in PARTS. The result is one file that needs nothing else.
 """
 
 import argparse
@@ -37,6 +37,8 @@ WIDTHS: Final = {"%u": 32, "%i": 32, "%hu": 16, "%hi": 16, "%c": 8}
 """Bits of a number with this code."""
 _KINDS: Final = {FieldKind.UNSIGNED: "number", FieldKind.HEX: "hex", FieldKind.UUID: "uuid"}
 ANY: Final = "any"
+PARTS: Final = ("dissector_fields.lua", "dissector_read.lua", "dissector_show.lua")
+"""The Lua code, which becomes one file."""
 HEAD: Final = """\
 -- A Wireshark dissector of the protocol that Klipper's firmware and canductor's speak over CAN.
 -- Made by `canductor can dissector`; do not edit it, make it again.
@@ -140,7 +142,8 @@ def _count(dictionaries: Iterable[Dictionary]) -> int:
 
 def dissector(dictionaries: Mapping[int | str, Dictionary]) -> str:
     """Return the dissector with these dictionaries, by node id or ANY."""
-    code = resources.files("canbus_tools").joinpath("dissector.lua").read_text(encoding="utf-8")
+    folder = resources.files("canbus_tools")
+    code = "".join(folder.joinpath(part).read_text(encoding="utf-8") for part in PARTS)
     return f"{HEAD}\nlocal D = {lua(tables(dictionaries))}\n\n{code}"
 
 
