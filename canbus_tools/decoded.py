@@ -113,11 +113,11 @@ class MessageShape:
             if isinstance(value, bytes):
                 words[i] = value.hex()
             elif enumeration is not None and isinstance(value, int):
-                words[i] = _quoted(enumeration.name_of(value)) or value
+                words[i] = quoted(enumeration.name_of(value)) or value
         return self._template % tuple(words)
 
 
-def _quoted(name: str | None) -> str | None:
+def quoted(name: str | None) -> str | None:
     """Show a name as one word; what a terminal would obey is escaped."""
     return name if name is None or _WORD.match(name) else json.dumps(name)
 

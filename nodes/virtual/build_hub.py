@@ -9,6 +9,16 @@ from nodes.native_build import builder
 
 ffibuilder = builder(
     "nodes.virtual._hub",
-    headers=["nodes/can_bits.h", "nodes/virtual/hub.h", "nodes/virtual/hub_loop.h"],
-    sources=["nodes/can_bits.c", "nodes/virtual/hub.c", "nodes/virtual/hub_loop.c"],
+    headers=[
+        "nodes/can_bits.h",
+        "nodes/virtual/hub_faults.h",
+        "nodes/virtual/hub.h",
+        "nodes/virtual/hub_loop.h",
+    ],
+    sources=[
+        "nodes/can_bits.c",
+        "nodes/virtual/hub_faults.c",
+        "nodes/virtual/hub.c",
+        "nodes/virtual/hub_loop.c",
+    ],
 )

@@ -7,6 +7,12 @@
 
 enum { ID_MAX = 0x7FF, DATA_MAX = 8, LENGTH_AT = 4, DATA_AT = 8, OUTPUT_BYTES = HUB_OUTPUT * HUB_RECORD };
 
+// A controller whose transmissions fail so often in a row has its error counter (8 each) at 256: bus-off.
+// It may come back when it has seen the bus free for 128 times 11 bits. An error frame has a flag of 6 to 12
+// bits (here 12: others add their own to the first), a delimiter of 8, and 3 of space behind it.
+enum { ATTEMPTS = 256 / 8, RECOVERY_BITS = 128 * 11, ERROR_BITS = 12 + 8 + 3, UNPROTECTED_BITS = 7 + 3 };
+
+_Static_assert((int)HUB_SENDERS == (int)HUB_CLIENTS, "cffi wants the number itself in both headers");
 _Static_assert((HUB_INPUT & (HUB_INPUT - 1)) == 0, "free-running indices need a power of two");
 _Static_assert((OUTPUT_BYTES & (OUTPUT_BYTES - 1)) == 0, "free-running indices need a power of two");
 
@@ -61,6 +67,11 @@ void hub_init(struct hub *hub, const struct hub_config *config) {
     hub->random = config->seed;
     hub->loss_threshold = (uint64_t)(config->loss * 4294967296.0);
     hub->on_wire = -1;
+    hub_set_rules(hub, NULL, 0, 0);
+}
+
+void hub_set_rules(struct hub *hub, const struct hub_rule *rules, size_t count, uint64_t now_ns) {
+    hub_faults_init(&hub->faults, rules, count, hub->config.seed, now_ns);
 }
 
 int hub_connect(struct hub *hub) {
@@ -101,6 +112,47 @@ void hub_release(struct hub *hub, int client) {
     hub->clients[client].state = HUB_FREE;
 }
 
+// ------------------------------------------------------------------------------------------------- faults
+
+static bool is_connected(const struct hub_client *client) {
+    return client->state == HUB_PRESENT || client->state == HUB_LEAVING;
+}
+
+// What it has waiting is gone; what it has on the wire is cut off.
+static void go_off(struct hub *hub, int i, uint64_t now_ns, uint64_t duration_ns) {
+    struct hub_client *client = &hub->clients[i];
+    uint32_t kept = hub->on_wire == i;
+    hub->aborted = hub->aborted || kept;
+    uint32_t dropped = input_count(client) - kept;
+    client->input_tail = client->input_head + kept;
+    client->attempts = 0;
+    client->repeating = false;
+    hub->counters.unsent += dropped;
+    hub->counters.bus_offs++;
+    if (now_ns + duration_ns > client->off_ns)
+        client->off_ns = now_ns + duration_ns;
+}
+
+// Lets timed rules act whose time is up to NOW_NS; returns whether one did.
+static bool act_in_time(struct hub *hub, uint64_t now_ns) {
+    bool acted = false;
+    for (int i; (i = hub_faults_due(&hub->faults, now_ns)) >= 0; acted = true) {
+        const struct hub_rule *rule = &hub->faults.rules[i];
+        for (int k = 0; k < hub->places; k++)
+            if (is_connected(&hub->clients[k]) && (rule->sender < 0 || rule->sender == k))
+                go_off(hub, k, hub->faults.start_ns + rule->from_ns, rule->time_ns);
+    }
+    return acted;
+}
+
+// The verdict on a frame of CLIENT by rules of these kinds; usually there are none.
+static struct hub_verdict judge(struct hub *hub, uint32_t kinds, int client, const uint8_t *record,
+                                uint64_t now_ns) {
+    if (!(hub->faults.kinds & kinds))
+        return (struct hub_verdict){0};
+    return hub_faults_judge(&hub->faults, kinds, client, record_id(record), record[LENGTH_AT], now_ns);
+}
+
 // ------------------------------------------------------------------------------------------------- input
 
 size_t hub_room(const struct hub *hub, int client) {
@@ -108,21 +160,30 @@ size_t hub_room(const struct hub *hub, int client) {
     return (HUB_INPUT - input_count(from)) * HUB_RECORD - from->partial_size;
 }
 
-static void take_record(struct hub *hub, struct hub_client *from, uint64_t ready_ns) {
+static void take_record(struct hub *hub, int client, uint64_t ready_ns) {
+    struct hub_client *from = &hub->clients[client];
     if (!is_frame(from->partial)) {
         from->counters.rejected++;
         hub->counters.rejected++;
         return;
     }
+    if (ready_ns < from->off_ns) {
+        hub->counters.unsent++;
+        return;
+    }
+    uint64_t delay_ns = judge(hub, 1u << HUB_DELAY, client, from->partial, ready_ns).delay_ns;
+    hub->counters.delayed += delay_ns > 0;
     struct hub_frame *frame = &from->input[from->input_tail++ % HUB_INPUT];
-    frame->ready_ns = ready_ns;
+    frame->ready_ns = ready_ns + delay_ns;
     copy_frame(frame->record, from->partial);
 }
 
 void hub_receive(struct hub *hub, int client, const uint8_t *data, size_t size, uint64_t now_ns) {
     struct hub_client *from = &hub->clients[client];
-    if (from->state != HUB_PRESENT && from->state != HUB_LEAVING)
+    if (!is_connected(from))
         return;
+    if (hub->faults.next_off_ns <= now_ns) // what it had sent before it goes off, or comes back, is another's
+        hub_run(hub, now_ns);
     // What had no room last time was ready then: it must not lose its place because of a late reader.
     uint64_t ready_ns = from->backlog_ns ? from->backlog_ns : now_ns;
     bool fills = size == hub_room(hub, client);
@@ -135,7 +196,7 @@ void hub_receive(struct hub *hub, int client, const uint8_t *data, size_t size, 
         size -= part;
         if (from->partial_size == HUB_RECORD) {
             from->partial_size = 0;
-            take_record(hub, from, ready_ns);
+            take_record(hub, client, ready_ns);
         }
     }
     from->backlog_ns = fills ? now_ns : 0;
@@ -152,7 +213,7 @@ static uint32_t next_random(struct hub *hub) {
 }
 
 static bool takes_part(const struct hub_client *client) {
-    return (client->state == HUB_PRESENT || client->state == HUB_LEAVING) && input_count(client) > 0;
+    return is_connected(client) && input_count(client) > 0;
 }
 
 // When the next frame can start, or HUB_NEVER.
@@ -207,6 +268,11 @@ static bool all_have_room(struct hub *hub, int sender, uint64_t now_ns) {
 static void start_frame(struct hub *hub, int client, uint64_t start_ns) {
     const uint8_t *record = input_head(&hub->clients[client])->record;
     uint32_t bits = can_frame_bits(record_id(record), record[LENGTH_AT], record + DATA_AT);
+    struct hub_verdict verdict = judge(hub, 1u << HUB_ERROR, client, record, start_ns);
+    hub->fails = verdict.error;
+    hub->aborted = false;
+    if (hub->fails)
+        bits = 1 + (uint32_t)((uint64_t)verdict.error_at * (bits - UNPROTECTED_BITS) >> 32) + ERROR_BITS;
     uint64_t duration_ns = 0;
     if (hub->config.bitrate) {
         // The rest of the division is carried on, so that no rate drifts by its rounding.
@@ -217,58 +283,120 @@ static void start_frame(struct hub *hub, int client, uint64_t start_ns) {
     }
     hub->on_wire = hub->last_winner = client;
     hub->free_ns = start_ns + duration_ns;
-    hub->counters.frames++;
+    hub->counters.frames += !hub->fails;
     hub->counters.bits += bits;
     hub->counters.busy_ns += duration_ns;
 }
 
+// Sends the frame to everybody else but those whom the verdict or their being off spares.
+static void deliver(struct hub *hub, const uint8_t *record, const struct hub_verdict *verdict) {
+    uint8_t corrupted[HUB_RECORD];
+    memcpy(corrupted, record, HUB_RECORD);
+    corrupted[DATA_AT + verdict->corrupt_bit / 8] ^= (uint8_t)(0x80 >> verdict->corrupt_bit % 8);
+    bool changed = false;
+    for (int i = 0; i < hub->places; i++) {
+        struct hub_client *client = &hub->clients[i];
+        if (i == hub->on_wire || client->state != HUB_PRESENT)
+            continue;
+        bool corrupt = verdict->corrupt_to >> i & 1;
+        if (client->off_ns > hub->free_ns)
+            hub->counters.unheard++;
+        else if (verdict->lost_to >> i & 1)
+            hub->counters.lost_copies++;
+        else
+            output_push(client, corrupt ? corrupted : record);
+        changed = changed || corrupt;
+    }
+    hub->counters.corrupted += changed;
+}
+
+// The head of the sender's queue reached its last bit; returns whether it has been sent.
+static bool complete_frame(struct hub *hub, struct hub_client *sender) {
+    const uint8_t *record = input_head(sender)->record;
+    uint32_t kinds = 1u << HUB_LOSE | 1u << HUB_CORRUPT | 1u << HUB_BUS_OFF;
+    if (!sender->repeating)
+        kinds |= 1u << HUB_DUPLICATE;
+    struct hub_verdict verdict = judge(hub, kinds, hub->on_wire, record, hub->free_ns);
+    if (verdict.off_ns > 0) {
+        go_off(hub, hub->on_wire, hub->free_ns, verdict.off_ns);
+        return false;
+    }
+    sender->attempts = 0;
+    sender->counters.sent++;
+    if (next_random(hub) < hub->loss_threshold || verdict.lost_to == HUB_EVERYONE) {
+        hub->counters.lost++;
+        return true;
+    }
+    deliver(hub, record, &verdict);
+    sender->repeating = verdict.duplicate;
+    hub->counters.duplicated += sender->repeating;
+    return !sender->repeating;
+}
+
+static uint64_t recovery_ns(const struct hub *hub) {
+    return hub->config.bitrate ? RECOVERY_BITS * NS_PER_S / hub->config.bitrate : 0;
+}
+
 static void end_frame(struct hub *hub) {
     struct hub_client *sender = &hub->clients[hub->on_wire];
-    const uint8_t *record = input_head(sender)->record;
-    sender->counters.sent++;
-    if (next_random(hub) < hub->loss_threshold) {
-        hub->counters.lost++;
-    } else {
-        for (int i = 0; i < hub->places; i++)
-            if (i != hub->on_wire && hub->clients[i].state == HUB_PRESENT)
-                output_push(&hub->clients[i], record);
+    bool sent = false;
+    if (hub->fails && !hub->aborted) {
+        hub->counters.errors++;
+        if (++sender->attempts == ATTEMPTS)
+            go_off(hub, hub->on_wire, hub->free_ns, recovery_ns(hub));
+    } else if (!hub->aborted) {
+        sent = complete_frame(hub, sender);
     }
-    sender->input_head++;
+    if (hub->aborted) {
+        hub->counters.unsent++;
+        hub->counters.frames -= !hub->fails;
+    }
+    sender->input_head += sent || hub->aborted;
     hub->on_wire = -1;
+}
+
+static uint64_t earlier(uint64_t a_ns, uint64_t b_ns) {
+    return a_ns < b_ns ? a_ns : b_ns;
 }
 
 void hub_run(struct hub *hub, uint64_t now_ns) {
     for (;;) {
         if (hub->on_wire >= 0) {
+            act_in_time(hub, earlier(hub->free_ns, now_ns));
             if (hub->free_ns > now_ns)
                 return;
             end_frame(hub);
         }
         uint64_t start_ns = next_start(hub);
+        if (act_in_time(hub, earlier(start_ns, now_ns)))
+            continue; // perhaps what was to start is gone
         if (start_ns > now_ns)
             return;
         int winner = arbitrate(hub, start_ns);
-        if (!all_have_room(hub, winner, now_ns))
+        if (!all_have_room(hub, winner, now_ns)) {
+            if (act_in_time(hub, now_ns)) // the bus stands still, time does not
+                continue;
             return;
+        }
         // Expelling someone may have moved the time at which the bus was free.
         start_frame(hub, winner, start_ns > hub->free_ns ? start_ns : hub->free_ns);
     }
 }
 
 uint64_t hub_deadline(const struct hub *hub) {
+    uint64_t off_ns = hub->faults.next_off_ns;
     if (hub->on_wire >= 0)
-        return hub->free_ns;
+        return earlier(hub->free_ns, off_ns);
     uint64_t start_ns = next_start(hub);
     if (start_ns == HUB_NEVER)
-        return HUB_NEVER;
+        return off_ns;
     uint64_t expel_ns = HUB_NEVER;
     for (int i = 0; i < hub->places; i++) {
         const struct hub_client *client = &hub->clients[i];
-        if (client->state == HUB_PRESENT && client->stuck_ns &&
-            client->stuck_ns + hub->config.stuck_limit_ns < expel_ns)
-            expel_ns = client->stuck_ns + hub->config.stuck_limit_ns;
+        if (client->state == HUB_PRESENT && client->stuck_ns)
+            expel_ns = earlier(expel_ns, client->stuck_ns + hub->config.stuck_limit_ns);
     }
-    return expel_ns == HUB_NEVER ? start_ns : expel_ns;
+    return earlier(expel_ns == HUB_NEVER ? start_ns : expel_ns, off_ns);
 }
 
 // ------------------------------------------------------------------------------------------------- output

@@ -9,10 +9,12 @@
 // pass. The head of each client's queue takes part in arbitration; the lowest id wins, equals take turns. The
 // winner keeps the bus busy for its true length, then reaches all other clients at once.
 //
-// Nothing is lost unless `loss` says so: a client that does not read stops the bus (a real one would lose
-// frames), and after `stuck_limit_ns` of that it is expelled.
+// Nothing is lost unless `loss` or a fault (hub_faults.h) says so: a client that does not read stops the bus
+// (a real one would lose frames), and after `stuck_limit_ns` of that it is expelled.
 #ifndef VIRTUAL_HUB_H
 #define VIRTUAL_HUB_H
+
+#include "nodes/virtual/hub_faults.h"
 
 #include <stdbool.h>
 #include <stddef.h>
@@ -24,7 +26,7 @@ enum { HUB_RECORD = 16, HUB_CLIENTS = 64, HUB_INPUT = 256, HUB_OUTPUT = 1024 };
 struct hub_config {
     uint32_t bitrate;        // bit/s; 0: frames take no time
     double loss;             // 0..1: the share of frames that reach nobody
-    uint64_t seed;           // of the losses: same seed, same frames
+    uint64_t seed;           // of the losses and faults: same seed, same frames
     uint64_t stuck_limit_ns; // how long one client may stop the bus
 };
 
@@ -36,6 +38,15 @@ struct hub_counters {
     uint64_t rejected; // records that were no frame of this bus
     uint64_t expelled; // clients that had stopped the bus for too long
     uint64_t refused;  // clients beyond HUB_CLIENTS
+    // By rules, on purpose:
+    uint64_t lost_copies; // that single receivers did not get
+    uint64_t corrupted;   // frames that someone got with a bit changed
+    uint64_t duplicated;  // frames that went over the bus once more, although all had got them
+    uint64_t errors;      // attempts destroyed by an error frame; `bits` and `busy_ns` hold what they took
+    uint64_t delayed;     // frames
+    uint64_t bus_offs;    // times that a client left the bus
+    uint64_t unsent;      // frames of clients that were off
+    uint64_t unheard;     // frames times clients that were off
 };
 
 struct hub_client_counters {
@@ -65,6 +76,9 @@ struct hub_client {
     uint8_t partial[HUB_RECORD];
     uint64_t backlog_ns; // not 0: input was full at this time, so what comes next was ready since then
     uint64_t stuck_ns;   // not 0: since when this client stops the bus
+    uint64_t off_ns;     // until when it is off the bus
+    uint32_t attempts;   // that failed in a row
+    bool repeating;      // its head has been delivered, and it does not know
     uint32_t input_head, input_tail;   // frames; free-running, as the queues are powers of two
     uint32_t output_head, output_tail; // bytes
     struct hub_frame input[HUB_INPUT];
@@ -77,15 +91,21 @@ struct hub {
     uint64_t random;
     uint64_t loss_threshold; // of 2^32
     int on_wire;             // the client whose head is being sent, or -1
+    bool fails;              // what is on the wire ends in an error frame
+    bool aborted;            // its sender went off the bus
     int last_winner;
     int places;         // clients[places] and all behind have never been used
     uint64_t free_ns;   // when the bus is or was free for the next frame
     uint64_t bit_carry; // part of a nanosecond by which free_ns is early, in 1/bitrate
     struct hub_counters counters;
+    struct hub_faults faults;
     struct hub_client clients[HUB_CLIENTS];
 };
 
 void hub_init(struct hub *hub, const struct hub_config *config);
+
+// From now on these rules hold, and no earlier ones; there are none at first.
+void hub_set_rules(struct hub *hub, const struct hub_rule *rules, size_t count, uint64_t now_ns);
 
 // Returns the new client's number, or -1 (and counts) when all places are taken.
 int hub_connect(struct hub *hub);

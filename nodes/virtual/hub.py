@@ -16,6 +16,7 @@ import socket
 import stat
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +24,7 @@ from typing import Any, Self
 
 from nodes.errors import CanductorError
 from nodes.virtual._hub import ffi, lib
+from nodes.virtual.faults import RULES_MAX, Fault
 
 STUCK_LIMIT_S = 2.0
 """How long a client may stop the bus by not reading before it is disconnected."""
@@ -48,15 +50,25 @@ class ClientStats:
 
 
 @dataclass(frozen=True, slots=True)
+class FaultStats:
+    """What one rule did."""
+
+    picked: int
+    """Frames it looked at."""
+    hits: int
+    """Of these; of a timed bus-off: how often it happened."""
+
+
+@dataclass(frozen=True, slots=True)
 class BusStats:
     """Counters of a bus since its start."""
 
     frames: int
-    """Frames that went over the bus, lost ones included."""
+    """Frames that went over the bus, lost ones and repetitions included."""
     bits: int
-    """Their true length, stuff bits and interframe space included."""
+    """Their true length, stuff bits and interframe space included, and the length of error frames."""
     lost: int
-    """Frames taken away by the asked-for loss."""
+    """Frames taken away from everybody on purpose."""
     busy_ns: int
     """Time in which the bus was taken."""
     rejected: int
@@ -65,20 +77,38 @@ class BusStats:
     """Clients disconnected because they had stopped the bus for too long."""
     refused: int
     """Connections beyond the 64 places."""
+    lost_copies: int
+    """Frames that single receivers did not get, on purpose."""
+    corrupted: int
+    """Frames that someone got with a bit changed."""
+    duplicated: int
+    """Frames that went over the bus once more although all had got them."""
+    errors: int
+    """Attempts that ended in an error frame."""
+    delayed: int
+    """Frames that came later than their sender wanted."""
+    bus_offs: int
+    """Times that a client left the bus and came back."""
+    unsent: int
+    """Frames that clients wanted to send while they were off, or had waiting."""
+    unheard: int
+    """Frames times clients that did not hear them because they were off."""
     late_ns_max: int
     """The latest the bus ever woke for the end of a frame."""
     realtime: bool
     """Whether the bus was granted real-time priority; without, more latency jitter is to be expected."""
     clients: tuple[ClientStats, ...]
     """Who is connected now."""
+    faults: tuple[FaultStats, ...]
+    """What each rule did since it was set."""
 
 
 class VirtualBus:
     """A virtual CAN bus at the Unix socket PATH.
 
     ``bitrate`` in bit/s, or None for frames that take no time. ``loss`` (0..1) is the share of frames that
-    reach nobody; which ones is decided by ``seed``. ``stuck_limit_s``: see STUCK_LIMIT_S. Use it as a context
-    manager, or call start() and close(); methods are for one thread.
+    reach nobody; which ones is decided by ``seed``, as for the ``faults``. ``stuck_limit_s``: see
+    STUCK_LIMIT_S. Use it as a context manager, or call start() and close(); methods are for one thread.
     """
 
     def __init__(
@@ -88,6 +118,7 @@ class VirtualBus:
         bitrate: int | None = 1_000_000,
         loss: float = 0.0,
         seed: int = 0,
+        faults: Sequence[Fault] = (),
         stuck_limit_s: float = STUCK_LIMIT_S,
     ) -> None:
         """Check the arguments; raises CanductorError. Nothing happens before start()."""
@@ -115,12 +146,38 @@ class VirtualBus:
             "seed": seed % 2**64,
             "stuck_limit_ns": int(stuck_limit_s * 1e9),
         }
+        self._faults = self._checked(faults)
         self._listener: socket.socket | None = None
         self._inode = 0
         self._loop = ffi.NULL
         self._thread: threading.Thread | None = None
         self._final: BusStats | None = None
         self._error = 0
+
+    def _checked(self, faults: Sequence[Fault]) -> tuple[Fault, ...]:
+        if len(faults) > RULES_MAX:
+            raise CanductorError(
+                f"virtual bus {self.path}: {len(faults)} faults are more than the {RULES_MAX} it can have"
+            )
+        return tuple(faults)
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """The rules that hold now."""
+        return self._faults
+
+    def set_faults(self, faults: Sequence[Fault]) -> None:
+        """Let these rules, and no others, hold from now on; raises CanductorError if there are too many.
+
+        Their times count from now, and so do their figures.
+        """
+        self._faults = self._checked(faults)
+        if self._loop != ffi.NULL:
+            self._set_rules()
+
+    def _set_rules(self) -> None:
+        rules: Any = ffi.new("struct hub_rule[]", [fault.to_c() for fault in self._faults])
+        lib.hub_loop_set_rules(self._loop, rules, len(self._faults))
 
     @property
     def address(self) -> str:
@@ -143,6 +200,8 @@ class VirtualBus:
             reason = os.strerror(ffi.errno)
             self._close_listener()
             raise CanductorError(f"virtual bus {self.path}: cannot start: {reason}")
+        if self._faults:
+            self._set_rules()
         self._thread = threading.Thread(target=self._run, name=f"virtual bus {self.path}", daemon=True)
         self._thread.start()
         return self
@@ -157,7 +216,7 @@ class VirtualBus:
             return self._final
         if self._loop == ffi.NULL:
             raise CanductorError(f"virtual bus {self.path}: not started, so it has no figures yet")
-        return _read_stats(self._loop)
+        return _read_stats(self._loop, len(self._faults))
 
     def close(self) -> None:
         """Disconnect everybody and remove the socket; doing it again is harmless.
@@ -169,7 +228,7 @@ class VirtualBus:
         lib.hub_loop_stop(self._loop)
         self._thread.join()
         self._thread = None
-        self._final = _read_stats(self._loop)
+        self._final = _read_stats(self._loop, len(self._faults))
         lib.hub_loop_free(self._loop)
         self._loop = ffi.NULL
         self._close_listener()
@@ -193,7 +252,7 @@ class VirtualBus:
         self.close()
 
 
-def _read_stats(loop: object) -> BusStats:
+def _read_stats(loop: object, fault_count: int) -> BusStats:
     report: Any = ffi.new("struct hub_report *")
     lib.hub_loop_report(loop, report)
     counters = report.counters
@@ -205,12 +264,21 @@ def _read_stats(loop: object) -> BusStats:
         rejected=counters.rejected,
         expelled=counters.expelled,
         refused=counters.refused,
+        lost_copies=counters.lost_copies,
+        corrupted=counters.corrupted,
+        duplicated=counters.duplicated,
+        errors=counters.errors,
+        delayed=counters.delayed,
+        bus_offs=counters.bus_offs,
+        unsent=counters.unsent,
+        unheard=counters.unheard,
         late_ns_max=report.late_ns_max,
         realtime=report.realtime,
         clients=tuple(
             ClientStats(c.place, c.counters.sent, c.counters.received, c.counters.rejected)
             for c in report.clients[0 : report.client_count]
         ),
+        faults=tuple(FaultStats(rule.picked, rule.hits) for rule in report.rules[0:fault_count]),
     )
 
 

@@ -7,14 +7,15 @@
 #include <poll.h>
 #include <pthread.h>
 #include <stdlib.h>
+#include <string.h>
 #include <sys/eventfd.h>
 #include <sys/prctl.h>
 #include <sys/socket.h>
 #include <time.h>
 #include <unistd.h>
 
-// Places in the poll set: the stop event, the listening socket, then the clients.
-enum { AT_STOP, AT_LISTEN, AT_CLIENTS, POLL_SIZE = AT_CLIENTS + HUB_CLIENTS };
+// Places in the poll set: the event that wakes the thread, the listening socket, then the clients.
+enum { AT_WAKE, AT_LISTEN, AT_CLIENTS, POLL_SIZE = AT_CLIENTS + HUB_CLIENTS };
 
 enum { REALTIME_PRIORITY = 10 };
 
@@ -22,13 +23,15 @@ static const uint64_t NS_PER_S = 1000000000;
 // Without file descriptors, connections wait; trying at once again would only burn time.
 static const uint64_t ACCEPT_PAUSE_NS = 100000000;
 
+_Static_assert(HUB_RULES == sizeof(((struct hub_report *)0)->rules) / sizeof(struct hub_rule_counters),
+               "cffi wants the number itself in hub_loop.h");
 _Static_assert(HUB_CLIENTS == sizeof(((struct hub_report *)0)->clients) / sizeof(struct hub_client_report),
                "cffi wants the number itself in hub_loop.h");
 
 struct hub_loop {
-    pthread_mutex_t mutex; // over all below but stop_fd; free while the thread sleeps
-    int stop_fd, listen_fd;
-    bool realtime;
+    pthread_mutex_t mutex; // over all below but wake_fd; free while the thread sleeps
+    int wake_fd, listen_fd;
+    bool realtime, stopping;
     uint64_t late_ns_max;
     uint64_t accept_ns; // earliest time of the next accept()
     int fds[HUB_CLIENTS];
@@ -48,8 +51,8 @@ struct hub_loop *hub_loop_new(int listen_fd, const struct hub_config *config) {
     if (!loop)
         return NULL;
     loop->listen_fd = listen_fd;
-    loop->stop_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
-    if (loop->stop_fd < 0) {
+    loop->wake_fd = eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK);
+    if (loop->wake_fd < 0) {
         free(loop);
         return NULL;
     }
@@ -64,13 +67,23 @@ void hub_loop_free(struct hub_loop *loop) {
     for (int i = 0; i < HUB_CLIENTS; i++)
         if (loop->fds[i] >= 0)
             close(loop->fds[i]);
-    close(loop->stop_fd);
+    close(loop->wake_fd);
     pthread_mutex_destroy(&loop->mutex);
     free(loop);
 }
 
 void hub_loop_stop(struct hub_loop *loop) {
-    eventfd_write(loop->stop_fd, 1);
+    pthread_mutex_lock(&loop->mutex);
+    loop->stopping = true;
+    pthread_mutex_unlock(&loop->mutex);
+    eventfd_write(loop->wake_fd, 1);
+}
+
+void hub_loop_set_rules(struct hub_loop *loop, const struct hub_rule *rules, size_t count) {
+    pthread_mutex_lock(&loop->mutex);
+    hub_set_rules(&loop->hub, rules, count, monotonic_ns());
+    pthread_mutex_unlock(&loop->mutex);
+    eventfd_write(loop->wake_fd, 1); // a rule may want to act sooner than the thread would wake
 }
 
 // ------------------------------------------------------------------------------------------------- sockets
@@ -146,7 +159,7 @@ static uint64_t fill_poll_set(const struct hub_loop *loop, struct pollfd *set, u
     bool accepting = now_ns >= loop->accept_ns;
     if (!accepting && loop->accept_ns < wake_ns)
         wake_ns = loop->accept_ns;
-    set[AT_STOP] = (struct pollfd){.fd = loop->stop_fd, .events = POLLIN};
+    set[AT_WAKE] = (struct pollfd){.fd = loop->wake_fd, .events = POLLIN};
     set[AT_LISTEN] = (struct pollfd){.fd = accepting ? loop->listen_fd : -1, .events = POLLIN};
     for (int i = 0; i < HUB_CLIENTS; i++) {
         short events = loop->fds[i] >= 0 ? client_events(loop, i) : 0;
@@ -167,6 +180,9 @@ static int wait_for_work(struct pollfd *set, uint64_t now_ns, uint64_t wake_ns) 
 // Reads come first, then new connections: whoever was connected before a frame was sent gets that frame.
 static void work(struct hub_loop *loop, const struct pollfd *set, uint64_t now_ns) {
     struct hub *hub = &loop->hub;
+    eventfd_t woken;
+    if (set[AT_WAKE].revents)
+        eventfd_read(loop->wake_fd, &woken);
     for (int i = 0; i < HUB_CLIENTS; i++) {
         short events = set[AT_CLIENTS + i].revents;
         if (events & POLLIN)
@@ -209,7 +225,7 @@ int hub_loop_run(struct hub_loop *loop) {
             loop->late_ns_max = now_ns - wake_ns;
         if (error == 0)
             work(loop, set, now_ns);
-    } while (error == 0 && !set[AT_STOP].revents);
+    } while (error == 0 && !loop->stopping);
     pthread_mutex_unlock(&loop->mutex);
     return error;
 }
@@ -217,6 +233,7 @@ int hub_loop_run(struct hub_loop *loop) {
 void hub_loop_report(struct hub_loop *loop, struct hub_report *report) {
     pthread_mutex_lock(&loop->mutex);
     report->counters = loop->hub.counters;
+    memcpy(report->rules, loop->hub.faults.counters, sizeof(report->rules));
     report->late_ns_max = loop->late_ns_max;
     report->realtime = loop->realtime;
     report->client_count = 0;

@@ -16,8 +16,9 @@ struct hub_client_report {
 
 struct hub_report {
     struct hub_counters counters;
-    uint64_t late_ns_max; // the latest the thread ever woke for the end of a frame
-    bool realtime;        // whether the thread was granted real-time priority
+    struct hub_rule_counters rules[32]; // HUB_RULES; as many as were set
+    uint64_t late_ns_max;               // the latest the thread ever woke for the end of a frame
+    bool realtime;                      // whether the thread was granted real-time priority
     int32_t client_count;
     struct hub_client_report clients[64]; // HUB_CLIENTS
 };
@@ -31,6 +32,9 @@ int hub_loop_run(struct hub_loop *loop);
 
 // Makes hub_loop_run() return; from any thread.
 void hub_loop_stop(struct hub_loop *loop);
+
+// From now on these rules of hub_faults.h hold, and no earlier ones; from any thread, also before the run.
+void hub_loop_set_rules(struct hub_loop *loop, const struct hub_rule *rules, size_t count);
 
 // The figures up to now; from any thread.
 void hub_loop_report(struct hub_loop *loop, struct hub_report *report);

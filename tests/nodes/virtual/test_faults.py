@@ -1,0 +1,118 @@
+"""Faults of the virtual bus with real sockets; what each kind does is tested in test_hub_faults.c."""
+
+import contextlib
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from nodes.errors import CanductorError
+from nodes.transport.frame import RECORD_SIZE, CanFrame
+from nodes.virtual.faults import RULES_MAX, Fault, FaultKind
+from nodes.virtual.hub import FaultStats, VirtualBus
+
+WAIT_S = 20.0
+END = CanFrame(0x7FF).to_record()
+
+
+@contextlib.contextmanager
+def client(bus: VirtualBus) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
+        sock.connect(str(bus.path))
+        sock.settimeout(WAIT_S)
+        yield sock
+
+
+def numbered(can_id: int, number: int) -> bytes:
+    return CanFrame(can_id, number.to_bytes(8)).to_record()
+
+
+def read_to_end(sock: socket.socket) -> list[bytes]:
+    """All records up to the first with the id 7FF."""
+    records: list[bytes] = []
+    while not records or records[-1] != END:
+        records.append(sock.recv(RECORD_SIZE, socket.MSG_WAITALL))
+    return records[:-1]
+
+
+def heard(folder: Path, seed: int, faults: list[Fault]) -> list[bytes]:
+    with (
+        VirtualBus(folder / "bus", bitrate=None, seed=seed, faults=faults) as bus,
+        client(bus) as sender,
+        client(bus) as listener,
+    ):
+        sender.sendall(b"".join(numbered(0x123, number) for number in range(900)) + END)
+        return read_to_end(listener)
+
+
+def test_the_same_seed_hits_the_same_frames(tmp_path: Path) -> None:
+    faults = [
+        Fault(kind=FaultKind.LOSE, share=0.1, can_id=0x123, mask=0x7FF),
+        Fault(kind=FaultKind.CORRUPT, share=0.1),
+        Fault(kind=FaultKind.DUPLICATE, share=0.1),
+    ]
+    first = heard(tmp_path, 1, faults)
+    assert heard(tmp_path, 1, faults) == first
+    assert heard(tmp_path, 2, faults) != first
+    good = {numbered(0x123, number) for number in range(900)}
+    assert 40 < len([record for record in first if record not in good]) < 160
+
+
+def test_rules_can_change_while_the_bus_runs_and_count_for_themselves(tmp_path: Path) -> None:
+    with VirtualBus(tmp_path / "bus", bitrate=None) as bus, client(bus) as sender, client(bus) as listener:
+        sender.sendall(numbered(1, 1) + END)
+        assert read_to_end(listener) == [numbered(1, 1)]
+        assert not bus.stats.faults
+        bus.set_faults([Fault(kind=FaultKind.LOSE, can_id=1, mask=0x7FF)])
+        sender.sendall(numbered(1, 2) + numbered(2, 3) + END)
+        assert read_to_end(listener) == [numbered(2, 3)]
+        assert bus.stats.faults == (FaultStats(picked=1, hits=1),)
+        bus.set_faults([])
+        sender.sendall(numbered(1, 4) + END)
+        assert read_to_end(listener) == [numbered(1, 4)]
+        assert bus.stats.lost == 1
+
+
+def test_bus_off_begins_without_any_traffic(tmp_path: Path) -> None:
+    """The thread sleeps without a deadline when the rule comes: it has to be woken."""
+    with VirtualBus(tmp_path / "bus", bitrate=None) as bus, client(bus) as sender, client(bus) as listener:
+        sender.sendall(END)
+        assert read_to_end(listener) == []
+        off = Fault(kind=FaultKind.BUS_OFF, timed=True, sender=0, time_s=1000.0)
+        bus.set_faults([off])
+        while bus.stats.bus_offs == 0:
+            pass
+        sender.sendall(numbered(1, 1))
+        while bus.stats.unsent == 0:
+            pass
+        listener.sendall(END)
+        while bus.stats.unheard == 0:
+            pass
+        assert bus.stats.frames == 2
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"kind": FaultKind.LOSE, "share": 1.5}, "fault lose: share 1.5 is not between 0 and 1"),
+        ({"kind": FaultKind.LOSE, "can_id": 0x800}, "fault lose: id 2048 is not between 0 and 2047"),
+        ({"kind": FaultKind.LOSE, "nth": 0}, "fault lose: frame 0 is not between 1"),
+        ({"kind": FaultKind.LOSE, "sender": 64}, "fault lose: sender 64 is not between 0 and 63"),
+        ({"kind": FaultKind.LOSE, "from_s": 2, "until_s": 1}, "fault lose: end 1 is not between 2"),
+        ({"kind": FaultKind.DELAY, "time_s": -1}, "fault delay: time -1 is not between 0"),
+        ({"kind": FaultKind.DELAY, "receiver": 1}, "only a loss or corruption can hit a single receiver"),
+        ({"kind": FaultKind.BUS_OFF}, "fault bus_off: needs to last for some time"),
+        ({"kind": FaultKind.LOSE, "timed": True}, "only bus-off can happen without a frame"),
+    ],
+)
+def test_impossible_faults_are_refused(fields: dict[str, object], said: str) -> None:
+    with pytest.raises(CanductorError, match=said):
+        Fault(**fields)  # type: ignore[arg-type]
+
+
+def test_too_many_faults_are_refused(tmp_path: Path) -> None:
+    bus = VirtualBus(tmp_path / "bus", faults=[Fault(kind=FaultKind.LOSE)] * RULES_MAX)
+    with pytest.raises(CanductorError, match="33 faults are more than the 32 it can have"):
+        bus.set_faults([Fault(kind=FaultKind.LOSE)] * (RULES_MAX + 1))
+    assert len(bus.faults) == RULES_MAX
