@@ -12,6 +12,7 @@ ffibuilder = builder(
     headers=["coordinator/motion/trapezoid.h", "coordinator/motion/steps.h"],
     sources=[
         "coordinator/motion/steps.c",
+        "coordinator/motion/step_change.c",
         "coordinator/motion/step_times.c",
         "coordinator/motion/step_axes.c",
         "coordinator/motion/step_smooth.c",
