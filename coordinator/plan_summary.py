@@ -12,7 +12,13 @@ from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.pipeline import Pipeline
 from coordinator.plan_figures import Bus, Peak, PlanFigures, WatchedNode
 from coordinator.plan_report import AxisReport, BusReport, NodeReport, PlanReport, StepperReport, Timeline
-from coordinator.plan_warnings import CEILING, bus_warnings, queue_warnings, step_rate_warnings
+from coordinator.plan_warnings import (
+    CEILING,
+    bus_warnings,
+    queue_warnings,
+    slowed_warnings,
+    step_rate_warnings,
+)
 from nodes.errors import CanductorError
 from nodes.records import record
 
@@ -76,6 +82,7 @@ class Made:
             steppers=steppers,
             nodes=nodes,
             buses=bus_reports,
+            slowed=self.pipeline.planner.slowed,
             timeline=Timeline(
                 bin_s=self.figures.bin_s,
                 speed_mm_s=_rounded(self.figures.speeds()),
@@ -155,6 +162,7 @@ class Made:
     ) -> list[str]:
         program = self.pipeline.job.program.name
         warnings = [*bus_warnings(program, buses), *queue_warnings(program, nodes)]
+        warnings += slowed_warnings(program, self.pipeline.planner.slowed)
         for index, stream in enumerate(self.streams):
             together = self._busiest(self.figures.node_steps(index))
             mine = [s for s in steppers if s.node == stream.name]

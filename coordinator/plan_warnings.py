@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
+from coordinator.motion.planner_values import Slowed
 from coordinator.plan_figures import Peak
 from coordinator.plan_report import BusReport, NodeReport, StepperReport
 
@@ -31,6 +32,17 @@ def queue_warnings(program: str, nodes: Sequence[NodeReport]) -> Iterator[str]:
                 f"{program}: node {node.name} gets {node.late_slots:,} commands before one of its "
                 f"{node.move_count:,} queue slots is free for them; lower speed or microsteps"
             )
+
+
+def slowed_warnings(program: str, slowed: Sequence[Slowed]) -> Iterator[str]:
+    """Name each limit that makes moves slower than the program asks."""
+    for s in slowed:
+        many = f"from here on {s.moves:,} moves ask for more speed than {s.limit} allows, line {s.worst_line}"
+        one = f"one move asks for more speed than {s.limit} allows,"
+        yield (
+            f"{program}:{s.first_line}: {many if s.moves > 1 else one} for {s.asked_mm_s:,.1f} mm/s where "
+            f"{s.allowed_mm_s:,.1f} are made; lower F, or the print takes longer than its slicer thinks"
+        )
 
 
 def step_rate_warnings(

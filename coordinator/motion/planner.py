@@ -11,10 +11,12 @@ from typing import Any
 
 from coordinator.motion._planner import ffi, lib
 from coordinator.motion.planner_values import (
+    SPEED_LIMITS,
     Fault,
     FaultKind,
     Feed,
     FeedStatus,
+    Slowed,
     Trapezoids,
     check_limits,
     check_number,
@@ -32,6 +34,7 @@ __all__ = [
     "FeedStatus",
     "Planner",
     "Position",
+    "Slowed",
     "Trapezoids",
 ]
 
@@ -378,6 +381,15 @@ class Planner:
     def moves_dropped(self) -> int:
         """Moves shorter than 1 nm, which were dropped."""
         return int(self._core.moves_dropped)
+
+    @property
+    def slowed(self) -> tuple[Slowed, ...]:
+        """Moves that the limits made slower than they asked for, by limit; without those that did not."""
+        return tuple(
+            Slowed(name, s.moves, s.first_line, s.worst_line, s.asked, s.allowed)
+            for name, s in zip(SPEED_LIMITS, self._core.slowed, strict=True)
+            if s.moves
+        )
 
     @property
     def moves_overflowed(self) -> int:

@@ -93,6 +93,31 @@ _FAULTS: Mapping[FaultKind, Callable[[Fault], str]] = {
 }
 
 
+SPEED_LIMITS = (
+    "max_velocity",
+    "max_x_velocity",
+    "max_y_velocity",
+    "max_z_velocity",
+    "max_extrude_only_velocity",
+)
+"""By PLANNER_LIMIT_...: options of the configuration."""
+
+
+@record
+class Slowed:
+    """Moves that ask for a higher speed than a limit allows; they are made at that limit."""
+
+    limit: str
+    """One of SPEED_LIMITS, the lowest of those that apply to the move."""
+    moves: int
+    first_line: int
+    worst_line: int
+    """Of the move that loses the largest share of its speed."""
+    asked_mm_s: float
+    """Along that move."""
+    allowed_mm_s: float
+
+
 @record
 class Trapezoids:
     """Consecutive trapezoids in the planner's memory: valid until they are released."""

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from coordinator.commands import DEMO_MACHINE, PlanOptions
+from coordinator.machine.description import load_machine
 from coordinator.plan import plan_file
 from coordinator.plan_plot import draw
 from coordinator.plan_report import PlanReport, Timeline
@@ -134,6 +135,33 @@ def test_a_step_rate_beyond_the_node_is_told_with_its_line(tmp_path: Path) -> No
     )
     line = next(s.max_step_rate_line for s in report.steppers if s.name == "stepper_x")
     assert any(text.startswith(f"{tmp_path}/square.gcode:{line}: stepper_x") for text in report.warnings)
+
+
+def test_speeds_that_limits_lower_are_counted_with_their_lines(tmp_path: Path) -> None:
+    text = "G28\nG90\nM83\nG1 X10 Y10 Z1 F120\n"
+    limits = load_machine(str(DEMO_MACHINE)).limits
+    assert not plan(tmp_path, text).slowed
+    fast, z, e = (
+        v * 60 for v in (limits.max_velocity, limits.max_z_velocity, limits.max_extrude_only_velocity)
+    )
+    asked = [
+        f"G1 X60 F{fast:.3f}", f"G1 X10 F{1.5 * fast:.3f}", f"G1 Y60 F{2 * fast:.3f}",
+        f"G1 Z11 F{z:.3f}", f"G1 Z1 F{3 * z:.3f}", f"G1 E5 F{e:.3f}", f"G1 E-5 F{1.25 * e:.3f}",
+    ]  # fmt: skip
+    report = plan(tmp_path, text + "\n".join(asked))
+    assert [(s.limit, s.moves, s.first_line, s.worst_line) for s in report.slowed] == [
+        ("max_velocity", 2, 6, 7),
+        ("max_z_velocity", 1, 9, 9),
+        ("max_extrude_only_velocity", 1, 11, 11),
+    ]
+    assert [s.asked_mm_s / s.allowed_mm_s for s in report.slowed] == pytest.approx([2, 3, 1.25], rel=1e-3)
+    told = [w for w in report.warnings if " allows" in w]
+    assert (
+        f"square.gcode:6: from here on 2 moves ask for more speed than max_velocity allows, line 7 for "
+        f"{fast / 30:.1f} mm/s where {fast / 60:.1f} are made;" in told[0]
+    )
+    assert "square.gcode:9: one move asks for more speed than max_z_velocity allows, for " in told[1]
+    assert len(told) == 3
 
 
 def test_steps_faster_than_the_pulse_end_the_plan_near_their_line(tmp_path: Path) -> None:
