@@ -71,7 +71,8 @@ class Planner:
         self.limits = limits
         """What was configured; ``max_accel`` and the like below never exceed it."""
         self._limits: Any = ffi.new(
-            "struct planner_limits *", {field.name: getattr(limits, field.name) for field in fields(limits)}
+            "struct planner_limits *",
+            {f.name: getattr(limits, f.name) for f in fields(limits) if f.name != "range_options"},
         )
         self._core: Any = ffi.new("struct planner *")
         self._memory: Any = ffi.buffer(self._core)
@@ -129,7 +130,9 @@ class Planner:
     def fault(self) -> Fault:
         """Why the last refused move was refused."""
         fault = self._core.fault
-        return Fault(FaultKind(fault.kind), AXIS_LETTERS[fault.axis], fault.value, fault.low, fault.high)
+        options = (*self.limits.range_options, "")[fault.axis]
+        kind, axis = FaultKind(fault.kind), AXIS_LETTERS[fault.axis]
+        return Fault(kind, axis, fault.value, fault.low, fault.high, options)
 
     # ---- Trapezoids out ----
 

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import re
 import struct
 import subprocess
 import sys
@@ -162,6 +163,35 @@ def test_speeds_that_limits_lower_are_counted_with_their_lines(tmp_path: Path) -
     )
     assert "square.gcode:9: one move asks for more speed than max_z_velocity allows, for " in told[1]
     assert len(told) == 3
+
+
+@pytest.mark.parametrize(
+    ("machine", "line", "told"),
+    [
+        ("cartesian", "G1 X9999", "correct the program or position_min and position_max of [stepper_x]"),
+        ("corexz", "G1 Z9999", "correct the program or position_min and position_max of [stepper_z]"),
+        ("delta", "G1 X9999", "correct the program or print_radius of [printer]"),
+        ("delta", "G1 Z-99", "or minimum_z_position of [printer] and position_endstop of [stepper_a]"),
+        ("rotary_delta", "G1 Y9999", "correct the program or print_radius of [printer]"),
+        ("deltesian", "G1 X9999", "correct the program or print_width and min_angle of [printer]"),
+        ("deltesian", "G1 Y9999", "correct the program or position_min and position_max of [stepper_y]"),
+        ("polar", "G1 X9999", "correct the program or position_min and position_max of [stepper_arm]"),
+        ("polar", "G1 Z9999", "correct the program or position_min and position_max of [stepper_z]"),
+        ("winch", "G1 Y9999", "correct the program or anchor_y of the sections [stepper_a], [stepper_b], …"),
+        ("generic_cartesian", "G1 Y9999", "or position_min and position_max of [carriage "),
+        ("idex", "G1 X9999", "of [stepper_x], or those and safe_distance of [dual_carriage]"),
+    ],
+)
+def test_a_refusal_names_the_options_that_this_machine_has(
+    tmp_path: Path, machine: str, line: str, told: str
+) -> None:
+    config = DEMO_MACHINE.parents[1] / f"{machine}.cfg"
+    with pytest.raises(CanductorError) as refused:
+        plan(tmp_path, f"G28\nG90\n{line} F600\n", config=config)
+    assert "square.gcode:3: the move goes to " in str(refused.value)
+    assert told in str(refused.value)
+    sections = re.findall(r"\[(\w+(?: \w+)?)\]", str(refused.value))
+    assert all(f"\n[{section}]" in config.read_text() for section in sections)
 
 
 def test_steps_faster_than_the_pulse_end_the_plan_near_their_line(tmp_path: Path) -> None:
