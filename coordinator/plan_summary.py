@@ -2,7 +2,7 @@
 
 import math
 import resource
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from coordinator.plan_figures import Bus, Peak, PlanFigures, WatchedNode
 from coordinator.plan_report import AxisReport, BusReport, NodeReport, PlanReport, StepperReport, Timeline
 from coordinator.plan_warnings import (
     CEILING,
+    NodeClock,
     bus_warnings,
     queue_warnings,
     slowed_warnings,
@@ -54,6 +55,8 @@ class Made:
     figures: PlanFigures
     streams: Sequence[NodeStreamSpec]
     specs: Sequence[StepperSpec]
+    chips: Mapping[str, str]
+    """Constant MCU by node."""
     notices: list[str]
     print_time_s: float
 
@@ -166,7 +169,8 @@ class Made:
         for index, stream in enumerate(self.streams):
             together = self._busiest(self.figures.node_steps(index))
             mine = [s for s in steppers if s.node == stream.name]
-            warnings += step_rate_warnings(program, stream.name, stream.clock_freq, together, mine)
+            clock = NodeClock(stream.name, self.chips.get(stream.name, ""), stream.clock_freq)
+            warnings += step_rate_warnings(program, clock, together, mine)
         return warnings
 
 

@@ -17,8 +17,10 @@ import pytest
 from coordinator.commands import DEMO_MACHINE, PlanOptions
 from coordinator.machine.description import load_machine
 from coordinator.plan import plan_file
+from coordinator.plan_figures import Peak
 from coordinator.plan_plot import draw
 from coordinator.plan_report import PlanReport, Timeline
+from coordinator.plan_warnings import NodeClock, step_rate_warnings, ticks_per_step
 from nodes.errors import CanductorError
 from nodes.virtual.firmware import MAINBOARD, firmware_dictionary
 
@@ -136,6 +138,24 @@ def test_a_step_rate_beyond_the_node_is_told_with_its_line(tmp_path: Path) -> No
     )
     line = next(s.max_step_rate_line for s in report.steppers if s.name == "stepper_x")
     assert any(text.startswith(f"{tmp_path}/square.gcode:{line}: stepper_x") for text in report.warnings)
+
+
+@pytest.mark.parametrize(
+    ("chip", "clock_hz", "limit"),
+    [
+        ("stm32f407xx", 16_800_000, "168,000"),
+        ("atmega2560", 16_000_000, "100,000"),
+        ("rp2040", 12_000_000, "1,200,000"),
+    ],
+)
+def test_how_fast_a_node_may_step_depends_on_its_chip(chip: str, clock_hz: int, limit: str) -> None:
+    assert ticks_per_step(chip) == {"s": 100, "a": 160, "r": 10}[chip[0]]
+    node = NodeClock("mcu", chip, clock_hz)
+    most = clock_hz / ticks_per_step(chip)
+    assert not list(step_rate_warnings("p", node, Peak(most, 1.0, 7), []))
+    (told,) = step_rate_warnings("p", node, Peak(1.01 * most, 1.0, 7), [])
+    assert told.startswith("p:7: the steppers of node mcu are to make ")
+    assert f"more than the {limit} that node mcu, {chip}, with its clock of " in told
 
 
 def test_speeds_that_limits_lower_are_counted_with_their_lines(tmp_path: Path) -> None:
