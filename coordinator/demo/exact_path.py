@@ -6,7 +6,7 @@ step; ``turning_points`` cuts u into monotone pieces, so that ``crossings`` coun
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -115,8 +115,9 @@ class StepperPath:
     """One stepper's place in steps, over a stretch of print time in which nothing is declared anew."""
 
     def __init__(
-        self, spec: StepperSpec, start: Position, moves: NDArray[np.void], setting: Setting, position: int
+        self, spec: StepperSpec, start: Position, moves: NDArray[np.void], setting: Setting, position: float
     ) -> None:
+        """POSITION: where the stepper stands at START, in steps."""
         self.spec = spec
         phases = Phases.of(start, moves)
         if spec.kinematics == StepKinematics.LINEAR:
@@ -294,6 +295,41 @@ def places(path: StepperPath) -> tuple[Floats, Floats, Floats]:
     if path.curved:
         place = np.where(standing(t, u), place, between_rests(u, place))
     return t, u, place
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A stretch of moves over which the same acts on a stepper."""
+
+    spec: StepperSpec
+    start: Position
+    """Where the axes stand before the first move."""
+    moves: NDArray[np.void]
+    setting: Setting
+    declared: bool = True
+    """START is a new name for where the stepper stands; else it came there and keeps its share of a step."""
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the stepper moves as the axes do."""
+        return self.spec.kinematics is StepKinematics.LINEAR and not self.setting.acts_on(self.spec.weights)
+
+
+def legs_of(
+    spec: StepperSpec, epochs: Iterable[tuple[Position, NDArray[np.void]]], setting: Setting
+) -> list[Leg]:
+    """Return the legs of a program that changes nothing but where the axes are declared to stand."""
+    return [Leg(spec, start, moves, setting) for start, moves in epochs if len(moves)]
+
+
+def follow(legs: Iterable[Leg]) -> Iterator[tuple[StepperPath, Floats, Floats, Floats]]:
+    """Yield the path of each leg with its ``places``."""
+    at = 0.0
+    for leg in legs:
+        path = StepperPath(leg.spec, leg.start, leg.moves, leg.setting, resting(at) if leg.declared else at)
+        t, u, place = places(path)
+        yield path, t, u, place
+        at = float(u[-1])
 
 
 def crossings(path: StepperPath) -> tuple[int, int]:
