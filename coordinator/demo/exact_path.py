@@ -22,6 +22,8 @@ Position = tuple[float, float, float, float]
 AxisSignal = Signal | Shaped | Smoothed
 UNSHAPED: Impulses = ((1.0, 0.0),)
 SNAP = 65536
+PIECES = 1 << 16
+"""Looked at together: bounds the memory that long programs take."""
 SAMPLES = 7
 """Of the slope, per piece: a cubic has at most two turns inside."""
 HALVINGS = 60
@@ -251,7 +253,16 @@ def crossing_times(path: StepperPath, boundary: Floats, direction: Ints, low: Fl
 def turning_points(path: StepperPath) -> Floats:
     """Return times between which u is monotone, rising: breaks, and where the slope changes its sign."""
     breaks = path.breaks()
-    begin, end = breaks[:-1], breaks[1:]
+    turns = [
+        _turns(path, breaks[at : at + PIECES], breaks[at + 1 : at + PIECES + 1])
+        for at in range(0, len(breaks) - 1, PIECES)
+    ]
+    return np.unique(np.concatenate((breaks, *turns)))
+
+
+def _turns(path: StepperPath, begin: Floats, end: Floats) -> Floats:
+    """Return where the slope changes its sign within the pieces from BEGIN to END."""
+    begin = begin[: len(end)]
     # From just inside one end to just inside the other: at a break itself the slope may jump.
     share = np.linspace(1e-6, 1 - 1e-6, SAMPLES)
     at = begin[:, None] + (end - begin)[:, None] * share
@@ -262,7 +273,7 @@ def turning_points(path: StepperPath) -> Floats:
         middle = (low + high) / 2
         before = path.slope(middle) * sign > 0
         low, high = np.where(before, middle, low), np.where(before, high, middle)
-    return np.unique(np.concatenate((breaks, low)))
+    return low
 
 
 def standing(t: Floats, u: Floats) -> NDArray[np.bool_]:
