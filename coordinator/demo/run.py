@@ -147,11 +147,10 @@ class _Prover:
         if not all(leg.is_plain and leg.spec.weights == legs[0].spec.weights for leg in legs):
             yield from expected_curved(legs, self._outcome.maps[stepper.node].clock_freq)
             return
-        origin = 0.0
-        for leg in legs:
-            if leg.declared:
-                origin = float(np.dot(leg.spec.weights, leg.start))
-            yield from expected_steps(leg.moves, leg.spec.weights, stepper.step_distance, origin)
+        weights = legs[0].spec.weights if legs else stepper.weights
+        for position, moves in self._record.epochs():
+            origin = float(np.dot(weights, position))
+            yield from expected_steps(moves, weights, stepper.step_distance, origin)
 
     def _spec(self, stepper: StepperDescription) -> StepperSpec:
         function = stepper.function
