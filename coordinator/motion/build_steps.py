@@ -25,6 +25,8 @@ ffibuilder = builder(
         "coordinator/motion/step_curve.c",
         "coordinator/motion/step_compress.c",
         "coordinator/motion/step_fit.c",
+        "coordinator/motion/step_bands.c",
+        "coordinator/motion/step_arithmetic.c",
         "coordinator/motion/step_stream.c",
         "firmware/wire/vlq.c",
     ],

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The generator as a whole: memory, moves in, time forward.
+#include "coordinator/motion/step_arithmetic.h"
 #include "coordinator/motion/step_change.h"
 
 #include <string.h>
@@ -94,6 +95,7 @@ struct step_gen *step_gen_init(void *memory, const struct step_config *config) {
     struct step_gen *gen = carve(&arena, config);
     gen->stepper_count = config->stepper_count;
     gen->node_count = config->node_count;
+    gen->arithmetic = step_arithmetic();
     gen->max_error_s = config->max_error_s;
     gen->moves_end = -LONGEST_S;
     gen->error.stepper = -1;
