@@ -6,9 +6,9 @@ Host and virtual nodes run with a clock that is FACTOR times as fast (fast_clock
 seconds of motion in every second, on a core of its own, the nodes execute every step of it on the others.
 All figures but the CPU time are in the seconds of that world: a lead of 500 ms lasts 50 ms of ours, and what
 the host computes counts ten times. The worker's lead is how far ahead of now its commands reach when it hands
-them over, smallest from a second after the start to the end of the file; M400 is left out, since nobody can be
-ahead of a wait. A command's lead is from its arrival at the node until it is due, the start included. At last,
-in real time: from the first G1 to the first step.
+them over, smallest from a second after the start to the end of the file; M400 is left out, since nobody can
+be ahead of a wait. A command's lead is from its arrival at the node until it is due, the start included.
+At last, in real time: from the first G1 to the first step.
 """
 
 import argparse
