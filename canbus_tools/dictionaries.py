@@ -2,7 +2,8 @@
 
 A host downloads a node's dictionary with ``identify``, in pieces that everybody on the bus can read. A host
 that knows it already asks only for three pieces, by which the user's cache knows it here too. And of a node
-that was running before anybody listened, the cache may have the dictionary that explains its traffic (guess.py).
+that was running before anybody listened, the cache may have the dictionary that explains what it says
+(guess.py).
 """
 
 import argparse
@@ -69,7 +70,7 @@ class DictionarySource:
         if found is not None:
             self._remember(found, complete=download.complete)
             self.put(nodeid, found.dictionary, LEARNT if download.complete else CACHED)
-        return found and found.dictionary
+        return None if found is None else found.dictionary
 
     def unread(self, nodeid: int, direction: Direction, content: bytes, time_s: float) -> bool:
         """Take what a block holds that the node's dictionary, if there is one, does not explain.
@@ -89,6 +90,11 @@ class DictionarySource:
             self.put(nodeid, fitting[0], GUESSED)
             self.fitting[nodeid] = fitting
         return bool(fitting)
+
+    def is_open(self, nodeid: int) -> bool:
+        """Tell whether a dictionary is not known yet that the cache may have."""
+        guess = self._guesses.get(nodeid)
+        return nodeid not in self.known and guess is not None and guess.is_open
 
     def _drop(self, nodeid: int) -> None:
         self.known.pop(nodeid, None)

@@ -1,10 +1,10 @@
 """Which dictionary of the user's cache explains the traffic of a node that was never asked. Sans-IO.
 
-A message's number means something else in each firmware, so that a wrong dictionary soon meets a block that it
-cannot read, to the byte. What it can read may still be chance: therefore one counts only when the node's clock,
-which every host asks for about once a second, runs at the rate that the dictionary names. When several are left,
-they have to agree on the name of everything heard. It stays a guess, is called one, and is taken back as
-soon as a block contradicts it.
+A message's number means something else in each firmware, so that a wrong dictionary soon meets a block that
+it cannot read, to the byte. What it can read may still be chance: therefore one counts only when the node's
+clock, which every host asks for about once a second, runs at the rate that the dictionary names. When several
+are left, they have to agree on the name of everything heard. It stays a guess, is called one, and is taken
+back as soon as a block contradicts it.
 """
 
 from collections.abc import Iterable
@@ -30,6 +30,11 @@ class Guess:
 
     def __init__(self, candidates: Iterable[Dictionary]) -> None:
         self._left = [_Candidate(dictionary) for dictionary in candidates]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether hearing more may find one."""
+        return bool(self._left)
 
     def take(self, direction: Direction, content: bytes, time_s: float) -> tuple[Dictionary, ...]:
         """Take what a block holds; returns the dictionaries that fit, which is none while that is open.

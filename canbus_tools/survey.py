@@ -15,6 +15,7 @@ from typing import Final
 from canbus_tools.census import ROUNDS, Application, CensusResult, NodeHere, WaitingNode
 from canbus_tools.discovery import take_census
 from canbus_tools.interview import Facts, interview
+from canbus_tools.overhear import Overhearing
 from canbus_tools.talk import DATA_IDS, LISTEN_S, BusTalk, data_ids
 from nodes.assign import FIRST_NODEID, Uuid
 from nodes.errors import CanductorError
@@ -33,6 +34,9 @@ PROBE_PAUSE_S: Final = 0.002
 PROBE_ANSWER_S: Final = 0.03
 """For the last answers; adapters on USB may hold frames back for 16 ms."""
 INTERVIEWS_AT_ONCE: Final = 8
+HEAR_OUT_S: Final = 0.1
+HEAR_OUT_TIMES: Final = 12
+"""So often that a host that asks for clocks every 0.98 s has asked twice since the beginning."""
 
 
 class State(Enum):
@@ -62,6 +66,8 @@ class Entry:
     facts: Facts | None = None
     twins: bool = False
     """Another board has the same uuid."""
+    overheard: Facts | None = None
+    """Of a node in use: what its traffic tells by a dictionary of the cache that explains it."""
     trouble: str = ""
 
 
@@ -94,6 +100,8 @@ async def survey(
 ) -> SurveyResult:
     """Find all nodes on BUS, after listening for LISTEN_S; raises CanductorError when the bus fails."""
     started_s = asyncio.get_running_loop().time()
+    overhearing = Overhearing(bus.cache)
+    bus.on_frame(overhearing.frame)
     census = await take_census(bus, rounds)
     await bus.wait(max(0.0, started_s + listen_s - asyncio.get_running_loop().time()))
     here = {node.nodeid for node in census.here}
@@ -103,12 +111,30 @@ async def survey(
     shared = _shared_ids(census)
     asked = sorted(answering - hosted - shared)
     facts = dict(zip(asked, await _interview_all(bus, asked), strict=True))
+    await _hear_out(bus, hosted, overhearing)
     entries = [_assigned(nodeid, facts[nodeid], census) for nodeid in asked]
     entries += [_not_asked(node, hosted, shared) for node in census.here if node.nodeid not in facts]
     entries += [_hosted(nodeid, answers=nodeid in bus.talking) for nodeid in sorted(hosted - here)]
     entries.sort(key=lambda entry: (entry.nodeid or 0, entry.uuid.raw if entry.uuid else b""))
     entries += [_waiting(node) for node in await _still_waiting(bus, census, {e.uuid for e in entries})]
+    entries = [_overheard(entry, overhearing) for entry in entries]
     return SurveyResult(_mark_twins(entries), census, candidates)
+
+
+async def _hear_out(bus: BusTalk, hosted: Iterable[int], overhearing: Overhearing) -> None:
+    """Wait for a node's second word about its clock where that may tell what it is."""
+    for _ in range(HEAR_OUT_TIMES):
+        if not any(overhearing.is_open(nodeid) for nodeid in hosted):
+            return
+        await bus.wait(HEAR_OUT_S)
+
+
+def _overheard(entry: Entry, overhearing: Overhearing) -> Entry:
+    if entry.state is not State.IN_USE or entry.nodeid is None:
+        return entry
+    facts = overhearing.facts(entry.nodeid)
+    uuid = entry.uuid or (facts.uuid if facts else None)
+    return replace(entry, overheard=facts, uuid=uuid)
 
 
 async def _still_waiting(

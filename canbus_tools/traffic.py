@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable
 
-from canbus_tools.dictionaries import DictionarySource
+from canbus_tools.dictionaries import GUESSED, DictionarySource
 from canbus_tools.flow import Flow
 
 
@@ -55,6 +55,17 @@ class NodeTraffic:
         self.mcu = _common(str(each.constants.get("MCU", ""))[:80] for each in alike)
         self.version = _common(each.version for each in alike)
 
+    @property
+    def guess(self) -> str | None:
+        """A sentence about the node's dictionary when that is a guess."""
+        if self.dictionary_origin != GUESSED:
+            return None
+        what = " ".join(filter(None, (self.mcu, self.version))) or "one of several"
+        return (
+            f"node {self.nodeid}: its dictionary ({what}) is guessed: the cache has it, and it explains what "
+            f"was heard; --dictionary {self.nodeid}=FILE makes sure"
+        )
+
     def to_json(self) -> dict[str, object]:
         """Return it as ``--json`` shows it."""
         return {
@@ -74,6 +85,6 @@ class NodeTraffic:
 
 
 def _common(texts: Iterable[str]) -> str:
-    """Return what all of them say, or nothing: of a guess, only what every fitting dictionary says is told."""
+    """Return what all of them say, or nothing: of a guess only what all that fit say is told."""
     different = set(texts)
     return different.pop() if len(different) == 1 else ""
