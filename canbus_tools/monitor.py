@@ -100,7 +100,7 @@ def run_monitor(options: MonitorOptions) -> "MonitorReport":
         for nodeid, dictionary in asyncio.run(fetch(options.bus, options.fetch)).items():
             source.put(nodeid, dictionary, FETCHED)
     watch = BusWatch(BusDecoder(source), LoadMeter(options.bitrate), time.monotonic())
-    with FrameQueue(open_bus(options.bus), short_name(options.bus)) as queue:
+    with FrameQueue(open_bus(options.bus), options.bus.short_name) as queue:
         run = _run_lines if options.lines else _run_screen
         shown = run(options, watch, queue)
         return MonitorReport(options, watch, shown, queue.dropped)
@@ -239,11 +239,6 @@ def _filter_text(given: argparse.Namespace) -> str:
     words += [f"kind={','.join(given.kind)}"] if given.kind else []
     words += [f"dir={given.direction}"] if given.direction else []
     return " ".join([*words, *(given.message or ())]) or "none"
-
-
-def short_name(bus: BusOptions) -> str:
-    """Return how a bus is called where room is short: of a path, the last part."""
-    return bus.channel.rpartition("/")[2] or bus.channel
 
 
 def _bitrate(bus: BusOptions) -> tuple[int, bool]:

@@ -121,7 +121,7 @@ def _tool(words: Sequence[str]) -> Job:
         add_tools(commands.add_parser("can", allow_abbrev=False, description=TOOL_COMMANDS["can"]), words)
     arguments = parser.parse_args(list(words))
     if "make_job" not in arguments:
-        raise UsageError("the CAN tool is missing; 'canductor can --help' lists them")
+        raise UsageError("the CAN tool is missing")
     return cast("Job", arguments.make_job(arguments))
 
 
