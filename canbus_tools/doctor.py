@@ -134,7 +134,10 @@ def _unusable(said: str, place: Place) -> Finding:
             " capability NET_RAW",
         )
     return problem(
-        "bus-unusable", said, "the bus could not be used, so not everything was checked", "see above"
+        "bus-unusable",
+        said,
+        "the bus could not be used, so not everything was checked",
+        f"put right what is said there, and ask again: 'canductor can doctor {place.words}'",
     )
 
 

@@ -17,6 +17,7 @@ from canbus_tools.open_bus import BusOptions
 from canbus_tools.survey import SurveyResult
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, NODE_IS_HERE, WHO_IS_HERE, Uuid
 from nodes.transport import CanFrame
+from nodes.virtual.faults import Fault, FaultKind
 from nodes.virtual.hub import VirtualBus
 from tests.canbus_tools.command import Command, Said
 from tests.canbus_tools.stage import (
@@ -177,6 +178,25 @@ def test_loss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "frames-lost" in problems(said)
     ping = said.json["pings"][0]
     assert ping["lost"] + ping["invalid_bytes"] > 0
+
+
+def test_a_node_that_goes_off_the_bus_while_it_is_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with VirtualBus(tmp_path / "bus") as bus:
+        place = Place("canductor", str(bus.path))
+        with place.start_node("mainboard", MAIN) as node:
+            node.wait_ready()
+            with closing(place.open()) as host:
+                set_nodeid(host, MAIN, MAIN_ID)
+            assert problems(run(Command(place, capsys))) == set()
+            # With the dictionary in the cache it says what it is in some forty frames.
+            bus.set_faults([Fault(kind=FaultKind.BUS_OFF, sender=0, nth=100, time_s=3600)])
+            said = run(Command(place, capsys))
+    assert (said.status, problems(said)) == (1, {"node-went-silent"})
+    finding = findings(said)["node-went-silent"]
+    assert finding["seen"].startswith(f"node {MAIN_ID} said what it is, and then answered no more: ")
+    assert "bus-off" in finding["means"]
 
 
 def test_overload_by_a_babbler(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
