@@ -7,10 +7,10 @@ from typing import Final
 from canbus_tools.census import ROUNDS, Census, CensusResult
 from canbus_tools.open_bus import BusOptions
 from canbus_tools.talk import LISTEN_S, BusTalk
-from nodes.can_bus import BUS_OFF
 from nodes.errors import CanductorError
 from nodes.link import Frame
 from nodes.option_values import number
+from nodes.transport.frame import BUS_OFF
 
 _LISTEN_MIN_S: Final = 0.1
 _LISTEN_MAX_S: Final = 60.0

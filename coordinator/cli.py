@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Mapping, Sequence
 
-from coordinator.command_line import Answered, print_help, read_words, version
+from coordinator.command_line import Answered, help_of, print_help, read_words, version
 from coordinator.commands import Report, Terminated
 from nodes.errors import CanductorError
 from nodes.option_values import UsageError
@@ -59,7 +59,7 @@ def _run(words: list[str], as_json: bool) -> int:
     except CanductorError as error:
         return _fail(str(error), EXIT_FAILED, as_json)
     except UsageError as error:
-        return _fail(f"{' '.join(str(error).split())} (see '{_help_of(words)}')", EXIT_USAGE, as_json)
+        return _fail(f"{' '.join(str(error).split())} (see '{help_of(words)}')", EXIT_USAGE, as_json)
     except KeyboardInterrupt as error:
         terminated = isinstance(error, Terminated)
         return _fail(
@@ -71,16 +71,6 @@ def _run(words: list[str], as_json: bool) -> int:
         raise
     except Exception:  # noqa: BLE001 (the last line of defence: whatever comes here is a bug, and is told so)
         return _report_bug(as_json)
-
-
-def _help_of(words: list[str]) -> str:
-    """Return the command that explains the words: of the CAN tools each has its own help."""
-    from canbus_tools.command_line import TOOLS  # noqa: PLC0415 (start-up time)
-
-    named = words[:1] if words[0] == "console" else words[:2] if words[0] == "can" else []
-    if named[1:] and named[1] not in TOOLS:
-        named = named[:1]
-    return " ".join(["canductor", *named, "--help"])
 
 
 def _show(report: Report, as_json: bool) -> int:

@@ -70,6 +70,16 @@ def print_help() -> None:
     _parser().print_help()
 
 
+def help_of(words: Sequence[str]) -> str:
+    """Return the command that explains the words: of the CAN tools each has its own help."""
+    from canbus_tools.command_line import TOOLS  # noqa: PLC0415 (start-up time)
+
+    named = words[:1] if words[0] == "console" else words[:2] if words[0] == "can" else []
+    if named[1:] and named[1] not in TOOLS:
+        named = named[:1]
+    return " ".join(["canductor", *named, "--help"])
+
+
 def version() -> str:
     """Return the version of the installed project."""
     from importlib import metadata  # noqa: PLC0415 (start-up time: it draws in the mail parser)
