@@ -35,8 +35,8 @@ PROBE_ANSWER_S: Final = 0.03
 """For the last answers; adapters on USB may hold frames back for 16 ms."""
 INTERVIEWS_AT_ONCE: Final = 8
 HEAR_OUT_S: Final = 0.1
-HEAR_OUT_TIMES: Final = 12
-"""So often that a host that asks for clocks every 0.98 s has asked twice since the beginning."""
+HEAR_OUT_TIMES: Final = 22
+"""At most so often: a host that asks for clocks every 0.98 s has asked three times since the beginning."""
 
 
 class State(Enum):
