@@ -4,13 +4,22 @@ from pathlib import Path
 
 import pytest
 
+from canbus_tools.bus_load import LoadMeter
+from canbus_tools.bus_watch import BusWatch
+from canbus_tools.candump import candump_line
 from canbus_tools.decoded import Decoded
 from canbus_tools.decoder import BusDecoder
 from canbus_tools.dictionaries import GUESSED, LEARNT, DictionarySource
+from canbus_tools.filters import Filter
 from canbus_tools.frame import Frame
+from canbus_tools.frame_queue import FrameQueue
+from canbus_tools.monitor import Lines, MonitorOptions
+from canbus_tools.open_bus import BusOptions, open_bus
 from canbus_tools.protocol import Direction
+from coordinator.cli import main
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
+from nodes.virtual.hub import VirtualBus
 from tests import wire_twin as twin
 from tests.canbus_tools.talk_twin import (
     DICTIONARY,
@@ -131,3 +140,35 @@ def test_eight_real_firmwares_are_told_from_one_another(tmp_path: Path) -> None:
         decoder = BusDecoder(DictionarySource(cache=cache))
         decode(decoder, host(dictionary))
         assert decoder.nodes[4].mcu == dictionary.constants["MCU"], stem
+
+
+def test_decode_says_that_it_guessed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cache_of(tmp_path / "cache" / "canductor" / "dictionaries", DICTIONARY_JSON)
+    log = tmp_path / "some.log"
+    log.write_text("".join(map(candump_line, host())))
+    assert main(["can", "decode", str(log)]) == 0
+    said = capsys.readouterr()
+    assert "clock clock=" in said.out.splitlines()[-1]
+    assert said.err == (
+        f"canductor: node 4: its dictionary (twin {DICTIONARY.version}) is guessed: the cache has it, and it"
+        " explains what was heard; --dictionary 4=FILE makes sure\n"
+    )
+
+
+def test_lines_say_once_that_they_are_guessed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    decoder = BusDecoder(DictionarySource(cache=cache_of(tmp_path / "cache", DICTIONARY_JSON)))
+    watch = BusWatch(decoder, LoadMeter(1_000_000), 0.0)
+    for frame in host():
+        watch.feed(frame)
+    with VirtualBus(tmp_path / "bus") as bus:
+        options = MonitorOptions(
+            bus=BusOptions(interface="canductor", channel=str(bus.path)),
+            bitrate=1_000_000,
+            bitrate_is_known=False,
+            filter_=Filter(),
+            dictionaries={},
+            duration_s=0.3,  # some rounds
+        )
+        with FrameQueue(open_bus(options.bus), "bus") as queue:
+            assert Lines(options, watch, queue).run() == 0
+    assert capsys.readouterr().err.count("is guessed") == 1
