@@ -9,7 +9,7 @@ from typing import Final
 from canbus_tools.census import Application
 from canbus_tools.discovery import declare_listen, listen_option, where
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.survey import PROBED, Entry, State, SurveyResult, survey
+from canbus_tools.survey import PROBED, Entry, State, SurveyResult, survey_and_overhear
 from canbus_tools.table import count, paragraph, table
 from canbus_tools.talk import LISTEN_S, BusTalk
 from nodes.assign import LAST_NODEID
@@ -84,7 +84,7 @@ def list_nodes(options: BusOptions, *, probed: range = PROBED, listen_s: float =
 
     async def find() -> SurveyResult:
         async with BusTalk.open(options) as bus:
-            return await survey(bus, probed=probed, listen_s=listen_s)
+            return await survey_and_overhear(bus, probed=probed, listen_s=listen_s)
 
     return NodesReport(options, asyncio.run(find()))
 

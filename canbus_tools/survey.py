@@ -100,8 +100,6 @@ async def survey(
 ) -> SurveyResult:
     """Find all nodes on BUS, after listening for LISTEN_S; raises CanductorError when the bus fails."""
     started_s = asyncio.get_running_loop().time()
-    overhearing = Overhearing(bus.cache)
-    bus.on_frame(overhearing.frame)
     census = await take_census(bus, rounds)
     await bus.wait(max(0.0, started_s + listen_s - asyncio.get_running_loop().time()))
     here = {node.nodeid for node in census.here}
@@ -111,14 +109,24 @@ async def survey(
     shared = _shared_ids(census)
     asked = sorted(answering - hosted - shared)
     facts = dict(zip(asked, await _interview_all(bus, asked), strict=True))
-    await _hear_out(bus, hosted, overhearing)
     entries = [_assigned(nodeid, facts[nodeid], census) for nodeid in asked]
     entries += [_not_asked(node, hosted, shared) for node in census.here if node.nodeid not in facts]
     entries += [_hosted(nodeid, answers=nodeid in bus.talking) for nodeid in sorted(hosted - here)]
     entries.sort(key=lambda entry: (entry.nodeid or 0, entry.uuid.raw if entry.uuid else b""))
     entries += [_waiting(node) for node in await _still_waiting(bus, census, {e.uuid for e in entries})]
-    entries = [_overheard(entry, overhearing) for entry in entries]
     return SurveyResult(_mark_twins(entries), census, candidates)
+
+
+async def survey_and_overhear(bus: BusTalk, *, probed: Iterable[int], listen_s: float) -> SurveyResult:
+    """Find all nodes as ``survey`` does, and tell of nodes in use what their traffic does."""
+    overhearing = Overhearing(bus.cache)
+    end = bus.on_frame(overhearing.frame)
+    try:
+        found = await survey(bus, probed=probed, listen_s=listen_s)
+        await _hear_out(bus, frozenset(bus.hosted), overhearing)
+    finally:
+        end()
+    return replace(found, entries=_mark_twins([_overheard(entry, overhearing) for entry in found.entries]))
 
 
 async def _hear_out(bus: BusTalk, hosted: Iterable[int], overhearing: Overhearing) -> None:
