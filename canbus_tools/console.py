@@ -63,6 +63,10 @@ def make_job(given: argparse.Namespace) -> Callable[[], "ConsoleReport"]:
     if given.execute and given.script:
         raise UsageError("console takes either --execute or --script")
     if given.node is not None and not _UUID.match(given.node):
+        if not given.node.isdecimal():
+            raise UsageError(
+                f"--node is '{given.node}', must be an id from 1 to 255, or a uuid of 12 hex digits"
+            )
         whole("--node", given.node, 1, NODEID_MAX)
     options = ConsoleOptions(
         bus=None if given.uart is not None else bus_options(given),

@@ -25,7 +25,6 @@ from canbus_tools.console_words import (
 from canbus_tools.decoded import MessageShape
 from canbus_tools.expressions import Quantity, evaluate, is_name, names_in
 from canbus_tools.talk import NodeTalk
-from nodes.clock import ticks_since
 from nodes.dictionary import Dictionary
 from nodes.message_format import Message
 
@@ -284,5 +283,5 @@ def _shown(value: Quantity) -> str:
     if value.value.denominator != 1:
         return f"{float(value.value):.9g}, sent as {whole}"
     if value.clocks == 1 and not 0 <= whole < 1 << 32:
-        return f"{whole}, sent as {ticks_since(whole, 0) % (1 << 32)}"
+        return f"{whole}, sent as {whole % (1 << 32)}"
     return str(whole) if abs(whole) < 10 else f"{whole} (0x{whole:x})"

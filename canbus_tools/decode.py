@@ -260,11 +260,11 @@ class DecodeReport:
         return "\n".join(parts)
 
     def _hints(self) -> list[str]:
-        return [
+        nodes = [node for bus in self._decoding.buses.values() for node in bus.nodes.values()]
+        return [guess for node in nodes if (guess := node.guess)] + [
             f"node {node.nodeid}: {unread} of its blocks could not be read, its dictionary is not in the"
             f" recording; give it with --dictionary {node.nodeid}=FILE"
-            for bus in self._decoding.buses.values()
-            for node in bus.nodes.values()
+            for node in nodes
             if (unread := node.to_node.unknown_messages + node.from_node.unknown_messages)
             and not node.dictionary_origin
         ]

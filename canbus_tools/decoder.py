@@ -192,6 +192,14 @@ class _Stream(BlockStream):
             self._shapes = {}
         return dictionary
 
+    def _learns_from(self, content: bytes, time_s: float) -> bool:
+        """Take a block that cannot be read; tells whether that made a dictionary known by which it can."""
+        before = self._known.get(self._node.nodeid)
+        known = self._dictionaries.unread(self._node.nodeid, self.direction, content, time_s)
+        if before is not self._known.get(self._node.nodeid):
+            self._node.take_dictionary(self._dictionaries)
+        return known
+
     def _shape(self, format_: MessageFormat | OutputFormat, dictionary: Dictionary) -> AnyShape:
         shape: AnyShape
         if isinstance(format_, OutputFormat):
@@ -222,6 +230,9 @@ class _CommandStream(_Stream):
             shape = found and (self._shapes.get(found[0]) or self._shape(found[0], dictionary))
             read = found and shape and shape.read(content, found[1])
             if not read or not shape:
+                if self._learns_from(content, time_s) and not at:
+                    dictionary = self._current()
+                    continue
                 self._way.unknown_messages += 1
                 rest = (content[at:],)
                 out.append(self._said(frame, _MESSAGE, shapes.UNKNOWN, rest, seq=seq, repeated=repeated))
@@ -237,8 +248,7 @@ class _ResponseStream(_Stream):
     direction = Direction.FROM_NODE
 
     def _block(self, out: list[Decoded], block: bytes, frame: Frame) -> None:
-        node = self._node
-        time_s, channel = frame[0], frame[4]
+        node, time_s = self._node, frame[0]
         node.last_heard_s = time_s
         seq = block[1] & SEQUENCE_MASK
         refused = node.flow.answered(block, time_s)
@@ -246,12 +256,18 @@ class _ResponseStream(_Stream):
             kind, shape = (Kind.NAK, shapes.NAK) if refused else (Kind.ACK, shapes.ACK)
             out.append(self._said(frame, kind, shape, (seq,), seq=seq))
             return
-        content = block[2:-3]
+        self._response(out, block[2:-3], frame, seq)
+
+    def _response(self, out: list[Decoded], content: bytes, frame: Frame, seq: int) -> None:
+        node, time_s, channel = self._node, frame[0], frame[4]
         dictionary = self._current()
         found = dictionary.response_at(content)
         said = found and (self._shapes.get(found[0]) or self._shape(found[0], dictionary))
         read = found and said and said.read(content, found[1])
         if not read or not said or read[1] != len(content):
+            if self._learns_from(content, time_s):
+                self._response(out, content, frame, seq)
+                return
             self._way.unknown_messages += 1
             out.append(self._said(frame, _MESSAGE, shapes.UNKNOWN, (content,), seq=seq))
             return

@@ -1,7 +1,9 @@
 """Which dictionary each node of a bus has: given in a file, fetched by a caller, or learnt by listening.
 
 A host downloads a node's dictionary with ``identify``, in pieces that everybody on the bus can read. A host
-that knows it already asks only for three pieces, by which the user's cache knows it here too.
+that knows it already asks only for three pieces, by which the user's cache knows it here too. And of a node
+that was running before anybody listened, the cache may have the dictionary that explains what it says
+(guess.py).
 """
 
 import argparse
@@ -10,7 +12,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from canbus_tools.protocol import DATA_NODEID_MAX
+from canbus_tools.guess import Guess
+from canbus_tools.protocol import DATA_NODEID_MAX, Direction
 from nodes.dictionary import MAX_COMPRESSED_BYTES, MAX_INFLATED_BYTES, Dictionary
 from nodes.dictionary_cache import CachedDictionary, DictionaryCache
 from nodes.dictionary_parts import DictionaryError
@@ -20,6 +23,7 @@ from nodes.option_values import assignments, existing_file, whole
 GIVEN: Final = "given"
 LEARNT: Final = "learnt from the bus"
 CACHED: Final = "recognised from the cache"
+GUESSED: Final = "guessed from the cache"
 
 
 class DictionarySource:
@@ -32,20 +36,24 @@ class DictionarySource:
         """By node id. Read it; change it with ``put`` and ``forget``."""
         self.origins: dict[int, str] = dict.fromkeys(self.known, GIVEN)
         """In words, where each came from."""
+        self.fitting: dict[int, tuple[Dictionary, ...]] = {}
+        """By node id, of a guess: all dictionaries that explain what was heard; the first one is taken."""
         self._cache = cache
         self._downloads: dict[int, _Download] = {}
+        self._guesses: dict[int, Guess] = {}
 
     def put(self, nodeid: int, dictionary: Dictionary, origin: str = GIVEN) -> None:
         """Set a node's dictionary; one with the origin GIVEN is not changed by what the bus says."""
         self.known[nodeid] = dictionary
         self.origins[nodeid] = origin
+        self.fitting.pop(nodeid, None)
 
     def forget(self, nodeid: int) -> None:
         """Drop what was learnt: another board has the id now."""
         self._downloads.pop(nodeid, None)
+        self._guesses.pop(nodeid, None)
         if self.origins.get(nodeid) != GIVEN:
-            self.known.pop(nodeid, None)
-            self.origins.pop(nodeid, None)
+            self._drop(nodeid)
 
     def hear(self, nodeid: int, offset: int, data: bytes) -> Dictionary | None:
         """Take an ``identify_response``; returns the dictionary when this piece made it known."""
@@ -60,8 +68,47 @@ class DictionarySource:
             return None
         found = download.take(offset, data)
         if found is not None:
-            self.put(nodeid, found, LEARNT if download.complete else CACHED)
-        return found
+            self._remember(found, complete=download.complete)
+            self.put(nodeid, found.dictionary, LEARNT if download.complete else CACHED)
+        return None if found is None else found.dictionary
+
+    def unread(self, nodeid: int, direction: Direction, content: bytes, time_s: float) -> bool:
+        """Take what a block holds that the node's dictionary, if there is one, does not explain.
+
+        Tells whether that made a dictionary known that does: a guess (``fitting`` has what it rests upon).
+        """
+        if self.origins.get(nodeid, GUESSED) != GUESSED or self._cache is None:
+            return False
+        guess = self._guesses.get(nodeid)
+        if guess is None:
+            guess = self._guesses[nodeid] = Guess(cached.dictionary for cached in self._cache.all())
+        if nodeid in self.known:  # a guess that this contradicts
+            guess.refuse(self.known[nodeid])
+            self._drop(nodeid)
+        fitting = guess.take(direction, content, time_s)
+        if fitting:
+            self.put(nodeid, fitting[0], GUESSED)
+            self.fitting[nodeid] = fitting
+        return bool(fitting)
+
+    def is_open(self, nodeid: int) -> bool:
+        """Tell whether a dictionary is not known yet that the cache may have."""
+        guess = self._guesses.get(nodeid)
+        return nodeid not in self.known and guess is not None and guess.is_open
+
+    def _drop(self, nodeid: int) -> None:
+        self.known.pop(nodeid, None)
+        self.origins.pop(nodeid, None)
+        self.fitting.pop(nodeid, None)
+
+    def _remember(self, found: CachedDictionary, *, complete: bool) -> None:
+        """Let the user's cache have what was heard: next time listening for a second may be enough."""
+        if self._cache is None:
+            return
+        if complete:
+            self._cache.store(found.compressed, found.dictionary)
+        else:
+            self._cache.used(found)
 
 
 class _Download:
@@ -83,21 +130,22 @@ class _Download:
         size = min(len(data), self._first_size)
         return self._compressed[:size] == data[:size]
 
-    def take(self, offset: int, data: bytes) -> Dictionary | None:
+    def take(self, offset: int, data: bytes) -> CachedDictionary | None:
         if offset == len(self._compressed) and data:
             found = self._append(data)
             if self.finished:
                 return found
         return self._recognise(offset, data) if offset else None
 
-    def _append(self, data: bytes) -> Dictionary | None:
+    def _append(self, data: bytes) -> CachedDictionary | None:
         self._first_size = self._first_size or len(data)
         self._compressed += data
         try:
             self._inflated_bytes += len(self._inflater.decompress(data, MAX_INFLATED_BYTES))
             if self._inflater.eof:
                 self.finished = self.complete = True
-                return Dictionary.parse(bytes(self._compressed))
+                compressed = bytes(self._compressed)
+                return CachedDictionary(compressed, Dictionary.parse(compressed))
         except (zlib.error, DictionaryError):
             self.finished = True  # what cannot be used is not there
             return None
@@ -106,7 +154,7 @@ class _Download:
         self.finished = bool(beyond) or len(self._compressed) > MAX_COMPRESSED_BYTES
         return None
 
-    def _recognise(self, offset: int, data: bytes) -> Dictionary | None:
+    def _recognise(self, offset: int, data: bytes) -> CachedDictionary | None:
         """Compare with the cache; a host's proof is the last piece, and that nothing follows it."""
         if data:
             self._agreed_at.add(offset + len(data))
@@ -121,7 +169,7 @@ class _Download:
         for candidate in self._candidates:
             if len(candidate.compressed) == offset:
                 self.finished = True
-                return candidate.dictionary
+                return candidate
         return None
 
 

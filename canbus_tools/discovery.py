@@ -7,11 +7,13 @@ from typing import Final
 from canbus_tools.census import ROUNDS, Census, CensusResult
 from canbus_tools.open_bus import BusOptions
 from canbus_tools.talk import LISTEN_S, BusTalk
-from nodes.can_bus import BUS_OFF
 from nodes.errors import CanductorError
 from nodes.link import Frame
 from nodes.option_values import number
+from nodes.transport.frame import BUS_OFF
 
+_CAUSE_S: Final = 0.2
+"""The sentence why a bus ended comes from another thread, maybe a little after sending fails."""
 _LISTEN_MIN_S: Final = 0.1
 _LISTEN_MAX_S: Final = 60.0
 
@@ -31,8 +33,12 @@ async def take_census(bus: BusTalk, rounds: int = ROUNDS) -> CensusResult:
     try:
         census.start(_ns(loop.time()))
         while census.deadline_ns is not None and not raise_later:
-            for frame in census.frames_to_send():
-                bus.send_frame(frame.can_id, frame.data)
+            try:
+                for frame in census.frames_to_send():
+                    bus.send_frame(frame.can_id, frame.data)
+            except CanductorError:
+                await bus.wait(_CAUSE_S)  # which raises what ended the bus, and that tells more
+                raise
             await bus.wait(max(0.0, census.deadline_ns * 1e-9 - loop.time()))
             census.timer(max(_ns(loop.time()), census.deadline_ns))
     finally:

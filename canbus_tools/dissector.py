@@ -37,7 +37,12 @@ WIDTHS: Final = {"%u": 32, "%i": 32, "%hu": 16, "%hi": 16, "%c": 8}
 """Bits of a number with this code."""
 _KINDS: Final = {FieldKind.UNSIGNED: "number", FieldKind.HEX: "hex", FieldKind.UUID: "uuid"}
 ANY: Final = "any"
-PARTS: Final = ("dissector_fields.lua", "dissector_read.lua", "dissector_show.lua")
+PARTS: Final = (
+    "dissector_fields.lua",
+    "dissector_values.lua",
+    "dissector_read.lua",
+    "dissector_show.lua",
+)
 """The Lua code, which becomes one file."""
 HEAD: Final = """\
 -- A Wireshark dissector of the protocol that Klipper's firmware and canductor's speak over CAN.

@@ -134,7 +134,10 @@ def _unusable(said: str, place: Place) -> Finding:
             " capability NET_RAW",
         )
     return problem(
-        "bus-unusable", said, "the bus could not be used, so not everything was checked", "see above"
+        "bus-unusable",
+        said,
+        "the bus could not be used, so not everything was checked",
+        f"put right what is said there, and ask again: 'canductor can doctor {place.words}'",
     )
 
 
@@ -208,6 +211,8 @@ class Diagnosis:
             severity: sum(finding.severity is severity for finding in self.findings) for severity in Severity
         }
         said = [count(number_of, severity.value) for severity, number_of in counts.items() if number_of]
+        if not said and self.nodes is None and self.traffic is not None and not self.traffic.frames:
+            return "nothing was heard and nothing was asked, so no node was checked"
         return ", ".join(said) or "nothing is wrong"
 
     def _figures(self) -> list[str]:

@@ -1,7 +1,6 @@
 """Gathers what the doctor judges: from the kernel, by listening, and by asking."""
 
 import asyncio
-import contextlib
 import errno
 import os
 import threading
@@ -234,11 +233,16 @@ async def ask_nodes(options: BusOptions, probed: range = PROBED) -> NodeFacts:
     """Find all nodes, and put questions to those to whom nobody else talks; raises CanductorError."""
     async with BusTalk.open(options) as bus:
         found = await survey(bus, probed=probed)
-        pings = []
+        pings: list[PingFacts] = []
+        silenced: dict[int, str] = {}
         for nodeid in _askable(found):
-            with contextlib.suppress(CanductorError):  # the survey says what is wrong with it
+            try:
                 pings.append(await _ping(bus, nodeid))
-    return NodeFacts(survey=found, pings=tuple(pings))
+            except CanductorError as error:
+                if bus.closed_because is not None:
+                    raise
+                silenced[nodeid] = str(error)
+    return NodeFacts(survey=found, pings=tuple(pings), silenced=silenced)
 
 
 def _askable(found: SurveyResult) -> list[int]:

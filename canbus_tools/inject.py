@@ -69,7 +69,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     )
     add("-b", "--bitrate", metavar="BIT/S", default="1000000", help="1000000 if not given; 0: no limit")
     add("--seed", metavar="N", default="0", help="decides which frames the faults hit; 0 if not given")
-    add("--for", dest="duration", metavar="SECONDS", help="end after this time; else on Ctrl-C")
+    add("--duration", "--for", metavar="S", help="end after so long; else at Ctrl-C")
     add(
         "--nodes",
         metavar="BOARD,…",
@@ -103,7 +103,7 @@ def make_job(given: argparse.Namespace) -> Callable[[], InjectReport]:
         nodes=nodes,
         socketcand=None if given.socketcand is None else _address(given.socketcand),
         socketcand_bus=name,
-        duration_s=None if given.duration is None else number("--for", given.duration, 0, 1e8, "s"),
+        duration_s=None if given.duration is None else number("--duration", given.duration, 0, 1e8, "s"),
         json=given.json,
     )
     return lambda: Injection(options).run()

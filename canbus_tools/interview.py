@@ -1,6 +1,7 @@
 """What one node says about itself, asked in its own words as far as its firmware knows the questions."""
 
-from typing import Final
+from collections.abc import Mapping, Sequence
+from typing import Final, TypeVar
 
 from canbus_tools.talk import BusTalk, NodeTalk
 from nodes.assign import UUID_SIZE, Uuid
@@ -10,8 +11,15 @@ from nodes.errors import CanductorError
 from nodes.message_format import Message
 from nodes.records import record
 
+T = TypeVar("T")
 BUS_STATES: Final = "canbus_bus_state"
 _TICKS_PER_WORD: Final = 1 << 32
+_QUESTIONS: Final = (
+    ("get_canbus_id", "canbus_id"),
+    ("get_config", "config"),
+    ("get_uptime", "uptime"),
+    ("get_canbus_status", "canbus_status"),
+)
 
 
 @record(kw_only=True)
@@ -24,6 +32,19 @@ class Firmware:
     build: str
     clock_hz: int | None
     bitrate: int | None
+
+    @classmethod
+    def common(cls, dictionaries: Sequence[Dictionary]) -> "Firmware":
+        """Read what all of them say."""
+        builds = [cls.of(dictionary) for dictionary in dictionaries]
+        return cls(
+            mcu=_same([build.mcu for build in builds]) or "",
+            version=_same([build.version for build in builds]) or "",
+            app=_same([build.app for build in builds]) or "",
+            build=_same([build.build for build in builds]) or "",
+            clock_hz=_same([build.clock_hz for build in builds]),
+            bitrate=_same([build.bitrate for build in builds]),
+        )
 
     @classmethod
     def of(cls, dictionary: Dictionary) -> "Firmware":
@@ -66,18 +87,23 @@ class Facts:
 async def interview(bus: BusTalk, nodeid: int) -> Facts:
     """Ask node NODEID, to whom nobody else talks; raises CanductorError."""
     async with bus.node(nodeid) as talk:
-        firmware = Firmware.of(talk.dictionary)
-        board = await _said(talk, "get_canbus_id", "canbus_id")
-        config = await _said(talk, "get_config", "config")
-        return Facts(
-            firmware=firmware,
-            uuid=_uuid(board),
-            believed_nodeid=_integer(board, "canbus_nodeid"),
-            uptime_s=_uptime_s(await _said(talk, "get_uptime", "uptime"), firmware.clock_hz),
-            configured=_flag(config, "is_config"),
-            shut_down=_flag(config, "is_shutdown"),
-            can=_status(await _said(talk, "get_canbus_status", "canbus_status"), talk.dictionary),
-        )
+        said = [await _said(talk, command, response) for command, response in _QUESTIONS]
+        return facts_of((talk.dictionary,), {message.name: message for message in said if message})
+
+
+def facts_of(alike: Sequence[Dictionary], said: Mapping[str, Message]) -> Facts:
+    """Return what a node SAID, by name; of several dictionaries that it may have what all of them say."""
+    firmware = Firmware.common(alike)
+    board, config = said.get("canbus_id"), said.get("config")
+    return Facts(
+        firmware=firmware,
+        uuid=_uuid(board),
+        believed_nodeid=_integer(board, "canbus_nodeid"),
+        uptime_s=_uptime_s(said.get("uptime"), firmware.clock_hz),
+        configured=_flag(config, "is_config"),
+        shut_down=_flag(config, "is_shutdown"),
+        can=_status(said.get("canbus_status"), alike[0]),
+    )
 
 
 async def _said(talk: NodeTalk, command: str, response: str) -> Message | None:
@@ -85,6 +111,10 @@ async def _said(talk: NodeTalk, command: str, response: str) -> Message | None:
     if not talk.knows(command, response) or talk.dictionary.commands[command].names:
         return None
     return (await talk.ask(command, response)).message
+
+
+def _same(values: Sequence[T]) -> T | None:
+    return values[0] if all(value == values[0] for value in values) else None
 
 
 def _text(dictionary: Dictionary, constant: str) -> str:

@@ -103,6 +103,8 @@ def read_link(interface: str) -> LinkFacts:
     if done.returncode:
         said = " ".join(done.stderr.split())
         if "does not exist" in said or "Cannot find device" in said or "not found" in said:
-            raise NoInterface(f"there is no interface {interface}")
+            raise NoInterface(
+                f"there is no interface {interface}; 'ip -details link show type can' lists those there are"
+            )
         raise CanductorError(f"'{' '.join(words)}' failed: {said}")
     return parse_link(done.stdout)

@@ -100,7 +100,7 @@ def run_monitor(options: MonitorOptions) -> "MonitorReport":
         for nodeid, dictionary in asyncio.run(fetch(options.bus, options.fetch)).items():
             source.put(nodeid, dictionary, FETCHED)
     watch = BusWatch(BusDecoder(source), LoadMeter(options.bitrate), time.monotonic())
-    with FrameQueue(open_bus(options.bus), short_name(options.bus)) as queue:
+    with FrameQueue(open_bus(options.bus), options.bus.short_name) as queue:
         run = _run_lines if options.lines else _run_screen
         shown = run(options, watch, queue)
         return MonitorReport(options, watch, shown, queue.dropped)
@@ -154,6 +154,7 @@ class Lines:
         self._queue = queue
         self._form = json_line if options.as_json else line_of
         self._told_dropped = 0
+        self._told: set[str] = set()
 
     def run(self) -> int:
         """Write until the duration is over, or Ctrl-C; returns how many lines."""
@@ -177,6 +178,13 @@ class Lines:
             f"canductor: {self._told_dropped} frames were dropped until now: lines are read too slowly\n"
         )
 
+    def _tell_guesses(self) -> None:
+        """Say it once of each; there are at most 255 nodes, and 64 dictionaries in the cache."""
+        guesses = {guess for node in self._watch.decoder.nodes.values() if (guess := node.guess)}
+        for guess in sorted(guesses - self._told):
+            sys.stderr.write(f"canductor: {guess}\n")
+        self._told |= guesses
+
     def _said(self) -> Iterator[Decoded]:
         passes = self._options.filter_.passes
         duration_s = self._options.duration_s
@@ -186,6 +194,7 @@ class Lines:
                 for said in self._watch.feed(frame):
                     if passes(said):
                         yield said
+            self._tell_guesses()
 
 
 def json_line(said: Decoded) -> str:
@@ -230,11 +239,6 @@ def _filter_text(given: argparse.Namespace) -> str:
     words += [f"kind={','.join(given.kind)}"] if given.kind else []
     words += [f"dir={given.direction}"] if given.direction else []
     return " ".join([*words, *(given.message or ())]) or "none"
-
-
-def short_name(bus: BusOptions) -> str:
-    """Return how a bus is called where room is short: of a path, the last part."""
-    return bus.channel.rpartition("/")[2] or bus.channel
 
 
 def _bitrate(bus: BusOptions) -> tuple[int, bool]:

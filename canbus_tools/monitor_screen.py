@@ -119,6 +119,8 @@ class MonitorScreen(App[None]):
 
     def refresh_now(self) -> None:
         """Take what came, and show it."""
+        if not self.query("#load"):
+            return  # at the end a timer may fire when the widgets are gone already
         try:
             frames = self._queue.take()
         except CanductorError as error:
@@ -204,6 +206,9 @@ class MonitorScreen(App[None]):
         if strangers:
             text.append(f"   no dictionary of {', '.join(map(str, strangers))}", "yellow")
             text.append(f" (--fetch {strangers[0]})")
+        guessed = sorted(node.nodeid for node in nodes if node.guess)
+        if guessed:
+            text.append(f"   dictionary of {', '.join(map(str, guessed))} guessed", "yellow")
         if not self._watch.frames:
             text.append("   nothing heard yet: is anybody talking on this bus?", "yellow")
         return text

@@ -9,7 +9,7 @@ from typing import Final
 from canbus_tools.census import Application
 from canbus_tools.discovery import declare_listen, listen_option, where
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.survey import PROBED, Entry, State, SurveyResult, survey
+from canbus_tools.survey import PROBED, Entry, State, SurveyResult, survey_and_overhear
 from canbus_tools.table import count, paragraph, table
 from canbus_tools.talk import LISTEN_S, BusTalk
 from nodes.assign import LAST_NODEID
@@ -84,7 +84,7 @@ def list_nodes(options: BusOptions, *, probed: range = PROBED, listen_s: float =
 
     async def find() -> SurveyResult:
         async with BusTalk.open(options) as bus:
-            return await survey(bus, probed=probed, listen_s=listen_s)
+            return await survey_and_overhear(bus, probed=probed, listen_s=listen_s)
 
     return NodesReport(options, asyncio.run(find()))
 
@@ -120,7 +120,7 @@ class NodesReport:
 
 def entry_json(entry: Entry) -> dict[str, object]:
     """Return one node with all that it said."""
-    facts = entry.facts
+    facts = entry.facts or entry.overheard
     return {
         "nodeid": entry.nodeid,
         "uuid": None if entry.uuid is None else str(entry.uuid),
@@ -128,6 +128,7 @@ def entry_json(entry: Entry) -> dict[str, object]:
         "state": entry.state.value,
         "several_boards": entry.twins,
         "trouble": entry.trouble or None,
+        "guessed": entry.overheard is not None,
         "firmware": None if facts is None else asdict(facts.firmware),
         "uptime_s": None if facts is None else facts.uptime_s,
         "configured": None if facts is None else facts.configured,
@@ -143,13 +144,13 @@ def _row(entry: Entry) -> list[str]:
         NAMES[entry.application],
         STATES[entry.state] + (", two boards!" if entry.twins else ""),
     ]
-    facts = entry.facts
+    facts = entry.facts or entry.overheard
     if facts is None:
         return row + [""] * (len(HEADINGS) - len(row))
     firmware, can = facts.firmware, facts.can
     return [
         *row,
-        firmware.mcu,
+        firmware.mcu + (" ?" if entry.overheard else ""),
         "" if firmware.clock_hz is None else f"{firmware.clock_hz / 1e6:g} MHz",
         " ".join(filter(None, (firmware.app, firmware.version))),
         duration(facts.uptime_s),
@@ -190,6 +191,16 @@ def _notes(found: SurveyResult, bus: BusOptions) -> list[str]:
         notes.append(
             "Nodes in use were not asked, so as not to disturb their host; a uuid is known of those whose "
             "firmware is canductor's."
+        )
+    if any(entry.overheard for entry in entries):
+        notes.append(
+            "What stands in a row with '?' was guessed: a dictionary in the cache explains what the node and "
+            "its host were heard to say."
+        )
+    elif any(entry.state is State.IN_USE for entry in entries):
+        notes.append(
+            "Their traffic tells what they are when their dictionary is in the cache: run this once while "
+            "their host is stopped."
         )
     return notes
 

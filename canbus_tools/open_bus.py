@@ -25,6 +25,11 @@ class BusOptions:
     """Never disturb the bus, not even by an acknowledgement; only some adapters can."""
 
     @property
+    def short_name(self) -> str:
+        """How a bus is called in recordings and lines: of a path, the last part."""
+        return self.channel.rpartition("/")[2] or self.channel
+
+    @property
     def name(self) -> str:
         """How messages call the bus."""
         return self.channel if self.interface == "socketcan" else f"{self.interface}:{self.channel}"
@@ -65,12 +70,16 @@ def open_bus(options: BusOptions) -> can.BusABC:
 
 def _why(options: BusOptions, error: Exception) -> str:
     said = " ".join(str(error).split()) or type(error).__name__
+    if options.interface == "canductor":
+        return said.partition(": ")[2] or said  # it names the bus, as the sentence does already
     if options.interface == "socketcan":
         if "No such device" in said:
             return (
                 f"there is no such interface; 'ip -details link show type can' lists those there are, and"
                 f" 'canductor can doctor -c {options.channel}' says more"
             )
+        if "Address family not supported" in said:
+            return "this kernel has no CAN; load the module can-raw: 'modprobe can-raw'"
         if "Operation not permitted" in said or "Permission denied" in said:
             return f"opening it is not permitted ({said})"
     return (

@@ -114,7 +114,8 @@ class _LiveBus:
     def __init__(self, options: BusOptions) -> None:
         self._bus = open_bus(options)
         self._name = options.name
-        self._channel = Path(options.channel).name
+        self._channel = options.short_name
+        self._named = options.interface == "socketcan"
 
     def receive(self, timeout_s: float) -> Frame | None:
         try:
@@ -126,7 +127,8 @@ class _LiveBus:
         if message is None:
             return None
         frame = Frame.from_message(message)
-        return frame if frame.channel else frame._replace(channel=self._channel)
+        # Only a kernel's interfaces have names of their own; other backends put sentences and paths there.
+        return frame if self._named and frame.channel else frame._replace(channel=self._channel)
 
     def close(self) -> None:
         self._bus.shutdown()

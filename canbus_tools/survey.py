@@ -15,6 +15,7 @@ from typing import Final
 from canbus_tools.census import ROUNDS, Application, CensusResult, NodeHere, WaitingNode
 from canbus_tools.discovery import take_census
 from canbus_tools.interview import Facts, interview
+from canbus_tools.overhear import Overhearing
 from canbus_tools.talk import DATA_IDS, LISTEN_S, BusTalk, data_ids
 from nodes.assign import FIRST_NODEID, Uuid
 from nodes.errors import CanductorError
@@ -33,6 +34,9 @@ PROBE_PAUSE_S: Final = 0.002
 PROBE_ANSWER_S: Final = 0.03
 """For the last answers; adapters on USB may hold frames back for 16 ms."""
 INTERVIEWS_AT_ONCE: Final = 8
+HEAR_OUT_S: Final = 0.1
+HEAR_OUT_TIMES: Final = 22
+"""At most so often: a host that asks for clocks every 0.98 s has asked three times since the beginning."""
 
 
 class State(Enum):
@@ -62,6 +66,8 @@ class Entry:
     facts: Facts | None = None
     twins: bool = False
     """Another board has the same uuid."""
+    overheard: Facts | None = None
+    """Of a node in use: what its traffic tells by a dictionary of the cache that explains it."""
     trouble: str = ""
 
 
@@ -109,6 +115,34 @@ async def survey(
     entries.sort(key=lambda entry: (entry.nodeid or 0, entry.uuid.raw if entry.uuid else b""))
     entries += [_waiting(node) for node in await _still_waiting(bus, census, {e.uuid for e in entries})]
     return SurveyResult(_mark_twins(entries), census, candidates)
+
+
+async def survey_and_overhear(bus: BusTalk, *, probed: Iterable[int], listen_s: float) -> SurveyResult:
+    """Find all nodes as ``survey`` does, and tell of nodes in use what their traffic does."""
+    overhearing = Overhearing(bus.cache)
+    end = bus.on_frame(overhearing.frame)
+    try:
+        found = await survey(bus, probed=probed, listen_s=listen_s)
+        await _hear_out(bus, frozenset(bus.hosted), overhearing)
+    finally:
+        end()
+    return replace(found, entries=_mark_twins([_overheard(entry, overhearing) for entry in found.entries]))
+
+
+async def _hear_out(bus: BusTalk, hosted: Iterable[int], overhearing: Overhearing) -> None:
+    """Wait for a node's second word about its clock where that may tell what it is."""
+    for _ in range(HEAR_OUT_TIMES):
+        if not any(overhearing.is_open(nodeid) for nodeid in hosted):
+            return
+        await bus.wait(HEAR_OUT_S)
+
+
+def _overheard(entry: Entry, overhearing: Overhearing) -> Entry:
+    if entry.state is not State.IN_USE or entry.nodeid is None:
+        return entry
+    facts = overhearing.facts(entry.nodeid)
+    uuid = entry.uuid or (facts.uuid if facts else None)
+    return replace(entry, overheard=facts, uuid=uuid)
 
 
 async def _still_waiting(

@@ -1,8 +1,9 @@
 """Counters of one node's traffic, as an onlooker counts it."""
 
 import math
+from collections.abc import Iterable
 
-from canbus_tools.dictionaries import DictionarySource
+from canbus_tools.dictionaries import GUESSED, DictionarySource
 from canbus_tools.flow import Flow
 
 
@@ -50,8 +51,20 @@ class NodeTraffic:
         """Take over what the node's dictionary says about it."""
         dictionary = dictionaries.known.get(self.nodeid)
         self.dictionary_origin = dictionaries.origins.get(self.nodeid, "")
-        self.mcu = "" if dictionary is None else str(dictionary.constants.get("MCU", ""))[:80]
-        self.version = "" if dictionary is None else dictionary.version
+        alike = dictionaries.fitting.get(self.nodeid) or ((dictionary,) if dictionary else ())
+        self.mcu = _common(str(each.constants.get("MCU", ""))[:80] for each in alike)
+        self.version = _common(each.version for each in alike)
+
+    @property
+    def guess(self) -> str | None:
+        """A sentence about the node's dictionary when that is a guess."""
+        if self.dictionary_origin != GUESSED:
+            return None
+        what = " ".join(filter(None, (self.mcu, self.version))) or "one of several"
+        return (
+            f"node {self.nodeid}: its dictionary ({what}) is guessed: the cache has it, and it explains what "
+            f"was heard; --dictionary {self.nodeid}=FILE makes sure"
+        )
 
     def to_json(self) -> dict[str, object]:
         """Return it as ``--json`` shows it."""
@@ -69,3 +82,9 @@ class NodeTraffic:
             "rtt": self.flow.round_trips.to_json(),
             "last_heard_s": None if math.isnan(self.last_heard_s) else self.last_heard_s,
         }
+
+
+def _common(texts: Iterable[str]) -> str:
+    """Return what all of them say, or nothing: of a guess only what all that fit say is told."""
+    different = set(texts)
+    return different.pop() if len(different) == 1 else ""

@@ -10,7 +10,7 @@ import signal
 import sys
 from collections.abc import Mapping, Sequence
 
-from coordinator.command_line import Answered, print_help, read_words, version
+from coordinator.command_line import Answered, help_of, print_help, read_words, version
 from coordinator.commands import Report, Terminated
 from nodes.errors import CanductorError
 from nodes.option_values import UsageError
@@ -59,7 +59,7 @@ def _run(words: list[str], as_json: bool) -> int:
     except CanductorError as error:
         return _fail(str(error), EXIT_FAILED, as_json)
     except UsageError as error:
-        return _fail(f"{' '.join(str(error).split())} (see 'canductor --help')", EXIT_USAGE, as_json)
+        return _fail(f"{' '.join(str(error).split())} (see '{help_of(words)}')", EXIT_USAGE, as_json)
     except KeyboardInterrupt as error:
         terminated = isinstance(error, Terminated)
         return _fail(

@@ -70,6 +70,16 @@ def print_help() -> None:
     _parser().print_help()
 
 
+def help_of(words: Sequence[str]) -> str:
+    """Return the command that explains the words: of the CAN tools each has its own help."""
+    from canbus_tools.command_line import TOOLS  # noqa: PLC0415 (start-up time)
+
+    named = words[:1] if words[0] == "console" else words[:2] if words[0] == "can" else []
+    if named[1:] and named[1] not in TOOLS:
+        named = named[:1]
+    return " ".join(["canductor", *named, "--help"])
+
+
 def version() -> str:
     """Return the version of the installed project."""
     from importlib import metadata  # noqa: PLC0415 (start-up time: it draws in the mail parser)
@@ -121,7 +131,7 @@ def _tool(words: Sequence[str]) -> Job:
         add_tools(commands.add_parser("can", allow_abbrev=False, description=TOOL_COMMANDS["can"]), words)
     arguments = parser.parse_args(list(words))
     if "make_job" not in arguments:
-        raise UsageError("the CAN tool is missing; 'canductor can --help' lists them")
+        raise UsageError("the CAN tool is missing")
     return cast("Job", arguments.make_job(arguments))
 
 

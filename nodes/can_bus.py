@@ -25,6 +25,7 @@ from nodes.node_errors import NodeError, NodeLost
 from nodes.node_states import NodeState
 from nodes.seams import BuildConfig, FrameLike, IoFactory, LinkLike, OnLost, OnResponses
 from nodes.sync_pulse import CONSTANT, PulseKeeper
+from nodes.transport.frame import BUS_OFF
 from nodes.vocabulary import KNOWS_BUS_STOP
 from nodes.wire_time import can_wire_ns
 
@@ -34,8 +35,6 @@ BUS_STOP_ID: Final = 0x010
 """Frame ``<reason> <node id of the origin>``: every node of this project's firmware shuts down at once."""
 BUS_STOP_FRAMES: Final = 3
 """Nobody acknowledges it, and a bus that has to be stopped may be one that loses frames."""
-BUS_OFF: Final = 0x2000_0040
-"""Id of the kernel's error frame (CAN_ERR_FLAG | CAN_ERR_BUSOFF): the controller took itself off the bus."""
 
 
 class CanBus(BusBase):

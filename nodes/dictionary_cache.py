@@ -68,6 +68,11 @@ class DictionaryCache:
         self._read_folder(beginning)
         return [kept for kept in reversed(self._kept.values()) if kept.compressed.startswith(beginning)]
 
+    def all(self) -> list[CachedDictionary]:
+        """Return every dictionary there is, the one used last first."""
+        self._read_folder(b"")
+        return list(reversed(self._kept.values()))
+
     def used(self, cached: CachedDictionary) -> None:
         """Take note that a node has this dictionary: it is the last to be dropped."""
         key = _sha256(cached.compressed)

@@ -89,6 +89,8 @@ class NodeFacts:
 
     survey: SurveyResult
     pings: tuple[PingFacts, ...] = ()
+    silenced: Mapping[int, str] = field(default_factory=dict)
+    """Nodes that said what they are and then answered no more: what went wrong, in a sentence."""
     heard_at: Mapping[int, int] = field(default_factory=dict)
     """Frames heard by bit rate, where other bit rates were tried."""
 

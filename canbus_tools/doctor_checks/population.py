@@ -8,6 +8,7 @@ from canbus_tools.doctor_checks.facts import NodeFacts, PingFacts, Place
 from canbus_tools.doctor_checks.finding import Finding, note, problem, warning
 from canbus_tools.doctor_checks.traffic import RTT_SPREAD_S, slow
 from canbus_tools.survey import Entry, State
+from nodes.assign import FIRST_NODEID, LAST_NODEID
 
 SAID_ACTIVE: Final = "active"
 LOSS_MANY: Final = 0.02
@@ -22,8 +23,11 @@ def check_nodes(facts: NodeFacts, place: Place) -> Iterator[Finding]:
         yield _nobody(facts, place)
     yield from _twins(entries)
     yield from _shared_ids(facts, entries)
+    free = _free_id(facts)
     for entry in entries:
-        yield from _node(entry, place)
+        yield from _node(entry, place, free)
+    for nodeid, said in facts.silenced.items():
+        yield _went_silent(nodeid, said, place)
     for ping in facts.pings:
         yield from _ping(ping, place)
 
@@ -89,7 +93,23 @@ def _shared_ids(facts: NodeFacts, entries: tuple[Entry, ...]) -> Iterator[Findin
             )
 
 
-def _node(entry: Entry, place: Place) -> Iterator[Finding]:
+def _free_id(facts: NodeFacts) -> int:
+    taken = {entry.nodeid for entry in facts.survey.entries}
+    return next(nodeid for nodeid in range(FIRST_NODEID, LAST_NODEID + 2) if nodeid not in taken)
+
+
+def _went_silent(nodeid: int, said: str, place: Place) -> Finding:
+    return problem(
+        "node-went-silent",
+        f"node {nodeid} said what it is, and then answered no more: {said}",
+        "while it was asked it was reset, lost its power, or its controller went off the bus (bus-off); when"
+        " several nodes fall silent together, this computer's adapter may have",
+        f"look whether it is back: 'canductor can nodes {place.words}'. If it waits for an id, it was reset:"
+        " look at its power; if it has its id, look at its cable, its crimp and the termination",
+    )
+
+
+def _node(entry: Entry, place: Place, free: int) -> Iterator[Finding]:
     name = _name(entry)
     if entry.state is State.SHUTDOWN:
         yield warning(
@@ -112,11 +132,14 @@ def _node(entry: Entry, place: Place) -> Iterator[Finding]:
             f"{name} waits for an id",
             "that is normal as long as no host runs that has it in its configuration",
             "put its uuid into the host's configuration; to try it:"
-            f" 'canductor can assign {entry.uuid} 4 {place.words}'",
+            f" 'canductor can assign {entry.uuid} {free} {place.words}'",
         )
     elif entry.state is State.UNCLEAR and entry.trouble and "more than one board" not in entry.trouble:
         yield warning(
-            "node-unclear", f"{name}: {entry.trouble}", "it could not be asked how it is", "see above"
+            "node-unclear",
+            f"{name}: {entry.trouble}",
+            "it could not be asked how it is",
+            f"switch it off and on, then look again: 'canductor can nodes {place.words}'",
         )
     status = entry.facts.can if entry.facts is not None else None
     if status is not None and (

@@ -30,6 +30,6 @@ def connect(path: str | Path) -> socket.socket:
         reason = error.strerror or str(error)  # a path too long has no errno
         raise CanductorError(
             f"virtual:{path}: no virtual CAN bus answers there ({reason});"
-            f" start one with: python -m nodes.virtual.hub {path}"
+            f" start one with 'canductor can inject -c {path}'"
         ) from error
     return sock

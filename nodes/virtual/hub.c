@@ -2,10 +2,9 @@
 // See hub.h.
 #include "nodes/virtual/hub.h"
 #include "nodes/can_bits.h"
+#include "nodes/virtual/hub_queue.h"
 
 #include <string.h>
-
-enum { ID_MAX = 0x7FF, DATA_MAX = 8, LENGTH_AT = 4, DATA_AT = 8, OUTPUT_BYTES = HUB_OUTPUT * HUB_RECORD };
 
 // A controller whose transmissions fail so often in a row has its error counter (8 each) at 256: bus-off.
 // It may come back when it has seen the bus free for 128 times 11 bits. An error frame has a flag of 6 to 12
@@ -13,51 +12,8 @@ enum { ID_MAX = 0x7FF, DATA_MAX = 8, LENGTH_AT = 4, DATA_AT = 8, OUTPUT_BYTES = 
 enum { ATTEMPTS = 256 / 8, RECOVERY_BITS = 128 * 11, ERROR_BITS = 12 + 8 + 3, UNPROTECTED_BITS = 7 + 3 };
 
 _Static_assert((int)HUB_SENDERS == (int)HUB_CLIENTS, "cffi wants the number itself in both headers");
-_Static_assert((HUB_INPUT & (HUB_INPUT - 1)) == 0, "free-running indices need a power of two");
-_Static_assert((OUTPUT_BYTES & (OUTPUT_BYTES - 1)) == 0, "free-running indices need a power of two");
 
 static const uint64_t NS_PER_S = 1000000000;
-
-// ------------------------------------------------------------------------------------------------- records
-
-static uint32_t record_id(const uint8_t *record) {
-    uint32_t id; // flags stand above the 11 bits
-    memcpy(&id, record, sizeof(id));
-    return id;
-}
-
-static bool is_frame(const uint8_t *record) {
-    return record_id(record) <= ID_MAX && record[LENGTH_AT] <= DATA_MAX;
-}
-
-// Receivers see the fields of a frame and zeros, never what else the sender's memory held.
-static void copy_frame(uint8_t *out, const uint8_t *record) {
-    memset(out, 0, HUB_RECORD);
-    memcpy(out, record, LENGTH_AT + 1);
-    memcpy(out + DATA_AT, record + DATA_AT, record[LENGTH_AT]);
-}
-
-// ------------------------------------------------------------------------------------------------- queues
-
-static uint32_t input_count(const struct hub_client *client) {
-    return client->input_tail - client->input_head;
-}
-
-static const struct hub_frame *input_head(const struct hub_client *client) {
-    return &client->input[client->input_head % HUB_INPUT];
-}
-
-static bool output_full(const struct hub_client *client) {
-    return client->state == HUB_PRESENT &&
-           client->output_tail - client->output_head > OUTPUT_BYTES - HUB_RECORD;
-}
-
-static void output_push(struct hub_client *client, const uint8_t *record) {
-    // The tail is always at the begin of a record, so none is split by the end of the ring.
-    memcpy(client->output + client->output_tail % OUTPUT_BYTES, record, HUB_RECORD);
-    client->output_tail += HUB_RECORD;
-    client->counters.received++;
-}
 
 // ------------------------------------------------------------------------------------------------- clients
 

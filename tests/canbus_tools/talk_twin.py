@@ -53,6 +53,13 @@ def identify_pieces(size: int = 40, text: bytes = DICTIONARY_JSON) -> list[tuple
     return [*pieces, (len(compressed), b"")]
 
 
+def download(talk: Talk, pieces: list[tuple[int, bytes]]) -> Talk:
+    """Add to TALK the answers to a host that asks for these pieces of a dictionary."""
+    for n, (offset, data) in enumerate(pieces):
+        talk.response(n, "identify_response", offset=offset, data=data)
+    return talk
+
+
 def other_dictionary() -> bytes:
     """Return the text of another firmware: get_clock has another id."""
     source = json.loads(DICTIONARY_JSON)

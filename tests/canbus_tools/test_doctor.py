@@ -1,5 +1,6 @@
 """``canductor can doctor`` names faults that are planted on a bus: the virtual one, or vcan0."""
 
+import asyncio
 import threading
 from contextlib import closing
 from pathlib import Path
@@ -15,8 +16,10 @@ from canbus_tools.doctor_checks.population import check_nodes
 from canbus_tools.doctor_facts import try_bitrates
 from canbus_tools.open_bus import BusOptions
 from canbus_tools.survey import SurveyResult
+from canbus_tools.talk import NodeTalk
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, NODE_IS_HERE, WHO_IS_HERE, Uuid
 from nodes.transport import CanFrame
+from nodes.virtual.faults import Fault, FaultKind
 from nodes.virtual.hub import VirtualBus
 from tests.canbus_tools.command import Command, Said
 from tests.canbus_tools.stage import (
@@ -179,6 +182,59 @@ def test_loss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert ping["lost"] + ping["invalid_bytes"] > 0
 
 
+def test_a_host_whose_blocks_get_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Somebody else's host repeats blocks, and an onlooker finds pieces of them: it only listens."""
+    if not why_no_socketcan():
+        pytest.skip("a kernel in a process is too slow for a bus that loses frames; tested outside of it")
+    with VirtualBus(tmp_path / "bus") as bus:
+        place = Place("canductor", str(bus.path))
+        end = threading.Event()
+        talks = threading.Event()
+
+        async def host() -> None:
+            async with NodeTalk.open(place.options, MAIN_ID, force=True) as talk:
+                bus.set_faults([Fault(kind=FaultKind.LOSE, share=0.1)])
+                while not end.is_set():
+                    await talk.ask("get_uptime", "uptime", tries=100)
+                    talks.set()
+
+        with place.start_node("mainboard", MAIN) as node:
+            node.wait_ready()
+            with closing(place.open()) as opened:
+                set_nodeid(opened, MAIN, MAIN_ID)
+            thread = threading.Thread(target=lambda: asyncio.run(host()))
+            thread.start()
+            try:
+                assert talks.wait(PATIENCE_S)
+                said = Command(place, capsys)(
+                    "doctor", "-b", BITRATE, "--listen", "3", "--quiet-bus", "--json"
+                )
+            finally:
+                end.set()
+                thread.join(PATIENCE_S)
+    assert said.status == 1
+    assert {"bytes-retransmit", "bytes-invalid"} <= problems(said)
+
+
+def test_a_node_that_goes_off_the_bus_while_it_is_asked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with VirtualBus(tmp_path / "bus") as bus:
+        place = Place("canductor", str(bus.path))
+        with place.start_node("mainboard", MAIN) as node:
+            node.wait_ready()
+            with closing(place.open()) as host:
+                set_nodeid(host, MAIN, MAIN_ID)
+            assert problems(run(Command(place, capsys))) == set()
+            # With the dictionary in the cache it says what it is in some forty frames.
+            bus.set_faults([Fault(kind=FaultKind.BUS_OFF, sender=0, nth=100, time_s=3600)])
+            said = run(Command(place, capsys))
+    assert (said.status, problems(said)) == (1, {"node-went-silent"})
+    finding = findings(said)["node-went-silent"]
+    assert finding["seen"].startswith(f"node {MAIN_ID} said what it is, and then answered no more: ")
+    assert "bus-off" in finding["means"]
+
+
 def test_overload_by_a_babbler(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with VirtualBus(tmp_path / "bus", bitrate=50_000) as bus:
         place = Place("canductor", str(bus.path))
@@ -195,7 +251,9 @@ def test_quiet_bus_sends_nothing(place: Place, can_tool: Command) -> None:
     with closing(place.open()) as onlooker:
         said = run(can_tool, "--quiet-bus")
         assert onlooker.receive(0.05) is None
+        text = can_tool("doctor", "-b", BITRATE, "--listen", "0.5", "--quiet-bus").words
     assert (said.status, said.json["checked"][-1]) == (0, "traffic")
+    assert "nothing was heard and nothing was asked" in text
 
 
 def test_other_bit_rates_are_listened_to() -> None:

@@ -127,7 +127,7 @@ def test_a_frame_by_its_number_is_lost_and_sigterm_ends_in_order_too(tmp_path: P
 
 
 def test_ends_by_itself_and_reports_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["can", "inject", "-c", str(tmp_path / "bus"), "--for", "0.1", "--corrupt", "1%"]
+    words = ["can", "inject", "-c", str(tmp_path / "bus"), "--duration", "0.1", "--corrupt", "1%"]
     assert cli.main([*words, "--socketcand", "0", "--bus-off", "1ms,at=0.01"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"virtual bus ready; attach with -i canductor -c {tmp_path / 'bus'}"
@@ -248,7 +248,7 @@ def test_bad_faults_are_refused_with_a_sentence(name: str, text: str, said: str)
         (["--socketcand-bus", "my bus"], "--socketcand-bus is 'my bus', must be 1 to 16 letters and digits"),
         (["--seed", "x"], "--seed is 'x', must be a whole number"),
         (["--bitrate", "fast"], "--bitrate is 'fast', must be a whole number"),
-        (["--for", "-1"], "--for is '-1', must be a number from 0"),
+        (["--duration", "-1"], "--duration is '-1', must be a number from 0"),
         (["--loss", "x"], "--loss is 'x', must be a share"),
     ],
 )

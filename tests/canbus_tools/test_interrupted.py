@@ -12,11 +12,11 @@ from canbus_tools.discovery import take_census
 from canbus_tools.open_bus import BusOptions
 from canbus_tools.talk import BusTalk
 from nodes.assign import ADMIN_ID
-from nodes.can_bus import BUS_OFF
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 from nodes.link import Frame
 from nodes.transport import CanFrame
+from nodes.transport.frame import BUS_OFF
 from nodes.virtual.hub import VirtualBus
 from tests.canbus_tools.stage import PATIENCE_S, Place
 

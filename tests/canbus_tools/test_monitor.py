@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -82,6 +82,13 @@ def talk_until(place: Place, process: "subprocess.Popen[str]", wanted: str) -> l
     reader.join(PATIENCE_S)
     assert found.is_set(), (seen[-5:], process.stderr and process.poll())
     return seen
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    end_s = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < end_s
+        time.sleep(0.001)
 
 
 def test_lines_learn_the_dictionary_and_end_in_order(node: Place) -> None:
@@ -221,8 +228,7 @@ def test_what_waits_too_long_gives_way_and_is_counted(tmp_path: Path) -> None:
         for n in range(25):
             host.send(CanFrame(0x108, bytes([n])))
         got: list[Frame] = []
-        while queue.dropped < 15:
-            time.sleep(0.001)
+        wait_until(lambda: queue.dropped >= 15)
         got = queue.take()
         assert [frame.data[0] for frame in got] == list(range(15, 25))
         assert queue.take() == []
@@ -255,8 +261,7 @@ def test_dropped_frames_are_told_now_and_then(tmp_path: Path, capsys: Captured) 
     ):
         for _ in range(50):
             set_nodeid(host, MAIN, MAIN_ID)
-        while queue.dropped < 45:
-            time.sleep(0.001)
+        wait_until(lambda: queue.dropped >= 45)
         options = MonitorOptions(
             bus=opened(bus),
             bitrate=1_000_000,

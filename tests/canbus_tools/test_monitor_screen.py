@@ -213,6 +213,15 @@ def test_memory_is_bounded_and_what_is_left_out_is_said(node: Place) -> None:
     on_screen(node, SMALL, test)
 
 
+def test_a_timer_that_fires_when_the_widgets_are_gone(node: Place) -> None:
+    async def test(stand: Stand) -> None:
+        await stand.screen.screen.remove_children()
+        stand.screen.refresh_now()
+        assert stand.screen.failure is None
+
+    on_screen(node, SMALL, test)
+
+
 def test_quit(node: Place) -> None:
     async def test(stand: Stand) -> None:
         await stand.pilot.press("q")

@@ -112,7 +112,7 @@ def test_beside_a_host_a_dictionary_is_read_with_pauses(stage: Stage) -> None:
             async with bus.node(MAIN_ID):
                 return time.monotonic() - began_s
 
-    alone_s = asyncio.run(read_dictionary_s())
+    alone_s = min(asyncio.run(read_dictionary_s()) for _ in range(3))  # the machine may be busy
     with OtherHost(stage.place, 200):
         beside_s = asyncio.run(read_dictionary_s())
     assert beside_s > 2.5 * alone_s  # 5 times, less what does not depend on it: opening, first contact

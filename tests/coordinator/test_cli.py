@@ -281,3 +281,19 @@ def test_starting_imports_nothing_slow() -> None:
         "coordinator.machine.options",
     }
     assert not slow & set(out.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("can query --rounds x", "canductor can query --help"),
+        ("can bogus", "canductor can --help"),
+        ("can", "canductor can --help"),
+        ("console --node zz", "canductor console --help"),
+    ],
+)
+def test_a_mistaken_tool_line_names_the_tools_own_help(
+    capsys: pytest.CaptureFixture[str], words: str, told: str
+) -> None:
+    assert cli.main(words.split()) == 2
+    assert capsys.readouterr().err.endswith(f" (see '{told}')\n")

@@ -4,11 +4,12 @@ import asyncio
 
 import pytest
 
-from nodes.can_bus import BUS_OFF, CanBus
+from nodes.can_bus import CanBus
 from nodes.errors import CanductorError
 from nodes.node_errors import NodeError, NodeRestarted
 from nodes.node_states import NodeState
 from nodes.seams import OnFrame, OnLost
+from nodes.transport.frame import BUS_OFF
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
 from tests.nodes.twin_bus import Frame, TwinIO, TwinNode, source_of, with_canbus_id
