@@ -42,15 +42,15 @@ class Ticket:
     read: bool = False
     """Whether nothing more of it will be planned."""
     ends_at_s: float | None = None
-    """Print time at which its last move ends, once it is known."""
+    """Print time at which its last move ends, once it is known; 0: it moved nothing."""
+    done: bool = False
+    """Whether that has passed."""
 
 
 class Feeder:
     """A ``MoveSource`` that never ends until ``close``: idles while nothing is to do."""
 
-    def __init__(
-        self, planner: Planner, homed_position: Mapping[str, float], machine: MachineState
-    ) -> None:
+    def __init__(self, planner: Planner, homed_position: Mapping[str, float], machine: MachineState) -> None:
         self.planner = planner
         self.machine = machine
         self._setting = Setting(planner, machine, dict(homed_position))
@@ -201,4 +201,3 @@ class Feeder:
 def _keep(ticket: Ticket, event: Reply | Notice) -> None:
     if len(ticket.told) < TOLD_MAX:
         ticket.told.append(event)
-

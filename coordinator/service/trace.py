@@ -50,7 +50,9 @@ class MotionTrace:
     def see_moves(self, trapezoids: Any, count: int) -> None:
         """Copy moves; in the worker's thread."""
         new = np.frombuffer(ffi_memory(trapezoids, count), TRAPEZOID).copy()
-        kept = [piece for piece in self._pieces if _end_s(piece[-1]) >= self.forget_before_s]
+        kept = list(self._pieces)
+        while len(kept) > 1 and _end_s(kept[0][-1]) < self.forget_before_s:
+            del kept[0]  # the last one stays: it is where the machine stands
         if kept and len(kept[-1]) + count <= PIECE_MOVES:
             kept[-1] = np.concatenate((kept[-1], new))
         else:

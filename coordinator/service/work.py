@@ -20,9 +20,7 @@ from nodes.errors import CanductorError
 LINES_MAX: Final = 10_000
 """Lines a client may send at once."""
 LINES_BYTES_MAX: Final = 1 << 20
-ASIDE: Final = frozenset(
-    "M73 M105 M114 M117 M118 M204 M220 M221 SET_VELOCITY_LIMIT".split()
-)
+ASIDE: Final = frozenset("M73 M105 M114 M117 M118 M204 M220 M221 SET_VELOCITY_LIMIT".split())
 """Commands that neither move nor wait: a client may give them while a job prints."""
 EMERGENCY: Final = "M112"
 
