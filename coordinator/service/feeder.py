@@ -42,7 +42,7 @@ class Ticket:
     read: bool = False
     """Whether nothing more of it will be planned."""
     ends_at_s: float | None = None
-    """Print time at which its last move ends, once it is known; 0: it moved nothing."""
+    """Print time at which its last move ends, once it is known; 0: there is nothing to wait for."""
     done: bool = False
     """Whether that has passed."""
 
@@ -172,7 +172,8 @@ class Feeder:
             return Full()
         ticket.read = True
         end_s = self.planner.print_time_end_s
-        ticket.ends_at_s = 0.0 if end_s == ticket.begun_at_s else end_s  # what moved nothing is done at once
+        at_once = end_s == ticket.begun_at_s or (ticket.work.rest is Rest.OPEN and not early)
+        ticket.ends_at_s = 0.0 if at_once else end_s
         ticket.work.close()
         self._now = None
         self.finished.append(ticket)

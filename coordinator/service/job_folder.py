@@ -1,5 +1,6 @@
 """The job folder: the only files that clients can have printed, whatever names they send."""
 
+import contextlib
 import os
 import stat
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ DEPTH_MAX: Final = 8
 FILES_MAX: Final = 10_000
 """Looked at for one list."""
 NAME_BYTES_MAX: Final = 1024
+_NO_LINK: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
 SUFFIXES: Final = (".gcode", ".gco", ".g", ".nc", ".ngc")
 
 
@@ -63,25 +65,23 @@ class JobFolder:
             fd = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except OSError as error:
             raise NoSuchJob(_no_folder(self.path, error)) from None
-        try:
-            for at, part in enumerate(parts):
-                last = at == len(parts) - 1
-                kind = os.O_NONBLOCK if last else os.O_DIRECTORY  # a pipe must not be waited for
-                inner = os.open(part, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | kind, dir_fd=fd)
-                os.close(fd)
-                fd = inner
-            status = os.fstat(fd)
-            if not stat.S_ISREG(status.st_mode):
-                raise NoSuchJob(f"{_shown(name)} in the job folder is not a file")
-        except OSError:
-            os.close(fd)
-            raise NoSuchJob(
-                f"there is no file {_shown(name)} in the job folder; job.list tells which there are"
-            ) from None
-        except BaseException:
-            os.close(fd)
-            raise
-        return Program(FileIO(fd, closefd=True), "/".join(parts), size_bytes=status.st_size)
+        with contextlib.ExitStack() as opened:
+            opened.callback(os.close, fd)
+            try:
+                for folder in parts[:-1]:
+                    fd = os.open(folder, _NO_LINK | os.O_DIRECTORY, dir_fd=fd)
+                    opened.callback(os.close, fd)
+                fd = os.open(parts[-1], _NO_LINK | os.O_NONBLOCK, dir_fd=fd)  # a pipe is not waited for
+            except OSError:
+                raise NoSuchJob(
+                    f"there is no file {_shown(name)} in the job folder; job.list tells which there are"
+                ) from None
+        file = FileIO(fd, closefd=True)
+        status = os.fstat(fd)
+        if not stat.S_ISREG(status.st_mode):
+            file.close()
+            raise NoSuchJob(f"{_shown(name)} in the job folder is not a file")
+        return Program(file, "/".join(parts), size_bytes=status.st_size)
 
 
 def _parts(name: str) -> tuple[str, ...]:
@@ -103,7 +103,7 @@ def _parts(name: str) -> tuple[str, ...]:
 
 
 def _shown(name: str) -> str:
-    return ascii(name if len(name) <= 60 else name[:60] + "...")  # noqa: PLR2004 (as much as fits a line)
+    return ascii(name if len(name) <= 60 else name[:60] + "...")
 
 
 def _no_folder(path: Path, error: OSError) -> str:

@@ -18,7 +18,10 @@ UNMOVED = Planned((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, "", 1.0, 1.0, 0.0)
 
 
 class Motion:
-    """What moves MACHINE, whose nodes are READY. ON_TOLD gets replies and notices, ON_CYCLE every cycle's end."""
+    """What moves MACHINE, whose nodes are READY.
+
+    ON_TOLD gets replies and notices, ON_CYCLE is called at the end of every cycle.
+    """
 
     def __init__(
         self, machine: Machine, *, on_told: Callable[[Told], None], on_cycle: Callable[[], None]
@@ -60,7 +63,7 @@ class Motion:
         return await self._wait_for(self.feeder.submit(work))
 
     async def do_aside(self, lines: LinesWork) -> Ticket:
-        """The same for lines that may run beside a job."""
+        """Do the same for lines that may run beside a job."""
         return await self._wait_for(self.feeder.submit_aside(lines))
 
     async def _wait_for(self, ticket: Ticket) -> Ticket:

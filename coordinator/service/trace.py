@@ -1,6 +1,6 @@
 """The motion of the last seconds: where the machine is now, and what to draw.
 
-The motion worker adds moves, the control loop reads; both see one immutable tuple at a time, so neither waits.
+The motion worker adds moves, the control loop reads; both see one immutable tuple at a time: neither waits.
 """
 
 from collections import deque
@@ -84,7 +84,8 @@ class MotionTrace:
         pieces = self._pieces
         every = np.concatenate(pieces) if pieces else np.empty(0, TRAPEZOID)
         ends = every["print_time"] + every["accel_s"] + every["cruise_s"] + every["decel_s"]
-        return every[ends > since_s]
+        kept: Moves = every[ends > since_s]
+        return kept
 
     def batches(self, node: int) -> tuple[bytes, ...]:
         """Return what was sent to a moving node, oldest first."""

@@ -20,7 +20,9 @@ from nodes.errors import CanductorError
 LINES_MAX: Final = 10_000
 """Lines a client may send at once."""
 LINES_BYTES_MAX: Final = 1 << 20
-ASIDE: Final = frozenset("M73 M105 M114 M117 M118 M204 M220 M221 SET_VELOCITY_LIMIT".split())
+ASIDE: Final = frozenset(
+    ["M73", "M105", "M114", "M117", "M118", "M204", "M220", "M221", "SET_VELOCITY_LIMIT"]
+)
 """Commands that neither move nor wait: a client may give them while a job prints."""
 EMERGENCY: Final = "M112"
 
@@ -152,20 +154,21 @@ class MoveWork:
     name: str = "move"
     rest: Rest = Rest.STANDSTILL
     _planner: Planner | None = None
-    _target: list[float] = field(default_factory=list)
+    target: list[float] = field(default_factory=list)
+    """X Y Z E, once it is begun."""
 
     def begin(self, setting: Setting) -> None:
         """Take where the machine will be."""
         self._planner = setting.planner
-        self._target = list(setting.planner.toolhead_position)
+        self.target = list(setting.planner.toolhead_position)
         for letter, value in self.axes.items():
             axis = AXIS_LETTERS.index(letter)
-            self._target[axis] = value + (self._target[axis] if self.relative else 0.0)
+            self.target[axis] = value + (self.target[axis] if self.relative else 0.0)
 
     def step(self) -> Event:
         """Plan it."""
         assert self._planner is not None
-        status = self._planner.move_to(self._target, self.speed_mm_s)
+        status = self._planner.move_to(self.target, self.speed_mm_s)
         if status is FeedStatus.FULL:
             return Full()
         if status is FeedStatus.LIMIT:
