@@ -65,3 +65,5 @@ class Planned:
     extrude_factor: float
     stands_from_s: float | None
     """Print time from which nothing moves any more; None: there is more to plan."""
+    steps_sent: tuple[int, ...] = ()
+    """By stepper: steps from the start that its commands add up to."""

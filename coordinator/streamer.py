@@ -291,6 +291,7 @@ class Streamer:
             speed_factor=planner.speed_factor,
             extrude_factor=planner.extrude_factor,
             stands_from_s=self.pipeline.moved_until + self.steps.lag_s if stands else None,
+            steps_sent=tuple(stepper.issued for stepper in self.steps.stats().steppers),
         )
 
     def _still_waiting(self, event: Event | None, now: float) -> bool:

@@ -87,7 +87,7 @@ class MachineService:
         self.starts = 0
         self.host = host
         self._load = load
-        self._tree = state
+        self.tree = state
         self._cache = cache
         self._figures = Figures(state)
         self._restart = asyncio.Event()
@@ -254,7 +254,7 @@ class MachineService:
 
     def _enter(self, state: ServiceState, cause: str = "") -> None:
         self.state, self.cause = state, cause
-        self._tree.update("machine", {"state": str(state), "cause": cause, "starts": self.starts})
+        self.tree.update("machine", {"state": str(state), "cause": cause, "starts": self.starts})
         self.log.add("state", f"{state}: {cause}" if cause else str(state))
         self._figures.show(self)
 

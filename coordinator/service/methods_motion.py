@@ -122,7 +122,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
     yield Method(
         "position.get",
         Scope.WATCH,
-        "Tell where the machine is in all frames, and each stepper; steps count from the start of the machine.",
+        "Tell where the machine is in all frames, and each stepper: steps since the machine started.",
         position,
         params=(
             Param(
@@ -212,18 +212,17 @@ async def _move(service: MachineService, params: dict[str, Any], *, relative: bo
     rest = Rest.STANDSTILL if params["wait"] else Rest.OPEN
     work = MoveWork(wanted, speed, relative, rest=rest)
     await _done(service, motion, work)
-    return {"position": axes(work.target)}
+    return {"position": axes((work.target[0], work.target[1], work.target[2], work.target[3]))}
 
 
 # --------------------------------------------------------------------------------------------- positions
 
 
 def _stepper_figures(machine: Machine, motion: Motion) -> Value:
-    stats = motion.streamer.steps.stats()
-    distances = {stepper.name: stepper.step_distance for stepper in machine.description.steppers}
+    steppers = machine.description.steppers
     return {
-        s.name: {"steps_sent": s.issued, "sent_mm": round(s.issued * distances[s.name], 6)}
-        for s in stats.steppers
+        stepper.name: {"steps_sent": steps, "sent_mm": round(steps * stepper.step_distance, 6)}
+        for stepper, steps in zip(steppers, motion.planned.steps_sent, strict=False)
     }
 
 

@@ -17,9 +17,9 @@ from coordinator.gcode.words import WordError, parse
 from coordinator.motion.planner import AXIS_LETTERS, FeedStatus, Planner
 from nodes.errors import CanductorError
 
-LINES_MAX: Final = 10_000
-"""Lines a client may send at once."""
-LINES_BYTES_MAX: Final = 1 << 20
+LINES_MAX: Final = 500
+"""Lines a client may send at once: they are looked through on the control loop, in some 2 ms."""
+LINES_BYTES_MAX: Final = 32_768
 ASIDE: Final = frozenset(
     ["M73", "M105", "M114", "M117", "M118", "M204", "M220", "M221", "SET_VELOCITY_LIMIT"]
 )
