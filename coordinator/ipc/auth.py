@@ -91,10 +91,6 @@ class FailureBrake:
             del self._failures[next(iter(self._failures))]
         self._failures[network] = (count + 1, now_s)
 
-    def succeeded(self, address: str) -> None:
-        """Forget the failures of ADDRESS."""
-        self._failures.pop(_network(address), None)
-
     def shut_out_s(self, address: str, now_s: float) -> float:
         """Return for how long ADDRESS has to wait, 0 if it may come in."""
         count, last_s = self._failures.get(_network(address), (0, 0.0))

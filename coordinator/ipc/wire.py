@@ -40,11 +40,11 @@ class Fault:
 
 
 class Encoder:
-    """Writes messages; one for many streams of the same thread."""
+    """Writes messages; one for many streams of the same thread. What UTF-8 cannot write becomes ``?``."""
 
     def __init__(self) -> None:
-        self._packer = msgpack.Packer(buf_size=65_536)
-        self._dumps = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode
+        self._packer = msgpack.Packer(buf_size=65_536, unicode_errors="replace")
+        self._dumps = json.JSONEncoder(allow_nan=False, ensure_ascii=False, separators=(",", ":")).encode
 
     def message(self, encoding: Encoding, message: Mapping[str, Value]) -> bytes:
         """Return MESSAGE as bytes; raises ValueError when it is too long, or holds what none can carry."""
@@ -69,12 +69,12 @@ class Encoder:
     def _pack(self, value: object) -> bytes:
         try:
             return bytes(self._packer.pack(value))
-        except (TypeError, OverflowError, UnicodeEncodeError) as error:
+        except (TypeError, OverflowError) as error:
             raise ValueError(str(error)) from None
 
     def _json(self, value: object) -> bytes:
         try:
-            return self._dumps(value).encode()
+            return self._dumps(value).encode(errors="replace")
         except (TypeError, RecursionError) as error:
             raise ValueError(str(error)) from None
 
