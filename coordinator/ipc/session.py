@@ -1,10 +1,10 @@
 """One client as the server sees it; sans-IO: bytes and times in, requests and bytes out.
 
 The way of a request: ``receive`` takes bytes, ``read`` turns some of them into requests and returns the
-urgent ones, ``next_request`` gives the others in order, and ``answer`` or ``fail`` ends each. All that is to be
-told to the client collects for ``take_output``. While the client does not read (``writable`` is False) requests
-wait, updates merge and notifications are dropped, but reading never stops: behind whatever waits there may be
-an emergency stop.
+urgent ones, ``next_request`` gives the others in order, and ``answer`` or ``fail`` ends each. What is to be
+told to the client collects for ``take_output``. While the client does not read (``writable`` is False)
+requests wait, updates merge and notifications are dropped, but reading never stops: behind whatever waits
+there may be an emergency stop.
 """
 
 from collections import deque
