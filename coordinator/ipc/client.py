@@ -188,7 +188,7 @@ class Client:
     # ----------------------------------------------------------------------------------------- feeds
 
     async def watch(self, fields: Iterable[str] = ("*",), rate_hz: float = 10.0) -> AsyncIterator[Update]:
-        """Yield the fields that match the globs FIELDS: a snapshot, then changes, up to RATE_HZ times a second.
+        """Yield fields that match the globs FIELDS: a snapshot, then changes, RATE_HZ times a second.
 
         Updates that come while the last one is looked at are merged. Raises ApiError, ConnectionLost.
         """

@@ -1,6 +1,8 @@
 """One client's socket: moves bytes between it and its session, and calls methods (asyncio)."""
 
 import asyncio
+import select
+import socket
 from collections.abc import Awaitable, Callable
 from typing import Final
 
@@ -11,7 +13,10 @@ from nodes.errors import CanductorError
 REQUESTS_PER_TURN: Final = 64
 """Requests of one client that are called before others get their turn."""
 LINGER_S: Final = 2.0
-"""For a client that is cut off to take the reason."""
+"""For a client that is cut off to take the reason. What it still sends is read and dropped meanwhile: closing
+a socket with unread bytes in it would reset it, and the reason would be lost."""
+HANG_UP_CHECK_S: Final = 0.5
+"""Between looks at whether a client that has closed its side is still there for its answers."""
 
 
 class Connection(asyncio.Protocol):
@@ -30,6 +35,7 @@ class Connection(asyncio.Protocol):
         self._linger: asyncio.TimerHandle | None = None
         self._turn_is_due = False
         self._half_closed = False
+        self._ended = False
         self.session: Session
         self.transport: asyncio.Transport
 
@@ -49,10 +55,29 @@ class Connection(asyncio.Protocol):
         self._turn()
 
     def eof_received(self) -> bool:
-        """Answer what was asked before the client closed its side."""
+        """Answer what was asked before the client closed its side; on TCP that cannot be told from leaving."""
+        if self._ended or self._has_left():
+            return False
         self._half_closed = True
         self._turn()
-        return not self.transport.is_closing() and self.transport.get_extra_info("sslcontext") is None
+        self._check_hang_up()
+        return not self.transport.is_closing()
+
+    def _has_left(self) -> bool:
+        opened = self.transport.get_extra_info("socket")
+        if opened.family != socket.AF_UNIX:
+            return True
+        poll = select.poll()
+        poll.register(opened.fileno(), 0)
+        return any(events & select.POLLHUP for _, events in poll.poll(0))
+
+    def _check_hang_up(self) -> None:
+        if self.transport.is_closing():
+            return
+        if self._has_left():
+            self.transport.abort()
+            return
+        self._linger = self._loop.call_later(HANG_UP_CHECK_S, self._check_hang_up)
 
     def pause_writing(self) -> None:
         """Stop sending: the client does not read."""
@@ -90,10 +115,10 @@ class Connection(asyncio.Protocol):
             if request in self._tasks:
                 self._tasks[request].cancel()
         self.flush()
-        if not session.has_work:
-            self.transport.resume_reading()
-        elif not self._turn_is_due:
-            self.transport.pause_reading()
+        more = session.has_work
+        if not self.transport.is_closing() and not self._half_closed:
+            (self.transport.pause_reading if more else self.transport.resume_reading)()
+        if more and not self._turn_is_due:
             self._turn_is_due = True
             self._loop.call_soon(self._next_turn)
 
@@ -105,15 +130,27 @@ class Connection(asyncio.Protocol):
     def flush(self) -> None:
         """Send what the session has to say, as far as the client reads."""
         session, transport = self.session, self.transport
-        if transport.is_closing():
+        if transport.is_closing() or self._ended:
             return
         if (session.writable or session.fault is not None) and (data := session.take_output()):
             transport.write(data)
-        if session.fault is not None or (self._half_closed and session.is_idle):
+        if session.fault is not None:
+            self._cut_off()
+        elif self._half_closed and session.is_idle:
             transport.close()
-            self._linger = self._loop.call_later(LINGER_S, transport.abort)
         else:
             self._set_timer()
+
+    def _cut_off(self) -> None:
+        """Give the client a moment to take the reason, and go."""
+        self._ended = True
+        for task in self._tasks.values():
+            task.cancel()
+        if self.transport.can_write_eof() and not self._half_closed:
+            self.transport.write_eof()
+        else:
+            self.transport.close()
+        self._linger = self._loop.call_later(LINGER_S, self.transport.abort)
 
     def _set_timer(self) -> None:
         deadline_s = self.session.next_deadline()

@@ -66,6 +66,7 @@ class IpcServer:
         for connection in list(self._connections):
             connection.session.end(Fault("closing", "the server ends"))
             connection.flush()
+            connection.transport.close()
         if self._servers and self._settings.unix_path is not None:
             with contextlib.suppress(OSError):
                 self._settings.unix_path.unlink()

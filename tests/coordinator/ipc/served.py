@@ -26,9 +26,26 @@ class Served:
     order: list[str] = field(default_factory=list)
     cancelled: asyncio.Event = field(default_factory=asyncio.Event)
 
+    writers: list[asyncio.StreamWriter] = field(default_factory=list)
+
     @property
     def at(self) -> str:
         return str(self.path)
+
+    async def dial(self, *, tcp: bool = False) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """Connect, and say nothing."""
+        if tcp:
+            opened = await asyncio.open_connection("127.0.0.1", self.server.tcp_port)
+        else:
+            opened = await asyncio.open_unix_connection(self.at, limit=2**24)
+        self.writers.append(opened[1])
+        return opened
+
+    async def script(self, **hello: Any) -> "Script":
+        """Connect and say hello."""
+        script = Script(*await self.dial())
+        assert "result" in await script.ask("api.hello", version=1, **hello)
+        return script
 
 
 def registry_of(served: Served) -> Registry:
@@ -42,7 +59,7 @@ def registry_of(served: Served) -> Registry:
         return {"to": params["x_mm"]}
 
     def raw(_: Caller, params: dict[str, Any]) -> Value:
-        return params["command"]
+        return {"said": params["command"]}
 
     def stop(caller: Caller, _: dict[str, Any]) -> Value:
         served.stops.append(caller.name)
@@ -88,6 +105,9 @@ async def serving(folder: Path, **settings: Any) -> AsyncIterator[Served]:
         yield served
     finally:
         await served.server.close()
+        for writer in served.writers:
+            writer.transport.abort()
+        await asyncio.sleep(0)
 
 
 class Script:
@@ -95,12 +115,6 @@ class Script:
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader, self.writer = reader, writer
-
-    @classmethod
-    async def connect(cls, path: str, **hello: Any) -> "Script":
-        script = cls(*await asyncio.open_unix_connection(path, limit=2**24))
-        assert "result" in await script.ask("api.hello", version=1, **hello)
-        return script
 
     def send(self, method: str, request_id: int = 1, **params: Any) -> None:
         self.writer.write(json.dumps({"id": request_id, "method": method, "params": params}).encode() + b"\n")
