@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import threading
-from collections.abc import Coroutine, Iterable, Iterator, Mapping
+from collections.abc import AsyncGenerator, Coroutine, Generator, Iterable, Mapping
 from typing import Any, Self, TypeVar
 
 from coordinator.ipc.client import Client
@@ -45,14 +45,14 @@ class BlockingClient:
         """Call METHOD with PARAMS and return its result; raises ApiError, ConnectionLost."""
         return self._wait(self._client.call(method, params))
 
-    def watch(self, fields: Iterable[str] = ("*",), rate_hz: float = 10.0) -> Iterator[Update]:
+    def watch(self, fields: Iterable[str] = ("*",), rate_hz: float = 10.0) -> Generator[Update, None, None]:
         """Yield updates as ``Client.watch`` does."""
         updates = self._client.watch(fields, rate_hz)
         try:
             while True:
-                yield self._wait(anext(updates))  # type: ignore[arg-type]
+                yield self._wait(_next(updates))
         finally:
-            self._wait(updates.aclose())  # type: ignore[attr-defined]
+            self._wait(_close(updates))
 
     async def _enter(self) -> Client:
         return await Client.connect(self._address, **self._options).__aenter__()
@@ -70,3 +70,11 @@ class BlockingClient:
         self._thread.join()
         with contextlib.suppress(RuntimeError):
             self._loop.close()
+
+
+async def _next(updates: AsyncGenerator[Update, None]) -> Update:
+    return await anext(updates)
+
+
+async def _close(updates: AsyncGenerator[Update, None]) -> None:
+    await updates.aclose()

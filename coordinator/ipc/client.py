@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import ssl
-from collections.abc import AsyncIterator, Iterable, Mapping
+from collections.abc import AsyncGenerator, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
@@ -187,7 +187,9 @@ class Client:
 
     # ----------------------------------------------------------------------------------------- feeds
 
-    async def watch(self, fields: Iterable[str] = ("*",), rate_hz: float = 10.0) -> AsyncIterator[Update]:
+    async def watch(
+        self, fields: Iterable[str] = ("*",), rate_hz: float = 10.0
+    ) -> AsyncGenerator[Update, None]:
         """Yield fields that match the globs FIELDS: a snapshot, then changes, RATE_HZ times a second.
 
         Updates that come while the last one is looked at are merged. Raises ApiError, ConnectionLost.
@@ -204,7 +206,7 @@ class Client:
             if watch.number is not None:
                 self._tell("api.unwatch", {"subscription": watch.number})
 
-    async def events(self, names: Iterable[str] = ("*",)) -> AsyncIterator[Event]:
+    async def events(self, names: Iterable[str] = ("*",)) -> AsyncGenerator[Event, None]:
         """Yield the notifications that match the globs NAMES; when not taken, the oldest are dropped."""
         feed = Feed(tuple(names))
         self._feeds.add(feed)

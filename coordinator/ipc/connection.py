@@ -55,7 +55,7 @@ class Connection(asyncio.Protocol):
         self._turn()
 
     def eof_received(self) -> bool:
-        """Answer what was asked before the client closed its side; on TCP that cannot be told from leaving."""
+        """Answer what was asked before the client closed its side; on TCP this counts as leaving."""
         if self._ended or self._has_left():
             return False
         self._half_closed = True
@@ -146,10 +146,13 @@ class Connection(asyncio.Protocol):
         self._ended = True
         for task in self._tasks.values():
             task.cancel()
-        if self.transport.can_write_eof() and not self._half_closed:
-            self.transport.write_eof()
-        else:
-            self.transport.close()
+        try:
+            if self.transport.can_write_eof() and not self._half_closed:
+                self.transport.write_eof()
+            else:
+                self.transport.close()
+        except OSError:  # it has left already
+            self.transport.abort()
         self._linger = self._loop.call_later(LINGER_S, self.transport.abort)
 
     def _set_timer(self) -> None:
