@@ -19,7 +19,9 @@ class Limits:
     message_timeout_s: float = 5.0
     """For a message to be complete after its first byte, and for the hello after connecting."""
     pending_requests: int = 256
-    """Requests of one client that wait or run; more are answered with "busy"."""
+    """Requests of one client that wait to be started; more are answered with "busy"."""
+    running_requests: int = 64
+    """Requests of one client that run; others wait."""
     subscriptions: int = 16
     filters: int = 64
     """Globs of one subscription."""

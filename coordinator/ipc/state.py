@@ -62,7 +62,7 @@ class Changes:
 
 
 class StateTree:
-    """The fields of one machine; lives on one loop. Lists and maps handed in must not be changed afterwards."""
+    """The fields of one machine; lives on one loop. Lists and maps that it is given must not be changed."""
 
     def __init__(self) -> None:
         self.sequence = 0
@@ -80,7 +80,7 @@ class StateTree:
         return self._fields.get(path, (None, 0))[0]
 
     def set(self, path: str, value: Value) -> None:
-        """Put VALUE at PATH; without effect when it is there already. A number that is not finite becomes None."""
+        """Put VALUE at PATH; without effect when it is there. A number that is not finite becomes None."""
         if type(value) is float and not math.isfinite(value):
             value = None
         before = self._fields.get(path)
