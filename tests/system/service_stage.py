@@ -2,15 +2,18 @@
 
 import asyncio
 import inspect
+import random
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from coordinator.host import LinuxHost
+from coordinator.host import Host, LinuxHost
 from coordinator.ipc.methods import Caller, Registry, Scope
 from coordinator.ipc.state import StateTree
-from coordinator.machine.description import load_machine
+from coordinator.machine.description import MachineDescription, load_machine
+from coordinator.motion.planner import Position
 from coordinator.motion.steps import resting_step
 from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
@@ -20,23 +23,32 @@ LIMIT_S = 60.0
 """Nothing here may take longer; most takes a fifth of it."""
 
 
+def zigzag(moves: int, seed: int) -> str:
+    """Return a job of short moves in all axes, at random, with extrusion; some tenth of a second each."""
+    chance = random.Random(seed)
+    lines = ["G28", "G90", "M83", "G1 Z1 F900", "G1 X50 Y50 F6000"]
+    for _ in range(moves):
+        x, y = chance.uniform(20, 80), chance.uniform(20, 80)
+        lines.append(f"G1 X{x:.3f} Y{y:.3f} E{chance.uniform(0, 1):.4f} F{chance.randrange(9000, 15000)}")
+    return "\n".join(lines) + "\n"
+
+
 class Served:
     """A service that runs, and how to call it."""
 
-    def __init__(self, hardware: Hardware, *, node_commands: bool = False) -> None:
-        self.jobs = hardware.folder / "jobs"
+    def __init__(
+        self, folder: Path, load: Callable[[], MachineDescription], host: Host, *, node_commands: bool = False
+    ) -> None:
+        self.jobs = folder / "jobs"
         self.jobs.mkdir(exist_ok=True)
         self.tree = StateTree()
         self.lines: list[str] = []
         settings = ServiceSettings(name="test", jobs=self.jobs, node_commands=node_commands)
         self.service = MachineService(
-            lambda: load_machine(str(hardware.config)),
-            LinuxHost(),
-            self.tree,
-            settings,
-            on_line=lambda entry: self.lines.append(str(entry["text"])),
+            load, host, self.tree, settings, on_line=lambda entry: self.lines.append(str(entry["text"]))
         )
         self._registry = Registry()
+        self._homed: tuple[dict[str, int], Position] = ({}, (0.0,) * 4)
         add_methods(self.service, self._registry)
 
     async def call(self, name: str, **params: Any) -> dict[str, Any]:
@@ -71,18 +83,24 @@ class Served:
         job = self.service.job
         return "none" if job is None else str(job.phase)
 
-    async def check_positions(self, homed_at: dict[str, int] | None = None) -> dict[str, int]:
-        """Make sure that every stepper stands where the plan says, by its node's count; return the counts.
+    async def homing_comes(self) -> None:
+        """Take note of where the steppers are now, when G28 will declare X Y Z to be 0."""
+        counted = await self.check_positions()
+        self._homed = (counted, (0.0, 0.0, 0.0, self.planned[3]))
 
-        HOMED_AT: the counts when the machine was declared to stand at 0; None: at its start.
-        """
-        told = await self.call("position.get", ask_nodes=True)
+    @property
+    def planned(self) -> Position:
+        """Where the last move ends."""
         assert self.service.motion is not None
+        return self.service.motion.planned.position
+
+    async def check_positions(self) -> dict[str, int]:
+        """Make sure that every stepper stands where the plan says, by its node's count; return the counts."""
+        told = await self.call("position.get", ask_nodes=True)
         assert self.service.machine is not None
-        planned = self.service.motion.planned.position
         specs = self.service.machine.devices.stepper_specs()
-        began = homed_at or dict.fromkeys((spec.name for spec in specs), 0)
-        expected = {spec.name: began[spec.name] + resting_step(spec, (0.0,) * 4, planned) for spec in specs}
+        counts, position = self._homed
+        expected = {s.name: counts.get(s.name, 0) + resting_step(s, position, self.planned) for s in specs}
         counted = told["nodes_steps"]
         assert isinstance(counted, dict)
         sent = {name: stepper["steps_sent"] for name, stepper in told["steppers"].items()}
@@ -93,7 +111,14 @@ class Served:
 @asynccontextmanager
 async def served(hardware: Hardware, *, node_commands: bool = False) -> AsyncIterator[Served]:
     """Run a service on HARDWARE; READY when the block begins."""
-    stage = Served(hardware, node_commands=node_commands)
+    load = partial(load_machine, str(hardware.config))
+    async with running(Served(hardware.folder, load, LinuxHost(), node_commands=node_commands)) as stage:
+        yield stage
+
+
+@asynccontextmanager
+async def running(stage: Served) -> AsyncIterator[Served]:
+    """Run STAGE's service; READY when the block begins."""
     life = asyncio.ensure_future(stage.service.run())
     try:
         await stage.until_state("ready")
@@ -102,10 +127,3 @@ async def served(hardware: Hardware, *, node_commands: bool = False) -> AsyncIte
         life.cancel()
         ended = await asyncio.gather(life, return_exceptions=True)
     assert isinstance(ended[0], asyncio.CancelledError), ended
-
-
-def outside(folder: Path) -> Path:
-    """Return a file beside the job folder."""
-    path = folder / "secret.gcode"
-    path.write_text("G28\n", encoding="utf-8")
-    return path
