@@ -85,6 +85,8 @@ class MachineService:
         self.confirmed_s: dict[str, float] = {}
         """By node: how long after the stop it confirmed it."""
         self.starts = 0
+        self.cut_off = False
+        """Whether ``run`` was ended while something moved."""
         self.host = host
         self._load = load
         self.tree = state
@@ -159,6 +161,7 @@ class MachineService:
     async def _stop_if_moving(self) -> None:
         machine, motion = self.machine, self.motion
         if machine is not None and motion is not None and machine.stopped is None and not motion.standing:
+            self.cut_off = True
             machine.stop("stopped by the user")
             await machine.confirm_stop()
 

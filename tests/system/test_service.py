@@ -1,4 +1,4 @@
-"""The machine as a service, on virtual nodes: whatever clients do, every stepper stands where the plan says."""
+"""The machine as a service on virtual nodes: whatever clients do, every stepper is where the plan says."""
 
 import asyncio
 
