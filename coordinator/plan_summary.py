@@ -59,7 +59,7 @@ class Made:
         bus_reports = tuple(self._bus(bus) for bus in buses)
         flow = self.figures.flow
         return PlanReport(
-            gcode=self.pipeline.job.program.name,
+            gcode=self.pipeline.job.name,
             moves=self.pipeline.moves,
             print_time_s=self.print_time_s,
             steps=sum(s.steps for s in stats.steppers),
@@ -153,7 +153,7 @@ class Made:
         nodes: tuple[NodeReport, ...],
         buses: tuple[BusReport, ...],
     ) -> list[str]:
-        program = self.pipeline.job.program.name
+        program = self.pipeline.job.name
         warnings = [*bus_warnings(program, buses), *queue_warnings(program, nodes)]
         for index, stream in enumerate(self.streams):
             together = self._busiest(self.figures.node_steps(index))

@@ -12,7 +12,7 @@ from typing import Final
 from coordinator.gcode.events import Emergency, End, Event, Full, Idle, Notice, Progress, Reply
 from coordinator.gcode.machine_state import MachineState
 from coordinator.motion.planner import Planner
-from coordinator.service.work import LinesWork, Rest, Setting, Work
+from coordinator.service.work import NO_PROGRESS, LinesWork, Rest, Setting, Work
 from nodes.errors import CanductorError
 
 WAITING_MAX: Final = 64
@@ -33,7 +33,8 @@ class Ticket:
     work: Work
     is_job: bool = False
     told: list[Reply | Notice] = field(default_factory=list)
-    progress: Progress | None = None
+    progress: Progress = NO_PROGRESS
+    """How far it is read."""
     cancelled: bool = False
     error: CanductorError | None = None
     """Why it ended before its end."""
@@ -159,9 +160,8 @@ class Feeder:
         if isinstance(event, End):
             ticket.read = True
             return self._finish(ticket)
-        if isinstance(event, Progress):
-            ticket.progress = event
-        elif isinstance(event, Reply | Notice):
+        ticket.progress = ticket.work.progress()
+        if isinstance(event, Reply | Notice):
             _keep(ticket, event)
         return event
 
@@ -177,7 +177,7 @@ class Feeder:
         ticket.work.close()
         self._now = None
         self.finished.append(ticket)
-        return ticket.progress or Progress(0, 0, None)
+        return ticket.progress
 
     def _do_aside(self, ticket: Ticket) -> Event | None:
         """Act on lines that neither move nor wait, and leave the work's own count of lines as it was.

@@ -54,16 +54,14 @@ class JobRun:
     @property
     def lines_read(self) -> int:
         """Lines read; they are carried out seconds later."""
-        progress = self._ticket.progress
-        return progress.line if progress else 0
+        return self._ticket.progress.line
 
     @property
     def done_bytes(self) -> int:
         """Bytes read."""
         if self.phase is JobPhase.DONE:
             return self.size_bytes
-        progress = self._ticket.progress
-        return progress.done_bytes if progress else 0
+        return self._ticket.progress.done_bytes
 
     @property
     def progress(self) -> float:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, Protocol
 
-from coordinator.gcode.events import End, Event, Full, Idle
+from coordinator.gcode.events import End, Event, Full, Idle, Progress
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
@@ -69,8 +69,15 @@ class Work(Protocol):
         """Go on; raises CanductorError when it cannot."""
         ...
 
+    def progress(self) -> Progress:
+        """Tell how far it is read."""
+        ...
+
     def close(self) -> None:
         """Release what it holds."""
+
+
+NO_PROGRESS: Final = Progress(0, 0, None)
 
 
 class _Text:
@@ -109,6 +116,10 @@ class LinesWork:
         event = self._job.step()
         return End(self._job.planner.lines, 0.0) if isinstance(event, Idle) else event
 
+    def progress(self) -> Progress:
+        """Tell nothing: it is read at once."""
+        return NO_PROGRESS
+
     def close(self) -> None:
         """Nothing to release."""
 
@@ -136,6 +147,11 @@ class FileWork:
         """Go on."""
         assert self._job is not None
         return self._job.step()
+
+    def progress(self) -> Progress:
+        """Tell how far the file is read."""
+        lines = 0 if self._job is None else self._job.planner.lines
+        return Progress(lines, self.program.done_bytes, self.program.size_bytes)
 
     def close(self) -> None:
         """Close the file; the modes of what follows are not this job's."""
@@ -174,6 +190,10 @@ class MoveWork:
         if status is FeedStatus.LIMIT:
             raise WorkError(str(self._planner.fault))
         return End(0, 0.0)
+
+    def progress(self) -> Progress:
+        """Tell nothing: it is one move."""
+        return NO_PROGRESS
 
     def close(self) -> None:
         """Nothing to release."""
