@@ -118,6 +118,15 @@ class Feeder:
         """End: ``step`` answers End once all is planned."""
         self._closed = True
 
+    def abandon(self) -> None:
+        """Release what works hold that will not be done any more; the worker has ended."""
+        left = [*self._waiting, *([self._now] if self._now is not None else [])]
+        self._waiting.clear()
+        self._asides.clear()
+        self._now = None
+        for ticket in left:
+            ticket.work.close()
+
     # ------------------------------------------------------------------------- for the worker's thread
 
     def step(self) -> Event:

@@ -44,10 +44,12 @@ class Figures:
     def show(self, service: "MachineService") -> None:
         """Bring the tree up to date."""
         self._tree.update("job", job_figures(service.job, service.now_s))
-        if service.motion is not None:
+        if service.motion is not None and service.machine is not None and service.machine.stopped is None:
             self._tree.update("position", position_figures(service.motion))
             waiting: Value = service.motion.streamer.held
             self._tree.set("machine.waits_for", waiting)
+        else:
+            self._tree.update("position", {"moving": False, "velocity_mm_s": 0.0, "homed": ""})
         if service.confirmed_s:
             confirmed: Value = {name: round(s * 1e3, 1) for name, s in service.confirmed_s.items()}
             self._tree.set("machine.stop_confirmed_ms", confirmed)

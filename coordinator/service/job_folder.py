@@ -76,12 +76,11 @@ class JobFolder:
                 raise NoSuchJob(
                     f"there is no file {_shown(name)} in the job folder; job.list tells which there are"
                 ) from None
-        file = FileIO(fd, closefd=True)
         status = os.fstat(fd)
         if not stat.S_ISREG(status.st_mode):
-            file.close()
+            os.close(fd)
             raise NoSuchJob(f"{_shown(name)} in the job folder is not a file")
-        return Program(file, "/".join(parts), size_bytes=status.st_size)
+        return Program(FileIO(fd), "/".join(parts), size_bytes=status.st_size)
 
 
 def _parts(name: str) -> tuple[str, ...]:

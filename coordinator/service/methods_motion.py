@@ -153,7 +153,7 @@ async def _done(service: MachineService, motion: Motion, work: Work, *, aside: b
     except FeederFull as error:
         raise ApiError("busy", str(error)) from None
     except MotionOver:
-        raise ApiError("stopped", f"the machine stopped: {service.cause}") from None
+        raise ApiError("stopped", f"the machine stopped: {service.cause or 'it begins anew'}") from None
     if isinstance(ticket.error, GCodeError | WorkError):
         raise ApiError("bad_gcode" if isinstance(ticket.error, GCodeError) else "bad_move", str(ticket.error))
     if ticket.error is not None:

@@ -34,17 +34,15 @@ class Motion:
             machine, self.feeder, witness=self.trace, on_told=on_told, on_state=self._cycle_ended
         )
         self._on_cycle = on_cycle
-        self._running = False
         self._ending: list[Ticket] = []
         self._waited_for: dict[Ticket, asyncio.Future[None]] = {}
 
     async def run(self) -> None:
         """Move until ``finish``, or until the machine stops; raises as the streamer does."""
-        self._running = True
         try:
             await self.streamer.run()
         finally:
-            self._running = False
+            self.feeder.abandon()
             for done in self._waited_for.values():
                 done.cancel()
             self._waited_for.clear()

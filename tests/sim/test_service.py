@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.ipc.methods import ApiError
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from tests.system.service_stage import Served, running, zigzag
@@ -82,6 +83,77 @@ def test_cancel_at_random_moments(tmp_path: Path, seed: int) -> None:
                 await stage.until_job("cancelled")
                 assert str(stage.service.state) == "ready"
                 await stage.check_positions()
+
+    with asyncio.Runner(loop_factory=world.make_loop) as runner:
+        runner.run(go())
+
+
+def test_restart_when_idle_begins_anew(tmp_path: Path) -> None:
+    world = Stage(load(CLEAN), 1)
+
+    async def go() -> None:
+        async with running(Served(tmp_path, lambda: world.description, world.host)) as stage:
+            await stage.call("gcode.run", script="G28\nG1 X20 F6000")
+            busy = asyncio.ensure_future(stage.call("move.by", x=100, speed_mm_s=50))
+            motion = stage.service.motion
+            assert motion is not None
+            await stage.until(lambda: not motion.standing, "motion")
+            with pytest.raises(ApiError, match="moves"):
+                await stage.call("machine.restart")
+            await busy
+            await stage.call("machine.restart")
+            await stage.until(lambda: stage.service.starts == 2, "a second start")
+            assert stage.tree.get("position.homed") == ""
+            await stage.until_state("ready")
+            with pytest.raises(ApiError, match="before it is homed"):
+                await stage.call("move.by", x=1)
+            await stage.call("gcode.run", script="G28\nG1 X20 F6000")
+            # The nodes' counts go on from the first life, what is sent counts anew.
+            told = await stage.call("position.get")
+            assert told["steppers"]["stepper_x"]["steps_sent"] > 0
+
+    with asyncio.Runner(loop_factory=world.make_loop) as runner:
+        runner.run(go())
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.05, 0.5, 1.5])
+def test_emergency_stop_while_it_starts(tmp_path: Path, after_s: float) -> None:
+    world = Stage(load(CLEAN), 1)
+
+    async def go() -> None:
+        stage = Served(tmp_path, lambda: world.description, world.host)
+        life = asyncio.ensure_future(stage.service.run())
+        try:
+            await asyncio.sleep(after_s)
+            assert str(stage.service.state) == "startup"
+            await stage.call("machine.emergency_stop", who="me")
+            await stage.until_state("shutdown")
+            assert stage.service.cause == "emergency stop by 'me'"
+            await stage.call("machine.restart")
+            await stage.until_state("ready")
+            assert stage.service.starts == 2
+        finally:
+            life.cancel()
+            await asyncio.gather(life, return_exceptions=True)
+
+    with asyncio.Runner(loop_factory=world.make_loop) as runner:
+        runner.run(go())
+
+
+def test_a_stop_in_the_middle_of_a_job_shows_no_more_motion(tmp_path: Path) -> None:
+    world = Stage(load(CLEAN), 2)
+
+    async def go() -> None:
+        async with running(Served(tmp_path, lambda: world.description, world.host)) as stage:
+            stage.write_job(zigzag(MOVES, 2))
+            await stage.call("job.start", file="job.gcode")
+            await stage.until(lambda: bool(stage.tree.get("position.moving")), "motion")
+            await stage.call("machine.emergency_stop")
+            at = stage.tree.get("position.commanded")
+            assert stage.tree.get("position.moving") is False
+            await asyncio.sleep(2)
+            assert stage.tree.get("position.commanded") == at
+            assert stage.tree.get("job.state") == "stopped"
 
     with asyncio.Runner(loop_factory=world.make_loop) as runner:
         runner.run(go())

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Coroutine
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from coordinator.ipc.client import Client
 from coordinator.ipc.methods import ApiError
 from tests.system.service_stage import zigzag
-from tests.system.stage import ROOT, SQUARE, Command, Hardware
+from tests.system.stage import ROOT, SQUARE, Command, Hardware, canductor, write_gcode
 
 LIMIT_S = 60.0
 
@@ -129,3 +130,41 @@ def test_emergency_stop_while_it_prints_then_restart(machine: Hardware) -> None:
         command.stdout.wait_for("emergency stop by 'a test'")
 
     assert with_client(machine, go) == 0
+
+
+def test_the_demo_is_served_without_hardware(tmp_path: Path) -> None:
+    socket = tmp_path / "demo.sock"
+    with Command("demo", "--serve", "--ipc", socket) as command:
+        command.stdout.wait_for("ready")
+
+        async def main() -> None:
+            async with asyncio.timeout(LIMIT_S), Client.connect(str(socket)) as client:
+                assert (await client.call("job.list"))["files"][0]["name"] == "part.gcode"
+                await client.call("gcode.run", {"script": "G28\nG1 X5 F6000"})
+                told = await client.call("position.get", {"ask_nodes": True})
+                assert told["nodes_steps"] == {n: s["steps_sent"] for n, s in told["steppers"].items()}
+
+        asyncio.run(main())
+        command.signal(signal.SIGINT)
+        assert command.end().status == 0
+
+
+def test_a_motion_that_is_cut_off_stops_the_nodes(machine: Hardware) -> None:
+    async def go(client: Client, _: Command) -> None:
+        await client.call("job.start", {"file": "zigzag.gcode"})
+        async for update in client.watch(["position.moving"], rate_hz=20):
+            if update.values.get("position.moving"):
+                break
+
+    assert with_client(machine, go) == 143
+    assert all(counters["is_shutdown"] for counters in machine.stop())
+
+
+def test_a_file_or_front_ends_but_not_both(tmp_path: Path, machine: Hardware) -> None:
+    job = write_gcode(tmp_path, SQUARE)
+    ended = canductor("run", machine.config, "--gcode", job, "--ipc", tmp_path / "sock")
+    assert "leave it out" in ended.sentence(2)
+    ended = canductor("run", machine.config, "--tcp", "127.0.0.1:7125")
+    assert "--tokens" in ended.sentence(2)
+    ended = canductor("run", machine.config, "--ipc", tmp_path / "sock", "--jobs", tmp_path / "none")
+    assert "must be a folder" in ended.sentence(2)

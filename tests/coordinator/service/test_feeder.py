@@ -2,15 +2,16 @@
 
 import pytest
 
+from coordinator.commands import DEMO_MACHINE
 from coordinator.gcode.events import Emergency, End, Event, Full, Idle, PositionSet, Reply
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
+from coordinator.machine.description import load_machine
 from coordinator.motion.planner import Planner
-from coordinator.motion.specs import MotionLimits
 from coordinator.service.feeder import ASIDES_MAX, WAITING_MAX, Feeder, FeederFull, Ticket
 from coordinator.service.work import FileWork, LinesWork, MoveWork, Rest, WorkError, commands_in
 
-LIMITS = MotionLimits(max_velocity=300, max_accel=3000, max_z_velocity=300, max_z_accel=3000)
+LIMITS = load_machine(str(DEMO_MACHINE)).limits
 
 
 @pytest.fixture

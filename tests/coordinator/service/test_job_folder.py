@@ -97,11 +97,11 @@ def test_a_missing_folder_is_told(tmp_path: Path) -> None:
 
 
 def test_descriptors_are_given_back(folder: JobFolder) -> None:
-    before = len(os.listdir("/proc/self/fd"))
+    before = len(list(Path("/proc/self/fd").iterdir()))
     for name in ("a.gcode", "parts/small/b.NC"):
         folder.open(name).close()
     for name in ("link.gcode", "out/secret.gcode", "parts", "pipe.gcode", "none"):
         with pytest.raises(NoSuchJob):
             folder.open(name)
     folder.files()
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
