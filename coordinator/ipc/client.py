@@ -75,7 +75,7 @@ class Client:
         self._encoder = Encoder()
         self._reader: asyncio.StreamReader
         self._writer: asyncio.StreamWriter | None = None
-        self._wire = WireReader(LIMITS)
+        self._wire = WireReader(LIMITS, checked=False)
         self._last_id = 0
         self._answers: dict[int, asyncio.Future[Value]] = {}
         self._begun: dict[int, Watch] = {}  # by the id of the request that begins it
@@ -241,7 +241,7 @@ class Client:
                 )
         except (OSError, ssl.SSLError) as error:
             raise ConnectionLost(f"{address} does not answer: {error.strerror or error}") from None
-        self._wire = WireReader(LIMITS)
+        self._wire = WireReader(LIMITS, checked=False)
         hello = asyncio.create_task(self._ask("api.hello", self._introduction))
         try:
             while not hello.done():

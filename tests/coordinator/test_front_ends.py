@@ -85,7 +85,8 @@ def test_send(tmp_path: Path) -> None:
     part = tmp_path / "part.gcode"
     part.write_text(text)
 
-    async def body(_: Served) -> None:
+    async def body(served: Served) -> None:
+        del served
         status, out, err = await canductor("send", str(part), "--json", folder=tmp_path)
         assert (status, err) == (0, "")
         assert json.loads(out)["result"] == {"file": "part.gcode"}
@@ -96,7 +97,7 @@ def test_send(tmp_path: Path) -> None:
         for name in ("../evil.gcode", ".hidden.gcode", "-x.gcode", "part.cfg", "a/b.gcode", "a\nb.gcode"):
             _, _, err = await canductor("send", str(part), "--name=" + name, folder=tmp_path)
             assert "must be a plain name" in err
-        assert os.listdir(tmp_path / "jobs") == ["part.gcode"]
+        assert [path.name for path in (tmp_path / "jobs").iterdir()] == ["part.gcode"]
 
     run(tmp_path, body)
 
