@@ -1,7 +1,7 @@
 """What the interface costs: rates, delays, subscribers, and the memory of a client that stalls.
 
-The server runs in a process of its own with a state tree of 500 fields, all set anew 20 times a second; there is
-no machine behind it. Usage: python bench/ipc.py [--seconds S]
+The server runs in a process of its own with a state tree of 500 fields, all set anew 20 times a second; no
+machine is behind it. Usage: python bench/ipc.py [--seconds S]
 """
 
 import argparse
@@ -61,12 +61,14 @@ class Peer:
         next(self.messages())
 
     def write(self, message: dict[str, Any]) -> bytes:
+        """Return MESSAGE as bytes."""
         if self.json:
             return json.dumps(message).encode() + b"\n"
         body: bytes = msgpack.packb(message)
         return struct.pack(">I", len(body)) + body
 
     def send(self, message: dict[str, Any]) -> None:
+        """Send MESSAGE."""
         self.socket.sendall(self.write(message))
 
     def messages(self) -> Iterator[dict[str, Any]]:
@@ -110,8 +112,7 @@ def at_rate(peer: Peer, rate_hz: float, seconds: float) -> list[float]:
             continue
         wait = 1.0 if count == total else max(0.0, began + count / rate_hz - now)
         if select.select([peer.socket], [], [], wait)[0]:
-            for message in peer.messages():
-                delays.append(time.perf_counter() - sent.pop(message["id"]))
+            delays += [time.perf_counter() - sent.pop(message["id"]) for message in peer.messages()]
     return delays
 
 
@@ -200,8 +201,8 @@ def main() -> None:
         load = (cpu_s(pid) - before) / given.seconds
         p99 = delays[int(len(delays) * 0.99)]
         print(
-            f"{kind}: 2,000 requests/s: p50 {statistics.median(delays) * 1e3:.2f} ms, p99 {p99 * 1e3:.2f} ms, "
-            f"longest {delays[-1] * 1e3:.1f} ms, {load:.0%} of a processor (with the tree's 20 Hz)"
+            f"{kind}: 2,000 requests/s: p50 {statistics.median(delays) * 1e3:.2f} ms, "
+            f"p99 {p99 * 1e3:.2f} ms, longest {delays[-1] * 1e3:.1f} ms, {load:.0%} of a processor (with the tree's 20 Hz)"
         )
         print(f"{kind}: flat out, 64 under way: {flat_out(Peer(path, kind), given.seconds):,.0f} requests/s")
     before = cpu_s(pid)
