@@ -202,7 +202,8 @@ def main() -> None:
         p99 = delays[int(len(delays) * 0.99)]
         print(
             f"{kind}: 2,000 requests/s: p50 {statistics.median(delays) * 1e3:.2f} ms, "
-            f"p99 {p99 * 1e3:.2f} ms, longest {delays[-1] * 1e3:.1f} ms, {load:.0%} of a processor (with the tree's 20 Hz)"
+            f"p99 {p99 * 1e3:.2f} ms, longest {delays[-1] * 1e3:.1f} ms, "
+            f"{load:.0%} of a processor (with the tree's 20 Hz)"
         )
         print(f"{kind}: flat out, 64 under way: {flat_out(Peer(path, kind), given.seconds):,.0f} requests/s")
     before = cpu_s(pid)
