@@ -1,7 +1,9 @@
 """What the interface costs: rates, delays, subscribers, and the memory of a client that stalls.
 
 The server runs in a process of its own with a state tree of 500 fields, all set anew 20 times a second; no
-machine is behind it. Usage: python bench/ipc.py [--seconds S]
+machine is behind it. With --at it is a machine that runs: canductor demo --serve --ipc PATH.
+
+Usage: python bench/ipc.py [--seconds S] [--stall-seconds S] [--at PATH]
 """
 
 import argparse
@@ -183,37 +185,50 @@ def stalled(path: Path, pid: int, seconds: float) -> int:
     return most - before
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--stall-seconds", type=float, default=20.0)
-    given = parser.parse_args()
-    path = Path(tempfile.mkdtemp()) / "bench.sock"
-    process = multiprocessing.get_context("spawn").Process(target=run_server, args=(path,), daemon=True)
-    process.start()
-    pid = process.pid
-    assert pid is not None
-    while not path.exists():
-        time.sleep(0.05)
+def measure(path: Path, pid: int, seconds: float, stall_s: float) -> None:
     for kind in ("msgpack", "json"):
         before = cpu_s(pid)
-        delays = sorted(at_rate(Peer(path, kind), 2000, given.seconds))
-        load = (cpu_s(pid) - before) / given.seconds
+        delays = sorted(at_rate(Peer(path, kind), 2000, seconds))
+        load = (cpu_s(pid) - before) / seconds
         p99 = delays[int(len(delays) * 0.99)]
         print(
             f"{kind}: 2,000 requests/s: p50 {statistics.median(delays) * 1e3:.2f} ms, "
             f"p99 {p99 * 1e3:.2f} ms, longest {delays[-1] * 1e3:.1f} ms, "
-            f"{load:.0%} of a processor (with the tree's 20 Hz)"
+            f"{load:.0%} of a processor, all in all"
         )
-        print(f"{kind}: flat out, 64 under way: {flat_out(Peer(path, kind), given.seconds):,.0f} requests/s")
+        print(f"{kind}: flat out, 64 under way: {flat_out(Peer(path, kind), seconds):,.0f} requests/s")
     before = cpu_s(pid)
-    rate, merged = subscribers(path, 200, 10, given.seconds)
-    load = (cpu_s(pid) - before) / given.seconds
+    rate, merged = subscribers(path, 200, 10, seconds)
+    load = (cpu_s(pid) - before) / seconds
+    print(f"200 subscribers of all fields at 10 Hz: {rate:,.0f} updates/s, {merged} merged, {load:.0%} CPU")
     print(
-        f"200 subscribers of {FIELDS} fields at 10 Hz: {rate:,.0f} updates/s, {merged} merged, {load:.0%} CPU"
+        f"a client that stops reading for {stall_s:g} s: the server grew by {stalled(path, pid, stall_s):,} KiB"
     )
-    grown = stalled(path, pid, given.stall_seconds)
-    print(f"a client that stops reading for {given.stall_seconds:g} s: the server grew by {grown:,} KiB")
+
+
+def pid_of(path: Path) -> int:
+    """Return the process that listens at PATH."""
+    with socket.socket(socket.AF_UNIX) as asked:
+        asked.connect(str(path))
+        return int(struct.unpack("3i", asked.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[0])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seconds", type=float, default=5.0)
+    parser.add_argument("--stall-seconds", type=float, default=20.0)
+    parser.add_argument("--at", type=Path)
+    given = parser.parse_args()
+    if given.at is not None:
+        measure(given.at, pid_of(given.at), given.seconds, given.stall_seconds)
+        return
+    path = Path(tempfile.mkdtemp()) / "bench.sock"
+    process = multiprocessing.get_context("spawn").Process(target=run_server, args=(path,), daemon=True)
+    process.start()
+    assert process.pid is not None
+    while not path.exists():
+        time.sleep(0.05)
+    measure(path, process.pid, given.seconds, given.stall_seconds)
     process.terminate()
 
 
