@@ -202,7 +202,8 @@ def measure(path: Path, pid: int, seconds: float, stall_s: float) -> None:
     load = (cpu_s(pid) - before) / seconds
     print(f"200 subscribers of all fields at 10 Hz: {rate:,.0f} updates/s, {merged} merged, {load:.0%} CPU")
     print(
-        f"a client that stops reading for {stall_s:g} s: the server grew by {stalled(path, pid, stall_s):,} KiB"
+        f"a client that stops reading for {stall_s:g} s: "
+        f"the server grew by {stalled(path, pid, stall_s):,} KiB"
     )
 
 
