@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn, cast
+from typing import Any, NoReturn, cast
 
 from coordinator.commands import (
     DemoOptions,
@@ -32,6 +32,15 @@ TOOL_COMMANDS = {
     "console": "Talk to one node in its own words.",
 }
 """Commands whose words are read by ``canbus_tools.command_line``."""
+FRONT_END_COMMANDS = {
+    "call": "Call a method of a machine that runs.",
+    "watch": "Show the fields of a machine that runs, and their changes.",
+    "status": "Tell how a machine that runs is doing.",
+    "send": "Send a file to a machine that runs, and print it.",
+    "estop": "Stop a machine that runs, at once.",
+    "completion": "Write what makes a shell complete the words of canductor.",
+}
+"""Commands whose words are read by ``coordinator.front_end_words``."""
 
 
 class Answered(Exception):  # noqa: N818 (no failure: the words asked for help or the version, and got it)
@@ -58,6 +67,8 @@ def read_words(words: Sequence[str]) -> Job:
     """
     if words[0] in TOOL_COMMANDS:
         return _tool(words)
+    if words[0] in FRONT_END_COMMANDS:
+        return _front_end(words)
     arguments = _parser().parse_args(list(words))
     if arguments.version:
         sys.stdout.write(f"canductor {version()}\n")
@@ -82,7 +93,41 @@ def version() -> str:
         return "(not installed)"
 
 
-def _parser() -> argparse.ArgumentParser:
+def whole_parser() -> argparse.ArgumentParser:
+    """Return the parser of all words, for what lists them: a start does not pay for those it does not use."""
+    from canbus_tools.command_line import add_tools, declare_tool  # noqa: PLC0415 (start-up time)
+
+    parser = _parser(whole=True)
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
+    for name, summary in FRONT_END_COMMANDS.items():
+        _declare_front_end(commands, name, summary)
+    can = commands.add_parser("can", allow_abbrev=False, help=_in_list(TOOL_COMMANDS["can"]))
+    add_tools(can, all_tools=True)
+    declare_tool(commands, "console")
+    return parser
+
+
+def _in_list(summary: str) -> str:
+    return f"{summary[0].lower()}{summary[1:].rstrip('.')}"
+
+
+def _front_end(words: Sequence[str]) -> Job:
+    """Read the words of a command that talks to a machine that runs."""
+    parser = _Parser(prog="canductor", allow_abbrev=False)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    _declare_front_end(commands, words[0], FRONT_END_COMMANDS[words[0]])
+    arguments = parser.parse_args(list(words))
+    return cast("Job", arguments.make_job(arguments))
+
+
+def _declare_front_end(commands: Any, name: str, summary: str) -> None:
+    from coordinator.front_end_words import declare  # noqa: PLC0415 (start-up time)
+
+    declare(commands.add_parser(name, help=_in_list(summary), description=summary, allow_abbrev=False), name)
+
+
+def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
+    """Return the parser; WHOLE: without the commands that others declare."""
     parser = _Parser(
         prog="canductor",
         description="One coordinator conducts many micro-controllers on CAN buses and UARTs as one machine.",
@@ -91,8 +136,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version")
     parser.set_defaults(make_job=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for name, summary in TOOL_COMMANDS.items():
-        commands.add_parser(name, help=f"{summary[0].lower()}{summary[1:].rstrip('.')}")
+    for name, summary in () if whole else (TOOL_COMMANDS | FRONT_END_COMMANDS).items():
+        commands.add_parser(name, help=_in_list(summary))
     for name, summary, declare, make_job in (
         ("demo", "print on virtual nodes and compare every stepper with the plan", _declare_demo, _demo),
         ("run", "bring up the machine of a configuration file", _declare_run, _run),

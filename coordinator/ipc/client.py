@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import ssl
-from collections.abc import AsyncGenerator, Iterable, Mapping
+from collections.abc import AsyncGenerator, Coroutine, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
@@ -75,7 +75,7 @@ class Client:
         self._encoder = Encoder()
         self._reader: asyncio.StreamReader
         self._writer: asyncio.StreamWriter | None = None
-        self._wire = WireReader(LIMITS)
+        self._wire = WireReader(LIMITS, checked=False)
         self._last_id = 0
         self._answers: dict[int, asyncio.Future[Value]] = {}
         self._begun: dict[int, Watch] = {}  # by the id of the request that begins it
@@ -84,6 +84,7 @@ class Client:
         self._connected = asyncio.Event()
         self._refusal: Refused | None = None
         self._keeper: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
 
     @classmethod
     def connect(
@@ -128,6 +129,8 @@ class Client:
     async def __aexit__(self, *_: object) -> None:
         if self._keeper is not None:
             self._keeper.cancel()
+            for task in self._tasks:
+                task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._keeper
         await self._hang_up()
@@ -241,7 +244,7 @@ class Client:
                 )
         except (OSError, ssl.SSLError) as error:
             raise ConnectionLost(f"{address} does not answer: {error.strerror or error}") from None
-        self._wire = WireReader(LIMITS)
+        self._wire = WireReader(LIMITS, checked=False)
         hello = asyncio.create_task(self._ask("api.hello", self._introduction))
         try:
             while not hello.done():
@@ -279,18 +282,28 @@ class Client:
                 await self._hang_up()
                 self._refuse(error)
                 return False
-            self._again = asyncio.create_task(self._resume_feeds())
+            self._begin(self._resume_feeds())
             return True
 
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
     async def _resume_feeds(self) -> None:
-        with contextlib.suppress(ConnectionLost):  # the next connection begins them all again
-            for watch in list(self._watches):
-                try:
-                    await self._begin_watch(watch)
-                except ApiError as error:
-                    watch.fail(error)
-            if self._feeds:
+        for watch in list(self._watches):
+            await self._resume_watch(watch)
+        if self._feeds:
+            with contextlib.suppress(ConnectionLost):  # the next connection listens again
                 await self._listen()
+
+    async def _resume_watch(self, watch: Watch) -> None:
+        try:
+            await self._begin_watch(watch)
+        except ConnectionLost:
+            pass  # the next connection begins it again
+        except ApiError as error:
+            watch.fail(error)
 
     def _refuse(self, error: ApiError) -> None:
         self._refusal = Refused(error.code, error.sentence)
@@ -371,5 +384,4 @@ class Client:
         for watch in self._watches:
             if watch.number == message["subscription"] and not watch.take(message):
                 self._tell("api.unwatch", {"subscription": watch.number})
-                task = asyncio.create_task(self._begin_watch(watch))
-                task.add_done_callback(lambda done: done.cancelled() or done.exception())
+                self._begin(self._resume_watch(watch))

@@ -227,8 +227,7 @@ def rule(param: Param) -> str:
 def shown(value: object, length_max: int = 40) -> str:
     """Return VALUE as a short, printable part of a sentence, whatever it is."""
     if isinstance(value, str):
-        text = "".join(c if c.isprintable() else "?" for c in value[:length_max])
-        return f"'{text}{'…' if len(value) > length_max else ''}'"
+        return f"'{printable(value[:length_max])}{'…' if len(value) > length_max else ''}'"
     if isinstance(value, list):
         return "a list"
     if isinstance(value, dict):
@@ -238,3 +237,8 @@ def shown(value: object, length_max: int = 40) -> str:
     if isinstance(value, int):
         return str(value) if INT_MIN <= value < 2**64 else "a huge number"
     return f"{value:g}" if isinstance(value, float) else f"of the type {type(value).__name__}"
+
+
+def printable(text: str) -> str:
+    """Return TEXT on one line, without what could steer a terminal."""
+    return "".join(c if c.isprintable() else "?" for c in text)

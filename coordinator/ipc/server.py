@@ -26,6 +26,8 @@ from nodes.errors import CanductorError
 _PEER: Final = struct.Struct("3i")
 """Of SO_PEERCRED: pid, uid, gid."""
 BACKLOG: Final = 128
+REFUSALS_MAX: Final = 32
+"""Connections beyond the most that are still told so; further ones are just closed."""
 
 
 class IpcServer:
@@ -42,6 +44,7 @@ class IpcServer:
         self._tokens: Tokens | None = None
         self._sessions = 0
         self._refused = 0
+        self._unsendable = 0  # notifications that no message can carry
         self._gone = SessionCounters()
         self.tcp_port: int | None = None
         """The port, once open; of use where the settings say 0, any port."""
@@ -82,7 +85,11 @@ class IpcServer:
             if not session.listens.matches(event):
                 continue
             if session.encoding not in encoded:
-                encoded[session.encoding] = self._encoder.message(session.encoding, message)
+                try:
+                    encoded[session.encoding] = self._encoder.message(session.encoding, message)
+                except ValueError:  # who notifies has other things to do than to fail for this
+                    self._unsendable += 1
+                    return
             session.notify(event, encoded[session.encoding])
             connection.flush()
 
@@ -92,7 +99,12 @@ class IpcServer:
         for connection in self._connections:
             for name, value in asdict(connection.session.counters).items():
                 counted[name] += value
-        return {"connections": len(self._connections), "refused_connections": self._refused, **counted}
+        return {
+            "connections": len(self._connections),
+            "refused_connections": self._refused,
+            "unsendable": self._unsendable + self._common.publisher.unsendable,
+            **counted,
+        }
 
     # ---------------------------------------------------------------------------------------- sockets
 
@@ -144,7 +156,11 @@ class IpcServer:
         address = str((transport.get_extra_info("peername") or ("unknown",))[0])
         session = self._session(connection, address, address)
         wait_s = self._brake.shut_out_s(address, asyncio.get_running_loop().time())
-        if wait_s > 0:
+        others = self._connections - {connection}
+        over_tcp = sum(1 for other in others if other.session.granted is None)
+        if over_tcp >= self._settings.tcp_connections_max:
+            self._refuse(session, Fault("busy", "there are too many connections over TCP; close others"))
+        elif wait_s > 0:
             sentence = f"too many wrong tokens from {address}; wait {wait_s:.0f} s"
             self._refuse(session, Fault("too_many_failures", sentence))
         return session
@@ -165,6 +181,8 @@ class IpcServer:
         self._connections.add(connection)
         if len(self._connections) > self._settings.connections_max:
             self._refuse(session, Fault("busy", "there are too many connections; close others"))
+        if len(self._connections) > self._settings.connections_max + REFUSALS_MAX:
+            connection.transport.abort()
         return session
 
     def _refuse(self, session: Session, fault: Fault) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
-from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope, Value, shown
+from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope, Value, printable
 from coordinator.ipc.wire import Fault
 
 if TYPE_CHECKING:
@@ -22,7 +22,8 @@ Handler = Callable[["Session", dict[str, Any], float], Value]
 def add_session_methods(registry: Registry) -> None:
     """Add the methods that every server has."""
     for method in _METHODS:
-        registry.add(method)
+        if method.name not in registry.methods:  # one registry may serve again
+            registry.add(method)
 
 
 # ------------------------------------------------------------------------------------------------ handlers
@@ -42,8 +43,7 @@ def _hello(session: "Session", params: dict[str, Any], now_s: float) -> Value:
     wanted = params["scope"]
     if wanted is not None:
         scope = min(scope, Scope[wanted.upper()])
-    name = params["client"] or "unnamed"
-    session.caller = Caller(f"{shown(name, CLIENT_NAME_MAX)} ({session.peer})", scope)
+    session.caller = Caller(f"{printable(params['client']) or 'unnamed'} ({session.peer})", scope)
     limits = session.common.limits
     return {
         "version": API_VERSION,

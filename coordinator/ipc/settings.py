@@ -57,4 +57,6 @@ class IpcSettings:
     """What the owner's programs may do on the Unix socket, without a token."""
     tcp: TcpSettings | None = None
     connections_max: int = 512
+    tcp_connections_max: int = 256
+    """Of those; a flood from the network leaves room for the owner's programs."""
     limits: Limits = field(default_factory=Limits)

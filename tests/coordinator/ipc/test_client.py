@@ -1,4 +1,7 @@
 import asyncio
+import shutil
+import ssl
+import subprocess
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +13,7 @@ from coordinator.ipc.blocking import BlockingClient
 from coordinator.ipc.client import Client, ConnectionLost, Refused
 from coordinator.ipc.methods import ApiError, Scope
 from coordinator.ipc.server import IpcServer
+from coordinator.ipc.settings import TcpSettings
 from coordinator.ipc.wire import Encoding
 from nodes.errors import CanductorError
 from tests.coordinator.ipc.served import Served, registry_of, serving
@@ -176,3 +180,33 @@ def test_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             read_address(bad)
     with pytest.raises(CanductorError, match="no machine runs here"):
         read_address(None)
+
+
+@pytest.fixture
+def certificate(tmp_path: Path) -> tuple[Path, Path]:
+    if (openssl := shutil.which("openssl")) is None:
+        pytest.skip("openssl is not installed, which makes the certificate for this test")
+    pem, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    options = f"req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -out {pem} -keyout {key}"
+    names = ["-subj", "/CN=machine", "-addext", "subjectAltName=IP:127.0.0.1"]
+    subprocess.run([openssl, *options.split(), *names], check=True, capture_output=True)
+    return pem, key
+
+
+def test_tls(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
+    pem, key = certificate
+    tokens = plain_tcp(tmp_path).tokens
+    tcp = TcpSettings(host="127.0.0.1", port=0, tokens=tokens, certificate=pem, private_key=key)
+
+    async def body(served: Served) -> None:
+        address = f"tls://127.0.0.1:{served.server.tcp_port}"
+        trusting = ssl.create_default_context(cafile=str(pem))
+        async with Client.connect(address, token=TOKENS[Scope.OPERATE], tls=trusting) as client:
+            assert (await client.call("machine.info"))["scope"] == "operate"
+        with pytest.raises(ConnectionLost, match="does not answer"):  # a server that nothing vouches for
+            await Client.connect(address, token=TOKENS[Scope.OPERATE]).__aenter__()
+        reader, writer = await served.dial(tcp=True)  # without TLS
+        writer.write(b'{"id":1,"method":"api.hello","params":{"version":1}}\n')
+        assert b"result" not in await reader.read()
+
+    run(tmp_path, body, tcp=tcp)

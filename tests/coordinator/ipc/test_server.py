@@ -45,7 +45,7 @@ def test_the_socket_is_its_owners_alone(tmp_path: Path) -> None:
         assert stat.S_IMODE(status.st_mode) == 0o600
         script = await served.script(client="test")
         info = (await script.ask("machine.info"))["result"]
-        assert info == {"caller": f"'test' (uid {os.getuid()}, pid {os.getpid()})", "scope": "admin"}
+        assert info == {"caller": f"test (uid {os.getuid()}, pid {os.getpid()})", "scope": "admin"}
 
     run(tmp_path, body)
     assert not (tmp_path / "m.sock").exists()
@@ -208,6 +208,37 @@ def test_an_emergency_stop_comes_through_when_nothing_else_does(tmp_path: Path) 
     run(tmp_path, body)
 
 
+def test_a_flood_over_tcp_leaves_room_for_the_owner(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        for _ in range(2):
+            reader, _ = await served.dial(tcp=True)
+        reader, _ = await served.dial(tcp=True)
+        assert "over TCP" in json.loads(await reader.read())["error"]["message"]
+        assert "result" in await (await served.script()).ask("machine.info")
+
+    run(tmp_path, body, tcp=plain_tcp(tmp_path), tcp_connections_max=2)
+
+
+def test_a_notification_that_cannot_be_sent_harms_nobody(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        script = await served.script()
+        await script.ask("api.listen", events=["*"])
+        served.server.notify("bad", {"x": float("nan")})
+        served.server.notify("good", {"x": 1})
+        assert await script.receive() == {"event": "good", "values": {"x": 1}}
+        assert served.server.figures()["unsendable"] == 1
+
+    run(tmp_path, body)
+
+
+def test_names_of_clients_cannot_steer_a_terminal(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        script = await served.script(client="\x1b[2J\nroot")
+        assert (await script.ask("machine.info"))["result"]["caller"].startswith("?[2J?root (uid")
+
+    run(tmp_path, body)
+
+
 def test_methods_that_fail(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     async def body(served: Served) -> None:
         script = await served.script()
@@ -292,7 +323,7 @@ def test_a_client_that_asks_without_reading_is_cut_off(tmp_path: Path) -> None:
         assert most <= served.settings.limits.output_bytes_max
         script.writer.transport.abort()
 
-    run(tmp_path, body)
+    run(tmp_path, body, limits=Limits(output_bytes_max=500_000))
 
 
 def test_too_many_connections(tmp_path: Path) -> None:
