@@ -1,6 +1,7 @@
 """``canductor run --ipc`` as a process of its own, virtual nodes, and real clients over the Unix socket."""
 
 import asyncio
+import os
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 from coordinator.ipc.client import Client
 from coordinator.ipc.methods import ApiError
 from tests.system.service_stage import zigzag
-from tests.system.stage import ROOT, SQUARE, Command, Hardware, canductor, write_gcode
+from tests.system.stage import CANDUCTOR, ROOT, SQUARE, Command, Hardware, canductor, write_gcode
 
 LIMIT_S = 60.0
 
@@ -168,3 +169,32 @@ def test_a_file_or_front_ends_but_not_both(tmp_path: Path, machine: Hardware) ->
     assert "--tokens" in ended.sentence(2)
     ended = canductor("run", machine.config, "--ipc", tmp_path / "sock", "--jobs", tmp_path / "none")
     assert "must be a folder" in ended.sentence(2)
+
+
+def test_at_a_terminal_lines_may_be_typed(
+    tmp_path: Path, machine: Hardware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    ours, theirs = os.openpty()
+    with subprocess.Popen(
+        [*CANDUCTOR, "run", str(machine.config), "--name", "typed"],
+        cwd=ROOT,
+        stdin=theirs,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as command:
+        os.close(theirs)
+        assert command.stdout is not None
+        assert (tmp_path / "canductor" / "typed.sock").name in command.stdout.readline()
+        for line in command.stdout:
+            if line == "ready\n":
+                os.write(ours, b"G28\nG1 X12 F6000\nG1 X9999\nM114\n")
+            if line.startswith("X:"):
+                break
+            assert "Traceback" not in line
+        assert line == "X:12.000 Y:0.000 Z:0.000 E:0.000\n"
+        command.send_signal(signal.SIGTERM)
+        said, failed = command.communicate(timeout=LIMIT_S)
+        assert "served at" in said or command.returncode == 143, (said, failed)
+        os.close(ours)
