@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import re
+import resource
 import statistics
 import subprocess
 import sys
@@ -125,6 +126,7 @@ def row(name: str, c: Cost) -> str:
 
 def prove(configs: Sequence[Path], programs: Sequence[Path]) -> None:
     print("every single step, by replaying the emitted commands: checked, outside its band, worst error")
+    begin_s = time.process_time()
     wrong = 0
     for program, config in product(programs, configs):
         plan = plan_program(config, program)
@@ -135,8 +137,14 @@ def prove(configs: Sequence[Path], programs: Sequence[Path]) -> None:
                 f"{program.stem + ', ' + config.stem:34} {v.name:10} {v.checked:12,} {v.outside:6} "
                 f"{v.worst_s * 1e6:8.4f} us  number and end of steps {'exact' if exact else 'WRONG'}"
             )
+        cpu_s, begin_s = time.process_time() - begin_s, time.process_time()
+        print(f"{'':34} {cpu_s:.1f} s of CPU, at most {peak_rss_mb():.0f} MB so far")
     if wrong:
         sys.exit(f"{wrong} faults")
+
+
+def peak_rss_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 # ------------------------------------------------------------------------------------ step generation

@@ -6,8 +6,9 @@ Host and virtual nodes run with a clock that is FACTOR times as fast (fast_clock
 seconds of motion in every second, on a core of its own, the nodes execute every step of it on the others.
 All figures but the CPU time are in the seconds of that world: a lead of 500 ms lasts 50 ms of ours, and what
 the host computes counts ten times. The worker's lead is how far ahead of now its commands reach when it hands
-them over, smallest from a second after the start to the end of the file; a command's lead is from its arrival
-at the node until it is due, the start included. At last, in real time: from the first G1 to the first step.
+them over, smallest from a second after the start to the end of the file; M400 is left out, since nobody can
+be ahead of a wait. A command's lead is from its arrival at the node until it is due, the start included.
+At last, in real time: from the first G1 to the first step.
 """
 
 import argparse
@@ -23,6 +24,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -116,12 +118,11 @@ def virtual_machine(config: Path, folder: Path, *, edges: bool = False) -> Itera
         yield played
 
 
-def shortened(gcode: Path, lines: int | None, folder: Path) -> Path:
-    if lines is None:
-        return gcode
+def without_waits(gcode: Path, lines: int | None, folder: Path) -> Path:
+    """Write what is to be played: the first LINES, without M400, during which nobody can be ahead."""
     part = folder / gcode.name
     with gcode.open() as source:
-        part.write_text("".join(line for line, _ in zip(source, range(lines), strict=False)))
+        part.write_text("".join(line for line in islice(source, lines) if not line.startswith("M400")))
     return part
 
 
@@ -175,7 +176,7 @@ def stream(config: Path, gcode: Path, lines: int | None, factor: int) -> None:
     with tempfile.TemporaryDirectory() as name, fast_world(factor):
         folder = Path(name)
         with virtual_machine(config, folder) as played:
-            files = [str(played), str(shortened(gcode, lines, folder))]
+            files = [str(played), str(without_waits(gcode, lines, folder))]
             command = ["taskset", "-c", str(HOST_CORE), sys.executable, __file__, "--host", *files]
             begin_s = time.monotonic()
             done = subprocess.run(command, stdout=subprocess.PIPE, check=False)

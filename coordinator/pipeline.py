@@ -4,7 +4,7 @@ The batch planner and the real-time streamer both drive this; it does no I/O bey
 program and keeps no clock. Not thread-safe: one thread at a time.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,7 @@ from coordinator.motion.planner import Planner, Position
 from coordinator.motion.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps import StepGenerator
 from coordinator.move_source import MoveSource
+from nodes.records import record
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,6 +35,30 @@ MoveWatch = Callable[[Any, int], None]
 BATCH_ROOM = 1 << 16
 
 
+@record
+class Acting:
+    """What acts between trapezoids and steppers."""
+
+    shapers: Mapping[str, Shaper]
+    """By axis letter."""
+    weights: Mapping[str, Position]
+    """By stepper, of those that were told others than their configuration says."""
+    windows_s: Mapping[str, float]
+    """By filament stepper: the window over which pressure advance is spread."""
+
+
+@record
+class Stretch:
+    """Trapezoids between which nothing is declared or changed."""
+
+    start: Position
+    """Where the axes stand at its begin."""
+    declared: bool
+    """Whether they were declared to stand there; else they came there, and every stepper goes on as it is."""
+    moves: "NDArray[np.void]"
+    acting: Acting
+
+
 @dataclass(slots=True)
 class PlanRecord:
     """What was planned, for whoever checks it: trapezoids in order, and where positions were declared."""
@@ -43,8 +68,8 @@ class PlanRecord:
     declared: list[tuple[int, Position]] = field(default_factory=list)
     """Before trapezoid number N the machine was declared to stand at a position."""
     count: int = 0
-    changes: int = 0
-    """How often shapers, smoothing, carriages or extruders changed after the begin."""
+    acting: list[tuple[int, Acting]] = field(default_factory=list)
+    """What acts from trapezoid number N on."""
 
     def add(self, trapezoids: "NDArray[np.void]") -> None:
         """Keep a copy."""
@@ -61,6 +86,27 @@ class PlanRecord:
         cuts = [(0, self.start), *self.declared]
         ends = [at for at, _ in cuts[1:]] + [len(every)]
         return [(position, every[at:end]) for (at, position), end in zip(cuts, ends, strict=True)]
+
+    def stretches(self) -> list[Stretch]:
+        """Return the stretches between declarations and changes, those with trapezoids, in order."""
+        found: list[Stretch] = []
+        at, changes = 0, [*self.acting]
+        acting = Acting({}, {}, {})
+        for position, moves in self.epochs():
+            begin, epoch_end = at, at + len(moves)
+            while at < epoch_end:
+                while changes and changes[0][0] <= at:
+                    acting = changes.pop(0)[1]
+                end = min([epoch_end, *(n for n, _ in changes[:1])])
+                start = _four(moves[at - begin]["start"].tolist()) if at > begin else position
+                found.append(Stretch(start, at == begin, moves[at - begin : end - begin], acting))
+                at = end
+        return found
+
+
+def _four(values: Sequence[float]) -> Position:
+    x, y, z, e = values
+    return (x, y, z, e)
 
 
 class Pipeline:
@@ -83,6 +129,9 @@ class Pipeline:
         self._record = record
         self._watch = watch
         self._appended_until = 0.0
+        self._shapers: dict[str, Shaper] = {}
+        self._weights: dict[str, Position] = {}
+        self._windows_s: dict[str, float] = {}
         self.moves = 0
         """Trapezoids handed to step generation."""
         self.moved_until = 0.0
@@ -101,8 +150,6 @@ class Pipeline:
 
     def act(self, event: PositionSet | MachineChange) -> None:
         """Carry out EVENT; all moves are generated, and all steps that they cause."""
-        if self._record is not None and not isinstance(event, PositionSet):
-            self._record.changes += 1
         match event:
             case PositionSet():
                 self._declare(event.position)
@@ -113,6 +160,7 @@ class Pipeline:
                 self._smooth()
             case SmoothTimeChange():
                 self._smooth()
+        self._note_acting()
         self.planner.begin_at(self.steps.next_move_s)
 
     def _begin(self) -> None:
@@ -125,9 +173,19 @@ class Pipeline:
         if machine.carriages is not None and machine.carriage_state is not None:
             self._follow(machine.carriages.weights(machine.carriage_state))
         self._smooth()
+        self._note_acting()
         self.planner.begin_at(self.steps.next_move_s)
 
+    def _note_acting(self) -> None:
+        """Record what acts from here on."""
+        if self._record is None:
+            return
+        shapers = {axis: shaper for axis, shaper in self._shapers.items() if shaper.frequency_hz}
+        acting = Acting(shapers, dict(self._weights), dict(self._windows_s))
+        self._record.acting.append((self._record.count, acting))
+
     def _shape(self, axis: str, shaper: Shaper) -> None:
+        self._shapers[axis] = shaper
         impulses: Impulses = ()
         if shaper.frequency_hz:
             impulses = shaper_impulses(shaper.kind, shaper.frequency_hz, shaper.damping_ratio)
@@ -136,6 +194,7 @@ class Pipeline:
     def _follow(self, weights: Mapping[str, Position]) -> None:
         for name, axes in weights.items():
             self.steps.set_weights(self.steps.index(name), axes)
+            self._weights[name] = axes
 
     def _smooth(self) -> None:
         """Give every filament stepper the window of the extruder whose motion it follows."""
@@ -145,6 +204,7 @@ class Pipeline:
         for stepper, extruder in machine.filament.followed.items():
             window_s = machine.extruders[extruder].window_s if extruder else 0.0
             self.steps.set_smooth_time(self.steps.index(stepper), window_s)
+            self._windows_s[stepper] = window_s
 
     def _declare(self, position: Position) -> None:
         self.steps.set_axis_position(position)

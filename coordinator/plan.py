@@ -71,7 +71,8 @@ def plan_file(options: PlanOptions) -> PlanReport:
         raise CanductorError(
             f"{figures.bad_records} emitted commands make no sense; this is a bug of step generation"
         )
-    made = Made(description, pipeline, figures, streams, specs, notices, end.print_time_s)
+    chips = {name: dictionary.str_constant("MCU", "") for name, dictionary in dictionaries.items()}
+    made = Made(description, pipeline, figures, streams, specs, chips, notices, end.print_time_s)
     return write_files(options, made.report())
 
 

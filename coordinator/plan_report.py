@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict
 
+from coordinator.motion.planner_values import Slowed
 from coordinator.plan_figures import Peak
 from nodes.records import record
 
@@ -102,6 +103,8 @@ class PlanReport:
     steppers: tuple[StepperReport, ...]
     nodes: tuple[NodeReport, ...]
     buses: tuple[BusReport, ...]
+    slowed: tuple[Slowed, ...]
+    """What the limits made slower than the program asks."""
     timeline: Timeline
     warnings: tuple[str, ...]
     """What would go wrong or be lost, with g-code file and line."""

@@ -2,7 +2,7 @@
 
 import math
 import resource
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +12,14 @@ from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.pipeline import Pipeline
 from coordinator.plan_figures import Bus, Peak, PlanFigures, WatchedNode
 from coordinator.plan_report import AxisReport, BusReport, NodeReport, PlanReport, StepperReport, Timeline
-from coordinator.plan_warnings import CEILING, bus_warnings, queue_warnings, step_rate_warnings
+from coordinator.plan_warnings import (
+    CEILING,
+    NodeClock,
+    bus_warnings,
+    queue_warnings,
+    slowed_warnings,
+    step_rate_warnings,
+)
 from nodes.errors import CanductorError
 from nodes.records import record
 
@@ -48,6 +55,8 @@ class Made:
     figures: PlanFigures
     streams: Sequence[NodeStreamSpec]
     specs: Sequence[StepperSpec]
+    chips: Mapping[str, str]
+    """Constant MCU by node."""
     notices: list[str]
     print_time_s: float
 
@@ -76,6 +85,7 @@ class Made:
             steppers=steppers,
             nodes=nodes,
             buses=bus_reports,
+            slowed=self.pipeline.planner.slowed,
             timeline=Timeline(
                 bin_s=self.figures.bin_s,
                 speed_mm_s=_rounded(self.figures.speeds()),
@@ -155,10 +165,12 @@ class Made:
     ) -> list[str]:
         program = self.pipeline.job.name
         warnings = [*bus_warnings(program, buses), *queue_warnings(program, nodes)]
+        warnings += slowed_warnings(program, self.pipeline.planner.slowed)
         for index, stream in enumerate(self.streams):
             together = self._busiest(self.figures.node_steps(index))
             mine = [s for s in steppers if s.node == stream.name]
-            warnings += step_rate_warnings(program, stream.name, stream.clock_freq, together, mine)
+            clock = NodeClock(stream.name, self.chips.get(stream.name, ""), stream.clock_freq)
+            warnings += step_rate_warnings(program, clock, together, mine)
         return warnings
 
 

@@ -35,7 +35,15 @@ def builder(module: str, headers: Sequence[str], sources: Iterable[str], *, cdef
         # Relative paths: setuptools refuses absolute ones.
         sources=list(sources),
         include_dirs=[".", "firmware"],
-        extra_compile_args=["-std=gnu11", "-O3", "-Wall", "-Wextra", "-fno-math-errno", "-pthread"],
+        extra_compile_args=[
+            "-std=gnu11",
+            "-O3",
+            "-Wall",
+            "-Wextra",
+            "-Wno-psabi",
+            "-fno-math-errno",
+            "-pthread",
+        ],
         extra_link_args=["-pthread"],
         libraries=["m"],
     )

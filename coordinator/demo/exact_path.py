@@ -6,7 +6,7 @@ step; ``turning_points`` cuts u into monotone pieces, so that ``crossings`` coun
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +22,8 @@ Position = tuple[float, float, float, float]
 AxisSignal = Signal | Shaped | Smoothed
 UNSHAPED: Impulses = ((1.0, 0.0),)
 SNAP = 65536
+PIECES = 1 << 16
+"""Looked at together: bounds the memory that long programs take."""
 SAMPLES = 7
 """Of the slope, per piece: a cubic has at most two turns inside."""
 HALVINGS = 60
@@ -115,8 +117,9 @@ class StepperPath:
     """One stepper's place in steps, over a stretch of print time in which nothing is declared anew."""
 
     def __init__(
-        self, spec: StepperSpec, start: Position, moves: NDArray[np.void], setting: Setting, position: int
+        self, spec: StepperSpec, start: Position, moves: NDArray[np.void], setting: Setting, position: float
     ) -> None:
+        """POSITION: where the stepper stands at START, in steps."""
         self.spec = spec
         phases = Phases.of(start, moves)
         if spec.kinematics == StepKinematics.LINEAR:
@@ -250,7 +253,16 @@ def crossing_times(path: StepperPath, boundary: Floats, direction: Ints, low: Fl
 def turning_points(path: StepperPath) -> Floats:
     """Return times between which u is monotone, rising: breaks, and where the slope changes its sign."""
     breaks = path.breaks()
-    begin, end = breaks[:-1], breaks[1:]
+    turns = [
+        _turns(path, breaks[at : at + PIECES], breaks[at + 1 : at + PIECES + 1])
+        for at in range(0, len(breaks) - 1, PIECES)
+    ]
+    return np.unique(np.concatenate((breaks, *turns)))
+
+
+def _turns(path: StepperPath, begin: Floats, end: Floats) -> Floats:
+    """Return where the slope changes its sign within the pieces from BEGIN to END."""
+    begin = begin[: len(end)]
     # From just inside one end to just inside the other: at a break itself the slope may jump.
     share = np.linspace(1e-6, 1 - 1e-6, SAMPLES)
     at = begin[:, None] + (end - begin)[:, None] * share
@@ -261,7 +273,7 @@ def turning_points(path: StepperPath) -> Floats:
         middle = (low + high) / 2
         before = path.slope(middle) * sign > 0
         low, high = np.where(before, middle, low), np.where(before, high, middle)
-    return np.unique(np.concatenate((breaks, low)))
+    return low
 
 
 def standing(t: Floats, u: Floats) -> NDArray[np.bool_]:
@@ -294,6 +306,41 @@ def places(path: StepperPath) -> tuple[Floats, Floats, Floats]:
     if path.curved:
         place = np.where(standing(t, u), place, between_rests(u, place))
     return t, u, place
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A stretch of moves over which the same acts on a stepper."""
+
+    spec: StepperSpec
+    start: Position
+    """Where the axes stand before the first move."""
+    moves: NDArray[np.void]
+    setting: Setting
+    declared: bool = True
+    """START is a new name for where the stepper stands; else it came there and keeps its share of a step."""
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the stepper moves as the axes do."""
+        return self.spec.kinematics is StepKinematics.LINEAR and not self.setting.acts_on(self.spec.weights)
+
+
+def legs_of(
+    spec: StepperSpec, epochs: Iterable[tuple[Position, NDArray[np.void]]], setting: Setting
+) -> list[Leg]:
+    """Return the legs of a program that changes nothing but where the axes are declared to stand."""
+    return [Leg(spec, start, moves, setting) for start, moves in epochs if len(moves)]
+
+
+def follow(legs: Iterable[Leg]) -> Iterator[tuple[StepperPath, Floats, Floats, Floats]]:
+    """Yield the path of each leg with its ``places``."""
+    at = 0.0
+    for leg in legs:
+        path = StepperPath(leg.spec, leg.start, leg.moves, leg.setting, resting(at) if leg.declared else at)
+        t, u, place = places(path)
+        yield path, t, u, place
+        at = float(u[-1])
 
 
 def crossings(path: StepperPath) -> tuple[int, int]:

@@ -7,39 +7,28 @@ turns, and every boundary between two turns solved for its time.
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from coordinator.demo.exact_path import Ints, Setting, StepperPath, crossing_times, places
+from coordinator.demo.exact_path import Ints, Leg, StepperPath, crossing_times, follow
 from coordinator.demo.exact_signal import Floats
 from coordinator.demo.expected import ExpectedSteps
-from coordinator.motion.specs import StepperSpec
 
 CHUNK = 50_000
 """Steps solved together."""
 SLACK_TICKS = 2.5
 """By so much more than its pulses need a pair of opposite steps may be apart and still be left out."""
 
-Epoch = tuple[tuple[float, float, float, float], NDArray[np.void]]
 
-
-def expected_curved(
-    spec: StepperSpec, epochs: Sequence[Epoch], setting: Setting, clock_freq: float
-) -> Iterator[ExpectedSteps]:
-    """Yield the steps that the moves of EPOCHS (PlanRecord) ask of one stepper, in order."""
-    closest_s = 2 * spec.step_pulse_s + SLACK_TICKS / clock_freq
-    position = 0
-    for start, moves in epochs:
-        if not len(moves):
-            continue
-        path = StepperPath(spec, start, moves, setting, position)
-        times, directions = _steps(path)
-        position += int(directions.sum())
+def expected_curved(legs: Sequence[Leg], clock_freq: float) -> Iterator[ExpectedSteps]:
+    """Yield the steps that LEGS ask of their stepper, in order."""
+    for path, turns, u, place in follow(legs):
+        closest_s = 2 * path.spec.step_pulse_s + SLACK_TICKS / clock_freq
+        times, directions = _steps(path, turns, u, place)
         keep = _without_pairs(times, directions, closest_s)
         yield ExpectedSteps(times[keep], directions[keep].astype(np.int8))
 
 
-def _steps(path: StepperPath) -> tuple[Floats, Ints]:
-    turns, u, place = places(path)
+def _steps(path: StepperPath, turns: Floats, u: Floats, place: Floats) -> tuple[Floats, Ints]:
+    """Return times and directions of the steps of PATH, given its places."""
     change = np.diff(place).astype(np.int64)
     count = np.abs(change)
     which = np.repeat(np.arange(len(count)), count)

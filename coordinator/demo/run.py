@@ -10,8 +10,7 @@ import numpy as np
 
 from coordinator.app import Machine
 from coordinator.commands import DEMO_GCODE, DemoOptions
-from coordinator.demo.exact_path import Setting
-from coordinator.demo.exact_shapers import impulses
+from coordinator.demo.exact_program import program_legs
 from coordinator.demo.expected import ExpectedSteps, expected_steps
 from coordinator.demo.expected_curved import expected_curved
 from coordinator.demo.proof import ClockProof, PrimaryClock, StepperProof, prove_clock, prove_stepper
@@ -20,12 +19,11 @@ from coordinator.demo.stage import Stage
 from coordinator.gcode.program import Program
 from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, StepperDescription, load_machine
-from coordinator.motion.specs import StepKinematics, StepperSpec
+from coordinator.motion.specs import StepperSpec
 from coordinator.pipeline import PlanRecord
 from coordinator.progress import ProgressDisplay
 from coordinator.session import Outcome, run_job
 from coordinator.streamer import Told
-from nodes.errors import CanductorError
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import firmware_dictionary
 
@@ -56,11 +54,6 @@ def run_demo(options: DemoOptions) -> DemoReport:
             )
         )
         figures = stage.stop_nodes()
-        if record.changes:
-            raise CanductorError(
-                f"{program.name} was printed, but it changes shapers, carriages or extruders on its way, "
-                "which the demo's proof does not follow yet; leave these commands out"
-            )
         prover = _Prover(description, stage.edge_log, outcome, record, both_edges)
         notices = [*map(str, description.not_yet_acting), *description.notes, *told]
         return _report(prover, stage, figures, outcome, notices)
@@ -150,14 +143,14 @@ class _Prover:
         )
 
     def _expected(self, stepper: StepperDescription) -> Iterator[ExpectedSteps]:
-        spec, setting = self._spec(stepper), self._setting
-        if spec.kinematics is not StepKinematics.LINEAR or setting.acts_on(spec.weights):
-            freq = self._outcome.maps[stepper.node].clock_freq
-            yield from expected_curved(spec, self._record.epochs(), setting, freq)
+        legs = program_legs(self._spec(stepper), self._record.stretches())
+        if not all(leg.is_plain and leg.spec.weights == legs[0].spec.weights for leg in legs):
+            yield from expected_curved(legs, self._outcome.maps[stepper.node].clock_freq)
             return
+        weights = legs[0].spec.weights if legs else stepper.weights
         for position, moves in self._record.epochs():
-            origin = float(np.dot(stepper.weights, position))
-            yield from expected_steps(moves, stepper.weights, stepper.step_distance, origin)
+            origin = float(np.dot(weights, position))
+            yield from expected_steps(moves, weights, stepper.step_distance, origin)
 
     def _spec(self, stepper: StepperDescription) -> StepperSpec:
         function = stepper.function
@@ -172,17 +165,6 @@ class _Prover:
             kinematics=function.kinematics,
             params=function.params,
         )
-
-    @property
-    def _setting(self) -> Setting:
-        """What the configuration says of shapers and pressure advance."""
-        shapers = {
-            s.axis.upper(): impulses(s.kind, s.frequency_hz, s.damping_ratio)
-            for s in self._description.shapers
-            if s.frequency_hz
-        }
-        first = self._description.extruder
-        return Setting(shapers, first.smooth_time_s if first and first.pressure_advance else 0.0)
 
     def _executed(self, stepper: StepperDescription, log: EdgeLog) -> Iterator[tuple[Any, Any]]:
         sign = np.int8(-1 if stepper.dir_pin.invert else 1)

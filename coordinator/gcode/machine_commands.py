@@ -128,7 +128,7 @@ def set_pressure_advance(job: Job, command: Command) -> bool:
 
 
 def activate_extruder(job: Job, command: Command) -> bool:
-    """ACTIVATE_EXTRUDER EXTRUDER=name: E moves this one from now on; where E stands reads as before."""
+    """ACTIVATE_EXTRUDER EXTRUDER=name: from now on E moves this one, and reads where this one stands."""
     values = _parameters(command, ("EXTRUDER",))
     return _activate(job, _extruder(job, command, _needed(command, values, "EXTRUDER")))
 
@@ -157,10 +157,19 @@ def _activate(job: Job, extruder: Extruder) -> bool:
         return True
     if not come_to_rest(job):
         return False
+    _change_places(job, job.machine.active, extruder)
     job.machine.filament = motion.activate(extruder.name)
     _use_extruder(job, extruder)
     _follow(job)
     return True
+
+
+def _change_places(job: Job, before: Extruder | None, after: Extruder) -> None:
+    """Let E read where AFTER was left; the machine's E axis goes on from where BEFORE has brought it."""
+    planner = job.planner
+    if before is not None:
+        before.place_mm = planner.gcode_position[3] * planner.unit_mm
+    planner.set_gcode_position({"E": after.place_mm / planner.unit_mm})
 
 
 def _use_extruder(job: Job, extruder: Extruder) -> None:

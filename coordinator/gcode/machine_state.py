@@ -43,6 +43,8 @@ class Extruder:
     """The window over which its advance is spread."""
     window_s: float = 0.0
     """The window in effect: without any advance so far there is none."""
+    place_mm: float = 0.0
+    """Where its E stood in the program's frame when it was last active, mm."""
 
     def __post_init__(self) -> None:
         if self.pressure_advance_s:

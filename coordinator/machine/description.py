@@ -1,8 +1,10 @@
 """From a configuration file to the description of a machine, in one call."""
 
 import re
+from dataclasses import replace
 
 from coordinator.machine.config_file import ConfigFile, RawSection, parse_config
+from coordinator.machine.frame import Frame
 from coordinator.machine.model import (
     CanConnection,
     DualCarriageDescription,
@@ -29,6 +31,7 @@ from coordinator.machine.read_shaper import read_shapers
 from coordinator.machine.read_steppers import is_extra_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_SECTIONS
+from coordinator.motion.specs import MotionLimits
 
 __all__ = [
     "CanConnection",
@@ -75,14 +78,17 @@ def load_machine(path: str) -> MachineDescription:
     frame = read_frame(reading, kinematics, reader)
     reading.finish(reader)
     space = frame.kinematics.work_space
-    extruders = read_extruders(reading, printer, space)
+    extruders = tuple(
+        replace(extruder, limits=_named(extruder.limits, frame))
+        for extruder in read_extruders(reading, printer, space)
+    )
     followers = read_extruder_steppers(reading, extruders)
     shapers = read_shapers(reading)
     description = MachineDescription(
         path=config.path,
         nodes=nodes,
         kinematics=frame.kinematics,
-        limits=extruders[0].limits if extruders else limits_without_extruder(printer, space),
+        limits=extruders[0].limits if extruders else _named(limits_without_extruder(printer, space), frame),
         rails=frame.rails,
         motors=frame.steppers,
         home=frame.home,
@@ -96,6 +102,11 @@ def load_machine(path: str) -> MachineDescription:
     _check_names(description)
     check_policies(description.nodes, description.steppers)
     return description
+
+
+def _named(limits: MotionLimits, frame: Frame) -> MotionLimits:
+    """Return LIMITS that know which options the ranges come from."""
+    return replace(limits, range_options=frame.range_options)
 
 
 def _check_names(description: MachineDescription) -> None:

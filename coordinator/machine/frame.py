@@ -2,6 +2,7 @@
 
 from coordinator.kinematics.base import Kinematics, Point, WorkSpace
 from coordinator.machine.model import DualCarriageDescription, RailDescription, StepperDescription
+from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 from nodes.records import record
 
 
@@ -16,6 +17,8 @@ class Frame:
     motors: tuple[StepperDescription, ...] = ()
     """Empty: the steppers of the rails, in order."""
     dual_carriage: DualCarriageDescription | None = None
+    range_options: tuple[str, str, str] = AXIS_RANGE_OPTIONS
+    """Which options say how far X, Y and Z may go."""
 
     @property
     def steppers(self) -> tuple[StepperDescription, ...]:

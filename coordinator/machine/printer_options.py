@@ -27,6 +27,12 @@ PRINT_RADIUS = FloatOption(
     above=0,
     maximum=MAX_POSITION,
 )
+ROUND_RANGE_OPTIONS = (
+    "print_radius of [printer]",
+    "print_radius of [printer]",
+    "minimum_z_position of [printer] and position_endstop of [stepper_a]",
+)
+"""What says how far X, Y and Z may go where carriages or arms stand around the bed."""
 DELTA_PRINTER = SectionSpec(
     help="What a delta needs besides", options=(DELTA_RADIUS, PRINT_RADIUS, MINIMUM_Z)
 )

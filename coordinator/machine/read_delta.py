@@ -6,7 +6,7 @@ from coordinator.kinematics.delta import MAX_TOWER_SPEED, Delta, Tower
 from coordinator.machine.frame import Frame, tidy
 from coordinator.machine.model import RailDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
-from coordinator.machine.printer_options import DELTA_RADIUS, MINIMUM_Z, PRINT_RADIUS
+from coordinator.machine.printer_options import DELTA_RADIUS, MINIMUM_Z, PRINT_RADIUS, ROUND_RANGE_OPTIONS
 from coordinator.machine.read_homing import HOMING, POSITION_ENDSTOP, read_tower_homing
 from coordinator.machine.read_rails import WAITING, read_extra_steppers
 from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, read_stepper
@@ -60,7 +60,8 @@ def read_delta(reading: Reading, printer: SectionReader) -> Frame:
         )
         reading.finish(reader, waiting=WAITING)
         rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
-    return Frame(delta, tuple(rails), tidy(delta.forward(delta.endstop_positions)))
+    home = tidy(delta.forward(delta.endstop_positions))
+    return Frame(delta, tuple(rails), home, range_options=ROUND_RANGE_OPTIONS)
 
 
 def _read_tower(reader: SectionReader, first: SectionReader, angle: float, radius: float) -> Tower:

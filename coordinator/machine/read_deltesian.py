@@ -14,6 +14,7 @@ from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, read_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.tower_checks import check_height
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
+from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
 ARM_LENGTH = FloatOption(
     name="arm_length",
@@ -36,6 +37,11 @@ SIDE = SectionSpec(
     later=LATER_STEPPER_OPTIONS,
 )
 WHY = "a deltesian has the towers stepper_left and stepper_right"
+RANGE_OPTIONS = (
+    "print_width and min_angle of [printer]",
+    AXIS_RANGE_OPTIONS[1],
+    "minimum_z_position of [printer] and position_endstop of [stepper_left]",
+)
 
 
 def read_deltesian(reading: Reading, printer: SectionReader) -> Frame:
@@ -59,7 +65,7 @@ def read_deltesian(reading: Reading, printer: SectionReader) -> Frame:
         name = reader.name.removeprefix("stepper_")
         rails.append(RailDescription(name, steppers, None, None, homing, reader.place))
     home = deltesian.forward((*deltesian.endstop_positions, home_of(y)))
-    return Frame(deltesian, (*rails, y), tidy(home))
+    return Frame(deltesian, (*rails, y), tidy(home), range_options=RANGE_OPTIONS)
 
 
 def _read_side(reader: SectionReader, first: SectionReader, sign: float) -> Arm:

@@ -54,17 +54,28 @@ def read_dual_carriage(reading: Reading, frame: Frame) -> Frame:
     second = read_axis(reading, reader, letter, _second_function(frame.kinematics.name, axis))
     dual = describe_dual(reader, axis, (first, first.steppers), (second, second.steppers))
     reading.finish(reader, waiting=WAITING)
-    return park(frame, dual, second.steppers)
+    return park(frame, dual, second.steppers, reader.name)
 
 
-def park(frame: Frame, dual: DualCarriageDescription, steppers: tuple[StepperDescription, ...]) -> Frame:
-    """Return the frame with a second carriage that stands still at start."""
+def park(
+    frame: Frame, dual: DualCarriageDescription, steppers: tuple[StepperDescription, ...], section: str
+) -> Frame:
+    """Return the frame with a second carriage, that of SECTION, which stands still at start."""
     weights = dual.carriages.weights(dual.carriages.home)
     parked = tuple(
         replace(stepper, function=StepFunction(weights=weights[stepper.name])) for stepper in steppers
     )
     dual = replace(dual, rails=(dual.rails[0], replace(dual.rails[1], steppers=parked)))
-    return replace(frame, motors=(*frame.steppers, *parked), dual_carriage=dual)
+    options = [
+        f"{text}, or those and safe_distance of [{section}]" if axis == dual.carriages.axis else text
+        for axis, text in enumerate(frame.range_options)
+    ]
+    return replace(
+        frame,
+        motors=(*frame.steppers, *parked),
+        dual_carriage=dual,
+        range_options=(options[0], options[1], options[2]),
+    )
 
 
 def describe_dual(

@@ -94,6 +94,12 @@ class _Carriages:
     first: dict[str, RailDescription]
     second: dict[str, tuple[RailDescription, SectionReader]]
 
+    def range_options(self) -> tuple[str, str, str]:
+        """Return which options say how far X, Y and Z may go."""
+        section = {rail.axis: f"[carriage {name}]" for name, rail in self.first.items()}
+        x, y, z = (f"position_min and position_max of {section[axis]}" for axis in "xyz")
+        return (x, y, z)
+
     def find(self, reader: SectionReader, option: Option[T], name: str) -> RailDescription:
         """Return a first or second carriage; raises ConfigError."""
         if name in self.first:
@@ -190,7 +196,13 @@ def _frame(
             "the [stepper NAME] sections do not move x, y and z independently; correct their 'carriages'",
         )
     x, y, z = (replace(rail, steppers=_movers(own, axis)) for axis, rail in enumerate(axes))
-    frame = Frame(kinematics, (x, y, z), (home_of(x), home_of(y), home_of(z)), own)
+    frame = Frame(
+        kinematics,
+        (x, y, z),
+        (home_of(x), home_of(y), home_of(z)),
+        own,
+        range_options=carriages.range_options(),
+    )
     for name, (rail, reader) in carriages.second.items():
         axis = "xyz".index(rail.axis)
         theirs = tuple(motor.stepper for motor in motors if motor.second == name)
@@ -200,7 +212,7 @@ def _frame(
             )
         dual = describe_dual(reader, axis, (frame.rails[axis], frame.rails[axis].steppers), (rail, theirs))
         reading.finish(reader, waiting=HOMING_WAITING)
-        frame = park(frame, dual, theirs)
+        frame = park(frame, dual, theirs, reader.name)
     return frame
 
 

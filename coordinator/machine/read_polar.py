@@ -8,10 +8,13 @@ from coordinator.machine.read_rails import POSITION_MAX, WAITING, read_extra_ste
 from coordinator.machine.read_steppers import TURNING_MOTOR, read_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
+from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
 BED = SectionSpec(
     help="The motor that turns the bed of a polar machine", options=TURNING_MOTOR, later=LATER_STEPPER_OPTIONS
 )
+ARM_RANGE = "position_min and position_max of [stepper_arm]"
+RANGE_OPTIONS = (ARM_RANGE, ARM_RANGE, AXIS_RANGE_OPTIONS[2])
 
 
 def read_polar(reading: Reading, _printer: SectionReader) -> Frame:
@@ -27,4 +30,5 @@ def read_polar(reading: Reading, _printer: SectionReader) -> Frame:
     if high <= 0:
         option = reading.config.sections["stepper_arm"]
         raise SectionReader(option, SectionSpec("", ())).bad(POSITION_MAX, "must be above 0")
-    return Frame(Polar((low, high), axis_range(z)), (bed, arm, z), (home_of(arm), 0.0, home_of(z)))
+    home = (home_of(arm), 0.0, home_of(z))
+    return Frame(Polar((low, high), axis_range(z)), (bed, arm, z), home, range_options=RANGE_OPTIONS)

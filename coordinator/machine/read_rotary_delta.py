@@ -9,6 +9,7 @@ from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
 from coordinator.machine.printer_options import (
     ARMS_PRINT_RADIUS,
     MINIMUM_Z,
+    ROUND_RANGE_OPTIONS,
     SHOULDER_HEIGHT,
     SHOULDER_RADIUS,
 )
@@ -72,7 +73,8 @@ def read_rotary_delta(reading: Reading, printer: SectionReader) -> Frame:
         steppers = (first, *read_extra_steppers(reading, reader.name, function))
         reading.finish(reader, waiting=WAITING)
         rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
-    return Frame(machine, tuple(rails), tidy(machine.forward(machine.endstop_angles)))
+    home = tidy(machine.forward(machine.endstop_angles))
+    return Frame(machine, tuple(rails), home, range_options=ROUND_RANGE_OPTIONS)
 
 
 def _read_arm(reader: SectionReader, first: SectionReader, angle: float) -> Arm:

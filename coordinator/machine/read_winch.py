@@ -31,6 +31,11 @@ WINCH = SectionSpec(
 )
 WHY = "a machine on cables has three winches at least, from stepper_a on"
 _MIN_SINE = 0.01
+RANGE_OPTIONS = (
+    "anchor_x of the sections [stepper_a], [stepper_b], …",
+    "anchor_y of the sections [stepper_a], [stepper_b], …",
+    "anchor_z of the sections [stepper_a], [stepper_b], …",
+)
 
 
 def read_winch(reading: Reading, _printer: SectionReader) -> Frame:
@@ -53,7 +58,7 @@ def read_winch(reading: Reading, _printer: SectionReader) -> Frame:
         steppers = (first, *read_extra_steppers(reading, reader.name, function))
         reading.finish(reader, waiting=WAITING)
         rails.append(RailDescription(name, steppers, None, None, NO_ENDSTOP, reader.place))
-    return Frame(winch, tuple(rails), (0.0, 0.0, 0.0))
+    return Frame(winch, tuple(rails), (0.0, 0.0, 0.0), range_options=RANGE_OPTIONS)
 
 
 def _read_anchor(reader: SectionReader) -> Point:

@@ -12,6 +12,7 @@ ffibuilder = builder(
     headers=["coordinator/motion/trapezoid.h", "coordinator/motion/steps.h"],
     sources=[
         "coordinator/motion/steps.c",
+        "coordinator/motion/step_change.c",
         "coordinator/motion/step_times.c",
         "coordinator/motion/step_axes.c",
         "coordinator/motion/step_smooth.c",
@@ -24,6 +25,8 @@ ffibuilder = builder(
         "coordinator/motion/step_curve.c",
         "coordinator/motion/step_compress.c",
         "coordinator/motion/step_fit.c",
+        "coordinator/motion/step_bands.c",
+        "coordinator/motion/step_arithmetic.c",
         "coordinator/motion/step_stream.c",
         "firmware/wire/vlq.c",
     ],

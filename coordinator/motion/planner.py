@@ -11,10 +11,12 @@ from typing import Any
 
 from coordinator.motion._planner import ffi, lib
 from coordinator.motion.planner_values import (
+    SPEED_LIMITS,
     Fault,
     FaultKind,
     Feed,
     FeedStatus,
+    Slowed,
     Trapezoids,
     check_limits,
     check_number,
@@ -32,6 +34,7 @@ __all__ = [
     "FeedStatus",
     "Planner",
     "Position",
+    "Slowed",
     "Trapezoids",
 ]
 
@@ -68,7 +71,8 @@ class Planner:
         self.limits = limits
         """What was configured; ``max_accel`` and the like below never exceed it."""
         self._limits: Any = ffi.new(
-            "struct planner_limits *", {field.name: getattr(limits, field.name) for field in fields(limits)}
+            "struct planner_limits *",
+            {f.name: getattr(limits, f.name) for f in fields(limits) if f.name != "range_options"},
         )
         self._core: Any = ffi.new("struct planner *")
         self._memory: Any = ffi.buffer(self._core)
@@ -138,7 +142,9 @@ class Planner:
     def fault(self) -> Fault:
         """Why the last refused move was refused."""
         fault = self._core.fault
-        return Fault(FaultKind(fault.kind), AXIS_LETTERS[fault.axis], fault.value, fault.low, fault.high)
+        options = (*self.limits.range_options, "")[fault.axis]
+        kind, axis = FaultKind(fault.kind), AXIS_LETTERS[fault.axis]
+        return Fault(kind, axis, fault.value, fault.low, fault.high, options)
 
     # ---- Trapezoids out ----
 
@@ -407,6 +413,15 @@ class Planner:
     def moves_dropped(self) -> int:
         """Moves shorter than 1 nm, which were dropped."""
         return int(self._core.moves_dropped)
+
+    @property
+    def slowed(self) -> tuple[Slowed, ...]:
+        """Moves that the limits made slower than they asked for, by limit; without those that did not."""
+        return tuple(
+            Slowed(name, s.moves, s.first_line, s.worst_line, s.asked, s.allowed)
+            for name, s in zip(SPEED_LIMITS, self._core.slowed, strict=True)
+            if s.moves
+        )
 
     @property
     def moves_overflowed(self) -> int:

@@ -7,6 +7,7 @@ static const double MIN_LENGTH = 1e-9;   // mm
 static const double POSITION_EPS = 1e-9; // mm by which sums of relative moves may miss a limit
 static const double MAX_EXTRUSION = 1e9; // mm; also keeps infinity and NaN out
 static const double MIN_SPEED = 1e-4;    // mm/s; keeps every duration finite
+static const double FASTEST = 1e9;       // mm/s; keeps what is told of any speed finite
 // A move that extrudes no more than this length of path may hold is never refused: slicers round.
 static const double TINY_PATH = 0.1; // mm
 
@@ -108,6 +109,38 @@ static int check_extrude_only(struct planner *p, struct planned_move *move) {
         return planner_refuse(p, PLANNER_EXTRUDE_LONG, AXIS_E, move->length, 0, l->max_extrude_only_distance);
     limit(move, 1, l->max_extrude_only_velocity, l->max_extrude_only_accel);
     return 0;
+}
+
+// The limit that bounds MOVE; the same figures as check_path and check_extrude_only used.
+static enum planner_speed_limit binding_limit(const struct planner_limits *l,
+                                              const struct planned_move *move) {
+    const double *ratio = move->ratio;
+    const double filament = fabs(ratio[AXIS_E]);
+    const int e_counts = move->extrude_only || ratio[AXIS_E] < 0 || filament > l->max_extrude_ratio;
+    const double per_mm[PLANNER_SPEED_LIMITS] = {1, fabs(ratio[AXIS_X]), fabs(ratio[AXIS_Y]),
+                                                 fabs(ratio[AXIS_Z]), e_counts ? filament : 0};
+    const double most[PLANNER_SPEED_LIMITS] = {l->max_velocity, l->max_x_velocity, l->max_y_velocity,
+                                               l->max_z_velocity, l->max_extrude_only_velocity};
+    enum planner_speed_limit lowest = PLANNER_LIMIT_PATH;
+    for (int i = 1; i < PLANNER_SPEED_LIMITS; i++)
+        if (most[i] > 0 && per_mm[i] * most[lowest] > most[i] * per_mm[lowest])
+            lowest = (enum planner_speed_limit)i;
+    return lowest;
+}
+
+void planner_note_slowed(struct planner *p, const struct planned_move *move, double speed) {
+    const double rounding = 1 + 1e-9;
+    if (speed * speed <= move->cruise_v2 * rounding)
+        return;
+    struct planner_slowed *slowed = &p->slowed[binding_limit(&p->limits, move)];
+    const double allowed = sqrt(move->cruise_v2);
+    if (!slowed->moves++)
+        slowed->first_line = p->line;
+    if (slowed->moves == 1 || speed * slowed->allowed > slowed->asked * allowed) {
+        slowed->worst_line = p->line;
+        slowed->asked = min_of(speed, FASTEST);
+        slowed->allowed = allowed;
+    }
 }
 
 int planner_describe(struct planner *p, struct planned_move *move, const double target[4], double speed) {

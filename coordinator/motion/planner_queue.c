@@ -84,6 +84,7 @@ int planner_add(struct planner *p, const double target[4], double speed) {
         p->moves_dropped += what == 0;
         return what;
     }
+    planner_note_slowed(p, move, speed);
     const struct planner_limits *l = &p->limits;
     double corner_v2 = l->square_corner_velocity * l->square_corner_velocity * (M_SQRT2 - 1);
     move->corner_v2 = corner_v2 * (move->accel / p->accel);

@@ -44,6 +44,23 @@ struct planner_fault {
     double value, low, high;
 };
 
+// Which limit of speed a move first runs into.
+enum planner_speed_limit {
+    PLANNER_LIMIT_PATH, // max_velocity
+    PLANNER_LIMIT_X,    // max_x_velocity, and so on
+    PLANNER_LIMIT_Y,
+    PLANNER_LIMIT_Z,
+    PLANNER_LIMIT_FILAMENT, // max_extrude_only_velocity
+    PLANNER_SPEED_LIMITS
+};
+
+// Moves that a limit made slower than they asked for.
+struct planner_slowed {
+    uint64_t moves;
+    int64_t first_line, worst_line;
+    double asked, allowed; // mm/s along the move of WORST_LINE, which lost the largest share
+};
+
 // As MotionLimits in specs.py: mm, s.
 struct planner_limits {
     double max_velocity, max_accel, max_z_velocity, max_z_accel;
@@ -83,6 +100,7 @@ struct planner {
 
     double print_time; // s, end of the last trapezoid handed out
     uint64_t moves_added, moves_dropped, moves_overflowed;
+    struct planner_slowed slowed[PLANNER_SPEED_LIMITS];
 
     // Queue: moves [head, tail). Junctions up to settled_v2 (settled_smooth_v2) cannot change any more.
     uint64_t head, tail, settled_v2, settled_smooth_v2;

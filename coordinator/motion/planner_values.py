@@ -59,6 +59,8 @@ class Fault:
     value: float
     low: float
     high: float
+    options: str = ""
+    """Those of the configuration that bound the axis."""
 
     def __str__(self) -> str:
         """Say what is wrong and what to do, without the place."""
@@ -69,7 +71,7 @@ _FAULTS: Mapping[FaultKind, Callable[[Fault], str]] = {
     FaultKind.NOT_HOMED: lambda f: f"{f.axis} is to move before it is homed; home with G28 first",
     FaultKind.OUTSIDE: lambda f: (
         f"the move goes to {f.axis} {f.value:.6g} mm, outside {f.low:.6g} to {f.high:.6g} mm; "
-        f"correct the program or position_min and position_max of [stepper_{f.axis.lower()}]"
+        f"correct the program or {f.options}"
     ),
     FaultKind.EXTRUDE_LONG: lambda f: (
         f"the move pushes {f.value:.6g} mm of filament at once, more than {f.high:.6g} mm; "
@@ -83,14 +85,39 @@ _FAULTS: Mapping[FaultKind, Callable[[Fault], str]] = {
         f"the speed is {f.value:.4g} mm/s, which is not above 0; give a positive F (mm/min)"
     ),
     FaultKind.TOO_FAR: lambda f: (
-        f"the move ends {f.value:.6g} mm from the middle, more than {f.high:.6g} mm; correct the program, "
-        "or the radius that the machine's configuration allows"
+        f"the move ends {f.value:.6g} mm from the middle, more than {f.high:.6g} mm; correct the program or "
+        f"{f.options}"
     ),
     FaultKind.TOO_NEAR: lambda f: (
         f"the move passes the middle at {f.value:.6g} mm, nearer than {f.low:.6g} mm, which the arm cannot "
         "reach; go around it"
     ),
 }
+
+
+SPEED_LIMITS = (
+    "max_velocity",
+    "max_x_velocity",
+    "max_y_velocity",
+    "max_z_velocity",
+    "max_extrude_only_velocity",
+)
+"""By PLANNER_LIMIT_...: options of the configuration."""
+
+
+@record
+class Slowed:
+    """Moves that ask for a higher speed than a limit allows; they are made at that limit."""
+
+    limit: str
+    """One of SPEED_LIMITS, the lowest of those that apply to the move."""
+    moves: int
+    first_line: int
+    worst_line: int
+    """Of the move that loses the largest share of its speed."""
+    asked_mm_s: float
+    """Along that move."""
+    allowed_mm_s: float
 
 
 @record
@@ -129,6 +156,8 @@ def check_limits(limits: MotionLimits) -> None:
     may_be_zero = {"square_corner_velocity", "instantaneous_corner_velocity", "max_radius", "radius_min"}
     may_be_zero |= {f"max_{axis}_{what}" for axis in "xy" for what in ("velocity", "accel")}
     for field in fields(limits):
+        if field.name == "range_options":
+            continue
         value = getattr(limits, field.name)
         if field.name in {"position_min", "position_max"}:
             for bound in value:

@@ -4,6 +4,13 @@ from enum import IntEnum
 
 from nodes.records import record
 
+AXIS_RANGE_OPTIONS = (
+    "position_min and position_max of [stepper_x]",
+    "position_min and position_max of [stepper_y]",
+    "position_min and position_max of [stepper_z]",
+)
+"""Where each axis has its rail."""
+
 
 @record
 class MotionLimits:
@@ -43,6 +50,8 @@ class MotionLimits:
     """Slopes 0: no cone. Else Z may be above position_max (as after homing a delta) within the cone
     z + √((sx·x)² + (sy·y)²) <= cone_top, and moves that begin or end above stay within."""
     cone_top: float = 0.0
+    range_options: tuple[str, str, str] = AXIS_RANGE_OPTIONS
+    """For messages: which options of the configuration say how far X, Y and Z may go."""
 
 
 @record

@@ -7,7 +7,7 @@
 // middle of the band is 1.16 times as long as one that goes from edge to edge, which longest-first settles
 // at.) So the search keeps a few ways in parallel, all of equally many segments, ranked by how far they came
 // and where in the band they stand.
-#include "coordinator/motion/step_fit.h"
+#include "coordinator/motion/step_arithmetic.h"
 #include "coordinator/motion/step_internal.h"
 
 #include <string.h>
@@ -25,66 +25,48 @@ static const double BYTE_IS_WORTH = 0.003;
 
 // ------------------------------------------------------------------------------------------------- bands
 
-static double half_gap(double max_error, double before, double behind) {
-    const double gap = before < behind ? before : behind;
-    return 0.5 * gap < max_error ? 0.5 * gap : max_error;
-}
-
 // Fills LOW and HIGH of the first FINAL steps; returns the smallest distance between two steps of
 // one direction.
-static double make_bands(struct stepper *s, size_t final, double next) {
-    enum { BLOCK = 4 };
-    const double *t = s->ticks, max_error = s->max_error_ticks;
-    double before = s->sent_direction ? t[0] - s->sent_ticks : HUGE_VAL;
-    const double first = s->sent_direction == s->direction ? before : HUGE_VAL;
-    double closest[BLOCK] = {first, first, first, first};
-    size_t i = 0;
-    for (; i + BLOCK + 1 < final; i += BLOCK) {
-        if (i == 0) { // the first step's predecessor is not in the buffer
-            const double e = half_gap(max_error, before, t[1] - t[0]);
-            s->low[0] = t[0] - e, s->high[0] = t[0] + e;
-            i = 1;
-        }
-        for (int j = 0; j < BLOCK; j++) {
-            const double *at = t + i + j;
-            const double gap = at[0] - at[-1], behind = at[1] - at[0];
-            const double nearer = gap < behind ? gap : behind;
-            const double e = 0.5 * nearer < max_error ? 0.5 * nearer : max_error;
-            s->low[i + (size_t)j] = at[0] - e;
-            s->high[i + (size_t)j] = at[0] + e;
-            closest[j] = gap < closest[j] ? gap : closest[j];
-        }
-    }
-    for (; i < final; i++) {
-        if (i)
-            before = t[i] - t[i - 1];
-        const double e = half_gap(max_error, before, (i + 1 < final ? t[i + 1] : next) - t[i]);
-        s->low[i] = t[i] - e;
-        s->high[i] = t[i] + e;
-        if (i)
-            closest[0] = before < closest[0] ? before : closest[0];
-    }
-    return fmin(fmin(closest[0], closest[1]), fmin(closest[2], closest[3]));
+static double make_bands(const struct step_gen *gen, struct stepper *s, size_t final, double next) {
+    const struct step_bands bands = {
+        .ticks = s->ticks,
+        .count = final,
+        .before = s->sent_direction ? s->sent_ticks : -HUGE_VAL,
+        .next = next,
+        .max_error = s->max_error_ticks,
+        .low = s->low,
+        .high = s->high,
+    };
+    const double first = s->sent_direction == s->direction ? s->ticks[0] - s->sent_ticks : HUGE_VAL;
+    return fmin(first, gen->arithmetic->bands(&bands));
 }
 
 // ------------------------------------------------------------------------------------------------- search
 
 // One way to do the first AT steps of a stretch, the last of them at CLOCK.
 struct way {
-    uint32_t at;
-    uint8_t from;   // the way it goes on from, a segment earlier
-    uint16_t bytes; // of the numbers in its commands
     double clock, rank;
     struct fit_segment segment; // its last
+    uint32_t at;
+    uint16_t bytes; // of the numbers in its commands
+    uint8_t from;   // the way it goes on from, a segment earlier
+};
+
+// How a way could go on.
+struct branch {
+    double rank;
+    uint8_t from, end;
 };
 
 struct search {
     const struct stepper *s;
+    const struct step_arithmetic *arithmetic;
     size_t begin;   // of the stretch, in the buffer
     uint32_t count; // its steps
     double force;   // a segment that begins before this time need not wait for steps to come
     struct way ways[DEPTH + 1][WAYS]; // best first
     int found[DEPTH + 1];
+    struct fit fits[WAYS]; // of the ways of the level looked at
 };
 
 static struct fit_problem problem_behind(const struct search *q, const struct way *way) {
@@ -114,84 +96,78 @@ static double end_of(const struct fit_segment *g, double clock) {
     return clock + g->interval * g->count + 0.5 * g->add * g->count * (g->count - 1.0);
 }
 
-// Two ways that end at the same step, and within so much of its band, are one.
-static const double SAME = 1.0 / 16;
-
-static void keep(struct way *ways, int *found, struct way way, double band) {
-    for (int i = 0; i < *found; i++) {
-        if (ways[i].at == way.at && fabs(ways[i].clock - way.clock) < SAME * band)
-            return;
-        if (way.rank > ways[i].rank) {
-            const struct way worse = ways[i];
-            ways[i] = way;
-            way = worse;
-        }
-    }
-    if (*found < WAYS)
-        ways[(*found)++] = way;
-}
-
 // Of ways of equally many segments: the further the better, and a good end helps the next segment; of those
 // that did all steps the one in fewest bytes.
-static double rank_of(const struct search *q, const struct way *way, int end, int level) {
-    if (way->at == q->count)
-        return 2.0 * q->count - way->bytes * BYTE_IS_WORTH;
-    const double came = way->at + way->segment.count * END_IS_WORTH[end];
-    return came * (1 - BYTE_IS_WORTH * way->bytes / level);
+static double rank_of(const struct search *q, uint32_t at, uint32_t count, int end, double bytes) {
+    if (at == q->count)
+        return 2.0 * at - bytes * BYTE_IS_WORTH;
+    return (at + count * END_IS_WORTH[end]) * (1 - BYTE_IS_WORTH * bytes);
 }
 
-// Goes on from every way of a level. Returns false when steps to come might lead one further.
-static bool look_on(struct search *q, int level) {
-    struct way *next = q->ways[level + 1];
-    int *found = &q->found[level + 1];
-    *found = 0;
+// Finds how each way of a level could go on, best first. Returns how many branches there are, or -1 when
+// steps to come might lead a way further.
+static int look_on(struct search *q, int level, struct branch *branches) {
+    int found = 0;
     for (int i = 0; i < q->found[level]; i++) {
         const struct way *way = &q->ways[level][i];
         const struct fit_problem p = problem_behind(q, way);
-        struct fit fit;
-        step_fit(&p, &fit);
-        if (fit.open && !(p.ticks[0] < q->force))
-            return false;
+        struct fit *fit = &q->fits[i];
+        q->arithmetic->fit_find(&p, fit);
+        if (fit->open && !(p.ticks[0] < q->force))
+            return -1;
+        const double bytes = way->bytes + size_of(fit->interval) + size_of(fit->add);
         for (int end = 0; end < FIT_ENDS; end++) {
-            const struct fit_segment *g = &fit.end[end];
-            if (!g->count)
+            const uint32_t count = fit->count[end];
+            if (!count)
                 continue;
-            struct way more = {
-                .at = way->at + g->count,
-                .from = (uint8_t)i,
-                .bytes = (uint16_t)(way->bytes + bytes_of(g)),
-                .clock = end_of(g, way->clock),
-                .segment = *g,
-            };
-            more.rank = rank_of(q, &more, end, level + 1);
-            keep(next, found, more, p.high[g->count - 1] - p.low[g->count - 1]);
+            const double rank =
+                rank_of(q, way->at + count, count, end, (bytes + size_of(count)) / (level + 1.0));
+            int place = found++;
+            for (; place > 0 && branches[place - 1].rank < rank; place--)
+                branches[place] = branches[place - 1];
+            branches[place] = (struct branch){rank, (uint8_t)i, (uint8_t)end};
         }
     }
+    return found;
+}
+
+// Two ways that end at the same step, and within so much of its band, are one.
+static const double SAME = 1.0 / 8;
+
+static bool is_new(const struct search *q, const struct way *ways, int count, const struct way *way) {
+    const size_t last = q->begin + way->at - 1;
+    const double same = SAME * (q->s->high[last] - q->s->low[last]);
+    for (int i = 0; i < count; i++)
+        if (ways[i].at == way->at && fabs(ways[i].clock - way->clock) < same)
+            return false;
     return true;
 }
 
-// Checks the newest segments of a level and drops those of which no step is right. Returns whether a way
-// did all steps; it is the first then.
-static bool settle_level(struct search *q, int level) {
-    struct way *ways = q->ways[level];
-    int good = 0, whole = -1;
-    for (int i = 0; i < q->found[level]; i++) {
-        struct way way = ways[i];
-        const struct way *before = &q->ways[level - 1][way.from];
+// Goes on with the best branches. Returns whether a way did all steps; it is the first then.
+static bool go_on(struct search *q, int level, const struct branch *branches, int count) {
+    struct way *ways = q->ways[level + 1];
+    int found = 0;
+    for (int i = 0; i < count && (found < WAYS || ways[WAYS - 1].rank < branches[i].rank); i++) {
+        const struct way *before = &q->ways[level][branches[i].from];
         const struct fit_problem p = problem_behind(q, before);
-        if (!step_fit_check(&p, &way.segment))
+        struct way way = {.from = branches[i].from};
+        if (!q->arithmetic->fit_make(&p, &q->fits[way.from], branches[i].end, &way.segment))
             continue;
         way.at = before->at + way.segment.count;
         way.clock = end_of(&way.segment, before->clock);
+        if (!is_new(q, ways, found, &way))
+            continue;
         way.bytes = (uint16_t)(before->bytes + bytes_of(&way.segment));
-        if (way.at == q->count && (whole < 0 || way.bytes < ways[whole].bytes))
-            whole = good;
-        ways[good++] = way;
+        way.rank = rank_of(q, way.at, way.segment.count, branches[i].end, way.bytes / (level + 1.0));
+        if (found == WAYS && way.rank <= ways[WAYS - 1].rank)
+            continue;
+        int place = found < WAYS ? found++ : WAYS - 1;
+        for (; place > 0 && ways[place - 1].rank < way.rank; place--)
+            ways[place] = ways[place - 1];
+        ways[place] = way;
     }
-    q->found[level] = good;
-    if (whole > 0)
-        ways[0] = ways[whole];
-    return whole >= 0;
+    q->found[level + 1] = found;
+    return found && ways[0].at == q->count;
 }
 
 // Returns how many segments the best way has that is certain; the way is the first of that level.
@@ -199,9 +175,11 @@ static int search(struct search *q, double clock, uint32_t expected) {
     q->ways[0][0] = (struct way){.clock = clock, .segment = {.count = expected}};
     q->found[0] = 1;
     for (int level = 0; level < DEPTH; level++) {
-        if (!look_on(q, level))
+        struct branch branches[WAYS * FIT_ENDS];
+        const int count = look_on(q, level, branches);
+        if (count < 0)
             return level > 1 ? level - 1 : level; // so that the last choice can still be a better one
-        if (settle_level(q, level + 1))
+        if (go_on(q, level, branches, count))
             return level + 1;
         if (!q->found[level + 1])
             return level;
@@ -210,24 +188,6 @@ static int search(struct search *q, double clock, uint32_t expected) {
 }
 
 // ---------------------------------------------------------------------------------------------- segments
-
-// Replays a segment as the node will and compares each clock with the steps. Returns false, or the worst
-// error.
-static bool replay(const struct stepper *s, size_t from, const struct segment *g, int64_t clock,
-                   double *worst) {
-    int64_t interval = g->interval, bad = 0;
-    double most = 0;
-    for (size_t i = from; i < from + g->count; i++) {
-        bad |= interval < s->pulse_ticks;
-        clock += interval;
-        interval += g->add;
-        const double at = (double)clock, error = fabs(at - s->ticks[i]);
-        bad |= (at < s->low[i]) | (at > s->high[i]);
-        most = error > most ? error : most;
-    }
-    *worst = most;
-    return !bad && clock + s->base == g->finish;
-}
 
 static void count_segment(struct stepper *s, const struct segment *g, double worst) {
     s->stats.steps += g->count;
@@ -309,7 +269,18 @@ static int send_way(struct step_gen *gen, struct search *q, int depth, struct se
         struct segment g = level == 1 ? *first : (struct segment){0};
         double worst;
         send(s, *from, &g, clock, &way->segment);
-        if (!replay(s, *from, &g, clock, &worst))
+        const struct replay steps = {
+            .clock = clock,
+            .interval = g.interval,
+            .count = g.count,
+            .add = g.add,
+            .shortest = s->pulse_ticks,
+            .finish = g.finish - s->base,
+            .ticks = s->ticks + *from,
+            .low = s->low + *from,
+            .high = s->high + *from,
+        };
+        if (!gen->arithmetic->replay(&steps, &worst))
             return step_fail(gen, STEP_BAD_CHECK, s, clock_print_time(s->clock, s->ticks[*from], s->base),
                              worst / s->clock->ticks_per_s);
         count_segment(s, &g, worst);
@@ -324,7 +295,8 @@ static int compress_stretch(struct step_gen *gen, struct stepper *s, size_t *fro
         struct segment first = {0};
         const int64_t clock = begin_segment(s, *from, &first);
         struct search q;
-        q.s = s, q.begin = *from, q.count = (uint32_t)(end - *from), q.force = force;
+        q.s = s, q.arithmetic = gen->arithmetic, q.begin = *from, q.count = (uint32_t)(end - *from),
+        q.force = force;
         const int depth = search(&q, (double)clock, s->expected);
         if (!depth && s->ticks[*from] < force)
             return step_fail(gen, STEP_NO_FIT, s, clock_print_time(s->clock, s->ticks[*from], s->base), 0);
@@ -338,7 +310,7 @@ static int compress_stretch(struct step_gen *gen, struct stepper *s, size_t *fro
 int step_compress(struct step_gen *gen, struct stepper *s, size_t final, double next, double force) {
     if (!final)
         return STEP_OK;
-    const double closest = make_bands(s, final, next), rate = s->clock->ticks_per_s;
+    const double closest = make_bands(gen, s, final, next), rate = s->clock->ticks_per_s;
     if (closest < s->closest_ticks - 0.5)
         return step_fail(gen, STEP_TOO_FAST, s, clock_print_time(s->clock, s->ticks[0], s->base),
                          closest / rate);

@@ -150,7 +150,10 @@ struct phase {
 #define STEP_VECTOR
 #endif
 
+struct step_arithmetic;
+
 struct step_gen {
+    const struct step_arithmetic *arithmetic;
     int32_t stepper_count, node_count;
     struct stepper *steppers;
     struct node *nodes;

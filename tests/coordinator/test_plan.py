@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import re
 import struct
 import subprocess
 import sys
@@ -14,9 +15,12 @@ from typing import Any
 import pytest
 
 from coordinator.commands import DEMO_MACHINE, PlanOptions
+from coordinator.machine.description import load_machine
 from coordinator.plan import plan_file
+from coordinator.plan_figures import Peak
 from coordinator.plan_plot import draw
 from coordinator.plan_report import PlanReport, Timeline
+from coordinator.plan_warnings import NodeClock, step_rate_warnings, ticks_per_step
 from nodes.errors import CanductorError
 from nodes.virtual.firmware import MAINBOARD, firmware_dictionary
 
@@ -134,6 +138,80 @@ def test_a_step_rate_beyond_the_node_is_told_with_its_line(tmp_path: Path) -> No
     )
     line = next(s.max_step_rate_line for s in report.steppers if s.name == "stepper_x")
     assert any(text.startswith(f"{tmp_path}/square.gcode:{line}: stepper_x") for text in report.warnings)
+
+
+@pytest.mark.parametrize(
+    ("chip", "clock_hz", "limit"),
+    [
+        ("stm32f407xx", 16_800_000, "168,000"),
+        ("atmega2560", 16_000_000, "100,000"),
+        ("rp2040", 12_000_000, "1,200,000"),
+    ],
+)
+def test_how_fast_a_node_may_step_depends_on_its_chip(chip: str, clock_hz: int, limit: str) -> None:
+    assert ticks_per_step(chip) == {"s": 100, "a": 160, "r": 10}[chip[0]]
+    node = NodeClock("mcu", chip, clock_hz)
+    most = clock_hz / ticks_per_step(chip)
+    assert not list(step_rate_warnings("p", node, Peak(most, 1.0, 7), []))
+    (told,) = step_rate_warnings("p", node, Peak(1.01 * most, 1.0, 7), [])
+    assert told.startswith("p:7: the steppers of node mcu are to make ")
+    assert f"more than the {limit} that node mcu, {chip}, with its clock of " in told
+
+
+def test_speeds_that_limits_lower_are_counted_with_their_lines(tmp_path: Path) -> None:
+    text = "G28\nG90\nM83\nG1 X10 Y10 Z1 F120\n"
+    limits = load_machine(str(DEMO_MACHINE)).limits
+    assert not plan(tmp_path, text).slowed
+    fast, z, e = (
+        v * 60 for v in (limits.max_velocity, limits.max_z_velocity, limits.max_extrude_only_velocity)
+    )
+    asked = [
+        f"G1 X60 F{fast:.3f}", f"G1 X10 F{1.5 * fast:.3f}", f"G1 Y60 F{2 * fast:.3f}",
+        f"G1 Z11 F{z:.3f}", f"G1 Z1 F{3 * z:.3f}", f"G1 E5 F{e:.3f}", f"G1 E-5 F{1.25 * e:.3f}",
+    ]  # fmt: skip
+    report = plan(tmp_path, text + "\n".join(asked))
+    assert [(s.limit, s.moves, s.first_line, s.worst_line) for s in report.slowed] == [
+        ("max_velocity", 2, 6, 7),
+        ("max_z_velocity", 1, 9, 9),
+        ("max_extrude_only_velocity", 1, 11, 11),
+    ]
+    assert [s.asked_mm_s / s.allowed_mm_s for s in report.slowed] == pytest.approx([2, 3, 1.25], rel=1e-3)
+    told = [w for w in report.warnings if " allows" in w]
+    assert (
+        f"square.gcode:6: from here on 2 moves ask for more speed than max_velocity allows, line 7 for "
+        f"{fast / 30:.1f} mm/s where {fast / 60:.1f} are made;" in told[0]
+    )
+    assert "square.gcode:9: one move asks for more speed than max_z_velocity allows, for " in told[1]
+    assert len(told) == 3
+
+
+@pytest.mark.parametrize(
+    ("machine", "line", "told"),
+    [
+        ("cartesian", "G1 X9999", "correct the program or position_min and position_max of [stepper_x]"),
+        ("corexz", "G1 Z9999", "correct the program or position_min and position_max of [stepper_z]"),
+        ("delta", "G1 X9999", "correct the program or print_radius of [printer]"),
+        ("delta", "G1 Z-99", "or minimum_z_position of [printer] and position_endstop of [stepper_a]"),
+        ("rotary_delta", "G1 Y9999", "correct the program or print_radius of [printer]"),
+        ("deltesian", "G1 X9999", "correct the program or print_width and min_angle of [printer]"),
+        ("deltesian", "G1 Y9999", "correct the program or position_min and position_max of [stepper_y]"),
+        ("polar", "G1 X9999", "correct the program or position_min and position_max of [stepper_arm]"),
+        ("polar", "G1 Z9999", "correct the program or position_min and position_max of [stepper_z]"),
+        ("winch", "G1 Y9999", "correct the program or anchor_y of the sections [stepper_a], [stepper_b], …"),
+        ("generic_cartesian", "G1 Y9999", "or position_min and position_max of [carriage "),
+        ("idex", "G1 X9999", "of [stepper_x], or those and safe_distance of [dual_carriage]"),
+    ],
+)
+def test_a_refusal_names_the_options_that_this_machine_has(
+    tmp_path: Path, machine: str, line: str, told: str
+) -> None:
+    config = DEMO_MACHINE.parents[1] / f"{machine}.cfg"
+    with pytest.raises(CanductorError) as refused:
+        plan(tmp_path, f"G28\nG90\n{line} F600\n", config=config)
+    assert "square.gcode:3: the move goes to " in str(refused.value)
+    assert told in str(refused.value)
+    sections = re.findall(r"\[(\w+(?: \w+)?)\]", str(refused.value))
+    assert all(f"\n[{section}]" in config.read_text() for section in sections)
 
 
 def test_steps_faster_than_the_pulse_end_the_plan_near_their_line(tmp_path: Path) -> None:

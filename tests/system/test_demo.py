@@ -75,9 +75,19 @@ G1 X3 Y2 Z1 E0.1
     [
         ("delta", "G1 X12 Y-15 Z-60 F6000", "G4 P50"),
         ("corexy", "G1 X40 Y40 Z6 F6000", "SET_PRESSURE_ADVANCE ADVANCE=0.1"),
+        (
+            "corexy",
+            "SET_INPUT_SHAPER SHAPER_TYPE=ei SHAPER_FREQ_X=45 SHAPER_FREQ_Y=0\nG1 X40 Y40 Z6 F6000",
+            "SET_INPUT_SHAPER SHAPER_FREQ_Y=38\nSET_PRESSURE_ADVANCE ADVANCE=0.1 SMOOTH_TIME=0.02",
+        ),
+        (
+            "extruders",
+            "G1 X40 Y40 Z6 F6000",
+            "T1\nG1 X3 E0.4\nSYNC_EXTRUDER_MOTION EXTRUDER=extruder MOTION_QUEUE=extruder1",
+        ),
     ],
 )
-def test_non_linear_shaped_and_smoothed_steppers_are_proved(
+def test_non_linear_shaped_smoothed_and_changing_steppers_are_proved(
     tmp_path: Path, machine: str, first: str, second: str
 ) -> None:
     ended = canductor(

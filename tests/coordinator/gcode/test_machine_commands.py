@@ -153,8 +153,34 @@ def test_another_extruder_brings_its_limits_its_advance_and_its_steppers() -> No
     ]
     assert t["pressure_advance"].tolist() == [0.05, 0.02, 0.05]
     assert job.machine.active is job.machine.extruders["extruder"]
-    with pytest.raises(GCodeError, match=r"part.gcode:4: the move pushes 3 mm of filament at once"):
+    with pytest.raises(GCodeError, match=r"part.gcode:4: the move pushes 6 mm of filament at once"):
         run("G28", "G1 E3", "T1", "G1 E6")
+
+
+def test_each_extruder_has_its_own_place() -> None:
+    events, t, job = run(
+        "G28", "G1 E1.5", "T1", "M114", "G1 E1", "T0", "M114", "G1 E2", "G92 E10", "T1", "M114", "G92 E0.25",
+        "G1 E0.5", "ACTIVATE_EXTRUDER EXTRUDER=extruder", "M114", "T0", "M114", "G1 E10.125",
+    )  # fmt: skip
+    told = [event.text.split("E:")[1] for event in events if isinstance(event, Reply)]
+    assert told == ["0.000", "1.500", "1.000", "10.000", "10.000"]
+    lengths = t["start_v"] * t["accel_s"] + t["accel"] * t["accel_s"] ** 2 / 2
+    lengths += t["cruise_v"] * (t["cruise_s"] + t["decel_s"]) - t["accel"] * t["decel_s"] ** 2 / 2
+    assert lengths.tolist() == pytest.approx([1.5, 1, 0.5, 0.25, 0.125])
+    # The machine's own axis just goes on: no stepper jumps when another takes over.
+    assert t["start"][:, 3].tolist() == pytest.approx([0, 1.5, 2.5, 3, 3.25])
+    assert job.planner.toolhead_position[3] == pytest.approx(3.375)
+
+
+def test_places_of_extruders_know_the_unit_and_the_extrude_factor() -> None:
+    events, t, _ = run(
+        "G28", "M221 S50", "G1 E2", "T1", "G20", "M221 S200", "G1 E0.01", "M114", "T0", "M114", "G1 E0.1",
+    )  # fmt: skip
+    told = [float(event.text.split("E:")[1]) for event in events if isinstance(event, Reply)]
+    assert told == pytest.approx([0.01, 2 / 25.4], abs=1e-3)
+    assert t["start"][:, 3].tolist() == pytest.approx([0, 1, 1 + 0.508])
+    with pytest.raises(GCodeError, match=r"part.gcode:5: the move pushes 2.5 mm"):
+        run("G28", "G1 E2", "T1", "G1 X1", "G1 E2.5")
 
 
 def test_one_extruder_needs_no_change() -> None:

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.demo.exact_path import SNAP, Position, Setting, StepperPath, crossings, solve
+from coordinator.demo.exact_path import SNAP, Leg, Position, StepperPath, follow, resting, solve
 from coordinator.demo.exact_signal import Floats
-from coordinator.motion.specs import StepperSpec
 from tests.coordinator.motion.replay import Stream
 
 CHUNK = 1 << 18
@@ -47,23 +46,20 @@ class Verdict:
 class StepperProof:
     """One stepper's paths: one for each stretch between two declarations of the position."""
 
-    def __init__(self, spec: StepperSpec, epochs: Sequence[Epoch], setting: Setting) -> None:
-        self.spec = spec
+    def __init__(self, legs: Sequence[Leg]) -> None:
+        self.name = legs[0].spec.name
         self.paths: list[StepperPath] = []
         self._begins: list[float] = []
-        position, end = 0, -math.inf
+        end, rest = -math.inf, 0.0
         self.wanted = 0
-        for start, moves in epochs:
-            if not len(moves):
-                continue
-            path = StepperPath(spec, start, moves, setting, position)
-            begin, last = float(moves[0]["print_time"]), moves[-1]
+        for leg, (path, _, u, place) in zip(legs, follow(legs), strict=True):
+            begin, last = float(leg.moves[0]["print_time"]), leg.moves[-1]
             self._begins.append((begin + end) / 2 if self.paths else -math.inf)
             end = float(last["print_time"] + last["accel_s"] + last["cruise_s"] + last["decel_s"])
-            count, position = crossings(path)
             self.paths.append(path)
-            self.wanted += count
-        self.wanted_position = position
+            self.wanted += int(np.abs(np.diff(place)).sum())
+            rest = float(u[-1])
+        self.wanted_position = resting(rest)
 
     def true_times(
         self, boundary: Floats, direction: NDArray[np.int64], near: Floats, reach_s: float
@@ -95,7 +91,7 @@ def check(
 ) -> Verdict:
     """Compare every step of STREAM, or those inside WINDOWS (print times), with its true time."""
     verdict = Verdict(
-        proof.spec.name,
+        proof.name,
         emitted=stream.steps,
         wanted=proof.wanted,
         position=stream.end_position,

@@ -3,12 +3,11 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from coordinator.demo.exact_path import Setting
-from coordinator.demo.exact_shapers import impulses
-from coordinator.gcode.events import End, Full, PositionSet
+from coordinator.demo.exact_program import program_legs
+from coordinator.gcode.events import End, Full, PositionSet, ShaperChange, SmoothTimeChange, WeightsChange
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
-from coordinator.machine.description import MachineDescription, load_machine
+from coordinator.machine.description import load_machine
 from coordinator.machine_devices import MachineDevices, stream_specs
 from coordinator.motion.planner import Planner
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
@@ -29,7 +28,6 @@ class Planned:
     steppers: list[StepperSpec]
     nodes: list[NodeStreamSpec]
     record: PlanRecord
-    setting: Setting
     stats: StepStats
     print_time_s: float
     batches: dict[int, bytearray] = field(default_factory=dict)
@@ -40,11 +38,11 @@ class Planned:
 
     def prove(self, windows: list[tuple[float, float]] | None = None) -> list[Verdict]:
         """Compare every stepper's steps with its exact motion, in WINDOWS of print time or everywhere."""
-        epochs, streams = self.record.epochs(), self.streams()
+        stretches, streams = self.record.stretches(), self.streams()
         verdicts = []
         for spec in self.steppers:
             freq = self.nodes[spec.node].clock_freq
-            proof = StepperProof(spec, epochs, self.setting)
+            proof = StepperProof(program_legs(spec, stretches))
             verdicts.append(check(proof, streams[spec.name], freq, MAX_ERROR_S, windows))
         return verdicts
 
@@ -67,7 +65,6 @@ def plan_program(config: Path, gcode: Path) -> Planned:
     nodes = stream_specs((name, dictionaries[name], MOVE_COUNT) for name in devices.moving_nodes)
     steppers = devices.stepper_specs()
     steps = StepGenerator(steppers, nodes)
-    setting = _setting(description)
     batches = {i: bytearray() for i in range(len(nodes))}
     record = PlanRecord((0.0, 0.0, 0.0, 0.0))
     with Program.open(str(gcode)) as program:
@@ -77,14 +74,7 @@ def plan_program(config: Path, gcode: Path) -> Planned:
             job, steps, lambda node, batch: batches[node].extend(batch), nodes=len(nodes), record=record
         )
         end = _run(pipeline)
-    return Planned(steppers, nodes, record, setting, steps.stats(), end.print_time_s, batches)
-
-
-def _setting(description: MachineDescription) -> Setting:
-    """Return how DESCRIPTION shapes, with impulses of our own."""
-    shapers = {s.axis.upper(): impulses(s.kind, s.frequency_hz, s.damping_ratio) for s in description.shapers}
-    extruder = description.extruder
-    return Setting(shapers, extruder.smooth_time_s if extruder and extruder.pressure_advance else 0.0)
+    return Planned(steppers, nodes, record, steps.stats(), end.print_time_s, batches)
 
 
 def _run(pipeline: Pipeline) -> End:
@@ -93,7 +83,7 @@ def _run(pipeline: Pipeline) -> End:
         match event:
             case Full():
                 pipeline.run_through()
-            case PositionSet():
+            case PositionSet() | ShaperChange() | SmoothTimeChange() | WeightsChange():
                 pipeline.finish()
                 pipeline.act(event)
             case End():

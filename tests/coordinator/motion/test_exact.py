@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coordinator.demo.exact_path import INVERSE, Setting, StepperPath, crossings, solve
+from coordinator.demo.exact_path import INVERSE, Setting, StepperPath, crossings, legs_of, solve
 from coordinator.demo.exact_signal import Floats, Phases, Shaped, Smoothed
 from coordinator.motion.specs import StepKinematics
 from tests.coordinator.motion.exact_cases import AWAY, LINEAR, PARAMS, SETTING, chain, spec_of, trapezoids
@@ -137,14 +137,14 @@ def test_slopes_of_the_kinematics_are_their_derivatives(kind: StepKinematics) ->
 
 def proof_of(moves: list[Move]) -> StepperProof:
     epochs: list[Epoch] = [(ORIGIN, trapezoids(moves))]
-    return StepperProof(stepper(0, X), epochs, Setting())
+    return StepperProof(legs_of(stepper(0, X), epochs, Setting()))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_good_steps_pass(seed: int) -> None:
     _, moves, streams = executed(seed)
     for spec in MACHINES["cartesian"]:
-        proof = StepperProof(spec, [(ORIGIN, trapezoids(moves))], Setting())
+        proof = StepperProof(legs_of(spec, [(ORIGIN, trapezoids(moves))], Setting()))
         stream = streams[spec.name]
         verdict = check(proof, stream, NODES[spec.node].clock_freq, 12.5e-6)
         assert verdict.checked == verdict.emitted == stream.steps
@@ -159,7 +159,7 @@ def test_the_end_of_a_stretch_is_where_the_next_begins() -> None:
     later["print_time"] += 100.0
     later["start"][:, 0] += 7.0
     epochs: list[Epoch] = [(ORIGIN, trapezoids(moves)), ((7.0, 0.0, 0.0, 0.0), later)]
-    proof = StepperProof(stepper(0, X), epochs, Setting())
+    proof = StepperProof(legs_of(stepper(0, X), epochs, Setting()))
     first, second = proof_of(moves), proof_of(again)
     assert proof.wanted == pytest.approx(first.wanted + second.wanted, abs=1)
     assert proof.wanted_position == pytest.approx(first.wanted_position + second.wanted_position, abs=1)

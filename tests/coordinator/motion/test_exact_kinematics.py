@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.demo.exact_path import Setting
+from coordinator.demo.exact_path import Setting, legs_of
 from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps import MAX_ERROR_S, StepGenerator
 from tests.coordinator.motion.exact_cases import AWAY, LINEAR, PARAMS, SETTING, chain, spec_of, trapezoids
@@ -47,7 +47,7 @@ def test_every_step_is_where_the_exact_motion_has_it(kind: str, setting: str, se
     moves["start"] += AWAY
     spec, chosen = spec_of(kind), SETTINGS[setting]
     stream = generated(spec, moves, chosen)
-    proof = StepperProof(spec, [(AWAY, moves)], chosen)
+    proof = StepperProof(legs_of(spec, [(AWAY, moves)], chosen))
     verdict = check(proof, stream, node_spec().clock_freq, MAX_ERROR_S)
     assert verdict.checked == verdict.emitted
     assert verdict.outside == 0, f"at {verdict.outside_s} s"

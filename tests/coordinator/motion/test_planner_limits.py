@@ -54,6 +54,22 @@ def test_each_of_these_limits_stands_alone(name: str) -> None:
     assert t[other][0] <= free[other][0]
 
 
+def test_moves_that_limits_slow_down_are_counted_by_limit_and_line() -> None:
+    limits = replace(LIMITS, max_velocity=200, max_x_velocity=100, max_y_velocity=150, max_z_velocity=10)
+    lines = (
+        b"G1 X10 F6000", b"G1 X20 F9000", b"G1 X10 F7200", b"G1 Y10 F9000", b"G1 Y20 F9001", b"G1 Z1 F601",
+        b"G1 X30 Y30 F12001", b"G1 X30.0000000000001 F90000", b"G1 F60000", b"G1 X31 Y31 E0.01 Z1 F3000",
+    )  # fmt: skip
+    planner = homed_planner(limits)
+    planned(planner, b"\n".join(lines) + b"\n")
+    first = planner.lines - len(lines)
+    x, y, z = planner.slowed
+    assert (x.limit, x.moves, x.first_line - first, x.worst_line - first) == ("max_x_velocity", 3, 2, 7)
+    assert [x.asked_mm_s, x.allowed_mm_s] == pytest.approx([12001 / 60, 50 * 5**0.5])
+    assert (y.limit, y.moves, y.first_line - first) == ("max_y_velocity", 1, 5)
+    assert (z.limit, z.moves, z.first_line - first, z.worst_line) == ("max_z_velocity", 1, 6, z.first_line)
+
+
 @given(st.lists(st.tuples(coordinates, coordinates), min_size=1, max_size=30))
 def test_no_move_leaves_a_ring(points: list[tuple[float, float]]) -> None:
     planner = homed_planner(RING)
