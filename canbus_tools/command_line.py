@@ -27,12 +27,12 @@ TOOLS: Final[dict[str, tuple[str, str]]] = {
 CONSOLE: Final = ("console", "talk to one node in its own words")
 
 
-def add_tools(can: argparse.ArgumentParser, words: Sequence[str]) -> None:
-    """Add all tools to the parser of ``canductor can``; the one that WORDS name with its options."""
+def add_tools(can: argparse.ArgumentParser, words: Sequence[str] = (), *, all_tools: bool = False) -> None:
+    """Add all tools to the parser of ``canductor can``; the one that WORDS name with its options, or ALL."""
     tools = can.add_subparsers(title="tools", metavar="TOOL")
     named = next((word for word in words[1:] if not word.startswith("-")), None)
     for name, summary in TOOLS.items():
-        if name == named:
+        if all_tools or name == named:
             declare_tool(tools, name)
         else:
             tools.add_parser(name, help=summary[1])

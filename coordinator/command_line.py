@@ -5,16 +5,18 @@ argparse, because the start counts: a library that is nicer to write with cost m
 
 import argparse
 import importlib
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn, cast
+from typing import Any, NoReturn, cast
 
 from coordinator.commands import (
     DemoOptions,
     PlanOptions,
     Report,
     RunOptions,
+    ServeOptions,
     SimulateOptions,
     find_machine,
 )
@@ -30,6 +32,15 @@ TOOL_COMMANDS = {
     "console": "Talk to one node in its own words.",
 }
 """Commands whose words are read by ``canbus_tools.command_line``."""
+FRONT_END_COMMANDS = {
+    "call": "Call a method of a machine that runs.",
+    "watch": "Show the fields of a machine that runs, and their changes.",
+    "status": "Tell how a machine that runs is doing.",
+    "send": "Send a file to a machine that runs, and print it.",
+    "estop": "Stop a machine that runs, at once.",
+    "completion": "Write what makes a shell complete the words of canductor.",
+}
+"""Commands whose words are read by ``coordinator.front_end_words``."""
 
 
 class Answered(Exception):  # noqa: N818 (no failure: the words asked for help or the version, and got it)
@@ -56,6 +67,8 @@ def read_words(words: Sequence[str]) -> Job:
     """
     if words[0] in TOOL_COMMANDS:
         return _tool(words)
+    if words[0] in FRONT_END_COMMANDS:
+        return _front_end(words)
     arguments = _parser().parse_args(list(words))
     if arguments.version:
         sys.stdout.write(f"canductor {version()}\n")
@@ -90,7 +103,41 @@ def version() -> str:
         return "(not installed)"
 
 
-def _parser() -> argparse.ArgumentParser:
+def whole_parser() -> argparse.ArgumentParser:
+    """Return the parser of all words, for what lists them: a start does not pay for those it does not use."""
+    from canbus_tools.command_line import add_tools, declare_tool  # noqa: PLC0415 (start-up time)
+
+    parser = _parser(whole=True)
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
+    for name, summary in FRONT_END_COMMANDS.items():
+        _declare_front_end(commands, name, summary)
+    can = commands.add_parser("can", allow_abbrev=False, help=_in_list(TOOL_COMMANDS["can"]))
+    add_tools(can, all_tools=True)
+    declare_tool(commands, "console")
+    return parser
+
+
+def _in_list(summary: str) -> str:
+    return f"{summary[0].lower()}{summary[1:].rstrip('.')}"
+
+
+def _front_end(words: Sequence[str]) -> Job:
+    """Read the words of a command that talks to a machine that runs."""
+    parser = _Parser(prog="canductor", allow_abbrev=False)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    _declare_front_end(commands, words[0], FRONT_END_COMMANDS[words[0]])
+    arguments = parser.parse_args(list(words))
+    return cast("Job", arguments.make_job(arguments))
+
+
+def _declare_front_end(commands: Any, name: str, summary: str) -> None:
+    from coordinator.front_end_words import declare  # noqa: PLC0415 (start-up time)
+
+    declare(commands.add_parser(name, help=_in_list(summary), description=summary, allow_abbrev=False), name)
+
+
+def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
+    """Return the parser; WHOLE: without the commands that others declare."""
     parser = _Parser(
         prog="canductor",
         description="One coordinator conducts many micro-controllers on CAN buses and UARTs as one machine.",
@@ -99,8 +146,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version")
     parser.set_defaults(make_job=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for name, summary in TOOL_COMMANDS.items():
-        commands.add_parser(name, help=f"{summary[0].lower()}{summary[1:].rstrip('.')}")
+    for name, summary in () if whole else (TOOL_COMMANDS | FRONT_END_COMMANDS).items():
+        commands.add_parser(name, help=_in_list(summary))
     for name, summary, declare, make_job in (
         ("demo", "print on virtual nodes and compare every stepper with the plan", _declare_demo, _demo),
         ("run", "bring up the machine of a configuration file", _declare_run, _run),
@@ -153,11 +200,16 @@ def _declare_demo(command: argparse.ArgumentParser) -> None:
     add("--rate-ppm", action="append", metavar="NAME=X", help="a node's clock error in ppm")
     add("--start-clock", action="append", metavar="NAME=N", help="a node's clock at its start, in ticks")
     add("--keep", type=Path, metavar="DIR", help="keep step logs here")
+    add("--serve", action="store_true", help="keep the virtual machine up for front ends instead of printing")
+    _declare_serving(command)
 
 
 def _demo(given: argparse.Namespace) -> Job:
+    machine = find_machine(given.machine)
+    if given.serve and given.gcode is not None:
+        raise UsageError("--serve prints nothing by itself; leave --gcode out, or --serve")
     options = DemoOptions(
-        machine=find_machine(given.machine),
+        machine=machine,
         gcode=existing_file(given.gcode),
         json=given.json,
         web=not given.no_web,
@@ -166,19 +218,68 @@ def _demo(given: argparse.Namespace) -> Job:
         rate_ppm=assignments("--rate-ppm", given.rate_ppm, _ppm),
         start_clock=assignments("--start-clock", given.start_clock, _ticks),
         keep=given.keep,
+        serve=_serving(given, machine) if given.serve else None,
     )
+    if options.serve is not None:
+        return lambda: _runner("coordinator.demo.serve", "serve_demo")(options)
     return lambda: _runner("coordinator.demo", "run_demo")(options)
 
 
 def _declare_run(command: argparse.ArgumentParser) -> None:
     command.add_argument("config", type=Path, help="configuration file")
     command.add_argument("--gcode", type=Path, metavar="FILE", help="g-code file to print")
+    _declare_serving(command)
 
 
 def _run(given: argparse.Namespace) -> Job:
     existing_file(given.config)
-    options = RunOptions(config=given.config, gcode=existing_file(given.gcode), json=given.json)
+    asked = given.ipc is not None or given.tcp is not None
+    if asked and given.gcode is not None:
+        raise UsageError("--gcode prints a file and ends; leave it out to serve front ends")
+    serves = asked or (given.gcode is None and sys.stdin is not None and sys.stdin.isatty())
+    options = RunOptions(
+        config=given.config,
+        gcode=existing_file(given.gcode),
+        json=given.json,
+        serve=_serving(given, given.config) if serves else None,
+    )
+    if options.serve is not None:
+        return lambda: _runner("coordinator.service.serve", "serve_machine")(options)
     return lambda: _runner("coordinator.run", "run_machine")(options)
+
+
+def _declare_serving(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument_group("serving front ends").add_argument
+    add("--ipc", type=Path, metavar="PATH", help="serve at this Unix socket; see docs/run.md")
+    add("--name", metavar="NAME", help="of the machine; the configuration file's name if not given")
+    add("--jobs", type=Path, metavar="DIR", help="folder of the files that front ends may print")
+    add("--node-commands", action="store_true", help="let administrators send raw commands to nodes")
+    add("--tcp", metavar="HOST:PORT", help="serve there, too; needs --tokens, and TLS but on loopback")
+    add("--tokens", type=Path, metavar="FILE", help="tokens of TCP clients; see docs/security.md")
+    add("--tls-certificate", type=Path, metavar="FILE", help="certificate chain, PEM")
+    add("--tls-key", type=Path, metavar="FILE", help="private key, PEM")
+    add("--no-tls-on-loopback", action="store_true", help="TCP without TLS, on a loopback address only")
+
+
+def _serving(given: argparse.Namespace, config: Path) -> ServeOptions:
+    name = given.name or (config.parent.name if config.stem == "machine" else config.stem)
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,48}", name):
+        raise UsageError(f"--name is '{name}', must be 1 to 48 letters, digits, - and _")
+    if given.jobs is not None and not given.jobs.is_dir():
+        raise UsageError(f"--jobs is '{given.jobs}', must be a folder; make it")
+    if given.tcp is not None and given.tokens is None:
+        raise UsageError("--tcp needs --tokens FILE: who comes over the network has to show one")
+    return ServeOptions(
+        name=name,
+        path=given.ipc,
+        jobs=given.jobs,
+        node_commands=given.node_commands,
+        tcp=None if given.tcp is None else _host_port(given.tcp),
+        tokens=given.tokens,
+        certificate=existing_file(given.tls_certificate),
+        private_key=existing_file(given.tls_key),
+        plain_on_loopback=given.no_tls_on_loopback,
+    )
 
 
 def _declare_plan(command: argparse.ArgumentParser) -> None:
@@ -252,6 +353,13 @@ def _seeds(text: str) -> range:
             f"--seeds is '{text}', must be A:B with B above A, at most {SEEDS_AT_ONCE_MAX:,} seeds"
         )
     return seeds
+
+
+def _host_port(text: str) -> tuple[str, int]:
+    host, colon, port = text.rpartition(":")
+    if not (colon and host and port.isascii() and port.isdecimal() and 0 < int(port[:6]) < 65536):
+        raise UsageError(f"--tcp is '{text}', must be HOST:PORT such as 127.0.0.1:7125")
+    return host.strip("[]"), int(port)
 
 
 def _ppm(text: str) -> float:

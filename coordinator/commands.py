@@ -36,6 +36,26 @@ class Report(Protocol):
 
 
 @record(kw_only=True)
+class ServeOptions:
+    """How a machine is served to front ends."""
+
+    name: str
+    """What front ends show; also the socket's name unless PATH says otherwise."""
+    path: Path | None = None
+    """The Unix socket; None: NAME.sock where this user's machines have theirs."""
+    jobs: Path | None = None
+    """Folder of the files that may be printed; None: there are no jobs."""
+    node_commands: bool = False
+    """Whether clients may send raw commands to nodes."""
+    tcp: tuple[str, int] | None = None
+    """Host and port."""
+    tokens: Path | None = None
+    certificate: Path | None = None
+    private_key: Path | None = None
+    plain_on_loopback: bool = False
+
+
+@record(kw_only=True)
 class DemoOptions:
     """``canductor demo``."""
 
@@ -55,6 +75,8 @@ class DemoOptions:
     """By node: how much faster its clock runs than nominal."""
     start_clock: Mapping[str, int] = field(default_factory=dict)
     """By node: ticks its clock shows when the node starts."""
+    serve: ServeOptions | None = None
+    """Serve the virtual machine to front ends instead of printing."""
     keep: Path | None = None
     """Folder that keeps step logs and captures; None: they are removed at the end."""
 
@@ -67,6 +89,8 @@ class RunOptions:
     gcode: Path | None = None
     """Printed once the machine is ready; None: commands come from elsewhere."""
     json: bool = False
+    serve: ServeOptions | None = None
+    """Serve the machine to front ends; None: print GCODE, or what comes on standard input, and end."""
 
 
 @record(kw_only=True)

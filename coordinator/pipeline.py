@@ -15,11 +15,11 @@ from coordinator.gcode.events import (
     SmoothTimeChange,
     WeightsChange,
 )
-from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import SHAPER_AXES, Shaper
 from coordinator.motion.planner import Planner, Position
 from coordinator.motion.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps import StepGenerator
+from coordinator.move_source import MoveSource
 from nodes.records import record
 
 if TYPE_CHECKING:
@@ -110,11 +110,11 @@ def _four(values: Sequence[float]) -> Position:
 
 
 class Pipeline:
-    """Moves of JOB, planned by its planner, turned by STEPS into batches that SINK takes."""
+    """Moves of JOB (any source), planned by its planner, turned by STEPS into batches that SINK takes."""
 
     def __init__(
         self,
-        job: Job,
+        job: MoveSource,
         steps: StepGenerator,
         sink: BatchSink,
         *,
@@ -134,6 +134,8 @@ class Pipeline:
         self._windows_s: dict[str, float] = {}
         self.moves = 0
         """Trapezoids handed to step generation."""
+        self.moved_until = 0.0
+        """Print time at which the last of them ends, in s."""
         self._begin()
 
     @property
@@ -216,7 +218,7 @@ class Pipeline:
             if taken:
                 last = waiting.pointer[taken - 1]
                 end = last.print_time + last.accel_s + last.cruise_s + last.decel_s
-                self._appended_until = float(end)
+                self._appended_until = self.moved_until = float(end)
                 self.moves += taken
                 if self._watch is not None:
                     self._watch(waiting.pointer, taken)

@@ -150,7 +150,7 @@ def _run(pipeline: Pipeline, display: ProgressDisplay) -> tuple[list[str], End]:
                 notices.append(event.text)
             case Emergency():
                 raise CanductorError(
-                    f"{pipeline.job.program.name}:{event.line}: M112 stops the machine here; "
+                    f"{pipeline.job.name}:{event.line}: M112 stops the machine here; "
                     "remove it to plan what follows"
                 )
             case End():

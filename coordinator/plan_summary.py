@@ -68,7 +68,7 @@ class Made:
         bus_reports = tuple(self._bus(bus) for bus in buses)
         flow = self.figures.flow
         return PlanReport(
-            gcode=self.pipeline.job.program.name,
+            gcode=self.pipeline.job.name,
             moves=self.pipeline.moves,
             print_time_s=self.print_time_s,
             steps=sum(s.steps for s in stats.steppers),
@@ -163,7 +163,7 @@ class Made:
         nodes: tuple[NodeReport, ...],
         buses: tuple[BusReport, ...],
     ) -> list[str]:
-        program = self.pipeline.job.program.name
+        program = self.pipeline.job.name
         warnings = [*bus_warnings(program, buses), *queue_warnings(program, nodes)]
         warnings += slowed_warnings(program, self.pipeline.planner.slowed)
         for index, stream in enumerate(self.streams):

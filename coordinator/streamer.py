@@ -24,9 +24,9 @@ from coordinator.gcode.events import (
     Reply,
     Wait,
 )
-from coordinator.gcode.interpreter import Job
 from coordinator.motion.planner import Planner
 from coordinator.motion.steps import StepGenerator
+from coordinator.move_source import MoveSource, Planned, Witness
 from coordinator.pipeline import Pipeline, PlanRecord
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ class JobState:
     print_time_s: float
     """Seconds of the job executed."""
     moves: int
+    planned: Planned
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,17 +74,22 @@ class _Cycle:
     told: list[Told]
     event: Event | None
     """What the job waits for; None: it has more."""
+    planned: Planned
 
 
 class Streamer:
-    """Runs one JOB on MACHINE, whose nodes are READY. ON_TOLD gets replies and notices, ON_STATE progress."""
+    """Runs one JOB on MACHINE, whose nodes are READY. ON_TOLD gets replies and notices, ON_STATE progress.
+
+    WITNESS sees the moves and the commands go by.
+    """
 
     def __init__(
         self,
         machine: Machine,
-        job: Job,
+        job: MoveSource,
         *,
         record: PlanRecord | None = None,
+        witness: Witness | None = None,
         on_told: Callable[[Told], None],
         on_state: Callable[[JobState], None],
     ) -> None:
@@ -91,13 +97,19 @@ class Streamer:
         self._job = job
         self._on_told = on_told
         self._on_state = on_state
+        self._witness = witness
         self._keeps_maps = record is not None
         self._nodes = machine.moving
         self._time_base = machine.time_base()
         self._batches: list[tuple[int, bytes]] = []
         self.steps = StepGenerator(machine.devices.stepper_specs(), machine.stream_specs())
         self.pipeline = Pipeline(
-            job, self.steps, lambda n, b: self._batches.append((n, b)), nodes=len(self._nodes), record=record
+            job,
+            self.steps,
+            lambda n, b: self._batches.append((n, b)),
+            nodes=len(self._nodes),
+            record=record,
+            watch=None if witness is None else witness.see_moves,
         )
         self.maps: list[ClockMap] = []
         """Per moving node: print time to ticks, as the steps were timed; without a record only its end."""
@@ -188,7 +200,7 @@ class Streamer:
                 event = cycle.event
                 self._hand_over(cycle)
                 if isinstance(event, Emergency):
-                    self._machine.stop(f"{self._job.program.name}:{event.line}: M112 stopped the machine")
+                    self._machine.stop(f"{self._job.name}:{event.line}: M112 stopped the machine")
                     return
                 if event is not None or self._held is not None:
                     await asyncio.sleep(CYCLE_S)
@@ -200,18 +212,20 @@ class Streamer:
     def _hand_over(self, cycle: _Cycle) -> None:
         for node, batch in cycle.batches:
             link_of(self._nodes[node]).send_batch(batch)
+            if self._witness is not None:
+                self._witness.see_batch(node, batch)
         if cycle.batches:
             self._machine.check_load()
         self._look_at_load()
         for told in cycle.told:
             self._on_told(told)
-        self._report()
+        self._report(cycle.planned)
 
     def _look_at_load(self) -> None:
         busy = any(bus.load.total > BUSY_LOAD for bus in self._machine.bus_stats().values())
         self._start_lead_s = BUSY_START_LEAD_S if busy else START_LEAD_S
 
-    def _report(self) -> None:
+    def _report(self, planned: Planned) -> None:
         now = self.print_time_now()
         self._on_state(
             JobState(
@@ -219,6 +233,7 @@ class Streamer:
                 self._done.size_bytes,
                 max(0.0, min(now, self.pipeline.appended_until) - self.began_s),
                 self.pipeline.moves,
+                planned,
             )
         )
 
@@ -263,7 +278,21 @@ class Streamer:
 
     def _cycle(self, told: Sequence[Told], event: Event | None) -> _Cycle:
         batches, self._batches = self._batches, []
-        return _Cycle(batches, list(told), event)
+        return _Cycle(batches, list(told), event, self._planned())
+
+    def _planned(self) -> Planned:
+        planner = self._planner
+        stands = planner.at_standstill and not planner.take().count
+        return Planned(
+            position=planner.toolhead_position,
+            gcode=planner.gcode_position,
+            base=planner.gcode_base,
+            homed=planner.homed,
+            speed_factor=planner.speed_factor,
+            extrude_factor=planner.extrude_factor,
+            stands_from_s=self.pipeline.moved_until + self.steps.lag_s if stands else None,
+            steps_sent=tuple(stepper.issued for stepper in self.steps.stats().steppers),
+        )
 
     def _still_waiting(self, event: Event | None, now: float) -> bool:
         if isinstance(event, Wait):

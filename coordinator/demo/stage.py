@@ -115,7 +115,7 @@ class Stage:
             % 2**47,
             jitter_us=JITTER_US,
             seed=self._options.seed + index,
-            edge_log=self.edge_log_path(node.name),
+            edge_log=None if self._options.serve is not None else self.edge_log_path(node.name),
         )
 
     # ------------------------------------------------------------------------------------------ afterwards

@@ -74,6 +74,11 @@ class Job:
         machine_commands.begin(self)
 
     @property
+    def name(self) -> str:
+        """What is being read."""
+        return self.program.name
+
+    @property
     def line(self) -> int:
         """Number of the line that comes next."""
         return self.planner.lines + 1

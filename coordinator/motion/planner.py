@@ -117,6 +117,18 @@ class Planner:
         refused = lib.gcode_move(self._state, self._core, self._given(words))
         return FeedStatus.LIMIT if refused else FeedStatus.NEED_DATA
 
+    def move_to(self, target: Sequence[float], speed_mm_s: float) -> FeedStatus:
+        """Move to TARGET (X Y Z E, mm) in the machine's frame, whatever the program's frame and modes are.
+
+        Answers as ``move``; the program's own position follows.
+        """
+        if not lib.planner_ready(self._core):
+            return FeedStatus.FULL
+        if lib.planner_add(self._core, target, speed_mm_s):
+            return FeedStatus.LIMIT
+        self._state.position = self.toolhead_position
+        return FeedStatus.NEED_DATA
+
     def _given(self, words: Mapping[str, float]) -> Any:
         """Fill struct gcode_words."""
         self._words.given = 0
@@ -355,6 +367,19 @@ class Planner:
     def pressure_advance(self, advance_s: float) -> None:
         self._core.pressure_advance = check_number("the pressure advance", advance_s, 0, MAX_ADVANCE_S)
 
+    def reset_modes(self) -> None:
+        """Take units, modes, speed and dynamics back to where a program begins.
+
+        Positions, the G-code origin, what is homed and the factors (M220, M221) stay.
+        """
+        self.unit_mm = 1.0
+        self.relative = self.relative_extrusion = False
+        self._state.speed = DEFAULT_SPEED_MM_S
+        self.accel = self.limits.max_accel
+        self.max_velocity = self.limits.max_velocity
+        self.square_corner_velocity = self.limits.square_corner_velocity
+        self.minimum_cruise_ratio = self.limits.minimum_cruise_ratio
+
     # ---- Where and how the moves to come may go when the machine changes ----
 
     def set_range(self, axis: int, low: float, high: float) -> None:
@@ -372,8 +397,12 @@ class Planner:
 
     @property
     def lines(self) -> int:
-        """Lines consumed."""
+        """Lines consumed; set it where another program begins or goes on."""
         return int(self._state.lines)
+
+    @lines.setter
+    def lines(self, lines: int) -> None:
+        self._state.lines = lines
 
     @property
     def moves(self) -> int:
@@ -403,3 +432,8 @@ class Planner:
     def moves_queued(self) -> int:
         """Moves that are not handed out yet."""
         return int(self._core.tail - self._core.head)
+
+
+def ffi_memory(trapezoids: Any, count: int) -> Any:
+    """Return the memory of COUNT trapezoids from a pointer to them; valid as long as they are."""
+    return ffi.buffer(trapezoids, count * ffi.sizeof("struct trapezoid"))

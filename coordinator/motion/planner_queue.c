@@ -9,6 +9,8 @@ static const double FLAT = 1e-9;
 static const double STRAIGHT_COS2 = 1e-16; // turn of 2e-8 rad
 static const double EVEN_FLOW = 1e-9;      // mm of filament per mm of path
 enum { PLAN_AFTER_MIN = 32 };
+// Whoever streams wants to know early what long moves are: what is added beyond plan_until cannot be paused.
+static const double PLAN_AFTER_S = 0.25;
 
 static inline struct planned_move *move_at(struct planner *p, uint64_t index) {
     return &p->queue[index & (PLANNER_QUEUE - 1)];
@@ -23,6 +25,7 @@ static void stand_still(struct planner *p) {
     p->speed = p->speed_v2 = p->hill_top_v2 = 0;
     p->hill_closed = p->falling = 0;
     p->fresh = 0;
+    p->fresh_s = 0;
     p->plan_after = PLAN_AFTER_MIN;
 }
 
@@ -103,7 +106,8 @@ int planner_add(struct planner *p, const double target[4], double speed) {
     move->line = p->line;
     p->tail++;
     p->moves_added++;
-    if (++p->fresh >= p->plan_after)
+    p->fresh_s += move->length / sqrt(move->cruise_v2);
+    if (++p->fresh >= p->plan_after || p->fresh_s >= PLAN_AFTER_S)
         planner_plan(p);
     return 0;
 }
@@ -135,6 +139,7 @@ static void look_back(struct planner *p) {
     p->settled_v2 = settled;
     p->settled_smooth_v2 = settled_smooth;
     p->fresh = 0;
+    p->fresh_s = 0;
 }
 
 // ---- Handing out

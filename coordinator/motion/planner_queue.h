@@ -105,6 +105,7 @@ struct planner {
     // Queue: moves [head, tail). Junctions up to settled_v2 (settled_smooth_v2) cannot change any more.
     uint64_t head, tail, settled_v2, settled_smooth_v2;
     uint32_t fresh, plan_after; // moves since the last backward pass, and after how many comes the next
+    double fresh_s;             // what they last at least; a pass is also due after a while of motion
     double speed, speed_v2;     // mm/s and square of it at head
     // The hill of the minimum-cruise profile at head: top of its moves before scanned, whether that is the
     // top of the whole hill, and whether the top lies behind head.

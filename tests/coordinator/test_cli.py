@@ -174,7 +174,7 @@ def test_a_bug_leaves_its_traceback_in_a_file(
 
 
 USAGE = {
-    "plam": "invalid choice: 'plam' (choose from 'can', 'console', 'demo', 'run', 'plan', 'simulate')",
+    "plam": "invalid choice: 'plam' (choose from 'can', 'console', 'call', 'watch', ",
     "plan": "the following arguments are required: config, gcode",
     "demo --sed 1": "unrecognized arguments: --sed 1",
     "demo --seed x": "--seed is 'x', must be a whole number of at least 0",

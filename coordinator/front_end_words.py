@@ -1,0 +1,134 @@
+"""The words of the commands that talk to a machine that runs, and of shell completion."""
+
+import argparse
+import importlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, cast
+
+from coordinator.commands import Report
+from nodes.errors import CanductorError
+from nodes.option_values import UsageError, existing_file, number, whole
+from nodes.records import record
+
+SHELLS: Final = ("bash", "zsh", "fish")
+
+
+@record(kw_only=True)
+class Target:
+    """Which machine, and who asks."""
+
+    address: str | None
+    """None: the only one of this user that runs here."""
+    token: str | None
+    certificate: Path | None
+    """What a TLS server must have been signed with; None: what this computer trusts."""
+    timeout_s: float
+
+
+def declare(command: argparse.ArgumentParser, name: str) -> None:
+    """Add the options of the command NAME."""
+    add = command.add_argument
+    if name == "call":
+        add("method", help="its name; api.methods lists all")
+        add("params", nargs="*", metavar="NAME=VALUE", help="parameters; values as JSON, or as they are")
+    elif name == "watch":
+        add("fields", nargs="*", metavar="FIELD", help="which fields; * stands for any characters")
+        add("--rate", default="2", metavar="HZ", help="updates a second, at most; 2 if not given")
+        add("--count", metavar="N", help="end after so many updates; else with Ctrl-C")
+    elif name == "send":
+        add("file", type=Path, help="g-code file")
+        add("--name", help="what it is called there; its own name if not given")
+        add("--replace", action="store_true", help="a file of that name may be there")
+        add("--no-start", action="store_true", help="only send it")
+    elif name == "completion":
+        add("shell", choices=SHELLS, help="for which shell")
+    if name != "completion":
+        add("--at", metavar="ADDRESS", help="socket, tcp://HOST:PORT or tls://HOST:PORT")
+        add("--token-file", type=Path, metavar="FILE", help="file that holds the token, for TCP")
+        add("--certificate", type=Path, metavar="PEM", help="certificate that the server must have")
+        add("--timeout", default="5", metavar="S", help="for the machine to answer; 5 if not given")
+    add("--json", action="store_true", help="print one JSON object as the last line")
+    command.set_defaults(make_job=_MAKERS[name])
+
+
+def _target(given: argparse.Namespace) -> Target:
+    token = None
+    if given.token_file is not None:
+        existing_file(given.token_file)
+        try:
+            token = given.token_file.read_text(encoding="utf-8").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise CanductorError(f"the token's file {given.token_file} cannot be read: {error}") from None
+    return Target(
+        address=given.at,
+        token=token,
+        certificate=existing_file(given.certificate),
+        timeout_s=number("--timeout", given.timeout, 0.1, 3600, "s"),
+    )
+
+
+def _run(name: str, *arguments: object, **options: object) -> Report:
+    function = getattr(importlib.import_module("coordinator.front_ends"), name)
+    return cast("Report", function(*arguments, **options))
+
+
+def read_params(pairs: list[str]) -> dict[str, Any]:
+    """Read NAME=VALUE words; a value that is no JSON is a string. Raises UsageError."""
+    params: dict[str, Any] = {}
+    for pair in pairs:
+        name, equals, text = pair.partition("=")
+        if not name or not equals:
+            raise UsageError(f"parameters are NAME=VALUE, not '{pair}'")
+        if name in params:
+            raise UsageError(f"the parameter {name} is given twice")
+        try:
+            params[name] = json.loads(text)
+        except (ValueError, RecursionError):
+            params[name] = text
+    return params
+
+
+def _call(given: argparse.Namespace) -> Callable[[], Report]:
+    target, params = _target(given), read_params(given.params)
+    return lambda: _run("call", target, given.method, params)
+
+
+def _watch(given: argparse.Namespace) -> Callable[[], Report]:
+    target, rate_hz = _target(given), number("--rate", given.rate, 0.01, 50, "Hz")
+    count = None if given.count is None else whole("--count", given.count, 1)
+    return lambda: _run("watch", target, given.fields or ["*"], rate_hz, count, as_json=given.json)
+
+
+def _status(given: argparse.Namespace) -> Callable[[], Report]:
+    target = _target(given)
+    return lambda: _run("status", target)
+
+
+def _send(given: argparse.Namespace) -> Callable[[], Report]:
+    target = _target(given)
+    existing_file(given.file)
+    name = given.name or given.file.name
+    return lambda: _run(
+        "send", target, given.file, name, replace=given.replace, start=not given.no_start, quiet=given.json
+    )
+
+
+def _estop(given: argparse.Namespace) -> Callable[[], Report]:
+    target = _target(given)
+    return lambda: _run("estop", target)
+
+
+def _completion(given: argparse.Namespace) -> Callable[[], Report]:
+    return lambda: _run("completion", given.shell)
+
+
+_MAKERS: Final = {
+    "call": _call,
+    "watch": _watch,
+    "status": _status,
+    "send": _send,
+    "estop": _estop,
+    "completion": _completion,
+}

@@ -1,0 +1,62 @@
+"""Where a machine is found: its address in words."""
+
+import os
+import tempfile
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from nodes.errors import CanductorError
+from nodes.records import record
+
+
+@record
+class Address:
+    """A Unix socket (PATH) or a TCP port (HOST, PORT), with or without TLS."""
+
+    path: Path | None = None
+    host: str = ""
+    port: int = 0
+    tls: bool = False
+
+    def __str__(self) -> str:
+        if self.path is not None:
+            return str(self.path)
+        return f"{'tls' if self.tls else 'tcp'}://{self.host}:{self.port}"
+
+
+def socket_folder() -> Path:
+    """Return where this user's machines have their sockets."""
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(base) / "canductor" if base else Path(tempfile.gettempdir()) / f"canductor-{os.geteuid()}"
+
+
+def read_address(text: str | None) -> Address:
+    """Read a path, ``tcp://HOST:PORT`` or ``tls://HOST:PORT``; None: the only machine of this user.
+
+    Raises CanductorError.
+    """
+    if text is None:
+        return _only_machine()
+    scheme, separator, _ = text.partition("://")
+    if not separator:
+        return Address(path=Path(text.removeprefix("unix:")))
+    try:
+        parts = urlsplit(text)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if scheme not in ("tcp", "tls") or not host or not port:
+        raise CanductorError(f"'{text}' is no address; it must be a path, tcp://HOST:PORT or tls://HOST:PORT")
+    return Address(host=host, port=port, tls=scheme == "tls")
+
+
+def _only_machine() -> Address:
+    folder = socket_folder()
+    found = sorted(path for path in folder.glob("*.sock") if path.is_socket())
+    if len(found) == 1:
+        return Address(path=found[0])
+    if not found:
+        raise CanductorError(
+            f"no machine runs here: there is no socket in {folder}; name one with --at ADDRESS"
+        )
+    raise CanductorError(f"several machines run here; name one with --at: {', '.join(map(str, found))}")

@@ -1,0 +1,108 @@
+"""Who may come in: tokens with scopes from a file, and a brake on those who guess."""
+
+import hmac
+import os
+import stat
+from dataclasses import dataclass
+from ipaddress import IPv6Address, ip_address
+from pathlib import Path
+from typing import Final
+
+from coordinator.ipc.methods import Scope
+from nodes.errors import CanductorError
+
+TOKEN_LENGTH_MIN: Final = 32
+FAILURES_MAX: Final = 5
+"""Failures in a row after which an address is shut out."""
+SHUT_OUT_S: Final = 30.0
+"""For so long after the last failure; then its failures are forgotten."""
+ADDRESSES_MAX: Final = 1_024
+"""Addresses whose failures are remembered; the one that failed longest ago makes room."""
+_SCOPES: Final = {scope.word: scope for scope in Scope}
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """What a token gives."""
+
+    name: str
+    scope: Scope
+
+
+class Tokens:
+    """Tokens with their scopes; ``#`` begins a comment, every other line is ``SCOPE NAME TOKEN``."""
+
+    def __init__(self, grants: dict[str, Grant]) -> None:
+        self._grants = {token.encode(): grant for token, grant in grants.items()}
+
+    @classmethod
+    def read(cls, path: Path) -> "Tokens":
+        """Read the file PATH; raises CanductorError when others may read it, or a line is none."""
+        try:
+            with path.open(encoding="utf-8") as file:
+                status = os.fstat(file.fileno())
+                text = file.read()
+        except (OSError, UnicodeDecodeError) as error:
+            raise CanductorError(f"the tokens' file {path} cannot be read: {error}") from None
+        if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077:
+            raise CanductorError(f"the tokens' file {path} must be yours alone; chmod 600 it, and own it")
+        grants: dict[str, Grant] = {}
+        for number, line in enumerate(text.splitlines(), 1):
+            words = line.split("#", 1)[0].split()
+            if not words:
+                continue
+            if len(words) != 3 or words[0] not in _SCOPES:
+                raise CanductorError(
+                    f"{path}, line {number}: must be SCOPE NAME TOKEN, the scope one of {', '.join(_SCOPES)}"
+                )
+            if len(words[2]) < TOKEN_LENGTH_MIN:
+                raise CanductorError(
+                    f"{path}, line {number}: the token has fewer than {TOKEN_LENGTH_MIN} characters; "
+                    "make one with: python3 -c 'import secrets; print(secrets.token_urlsafe())'"
+                )
+            if words[2] in grants:
+                raise CanductorError(f"{path}, line {number}: the token is there twice; make another one")
+            grants[words[2]] = Grant(words[1], _SCOPES[words[0]])
+        return cls(grants)
+
+    def check(self, token: str) -> Grant | None:
+        """Return what TOKEN gives, None if nothing; takes as long whichever token it resembles."""
+        given = token.encode(errors="replace")
+        found: Grant | None = None
+        for known, grant in self._grants.items():
+            if hmac.compare_digest(known, given):
+                found = grant
+        return found
+
+
+class FailureBrake:
+    """Shuts an address out that failed too often; sans-IO, times in seconds of one clock."""
+
+    def __init__(self) -> None:
+        self._failures: dict[str, tuple[int, float]] = {}  # the latest at the end
+
+    def failed(self, address: str, now_s: float) -> None:
+        """Note that ADDRESS gave a wrong token."""
+        network = _network(address)
+        count, last_s = self._failures.pop(network, (0, now_s))
+        if now_s - last_s > SHUT_OUT_S:
+            count = 0
+        if len(self._failures) >= ADDRESSES_MAX:
+            del self._failures[next(iter(self._failures))]
+        self._failures[network] = (count + 1, now_s)
+
+    def shut_out_s(self, address: str, now_s: float) -> float:
+        """Return for how long ADDRESS has to wait, 0 if it may come in."""
+        count, last_s = self._failures.get(_network(address), (0, 0.0))
+        return max(0.0, last_s + SHUT_OUT_S - now_s) if count >= FAILURES_MAX else 0.0
+
+
+def _network(address: str) -> str:
+    """Return what stands for ADDRESS: who has one IPv6 address has the other 2^64 of its network."""
+    try:
+        ip = ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if isinstance(ip, IPv6Address) and ip.ipv4_mapped is None:
+        return ip.exploded[:19]
+    return str(ip.ipv4_mapped if isinstance(ip, IPv6Address) else ip)

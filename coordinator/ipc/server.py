@@ -1,0 +1,247 @@
+"""The server's sockets: where it listens, and whom it lets in (asyncio)."""
+
+import asyncio
+import contextlib
+import os
+import socket
+import ssl
+import struct
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Final
+
+from coordinator.ipc.auth import FailureBrake, Grant, Tokens
+from coordinator.ipc.connection import Connection
+from coordinator.ipc.methods import Registry, Value
+from coordinator.ipc.publisher import Publisher
+from coordinator.ipc.session import Common, Session, SessionCounters
+from coordinator.ipc.session_methods import add_session_methods
+from coordinator.ipc.settings import IpcSettings, TcpSettings
+from coordinator.ipc.state import StateTree
+from coordinator.ipc.wire import Encoder, Encoding, Fault
+from nodes.errors import CanductorError
+
+_PEER: Final = struct.Struct("3i")
+"""Of SO_PEERCRED: pid, uid, gid."""
+BACKLOG: Final = 128
+REFUSALS_MAX: Final = 32
+"""Connections beyond the most that are still told so; further ones are just closed."""
+
+
+class IpcServer:
+    """Serves the methods of REGISTRY, and STATE, to front ends; lives on the loop that starts it."""
+
+    def __init__(self, registry: Registry, state: StateTree, settings: IpcSettings) -> None:
+        add_session_methods(registry)
+        self._settings = settings
+        self._encoder = Encoder()
+        self._common = Common(registry, Publisher(state, self._encoder), settings.limits)
+        self._servers: list[asyncio.AbstractServer] = []
+        self._connections: set[Connection] = set()
+        self._brake = FailureBrake()
+        self._tokens: Tokens | None = None
+        self._sessions = 0
+        self._refused = 0
+        self._unsendable = 0  # notifications that no message can carry
+        self._gone = SessionCounters()
+        self.tcp_port: int | None = None
+        """The port, once open; of use where the settings say 0, any port."""
+
+    # ------------------------------------------------------------------------------------------- life
+
+    async def start(self) -> None:
+        """Open the sockets; raises CanductorError with all closed."""
+        try:
+            if self._settings.unix_path is not None:
+                await self._open_unix(self._settings.unix_path)
+            if self._settings.tcp is not None:
+                await self._open_tcp(self._settings.tcp)
+        except BaseException:
+            await self.close()
+            raise
+
+    async def close(self) -> None:
+        """Let go of every client and close the sockets."""
+        for server in self._servers:
+            server.close()
+        for connection in list(self._connections):
+            connection.session.end(Fault("closing", "the server ends"))
+            connection.flush()
+            connection.transport.close()
+        if self._servers and self._settings.unix_path is not None:
+            with contextlib.suppress(OSError):
+                self._settings.unix_path.unlink()
+        self._servers.clear()
+        await asyncio.sleep(0)
+
+    def notify(self, event: str, values: Mapping[str, Value]) -> None:
+        """Send EVENT ("log", "gcode.reply") to every client that listens to it; never blocks."""
+        message: dict[str, Value] = {"event": event, "values": dict(values)}
+        encoded: dict[Encoding, bytes] = {}
+        for connection in self._connections:
+            session = connection.session
+            if not session.listens.matches(event):
+                continue
+            if session.encoding not in encoded:
+                try:
+                    encoded[session.encoding] = self._encoder.message(session.encoding, message)
+                except ValueError:  # who notifies has other things to do than to fail for this
+                    self._unsendable += 1
+                    return
+            session.notify(event, encoded[session.encoding])
+            connection.flush()
+
+    def figures(self) -> dict[str, Value]:
+        """Return how many clients there are, and what became of all messages since the start."""
+        counted = asdict(self._gone)
+        for connection in self._connections:
+            for name, value in asdict(connection.session.counters).items():
+                counted[name] += value
+        return {
+            "connections": len(self._connections),
+            "refused_connections": self._refused,
+            "unsendable": self._unsendable + self._common.publisher.unsendable,
+            **counted,
+        }
+
+    # ---------------------------------------------------------------------------------------- sockets
+
+    async def _open_unix(self, path: Path) -> None:
+        await asyncio.to_thread(_make_way, path)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            os.fchmod(listener.fileno(), 0o600)  # before there is a name, so that nobody can be faster
+            listener.bind(str(path))
+            server = await asyncio.get_running_loop().create_unix_server(
+                lambda: Connection(self._admit_unix, self._drop), sock=listener, backlog=BACKLOG
+            )
+        except OSError as error:
+            listener.close()
+            raise CanductorError(f"the socket {path} cannot be opened: {error.strerror or error}") from None
+        self._servers.append(server)
+
+    async def _open_tcp(self, tcp: TcpSettings) -> None:
+        context = await asyncio.to_thread(_tls_context, tcp)
+        self._tokens = await asyncio.to_thread(Tokens.read, tcp.tokens)
+        try:
+            server = await asyncio.get_running_loop().create_server(
+                lambda: Connection(self._admit_tcp, self._drop),
+                tcp.host,
+                tcp.port,
+                ssl=context,
+                ssl_handshake_timeout=None if context is None else self._common.limits.message_timeout_s,
+                backlog=BACKLOG,
+            )
+        except OSError as error:
+            raise CanductorError(
+                f"port {tcp.port} of {tcp.host} cannot be opened: {error.strerror}"
+            ) from None
+        self._servers.append(server)
+        self.tcp_port = server.sockets[0].getsockname()[1]
+
+    # ---------------------------------------------------------------------------------------- clients
+
+    def _admit_unix(self, transport: asyncio.Transport, connection: Connection) -> Session:
+        opened = transport.get_extra_info("socket")
+        pid, uid, _ = _PEER.unpack(opened.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
+        session = self._session(connection, f"uid {uid}, pid {pid}", "")
+        session.granted = self._settings.unix_scope
+        if uid not in (0, os.geteuid()):
+            self._refuse(session, Fault("not_allowed", f"this socket is not for the user with uid {uid}"))
+        return session
+
+    def _admit_tcp(self, transport: asyncio.Transport, connection: Connection) -> Session:
+        address = str((transport.get_extra_info("peername") or ("unknown",))[0])
+        session = self._session(connection, address, address)
+        wait_s = self._brake.shut_out_s(address, asyncio.get_running_loop().time())
+        others = self._connections - {connection}
+        over_tcp = sum(1 for other in others if other.session.granted is None)
+        if over_tcp >= self._settings.tcp_connections_max:
+            self._refuse(session, Fault("busy", "there are too many connections over TCP; close others"))
+        elif wait_s > 0:
+            sentence = f"too many wrong tokens from {address}; wait {wait_s:.0f} s"
+            self._refuse(session, Fault("too_many_failures", sentence))
+        return session
+
+    def _session(self, connection: Connection, peer: str, address: str) -> Session:
+        self._sessions += 1
+        loop = asyncio.get_running_loop()
+
+        def check(token: str) -> Grant | None:
+            grant = None if self._tokens is None else self._tokens.check(token)
+            if grant is None and address:
+                self._brake.failed(address, loop.time())
+            return grant
+
+        session = Session(
+            self._common, loop.time(), number=self._sessions, peer=peer, granted=None, check_token=check
+        )
+        self._connections.add(connection)
+        if len(self._connections) > self._settings.connections_max:
+            self._refuse(session, Fault("busy", "there are too many connections; close others"))
+        if len(self._connections) > self._settings.connections_max + REFUSALS_MAX:
+            connection.transport.abort()
+        return session
+
+    def _refuse(self, session: Session, fault: Fault) -> None:
+        self._refused += 1
+        session.end(fault)
+
+    def _drop(self, connection: Connection) -> None:
+        self._connections.discard(connection)
+        for field in fields(SessionCounters):
+            total = getattr(self._gone, field.name) + getattr(connection.session.counters, field.name)
+            setattr(self._gone, field.name, total)
+
+
+# ------------------------------------------------------------------------------------------------- opening
+
+
+def _make_way(path: Path) -> None:
+    """Make the folder of PATH, and remove a socket that a dead coordinator left there."""
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not path.is_socket():
+            if path.exists():
+                raise CanductorError(f"{path} is there and no socket; choose another path or remove it")
+            return
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            probe.settimeout(1.0)
+            try:
+                probe.connect(str(path))
+            except ConnectionRefusedError:
+                path.unlink()
+                return
+    except OSError as error:
+        raise CanductorError(f"the socket {path} cannot be opened: {error.strerror or error}") from None
+    raise CanductorError(f"another coordinator serves at {path}; stop it, or choose another path")
+
+
+def _tls_context(tcp: TcpSettings) -> ssl.SSLContext | None:
+    """Return how TCP is kept secret, None for plain loopback; raises CanductorError."""
+    if tcp.certificate is not None and tcp.private_key is not None:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        try:
+            context.load_cert_chain(tcp.certificate, tcp.private_key)
+        except (OSError, ssl.SSLError) as error:
+            raise CanductorError(
+                f"the certificate {tcp.certificate} or its key cannot be used: {error}"
+            ) from None
+        return context
+    if not tcp.plain_on_loopback:
+        raise CanductorError("TCP needs a certificate and its private key, or plain_on_loopback")
+    if not _is_loopback(tcp.host):
+        raise CanductorError(
+            f"TCP without TLS is for loopback only, and {tcp.host} is not: 127.0.0.1 or ::1 is"
+        )
+    return None
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return False  # a name may come to mean another address

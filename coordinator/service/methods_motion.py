@@ -1,0 +1,255 @@
+"""Methods that move: g-code lines, single moves; and positions in all frames."""
+
+import asyncio
+from collections.abc import Iterator
+from typing import Any, Final
+
+from coordinator.app import Machine
+from coordinator.gcode.errors import GCodeError
+from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
+from coordinator.service.feeder import FeederFull, Ticket
+from coordinator.service.figures import axes, position_figures
+from coordinator.service.machine_service import MachineService
+from coordinator.service.motion import Motion, MotionOver, texts
+from coordinator.service.work import (
+    ASIDE,
+    EMERGENCY,
+    LINES_BYTES_MAX,
+    LINES_MAX,
+    LinesWork,
+    MoveWork,
+    Rest,
+    Work,
+    WorkError,
+    commands_in,
+)
+from nodes.errors import CanductorError
+
+_DEFAULT_SPEED_MM_S: Final = 25.0
+_DISTANCE_MAX_MM: Final = 1e6
+_STEPS_KEPT_S: Final = 0.2
+"""What nodes told of their steppers is told again for so long: clients cannot load a bus by asking."""
+
+_AXES: Final = tuple(
+    Param(
+        axis,
+        Kind.FLOAT,
+        f"{axis.upper()} of the machine",
+        "mm",
+        required=False,
+        low=-_DISTANCE_MAX_MM,
+        high=_DISTANCE_MAX_MM,
+    )
+    for axis in "xyze"
+)
+_SPEED: Final = Param(
+    "speed_mm_s", Kind.FLOAT, "along the path", "mm/s", required=False, default=_DEFAULT_SPEED_MM_S, low=1e-3
+)
+_WAIT: Final = Param(
+    "wait", Kind.BOOL, "answer when it is carried out, not when it is read", required=False, default=True
+)
+_TOLD: Final = (
+    Param("replies", Kind.LIST, "what the lines asked for"),
+    Param("notices", Kind.LIST, "what the user should know"),
+)
+
+
+def motion_methods(service: MachineService) -> Iterator[Method]:
+    """Return them."""
+    steps = _StepsOfNodes(service)
+
+    async def run(_caller: Caller, params: dict[str, Any]) -> Value:
+        lines = _lines(params["script"])
+        if EMERGENCY in _commands(lines):
+            service.emergency_stop(f"{EMERGENCY} of a client")
+            return {"replies": [], "notices": []}
+        work = LinesWork(lines, rest=Rest.STANDSTILL if params["wait"] else Rest.OPEN)
+        motion = service.ready_motion()
+        if service.active_job is None:
+            return _answer(await _done(service, motion, work))
+        _check_aside(lines)
+        return _answer(await _done(service, motion, work, aside=True))
+
+    async def move_to(_caller: Caller, params: dict[str, Any]) -> Value:
+        return await _move(service, params, relative=False)
+
+    async def move_by(_caller: Caller, params: dict[str, Any]) -> Value:
+        return await _move(service, params, relative=True)
+
+    async def home(_caller: Caller, params: dict[str, Any]) -> Value:
+        named = params["axes"].upper()
+        _idle_motion(service)
+        work = LinesWork([f"G28 {' '.join(named)}"], name="move.home")
+        return _answer(await _done(service, service.ready_motion(), work))
+
+    async def position(_caller: Caller, params: dict[str, Any]) -> Value:
+        motion = service.ready_motion()
+        told = position_figures(motion)
+        told["steppers"] = _stepper_figures(service.up_machine(), motion)
+        if params["ask_nodes"]:
+            told["nodes_steps"] = await steps.ask()
+        return told
+
+    yield Method(
+        "gcode.run",
+        Scope.OPERATE,
+        "Run lines of g-code. While a job prints only such as neither move nor wait: "
+        + " ".join(sorted(ASIDE)),
+        run,
+        params=(Param("script", Kind.STR, "lines", high=LINES_BYTES_MAX), _WAIT),
+        returns=_TOLD,
+    )
+    for name, call, sentence in (
+        ("move.to", move_to, "Move straight to a place in the machine's frame, whatever g-code modes hold."),
+        ("move.by", move_by, "Move straight by a distance from where the last move ends."),
+    ):
+        yield Method(
+            name,
+            Scope.OPERATE,
+            sentence,
+            call,
+            params=(*_AXES, _SPEED, _WAIT),
+            returns=(Param("position", Kind.MAP, "end of the move in the machine's frame, mm"),),
+        )
+    yield Method(
+        "move.home",
+        Scope.OPERATE,
+        "Home axes, as G28 does.",
+        home,
+        params=(Param("axes", Kind.STR, "letters; empty: all", required=False, default="", high=3),),
+        returns=_TOLD,
+    )
+    yield Method(
+        "position.get",
+        Scope.WATCH,
+        "Tell where the machine is in all frames, and each stepper: steps since the machine started.",
+        position,
+        params=(
+            Param(
+                "ask_nodes", Kind.BOOL, "also ask the nodes what they count", required=False, default=False
+            ),
+        ),
+        returns=(
+            Param("commanded", Kind.MAP, "where it is now, machine's frame, mm"),
+            Param("planned", Kind.MAP, "where the last move read ends, machine's frame, mm"),
+            Param("gcode", Kind.MAP, "the same in the program's frame and units"),
+            Param("origin", Kind.MAP, "the program's origin in the machine's frame, mm"),
+            Param("steppers", Kind.MAP, "by name: steps sent, and mm of them"),
+            Param("nodes_steps", Kind.MAP, "by stepper: steps as its node counts them; when asked for"),
+        ),
+    )
+
+
+# ------------------------------------------------------------------------------------------------ doing
+
+
+async def _done(service: MachineService, motion: Motion, work: Work, *, aside: bool = False) -> Ticket:
+    """Have WORK done; raises ApiError where it was not, for whatever reason."""
+    try:
+        if aside and isinstance(work, LinesWork):
+            ticket = await motion.do_aside(work)
+        else:
+            ticket = await motion.do(work)
+    except FeederFull as error:
+        raise ApiError("busy", str(error)) from None
+    except MotionOver:
+        raise ApiError("stopped", f"the machine stopped: {service.cause or 'it begins anew'}") from None
+    if isinstance(ticket.error, GCodeError | WorkError):
+        raise ApiError("bad_gcode" if isinstance(ticket.error, GCodeError) else "bad_move", str(ticket.error))
+    if ticket.error is not None:
+        raise ticket.error
+    return ticket
+
+
+def _answer(ticket: Ticket) -> Value:
+    replies, notices = texts(ticket.told)
+    return {"replies": list(replies), "notices": list(notices)}
+
+
+def _lines(script: str) -> list[str]:
+    lines = script.splitlines()
+    if len(lines) > LINES_MAX:
+        raise ApiError(
+            "bad_params", f"gcode.run: {len(lines)} lines; at most {LINES_MAX}: print a file instead"
+        )
+    if not any(line.strip() for line in lines):
+        raise ApiError("bad_params", "gcode.run: script has no line")
+    return lines
+
+
+def _commands(lines: list[str]) -> list[str]:
+    try:
+        return commands_in(lines)
+    except WorkError as error:
+        raise ApiError("bad_gcode", str(error)) from None
+
+
+def _check_aside(lines: list[str]) -> None:
+    """Refuse what would disturb the job."""
+    for name in _commands(lines):
+        if name not in ASIDE:
+            raise ApiError(
+                "busy",
+                f"{name} cannot run while a job prints; wait for its end, or cancel it with job.cancel",
+            )
+
+
+def _idle_motion(service: MachineService) -> Motion:
+    motion = service.ready_motion()
+    if service.active_job is not None:
+        raise ApiError("busy", "a job prints; wait for its end, or cancel it with job.cancel")
+    return motion
+
+
+async def _move(service: MachineService, params: dict[str, Any], *, relative: bool) -> Value:
+    motion = _idle_motion(service)
+    wanted = {axis.upper(): params[axis] for axis in "xyze" if params[axis] is not None}
+    if not wanted:
+        raise ApiError("bad_params", "the move names no axis; give x, y, z or e")
+    speed, most = params["speed_mm_s"], service.up_machine().description.limits.max_velocity
+    if speed > most:
+        raise ApiError("bad_params", f"speed_mm_s is {speed:g}; this machine moves at most at {most:g} mm/s")
+    rest = Rest.STANDSTILL if params["wait"] else Rest.OPEN
+    work = MoveWork(wanted, speed, relative, rest=rest)
+    await _done(service, motion, work)
+    return {"position": axes((work.target[0], work.target[1], work.target[2], work.target[3]))}
+
+
+# --------------------------------------------------------------------------------------------- positions
+
+
+def _stepper_figures(machine: Machine, motion: Motion) -> Value:
+    steppers = machine.description.steppers
+    return {
+        stepper.name: {"steps_sent": steps, "sent_mm": round(steps * stepper.step_distance, 6)}
+        for stepper, steps in zip(steppers, motion.planned.steps_sent, strict=False)
+    }
+
+
+class _StepsOfNodes:
+    """Asks the nodes for their steppers' positions: one question at a time, however many clients ask."""
+
+    def __init__(self, service: MachineService) -> None:
+        self._service = service
+        self._asking: asyncio.Task[Value] | None = None
+        self._told: Value = None
+        self._told_s = float("-inf")
+
+    async def ask(self) -> Value:
+        """Return steps by stepper; raises CanductorError."""
+        loop = asyncio.get_running_loop()
+        if loop.time() - self._told_s < _STEPS_KEPT_S:
+            return self._told
+        if self._asking is None or self._asking.done():
+            self._asking = loop.create_task(self._ask())
+        return await asyncio.shield(self._asking)
+
+    async def _ask(self) -> Value:
+        try:
+            found: Value = dict(await self._service.up_machine().stepper_positions())
+        except ApiError:
+            raise
+        except CanductorError as error:
+            raise ApiError("failed", str(error)) from None
+        self._told, self._told_s = found, asyncio.get_running_loop().time()
+        return found

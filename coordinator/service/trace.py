@@ -1,0 +1,111 @@
+"""The motion of the last seconds: where the machine is now, and what to draw.
+
+The motion worker adds moves, the control loop reads; both see one immutable tuple at a time: neither waits.
+"""
+
+from collections import deque
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coordinator.motion.planner import ffi_memory
+from coordinator.motion.trapezoid_array import TRAPEZOID
+from nodes.records import record
+
+KEEP_S: Final = 10.0
+MOVES_MAX: Final = 20_000
+PIECE_MOVES: Final = 256
+BATCH_BYTES_MAX: Final = 1 << 20
+"""Per node."""
+
+Moves = NDArray[np.void]
+
+
+@record
+class Moment:
+    """The machine at a print time."""
+
+    position: tuple[float, float, float, float]
+    """X Y Z E in the machine's frame, mm."""
+    velocity_mm_s: float
+    """Along the path."""
+    line: int
+    """Of the program; 0: none."""
+    moving: bool
+
+
+class MotionTrace:
+    """A ``Witness`` that keeps what was planned and sent within the last KEEP_S, bounded in size."""
+
+    def __init__(self, nodes: int) -> None:
+        self._pieces: tuple[Moves, ...] = ()
+        self._batches: list[deque[bytes]] = [deque() for _ in range(nodes)]
+        self._batch_bytes = [0] * nodes
+        self.forget_before_s = 0.0
+        """Print time; set by the control loop."""
+
+    # ------------------------------------------------------------------------------------ as a witness
+
+    def see_moves(self, trapezoids: Any, count: int) -> None:
+        """Copy moves; in the worker's thread."""
+        new = np.frombuffer(ffi_memory(trapezoids, count), TRAPEZOID).copy()
+        kept = list(self._pieces)
+        while len(kept) > 1 and _end_s(kept[0][-1]) < self.forget_before_s:
+            del kept[0]  # the last one stays: it is where the machine stands
+        if kept and len(kept[-1]) + count <= PIECE_MOVES:
+            kept[-1] = np.concatenate((kept[-1], new))
+        else:
+            kept.append(new)
+        while len(kept) > 1 and sum(map(len, kept)) > MOVES_MAX:
+            del kept[0]
+        self._pieces = tuple(kept)
+
+    def see_batch(self, node: int, batch: bytes) -> None:
+        """Keep the newest commands of a node."""
+        kept = self._batches[node]
+        kept.append(batch)
+        self._batch_bytes[node] += len(batch)
+        while len(kept) > 1 and self._batch_bytes[node] > BATCH_BYTES_MAX:
+            self._batch_bytes[node] -= len(kept.popleft())
+
+    # --------------------------------------------------------------------------------------- to look at
+
+    def at(self, print_time: float) -> Moment | None:
+        """Return where the machine is at PRINT_TIME; None before all that is known."""
+        for piece in reversed(self._pieces):
+            if piece[0]["print_time"] <= print_time:
+                index = int(np.searchsorted(piece["print_time"], print_time, side="right")) - 1
+                return _moment(piece[index], print_time)
+        return None
+
+    def moves(self, since_s: float) -> Moves:
+        """Return the moves that end after print time SINCE_S, oldest first."""
+        pieces = self._pieces
+        every = np.concatenate(pieces) if pieces else np.empty(0, TRAPEZOID)
+        ends = every["print_time"] + every["accel_s"] + every["cruise_s"] + every["decel_s"]
+        kept: Moves = every[ends > since_s]
+        return kept
+
+    def batches(self, node: int) -> tuple[bytes, ...]:
+        """Return what was sent to a moving node, oldest first."""
+        return tuple(self._batches[node])
+
+
+def _end_s(move: Any) -> float:
+    return float(move["print_time"] + move["accel_s"] + move["cruise_s"] + move["decel_s"])
+
+
+def _moment(move: Any, print_time: float) -> Moment:
+    """Evaluate one move, or its end when it is over."""
+    t = print_time - float(move["print_time"])
+    accel, cruise_v = float(move["accel"]), float(move["cruise_v"])
+    accel_s, cruise_s, decel_s = (float(move[k]) for k in ("accel_s", "cruise_s", "decel_s"))
+    moving = t < accel_s + cruise_s + decel_s
+    a, c, d = min(t, accel_s), min(max(t - accel_s, 0.0), cruise_s), max(t - accel_s - cruise_s, 0.0)
+    d = min(d, decel_s)
+    start_v = float(move["start_v"])
+    way = start_v * a + accel * a * a / 2 + cruise_v * c + cruise_v * d - accel * d * d / 2
+    speed = start_v + accel * a if t < accel_s else cruise_v - accel * d
+    x, y, z, e = (float(s + r * way) for s, r in zip(move["start"], move["ratio"], strict=True))
+    return Moment((x, y, z, e), speed if moving else 0.0, int(move["line"]), moving)

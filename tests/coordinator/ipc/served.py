@@ -1,0 +1,133 @@
+"""A server with one method of each scope, for tests."""
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from coordinator.ipc.methods import Caller, Kind, Method, Param, Registry, Scope, Value
+from coordinator.ipc.server import IpcServer
+from coordinator.ipc.settings import IpcSettings
+from coordinator.ipc.state import StateTree
+
+
+@dataclass
+class Served:
+    """What the methods did."""
+
+    server: IpcServer
+    state: StateTree
+    path: Path
+    settings: IpcSettings
+    stops: list[str] = field(default_factory=list)
+    order: list[str] = field(default_factory=list)
+    cancelled: asyncio.Event = field(default_factory=asyncio.Event)
+
+    writers: list[asyncio.StreamWriter] = field(default_factory=list)
+
+    @property
+    def at(self) -> str:
+        return str(self.path)
+
+    async def dial(self, *, tcp: bool = False) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """Connect, and say nothing."""
+        if tcp:
+            opened = await asyncio.open_connection("127.0.0.1", self.server.tcp_port)
+        else:
+            opened = await asyncio.open_unix_connection(self.at, limit=2**24)
+        self.writers.append(opened[1])
+        return opened
+
+    async def script(self, **hello: Any) -> "Script":
+        """Connect and say hello."""
+        script = Script(*await self.dial())
+        assert "result" in await script.ask("api.hello", version=1, **hello)
+        return script
+
+
+def registry_of(served: Served) -> Registry:
+    registry = Registry()
+
+    def info(caller: Caller, _: dict[str, Any]) -> Value:
+        served.order.append("info")
+        return {"caller": caller.name, "scope": caller.scope.word}
+
+    def move(_: Caller, params: dict[str, Any]) -> Value:
+        return {"to": params["x_mm"]}
+
+    def raw(_: Caller, params: dict[str, Any]) -> Value:
+        return {"said": params["command"]}
+
+    def stop(caller: Caller, _: dict[str, Any]) -> Value:
+        served.stops.append(caller.name)
+        served.order.append("stop")
+        return {"state": "shutdown"}
+
+    async def wait(_: Caller, __: dict[str, Any]) -> Value:
+        try:
+            await asyncio.get_running_loop().create_future()
+        except asyncio.CancelledError:
+            served.cancelled.set()
+            raise
+        return None
+
+    def broken(_: Caller, __: dict[str, Any]) -> Value:
+        raise ZeroDivisionError
+
+    def unsendable(_: Caller, __: dict[str, Any]) -> Value:
+        return {"x": float("nan"), "y": 2**80}
+
+    x = Param("x_mm", Kind.FLOAT, "where to", "mm", low=0, high=200)
+    for method in (
+        Method("machine.info", Scope.WATCH, "Tell.", info),
+        Method("move.to", Scope.OPERATE, "Move.", move, (x,)),
+        Method("node.command", Scope.ADMIN, "Command.", raw, (Param("command", Kind.STR),)),
+        Method("machine.emergency_stop", Scope.OPERATE, "Stop.", stop, urgent=True),
+        Method("wait", Scope.WATCH, "Wait for ever.", wait),
+        Method("broken", Scope.WATCH, "Fail.", broken),
+        Method("unsendable", Scope.WATCH, "Return too much.", unsendable),
+    ):
+        registry.add(method)
+    return registry
+
+
+@contextlib.asynccontextmanager
+async def serving(folder: Path, **settings: Any) -> AsyncIterator[Served]:
+    """Serve at FOLDER/m.sock with SETTINGS."""
+    path = folder / "m.sock"
+    served = Served(None, StateTree(), path, IpcSettings(unix_path=path, **settings))  # type: ignore[arg-type]
+    served.server = IpcServer(registry_of(served), served.state, served.settings)
+    await served.server.start()
+    try:
+        yield served
+    finally:
+        await served.server.close()
+        for writer in served.writers:
+            writer.transport.abort()
+        await asyncio.sleep(0)
+
+
+class Script:
+    """A client that speaks JSON lines, byte by byte as the test wants."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.reader, self.writer = reader, writer
+
+    def send(self, method: str, request_id: int = 1, **params: Any) -> None:
+        self.writer.write(json.dumps({"id": request_id, "method": method, "params": params}).encode() + b"\n")
+
+    async def receive(self) -> Any:
+        async with asyncio.timeout(10):
+            return json.loads(await self.reader.readline())
+
+    async def ask(self, method: str, request_id: int = 1, **params: Any) -> Any:
+        self.send(method, request_id, **params)
+        return await self.receive()
+
+    async def rest(self) -> list[Any]:
+        """Return what comes until the server closes."""
+        async with asyncio.timeout(10):
+            return [json.loads(line) for line in (await self.reader.read()).splitlines()]

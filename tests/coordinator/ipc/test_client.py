@@ -1,0 +1,212 @@
+import asyncio
+import shutil
+import ssl
+import subprocess
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.ipc.address import read_address
+from coordinator.ipc.blocking import BlockingClient
+from coordinator.ipc.client import Client, ConnectionLost, Refused
+from coordinator.ipc.methods import ApiError, Scope
+from coordinator.ipc.server import IpcServer
+from coordinator.ipc.settings import TcpSettings
+from coordinator.ipc.wire import Encoding
+from nodes.errors import CanductorError
+from tests.coordinator.ipc.served import Served, registry_of, serving
+from tests.coordinator.ipc.test_server import TOKENS, plain_tcp
+
+
+def run(folder: Path, body: Callable[[Served], Awaitable[None]], **settings: Any) -> None:
+    async def main() -> None:
+        async with asyncio.timeout(60), serving(folder, **settings) as served:
+            await body(served)
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("encoding", Encoding)
+def test_calls(tmp_path: Path, encoding: Encoding) -> None:
+    async def body(served: Served) -> None:
+        async with Client.connect(served.at, name="test", scope=Scope.OPERATE, encoding=encoding) as client:
+            assert client.hello is not None
+            assert client.hello.scope is Scope.OPERATE
+            assert (await client.call("machine.info"))["scope"] == "operate"
+            moves = [client.call("move.to", {"x_mm": x}) for x in range(100)]
+            assert [m["to"] for m in await asyncio.gather(*moves)] == list(range(100))
+            with pytest.raises(ApiError, match="needs the scope admin") as refused:
+                await client.call("node.command", {"command": "x"})
+            assert refused.value.code == "not_allowed"
+
+    run(tmp_path, body)
+
+
+def test_cancelling_a_call_cancels_it_in_the_machine(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        async with Client.connect(served.at) as client:
+            call = asyncio.create_task(client.call("wait"))
+            await client.call("machine.info")
+            call.cancel()
+            await served.cancelled.wait()
+            await client.call("machine.info")
+
+    run(tmp_path, body)
+
+
+def test_watching(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        served.state.update("nodes.a", {"load": 1, "state": "ready"})
+        served.state.set("job.progress", 0.5)
+        async with Client.connect(served.at) as client:
+            updates = client.watch(["nodes.*"], rate_hz=50)
+            first = await anext(updates)
+            assert first.snapshot
+            assert first.values == {"nodes.a.load": 1, "nodes.a.state": "ready"}
+            served.state.set("job.progress", 0.6)
+            served.state.set("nodes.a.load", 2)
+            second = await anext(updates)
+            assert (second.values, second.snapshot) == ({"nodes.a.load": 2}, False)
+            served.state.remove("nodes.a.load")
+            assert (await anext(updates)).removed == {"nodes.a.load"}
+            await updates.aclose()
+            await client.call("api.ping")
+            (connection,) = served.server._connections
+            assert not connection.session.subscriptions
+
+    run(tmp_path, body)
+
+
+def test_a_gap_is_noticed_and_filled_with_a_snapshot(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        served.state.set("a", 1)
+        async with Client.connect(served.at) as client:
+            updates = client.watch(rate_hz=50)
+            await anext(updates)
+            (connection,) = served.server._connections
+            (subscription,) = connection.session.subscriptions.values()
+            subscription._told += 1  # as if a message had got lost
+            served.state.set("b", 2)
+            healed = await anext(updates)
+            assert healed.snapshot
+            assert healed.values == {"a": 1, "b": 2}
+
+    run(tmp_path, body)
+
+
+def test_notifications(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        async with Client.connect(served.at) as client:
+            events = client.events(["log", "gcode.*"])
+            taken = asyncio.ensure_future(anext(events))
+            (connection,) = served.server._connections
+            while not connection.session.listens.matches("log"):
+                await client.call("api.ping")
+            served.server.notify("other", {})
+            served.server.notify("gcode.reply", {"text": "ok \ud800"})
+            event = await taken
+            assert (event.name, event.values) == ("gcode.reply", {"text": "ok ?"})
+
+    run(tmp_path, body)
+
+
+def test_it_comes_back_and_goes_on_watching(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        served.state.set("a", 1)
+        async with Client.connect(served.at) as client:
+            updates = client.watch(rate_hz=50)
+            await anext(updates)
+            lost = asyncio.create_task(client.call("wait"))
+            await client.call("machine.info")
+            await served.server.close()
+            with pytest.raises(ConnectionLost, match="server ends"):
+                await lost
+            served.state.set("a", 2)
+            again = IpcServer(registry_of(served), served.state, served.settings)
+            await again.start()
+            fresh = await anext(updates)
+            assert fresh.snapshot
+            assert fresh.values == {"a": 2}
+            served.state.set("a", 3)
+            assert (await anext(updates)).values == {"a": 3}
+            assert await client.call("machine.info")
+            await again.close()
+
+    run(tmp_path, body)
+
+
+def test_who_is_not_there_or_refuses(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        with pytest.raises(ConnectionLost, match="does not answer"):
+            await Client.connect(str(tmp_path / "none")).__aenter__()
+        address = f"tcp://127.0.0.1:{served.server.tcp_port}"
+        with pytest.raises(Refused, match="token is not known"):
+            await Client.connect(address, token="x" * 40).__aenter__()
+        async with Client.connect(address, token=TOKENS[Scope.WATCH]) as client:
+            assert client.hello is not None
+            assert client.hello.scope is Scope.WATCH
+
+    run(tmp_path, body, tcp=plain_tcp(tmp_path))
+
+
+def test_the_blocking_face(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        served.state.set("a", 1)
+
+        def use() -> None:
+            with BlockingClient(served.at, name="script") as client:
+                assert client.call("move.to", {"x_mm": 3}) == {"to": 3}
+                updates = client.watch()
+                assert next(updates).values == {"a": 1}
+                updates.close()
+                with pytest.raises(ApiError, match="no method"):
+                    client.call("nothing")
+
+        await asyncio.to_thread(use)
+        with pytest.raises(ConnectionLost):
+            await asyncio.to_thread(BlockingClient("/none").__enter__)
+
+    run(tmp_path, body)
+
+
+def test_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    assert str(read_address("tls://printer.local:7130")) == "tls://printer.local:7130"
+    assert read_address("unix:/a/b").path == Path("/a/b")
+    for bad in ("http://x:1", "tcp://x", "tcp://:1", "tcp://x:99999", "tcp://[x:1"):
+        with pytest.raises(CanductorError, match="is no address"):
+            read_address(bad)
+    with pytest.raises(CanductorError, match="no machine runs here"):
+        read_address(None)
+
+
+@pytest.fixture
+def certificate(tmp_path: Path) -> tuple[Path, Path]:
+    if (openssl := shutil.which("openssl")) is None:
+        pytest.skip("openssl is not installed, which makes the certificate for this test")
+    pem, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    options = f"req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -out {pem} -keyout {key}"
+    names = ["-subj", "/CN=machine", "-addext", "subjectAltName=IP:127.0.0.1"]
+    subprocess.run([openssl, *options.split(), *names], check=True, capture_output=True)
+    return pem, key
+
+
+def test_tls(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
+    pem, key = certificate
+    tokens = plain_tcp(tmp_path).tokens
+    tcp = TcpSettings(host="127.0.0.1", port=0, tokens=tokens, certificate=pem, private_key=key)
+
+    async def body(served: Served) -> None:
+        address = f"tls://127.0.0.1:{served.server.tcp_port}"
+        trusting = ssl.create_default_context(cafile=str(pem))
+        async with Client.connect(address, token=TOKENS[Scope.OPERATE], tls=trusting) as client:
+            assert (await client.call("machine.info"))["scope"] == "operate"
+        with pytest.raises(ConnectionLost, match="does not answer"):  # a server that nothing vouches for
+            await Client.connect(address, token=TOKENS[Scope.OPERATE]).__aenter__()
+        reader, writer = await served.dial(tcp=True)  # without TLS
+        writer.write(b'{"id":1,"method":"api.hello","params":{"version":1}}\n')
+        assert b"result" not in await reader.read()
+
+    run(tmp_path, body, tcp=tcp)

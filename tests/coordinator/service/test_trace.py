@@ -1,0 +1,83 @@
+"""Where the machine is, from the moves it was given; a numeric integral is the witness."""
+
+import numpy as np
+import pytest
+
+from coordinator.commands import DEMO_MACHINE
+from coordinator.machine.description import load_machine
+from coordinator.motion.planner import Planner
+from coordinator.service.trace import BATCH_BYTES_MAX, MOVES_MAX, MotionTrace
+
+
+def planned(lines: bytes) -> tuple[Planner, MotionTrace]:
+    planner, trace = Planner(load_machine(str(DEMO_MACHINE)).limits), MotionTrace(1)
+    planner.homed = "XYZ"
+    planner.begin_at(100.0)
+    planner.feed(lines, 0, len(lines), final=True)
+    assert planner.flush()
+    while (waiting := planner.take()).count:
+        trace.see_moves(waiting.pointer, waiting.count)
+        planner.release(waiting.count)
+    return planner, trace
+
+
+LINES = b"G1 X10 F6000\nG1 X10 Y20 E1 F3000\nG1 X30 Y20\nG1 E3\nG1 X0 Y0 Z5\n"
+
+
+def test_position_follows_velocity_and_joins_the_moves() -> None:
+    planner, trace = planned(LINES)
+    times = np.linspace(100.0, planner.print_time_end_s, 20_001)
+    moments = [trace.at(t) for t in times]
+    assert all(moment is not None for moment in moments)
+    way = np.array([m.position for m in moments if m is not None])
+    steps = np.diff(way, axis=0)
+    path = np.hypot(np.hypot(steps[:, 0], steps[:, 1]), steps[:, 2])
+    path = np.where(path > 0, path, np.abs(steps[:, 3]))  # filament alone is its own path
+    speed = np.array([m.velocity_mm_s for m in moments if m is not None])
+    mean = (speed[1:] + speed[:-1]) / 2
+    # A corner within an interval bends the way; elsewhere speed and way agree.
+    assert np.median(np.abs(path / np.diff(times) - mean)) < 1e-3
+    assert path.sum() == pytest.approx((mean * np.diff(times)).sum(), rel=1e-3)
+    assert way[-1] == pytest.approx(planner.toolhead_position, abs=1e-9)
+    lines = [m.line for m in moments if m is not None]
+    assert lines == sorted(lines)
+    assert set(lines) == {1, 2, 3, 4, 5}
+
+
+def test_before_all_and_behind_all() -> None:
+    planner, trace = planned(LINES)
+    assert trace.at(99.9) is None
+    after = trace.at(planner.print_time_end_s + 5)
+    assert after is not None
+    assert (after.moving, after.velocity_mm_s) == (False, 0.0)
+    assert after.position == pytest.approx(planner.toolhead_position, abs=1e-9)
+
+
+def test_memory_is_bounded_and_the_newest_stays() -> None:
+    planner, trace = planned(
+        b"".join(b"G1 X%d F6000\nG1 X0\n" % (i % 100 + 1) for i in range(MOVES_MAX // 20))
+    )
+    for _ in range(15):
+        more = b"".join(b"G1 X%d F6000\nG1 X0\n" % (i % 100 + 1) for i in range(900))
+        planner.feed(more, 0, len(more), final=True)
+        planner.flush()
+        while (waiting := planner.take()).count:
+            trace.see_moves(waiting.pointer, waiting.count)
+            planner.release(waiting.count)
+        planner.flush()
+    assert len(trace.moves(0.0)) <= MOVES_MAX
+    trace.forget_before_s = planner.print_time_end_s
+    planner.feed(b"G1 X5\n", 0, 6, final=True)
+    planner.flush()
+    trace.see_moves(planner.take().pointer, 1)
+    assert len(trace.moves(0.0)) < MOVES_MAX / 4
+    for _ in range(100):
+        trace.see_batch(0, bytes(BATCH_BYTES_MAX // 10))
+    assert sum(map(len, trace.batches(0))) <= BATCH_BYTES_MAX
+
+
+def test_only_the_stretch_that_is_asked_for() -> None:
+    planner, trace = planned(LINES)
+    assert len(trace.moves(0.0)) == 5
+    assert len(trace.moves(planner.print_time_end_s + 1e-6)) == 0
+    assert trace.moves(planner.print_time_end_s - 1e-3)["line"].tolist() == [5]
