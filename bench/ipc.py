@@ -16,7 +16,7 @@ import statistics
 import struct
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,16 @@ async def serve(path: Path) -> None:
 
 def run_server(path: Path) -> None:
     asyncio.run(serve(path))
+
+
+def run_echo(path: Path) -> None:
+    """Send everything back: what the computer itself takes, in the same traffic."""
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    listener.listen()
+    connection, _ = listener.accept()
+    while data := connection.recv(1 << 18):
+        connection.sendall(data)
 
 
 class Peer:
@@ -185,17 +195,33 @@ def stalled(path: Path, pid: int, seconds: float) -> int:
     return most - before
 
 
+def start(target: Callable[[Path], None], name: str) -> tuple[Path, int]:
+    """Run TARGET in a process of its own; return where it listens, and its pid."""
+    path = Path(tempfile.mkdtemp()) / name
+    process = multiprocessing.get_context("spawn").Process(target=target, args=(path,), daemon=True)
+    process.start()
+    assert process.pid is not None
+    while not path.exists():
+        time.sleep(0.05)
+    return path, process.pid
+
+
+def show_delays(kind: str, delays: list[float]) -> None:
+    delays.sort()
+    p99 = delays[int(len(delays) * 0.99)]
+    print(
+        f"{kind}: 2,000 requests/s: p50 {statistics.median(delays) * 1e3:.2f} ms, "
+        f"p99 {p99 * 1e3:.2f} ms, longest {delays[-1] * 1e3:.1f} ms"
+    )
+
+
 def measure(path: Path, pid: int, seconds: float, stall_s: float) -> None:
+    echo, _ = start(run_echo, "echo")
+    show_delays("a bare echo, for comparison", at_rate(Peer(echo, "msgpack"), 2000, seconds))
     for kind in ("msgpack", "json"):
         before = cpu_s(pid)
-        delays = sorted(at_rate(Peer(path, kind), 2000, seconds))
-        load = (cpu_s(pid) - before) / seconds
-        p99 = delays[int(len(delays) * 0.99)]
-        print(
-            f"{kind}: 2,000 requests/s: p50 {statistics.median(delays) * 1e3:.2f} ms, "
-            f"p99 {p99 * 1e3:.2f} ms, longest {delays[-1] * 1e3:.1f} ms, "
-            f"{load:.0%} of a processor, all in all"
-        )
+        show_delays(kind, at_rate(Peer(path, kind), 2000, seconds))
+        print(f"{kind}: with that, {(cpu_s(pid) - before) / seconds:.0%} of a processor, all in all")
         print(f"{kind}: flat out, 64 under way: {flat_out(Peer(path, kind), seconds):,.0f} requests/s")
     before = cpu_s(pid)
     rate, merged = subscribers(path, 200, 10, seconds)
@@ -223,14 +249,8 @@ def main() -> None:
     if given.at is not None:
         measure(given.at, pid_of(given.at), given.seconds, given.stall_seconds)
         return
-    path = Path(tempfile.mkdtemp()) / "bench.sock"
-    process = multiprocessing.get_context("spawn").Process(target=run_server, args=(path,), daemon=True)
-    process.start()
-    assert process.pid is not None
-    while not path.exists():
-        time.sleep(0.05)
-    measure(path, process.pid, given.seconds, given.stall_seconds)
-    process.terminate()
+    path, pid = start(run_server, "bench")
+    measure(path, pid, given.seconds, given.stall_seconds)
 
 
 if __name__ == "__main__":
