@@ -13,6 +13,7 @@ from coordinator.ipc.methods import Registry
 from coordinator.ipc.server import IpcServer
 from coordinator.ipc.settings import IpcSettings, TcpSettings
 from coordinator.ipc.state import StateTree
+from coordinator.ipc.uploads import upload_method
 from coordinator.machine.description import MachineDescription, load_machine
 from coordinator.service.log_ring import Entry
 from coordinator.service.machine_service import MachineService, ServiceSettings
@@ -92,6 +93,8 @@ class _Hall:
             on_line=self._tell,
         )
         add_methods(service, registry)
+        if settings.jobs is not None:
+            registry.add(upload_method(settings.jobs))
         self._server = IpcServer(registry, tree, _ipc_settings(self._options, self.path))
         await self._server.start()
         _say(f"serving at {self.path}")

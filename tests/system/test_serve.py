@@ -150,6 +150,27 @@ def test_the_demo_is_served_without_hardware(tmp_path: Path) -> None:
         assert command.end().status == 0
 
 
+def test_the_command_line_drives_a_machine_that_runs(machine: Hardware, tmp_path: Path) -> None:
+    part = tmp_path / "sent.gcode"
+    part.write_text(SQUARE, encoding="utf-8")
+
+    async def go(client: Client, _: Command) -> None:
+        def run(*words: object) -> str:
+            ended = canductor(*words, "--at", client.address)
+            assert ended.status == 0, ended.stderr
+            return ended.stdout
+
+        say = asyncio.to_thread
+        assert "ready" in await say(run, "status")
+        await say(run, "send", part)
+        await until(client, "job.state", "done")
+        assert "x=20" in (await say(run, "call", "position.get")).replace(": ", "=").replace('"', "")
+        await say(run, "estop")
+        await until(client, "machine.state", "shutdown")
+
+    assert with_client(machine, go) == 0
+
+
 def test_a_motion_that_is_cut_off_stops_the_nodes(machine: Hardware) -> None:
     async def go(client: Client, _: Command) -> None:
         await client.call("job.start", {"file": "zigzag.gcode"})
