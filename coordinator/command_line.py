@@ -6,7 +6,7 @@ argparse, because the start counts: a library that is nicer to write with cost m
 import argparse
 import importlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn, cast
 
@@ -143,6 +143,12 @@ def _declare_demo(command: argparse.ArgumentParser) -> None:
     add("--rate-ppm", action="append", metavar="NAME=X", help="a node's clock error in ppm")
     add("--start-clock", action="append", metavar="NAME=N", help="a node's clock at its start, in ticks")
     add("--keep", type=Path, metavar="DIR", help="keep step logs here")
+    add(
+        "--socketcan",
+        action="append",
+        metavar="[BUS=]INTERFACE",
+        help="put the machine's CAN buses, or the one called BUS, on this interface (such as vcan0)",
+    )
 
 
 def _demo(given: argparse.Namespace) -> Job:
@@ -156,8 +162,23 @@ def _demo(given: argparse.Namespace) -> Job:
         rate_ppm=assignments("--rate-ppm", given.rate_ppm, _ppm),
         start_clock=assignments("--start-clock", given.start_clock, _ticks),
         keep=given.keep,
+        socketcan=_interfaces(given.socketcan),
     )
+    if options.socketcan and options.loss:
+        raise UsageError(
+            "--loss is of virtual buses; an interface loses frames by 'tc qdisc add dev INTERFACE root netem"
+            " loss 1%' (docs/can/vcan.md)"
+        )
     return lambda: _runner("coordinator.demo", "run_demo")(options)
+
+
+def _interfaces(words: list[str] | None) -> Mapping[str, str]:
+    """Read --socketcan: the interface by the bus it carries, that of all other buses under no name."""
+    every = [word for word in words or () if "=" not in word]
+    if len(every) > 1:
+        raise UsageError(f"--socketcan names two interfaces for every bus, {every[0]} and {every[1]}")
+    named = assignments("--socketcan", [word for word in words or () if "=" in word], str)
+    return {"": every[0], **named} if every else named
 
 
 def _declare_run(command: argparse.ArgumentParser) -> None:

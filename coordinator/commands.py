@@ -57,6 +57,9 @@ class DemoOptions:
     """By node: ticks its clock shows when the node starts."""
     keep: Path | None = None
     """Folder that keeps step logs and captures; None: they are removed at the end."""
+    socketcan: Mapping[str, str] = field(default_factory=dict)
+    """By CAN bus of the configuration: the SocketCAN interface that carries it, instead of a virtual bus.
+    Under the empty name: what carries those not named."""
 
 
 @record(kw_only=True)
