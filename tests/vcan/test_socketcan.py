@@ -22,7 +22,17 @@ from nodes.transport import CanFrame, CanTransport, TransportBusyError, Transpor
 from nodes.transport.socketcan import SocketCanTransport
 from nodes.virtual.processes import Flavour, NodeProcess
 from tests.nodes.machine import make_config, stepper_x
-from tests.vcan.kernel import INTERFACE, control, set_down, tiny_queue, why_no_control, why_no_socketcan
+from tests.vcan.kernel import (
+    INTERFACE,
+    bad_wire,
+    control,
+    netem_dropped,
+    set_down,
+    tiny_queue,
+    why_no_control,
+    why_no_netem,
+    why_no_socketcan,
+)
 
 pytestmark = pytest.mark.skipif(bool(why_no_socketcan()), reason=why_no_socketcan())
 controls_interface = pytest.mark.skipif(bool(why_no_control()), reason=why_no_control())
@@ -162,6 +172,28 @@ def test_nodes_are_assigned_identified_configured_and_queried(
     for nodeid, uuid in zip((4, 5), UUIDS, strict=True):
         assert any(f.id == ADMIN_RESPONSE_ID and f.data[:7] == b"\x20" + uuid.raw for f in frames)
         assert CanFrame(ADMIN_ID, b"\x01" + uuid.raw + bytes([nodeid])) in frames
+
+
+@pytest.mark.skipif(bool(why_no_netem()), reason=why_no_netem())
+def test_nodes_get_ids_and_answer_in_spite_of_lost_and_late_frames(
+    processes: list[NodeProcess], bench: Bench
+) -> None:
+    """Nothing is asked of a quiet bus: ids, dictionaries, configuration and answers come through loss."""
+
+    async def check() -> None:
+        assert [bench.bus.nodeid(uuid) for uuid in UUIDS] == [4, 5]
+        for node in bench.nodes:
+            for _ in range(10):
+                assert (await node.query("get_config", "config")).integer("is_config") == 1
+            assert await ping(node, 30) == expected_echo(30)
+        assert sum(node.link.stats().blocks_repeated for node in bench.nodes) > 0
+
+    with bad_wire("loss 3%", "delay 2ms"):
+        bench.run(check)
+        assert netem_dropped() > 5
+    for process in processes:
+        end = process.stop()
+        assert (end["is_shutdown"], end["lost"]) == (False, 0)
 
 
 def test_frames_of_other_protocols_on_the_bus_disturb_nobody(
