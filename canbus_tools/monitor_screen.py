@@ -119,6 +119,8 @@ class MonitorScreen(App[None]):
 
     def refresh_now(self) -> None:
         """Take what came, and show it."""
+        if not self.query("#log"):  # it is ending: the timer outlives what it writes to
+            return
         try:
             frames = self._queue.take()
         except CanductorError as error:

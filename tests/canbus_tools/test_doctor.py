@@ -31,7 +31,6 @@ from tests.canbus_tools.stage import (
     Stage,
     set_nodeid,
 )
-from tests.vcan.kernel import why_no_socketcan
 
 BITRATE = "1000000"
 
@@ -163,8 +162,6 @@ def test_a_node_that_another_host_lost(place: Place, can_tool: Command) -> None:
 
 
 def test_loss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    if not why_no_socketcan():
-        pytest.skip("a kernel in a process is too slow for a bus that loses frames; tested outside of it")
     with VirtualBus(tmp_path / "bus", loss=0.03, seed=3) as bus:
         place = Place("canductor", str(bus.path))
         with place.start_node("mainboard", MAIN) as node:

@@ -1,4 +1,4 @@
-"""The SocketCAN interface vcan0: whether it is there, and what tests do to it. See docs/vcan.md."""
+"""The SocketCAN interface vcan0: whether it is there, and what tests do to it. See docs/can/vcan.md."""
 
 import json
 import os
