@@ -263,11 +263,13 @@ def test_send_waits_for_room_in_a_full_queue_as_long_as_it_may() -> None:
         with tiny_queue():
             for frame in frames:
                 sender.send(frame, WAIT_S)
-        assert [receiver.receive(0) for _ in frames] == frames
+            assert [receiver.receive(WAIT_S) for _ in frames] == frames
         with tiny_queue(rate_kbit=1):
             taken = send_until_busy(sender, frames)
-        assert [receiver.receive(0) for _ in range(taken)] == frames[:taken]
-        assert receiver.receive(0) is None
+        # Those that waited in the queue went with it, if vcan passes frames on behind it (echo=1).
+        arrived = list(iter(lambda: receiver.receive(0), None))
+        assert taken - 2 <= len(arrived) <= taken
+        assert arrived == frames[: len(arrived)]
 
 
 def send_until_busy(sender: CanTransport, frames: list[CanFrame]) -> int:
