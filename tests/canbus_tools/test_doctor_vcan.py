@@ -110,7 +110,7 @@ def test_lost_frames(doctor: Command) -> None:
         node.wait_ready()
         with closing(KERNEL.open()) as host:
             set_nodeid(host, MAIN, MAIN_ID)
-        with bad_wire("loss 5%"):
+        with bad_wire("loss 4%"):
             said = run(doctor)
             dropped = netem_dropped()
     assert said.status == 1
