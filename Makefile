@@ -63,7 +63,7 @@ mutants: setup
 vcan: setup
 	@missing=$$(sh tests/vcan/missing-packages); [ -z "$$missing" ] || { \
 	  echo "canductor: make vcan needs: apt-get install --no-install-recommends $$missing" >&2; exit 1; }
-	tests/vcan/run $(BIN)/pytest
+	tests/vcan/run $(BIN)/python -m pytest
 
 bench: setup
 	@for b in bench/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

@@ -31,10 +31,11 @@ from nodes.assign import (
 from nodes.records import record
 
 ROUNDS: Final = 5
-ROUND_NS: Final = 25_000_000
+ROUND_NS: Final = 40_000_000
 """Nodes answer within milliseconds; adapters on USB may hold frames back for 16 ms."""
 LATE_NS: Final = 75_000_000
-"""How much longer a round may take when fewer answer than before: on a busy computer all take their time."""
+"""How much longer a round may take when nobody answers, or fewer than before: on a busy computer all take
+their time."""
 QUIET_ROUNDS: Final = 3
 """It goes on until so many rounds brought nobody new …"""
 ROUNDS_MAX: Final = 200
@@ -135,7 +136,7 @@ class Census:
         self._rounds = 0
         self._quiet_rounds = 0
         self._answers = 0
-        self._answers_max = 0
+        self._answers_max = 1
         self._latest_ns = 0
         self._asked = {QUERY_UNASSIGNED: 0, WHO_IS_HERE: 0}
         self._hosted: set[int] = set()

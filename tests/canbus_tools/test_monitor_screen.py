@@ -112,7 +112,7 @@ def test_traffic_is_shown_by_names(node: Place) -> None:
         await stand.until(lambda: stand.row(MAIN_ID)["mcu"] == "virtual-mainboard")
         row = stand.row(MAIN_ID)
         assert row["node"] == "4"
-        assert row["repeated"] == "0"
+        assert int(row["repeated"]) < 3  # a busy computer may take its time with an ack
         assert int(row["bad"]) < 64  # it may have begun to listen in the middle of a block
         assert float(row["rtt"]) > 0
         assert "uuid" not in row  # no room at 80 columns
