@@ -119,7 +119,7 @@ class MonitorScreen(App[None]):
 
     def refresh_now(self) -> None:
         """Take what came, and show it."""
-        if not self.query("#log"):  # it is ending: the timer outlives what it writes to
+        if len(self.query("#load, #state, #nodes, #log")) < 4:  # it is ending: the timer outlives them
             return
         try:
             frames = self._queue.take()
