@@ -59,12 +59,11 @@ sim: setup
 mutants: setup
 	$(BIN)/python tests/sim/mutants.py
 
-# SocketCAN in a Linux kernel booted as a process: one boot for all, since a boot costs 5 s. Builds nothing inside.
+# SocketCAN in Linux kernels booted as processes: two, since one has one CPU. Builds nothing inside.
 vcan: setup
 	@missing=$$(sh tests/vcan/missing-packages); [ -z "$$missing" ] || { \
 	  echo "canductor: make vcan needs: apt-get install --no-install-recommends $$missing" >&2; exit 1; }
-	UML_TIMEOUT=300 UML_MODULES=net/sched/sch_tbf \
-	  tests/vcan/uml-run $(BIN)/pytest -p no:cacheprovider tests/nodes/transport tests/vcan
+	tests/vcan/run $(BIN)/python -m pytest
 
 bench: setup
 	@for b in bench/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

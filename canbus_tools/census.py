@@ -31,8 +31,11 @@ from nodes.assign import (
 from nodes.records import record
 
 ROUNDS: Final = 5
-ROUND_NS: Final = 25_000_000
+ROUND_NS: Final = 40_000_000
 """Nodes answer within milliseconds; adapters on USB may hold frames back for 16 ms."""
+LATE_NS: Final = 75_000_000
+"""How much longer a round may take when nobody answers, or fewer than before: on a busy computer all take
+their time."""
 QUIET_ROUNDS: Final = 3
 """It goes on until so many rounds brought nobody new …"""
 ROUNDS_MAX: Final = 200
@@ -132,6 +135,9 @@ class Census:
         self._outbox: list[AdminFrame] = []
         self._rounds = 0
         self._quiet_rounds = 0
+        self._answers = 0
+        self._answers_max = 1
+        self._latest_ns = 0
         self._asked = {QUERY_UNASSIGNED: 0, WHO_IS_HERE: 0}
         self._hosted: set[int] = set()
         self._talking: set[int] = set()
@@ -165,6 +171,9 @@ class Census:
     def timer(self, now_ns: int) -> None:
         """Take the time; begins the next round, or ends, when the deadline has come."""
         if self.deadline_ns is None or now_ns < self.deadline_ns:
+            return
+        if self._answers < self._answers_max and now_ns < self._latest_ns:
+            self.deadline_ns = min(now_ns + ROUND_NS, self._latest_ns)
             return
         enough = self._rounds >= self._rounds_min and self._quiet_rounds >= QUIET_ROUNDS
         if enough or self._rounds >= max(ROUNDS_MAX, self._rounds_min):
@@ -203,7 +212,10 @@ class Census:
         for question in (WHO_IS_HERE, QUERY_UNASSIGNED):
             self._asked[question] += 1
             self._outbox.append(AdminFrame(ADMIN_ID, bytes((question,))))
+        self._answers_max = max(self._answers_max, self._answers)
+        self._answers = 0
         self.deadline_ns = now_ns + ROUND_NS + len(self._heard) * ANSWER_NS
+        self._latest_ns = self.deadline_ns + LATE_NS
 
     def _answer(self, data: bytes) -> None:
         if len(data) != UUID_SIZE + 2 or data[0] not in (NEED_NODEID, NODE_IS_HERE):
@@ -218,6 +230,7 @@ class Census:
             self._quiet_rounds = 0
         heard = self._heard[uuid]
         heard.says(data[0])
+        self._answers += 1
         if data[0] == NEED_NODEID:
             heard.answers += 1
             heard.set_commands.add(data[-1])

@@ -119,8 +119,8 @@ class MonitorScreen(App[None]):
 
     def refresh_now(self) -> None:
         """Take what came, and show it."""
-        if not self.query("#load"):
-            return  # at the end a timer may fire when the widgets are gone already
+        if len(self.query("#load, #state, #nodes, #log")) < 4:  # it is ending: the timer outlives them
+            return
         try:
             frames = self._queue.take()
         except CanductorError as error:

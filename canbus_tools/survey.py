@@ -154,7 +154,7 @@ async def _still_waiting(
     """
     if not any(node.uuid in with_id for node in census.waiting):
         return census.waiting
-    now = {node.uuid for node in (await take_census(bus, rounds=2)).waiting}
+    now = {node.uuid for node in (await take_census(bus)).waiting}
     return [node for node in census.waiting if node.uuid not in with_id or node.uuid in now]
 
 

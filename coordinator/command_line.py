@@ -7,7 +7,7 @@ import argparse
 import importlib
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
@@ -201,6 +201,12 @@ def _declare_demo(command: argparse.ArgumentParser) -> None:
     add("--start-clock", action="append", metavar="NAME=N", help="a node's clock at its start, in ticks")
     add("--keep", type=Path, metavar="DIR", help="keep step logs here")
     add("--serve", action="store_true", help="keep the virtual machine up for front ends instead of printing")
+    add(
+        "--socketcan",
+        action="append",
+        metavar="[BUS=]INTERFACE",
+        help="put the machine's CAN buses, or the one called BUS, on this interface (such as vcan0)",
+    )
     _declare_serving(command)
 
 
@@ -219,10 +225,25 @@ def _demo(given: argparse.Namespace) -> Job:
         start_clock=assignments("--start-clock", given.start_clock, _ticks),
         keep=given.keep,
         serve=_serving(given, machine) if given.serve else None,
+        socketcan=_interfaces(given.socketcan),
     )
+    if options.socketcan and options.loss:
+        raise UsageError(
+            "--loss is of virtual buses; an interface loses frames by 'tc qdisc add dev INTERFACE root netem"
+            " loss 1%' (docs/can/vcan.md)"
+        )
     if options.serve is not None:
         return lambda: _runner("coordinator.demo.serve", "serve_demo")(options)
     return lambda: _runner("coordinator.demo", "run_demo")(options)
+
+
+def _interfaces(words: list[str] | None) -> Mapping[str, str]:
+    """Read --socketcan: the interface by the bus it carries, that of all other buses under no name."""
+    every = [word for word in words or () if "=" not in word]
+    if len(every) > 1:
+        raise UsageError(f"--socketcan names two interfaces for every bus, {every[0]} and {every[1]}")
+    named = assignments("--socketcan", [word for word in words or () if "=" in word], str)
+    return {"": every[0], **named} if every else named
 
 
 def _declare_run(command: argparse.ArgumentParser) -> None:

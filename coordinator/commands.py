@@ -79,6 +79,9 @@ class DemoOptions:
     """Serve the virtual machine to front ends instead of printing."""
     keep: Path | None = None
     """Folder that keeps step logs and captures; None: they are removed at the end."""
+    socketcan: Mapping[str, str] = field(default_factory=dict)
+    """By CAN bus of the configuration: the SocketCAN interface that carries it, instead of a virtual bus.
+    Under the empty name: what carries those not named."""
 
 
 @record(kw_only=True)

@@ -184,6 +184,7 @@ def _report(
     outcome: Outcome,
     notices: Sequence[str],
 ) -> DemoReport:
+    frames, frames_lost = stage.frames()
     return DemoReport(
         moves=outcome.moves,
         print_time_s=outcome.print_time_s,
@@ -203,7 +204,7 @@ def _report(
             )
             for node in outcome.nodes
         ),
-        frames=sum(stats.frames for stats in stage.bus_stats()),
-        frames_lost=sum(stats.lost for stats in stage.bus_stats()),
+        frames=frames,
+        frames_lost=frames_lost,
         notices=tuple(notices),
     )

@@ -1,7 +1,7 @@
-"""The stage of the demo: a machine's configuration played by virtual nodes on a virtual bus."""
+"""The stage of the demo: a machine's configuration played by virtual nodes on virtual or SocketCAN buses."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -15,8 +15,9 @@ from coordinator.machine.description import (
     UartConnection,
 )
 from nodes.errors import CanductorError
+from nodes.transport.socketcan import SocketCanTransport
 from nodes.virtual.edge_log import EdgeLog
-from nodes.virtual.hub import BusStats, VirtualBus
+from nodes.virtual.hub import VirtualBus
 from nodes.virtual.processes import Flavour, NodeProcess
 
 BITRATE = 1_000_000
@@ -30,7 +31,8 @@ JITTER_US = 40
 class Stage:
     """Virtual hardware for DESCRIPTION; a context manager that leaves no process behind.
 
-    Every bus of the configuration becomes a virtual one in FOLDER, every UART a pseudo-terminal.
+    Every bus of the configuration becomes a virtual one in FOLDER, or the SocketCAN interface that the
+    options name for it; every UART becomes a pseudo-terminal.
     """
 
     def __init__(self, description: MachineDescription, options: DemoOptions, folder: Path) -> None:
@@ -38,6 +40,7 @@ class Stage:
         self._folder = folder
         self._check_names(description)
         self._buses: dict[str, VirtualBus] = {}
+        self._frames_before: dict[str, int] = {}
         self.processes: dict[str, NodeProcess] = {}
         self._stack = ExitStack()
         self._described = description
@@ -51,16 +54,29 @@ class Stage:
         for name in [*self._options.rate_ppm, *self._options.start_clock]:
             if name not in names:
                 raise CanductorError(f"the machine has no node '{name}'; it has {', '.join(names)}")
+        buses = dict.fromkeys(
+            node.connection.interface
+            for node in description.nodes
+            if isinstance(node.connection, CanConnection)
+        )
+        for name in self._options.socketcan:
+            if not buses:
+                raise CanductorError("the machine has no CAN bus; leave --socketcan out")
+            if name and name not in buses:
+                raise CanductorError(f"the machine has no CAN bus '{name}'; it has {', '.join(buses)}")
 
     # ------------------------------------------------------------------------------------------ set up
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            for path in dict.fromkeys(self._bus_path(n) for n in self._described.nodes):
-                if path is not None:
-                    self._buses[path] = stack.enter_context(
-                        VirtualBus(path, bitrate=BITRATE, loss=self._options.loss, seed=self._options.seed)
+            for bus in {self._bus(node): None for node in self._described.nodes}:
+                if isinstance(bus, Path):
+                    self._buses[str(bus)] = stack.enter_context(
+                        VirtualBus(bus, bitrate=BITRATE, loss=self._options.loss, seed=self._options.seed)
                     )
+                elif bus is not None:
+                    SocketCanTransport(bus).close()  # what is wrong with it is said before anything starts
+                    self._frames_before[bus] = _frames_sent(bus)
             for index, node in enumerate(self._described.nodes):
                 self.processes[node.name] = stack.enter_context(self._start(index, node))
             for process in self.processes.values():
@@ -76,11 +92,16 @@ class Stage:
     ) -> None:
         self._stack.__exit__(kind, error, trace)
 
-    def _bus_path(self, node: NodeDescription) -> str | None:
+    def _bus(self, node: NodeDescription) -> Path | str | None:
+        """Return the virtual bus's socket, the SocketCAN interface's name, or None for a UART."""
         if isinstance(node.connection, UartConnection):
             return None
-        safe = "".join(c if c.isalnum() else "_" for c in node.connection.interface)
-        return str(self._folder / f"{safe}.bus")
+        name = node.connection.interface
+        interfaces = self._options.socketcan
+        if interface := interfaces.get(name, interfaces.get("")):
+            return interface
+        safe = "".join(c if c.isalnum() else "_" for c in name)
+        return self._folder / f"{safe}.bus"
 
     def _uart_path(self, node: NodeDescription) -> Path:
         return self._folder / f"{node.name}.tty"
@@ -91,11 +112,12 @@ class Stage:
 
     def _virtual(self, node: NodeDescription) -> NodeDescription:
         connection: CanConnection | UartConnection
-        path = self._bus_path(node)
+        bus = self._bus(node)
         if isinstance(node.connection, UartConnection):
             connection = dataclasses.replace(node.connection, path=str(self._uart_path(node)))
         else:
-            connection = dataclasses.replace(node.connection, interface=f"virtual:{path}")
+            interface = f"virtual:{bus}" if isinstance(bus, Path) else str(bus)
+            connection = dataclasses.replace(node.connection, interface=interface)
         return dataclasses.replace(node, connection=connection)
 
     def _start(self, index: int, node: NodeDescription) -> NodeProcess:
@@ -103,12 +125,13 @@ class Stage:
         flavour: Flavour = "mainboard" if index == 0 else "uart" if on_uart else "toolhead"
         rollover_s = ROLLOVER_AFTER_S[index % len(ROLLOVER_AFTER_S)]
         freq = CLOCK_FREQS[flavour]
-        path = self._bus_path(node)
+        bus = self._bus(node)
         return NodeProcess(
             flavour,
             name=f"virtual node {node.name}",
             uuid=node.connection.uuid if isinstance(node.connection, CanConnection) else "000000000000",
-            can=None if path is None else Path(path),
+            can=bus if isinstance(bus, Path) else None,
+            socketcan=bus if isinstance(bus, str) else None,
             uart=self._uart_path(node) if on_uart else None,
             rate_ppm=self._options.rate_ppm.get(node.name, RATES_PPM[index % len(RATES_PPM)]),
             start_clock=self._options.start_clock.get(node.name, max(0, 2**32 - round(rollover_s * freq)))
@@ -120,9 +143,11 @@ class Stage:
 
     # ------------------------------------------------------------------------------------------ afterwards
 
-    def bus_stats(self) -> Sequence[BusStats]:
-        """Return the counters of the virtual buses."""
-        return [bus.stats for bus in self._buses.values()]
+    def frames(self) -> tuple[int, int]:
+        """Return how many frames were sent on all buses, and how many of them virtual ones lost."""
+        stats = [bus.stats for bus in self._buses.values()]
+        on_interfaces = sum(_frames_sent(name) - before for name, before in self._frames_before.items())
+        return sum(s.frames for s in stats) + on_interfaces, sum(s.lost for s in stats)
 
     def stop_nodes(self) -> Mapping[str, Mapping[str, Any]]:
         """End the nodes that still run, so that their logs are complete; return their statistics."""
@@ -131,6 +156,11 @@ class Stage:
     def edge_log(self, node: str) -> EdgeLog:
         """Return NODE's log of pin levels."""
         return EdgeLog(self.edge_log_path(node))
+
+
+def _frames_sent(interface: str) -> int:
+    """Return how many frames this computer's programs have sent by INTERFACE, as its kernel counts."""
+    return int(Path(f"/sys/class/net/{interface}/statistics/tx_packets").read_text())
 
 
 CLOCK_FREQS: Mapping[Flavour, int] = {"mainboard": 168_000_000, "toolhead": 64_000_000, "uart": 16_000_000}

@@ -3,8 +3,17 @@
 import random
 from collections.abc import Callable
 
-from canbus_tools.census import MAX_UUIDS, ROUNDS, ROUNDS_MAX, Application, Census, CensusResult
-from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, QUERY_UNASSIGNED, WHO_IS_HERE, Uuid
+from canbus_tools.census import (
+    LATE_NS,
+    MAX_UUIDS,
+    ROUND_NS,
+    ROUNDS,
+    ROUNDS_MAX,
+    Application,
+    Census,
+    CensusResult,
+)
+from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, ANSWER_NS, QUERY_UNASSIGNED, WHO_IS_HERE, Uuid
 
 A, B = Uuid(b"\x01" * 6), Uuid(b"\x02" * 6)
 Answers = Callable[[int, int], list[bytes]]
@@ -31,11 +40,20 @@ def ask(answers: Answers, rounds: int = ROUNDS) -> tuple[CensusResult, list[list
         for frame in frames:
             for said in answers(len(asked), frame.data[0]):
                 census.frame(ADMIN_RESPONSE_ID, said)
-        at_ns = census.deadline_ns
-        census.timer(at_ns - 1)
+        census.timer(census.deadline_ns - 1)
         assert census.frames_to_send() == []
-        census.timer(at_ns)
+        wait(census)
     return census.result(), asked
+
+
+def wait(census: Census) -> int:
+    """Let the time pass until the census asks again or ends; return when (ns)."""
+    asks = census.result().rounds
+    at_ns = 0
+    while census.deadline_ns is not None and census.result().rounds == asks:
+        at_ns = census.deadline_ns
+        census.timer(at_ns)
+    return at_ns
 
 
 def to_query(*said: bytes) -> Answers:
@@ -62,6 +80,23 @@ def test_a_board_heard_once_in_five_rounds_is_found_and_gets_three_more_rounds_f
     result, asked = ask(lambda n, question: [needs(A)] if n == 5 and question == QUERY_UNASSIGNED else [])
     assert [(node.uuid, node.answers) for node in result.waiting] == [(A, 1)]
     assert len(asked) == 8
+
+
+def test_a_round_waits_longer_when_fewer_answer_than_before_but_not_for_ever() -> None:
+    census = Census()
+    census.start(0)
+    for uuid in (A, B):
+        census.frame(ADMIN_RESPONSE_ID, needs(uuid))
+    first_ns = wait(census)
+    census.frame(ADMIN_RESPONSE_ID, needs(A))
+    second_ns = wait(census)
+    assert second_ns - first_ns == ROUND_NS + 2 * ANSWER_NS + LATE_NS
+    census.frame(ADMIN_RESPONSE_ID, needs(A))
+    assert census.deadline_ns is not None
+    census.timer(census.deadline_ns)
+    assert census.result().rounds == 3  # it waits …
+    census.frame(ADMIN_RESPONSE_ID, needs(B))
+    assert wait(census) - second_ns == 2 * ROUND_NS + 2 * ANSWER_NS  # … until all have answered
 
 
 def test_twins_show_by_one_answer_too_many() -> None:

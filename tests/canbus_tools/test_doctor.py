@@ -34,7 +34,6 @@ from tests.canbus_tools.stage import (
     Stage,
     set_nodeid,
 )
-from tests.vcan.kernel import why_no_socketcan
 
 BITRATE = "1000000"
 
@@ -166,8 +165,6 @@ def test_a_node_that_another_host_lost(place: Place, can_tool: Command) -> None:
 
 
 def test_loss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    if not why_no_socketcan():
-        pytest.skip("a kernel in a process is too slow for a bus that loses frames; tested outside of it")
     with VirtualBus(tmp_path / "bus", loss=0.03, seed=3) as bus:
         place = Place("canductor", str(bus.path))
         with place.start_node("mainboard", MAIN) as node:
@@ -184,8 +181,6 @@ def test_loss(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_host_whose_blocks_get_lost(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Somebody else's host repeats blocks, and an onlooker finds pieces of them: it only listens."""
-    if not why_no_socketcan():
-        pytest.skip("a kernel in a process is too slow for a bus that loses frames; tested outside of it")
     with VirtualBus(tmp_path / "bus") as bus:
         place = Place("canductor", str(bus.path))
         end = threading.Event()

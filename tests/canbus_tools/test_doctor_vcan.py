@@ -3,15 +3,24 @@
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import pytest
 
 from canbus_tools.link_facts import NoInterface, read_link
 from tests.canbus_tools.command import Command, Said
-from tests.canbus_tools.stage import MAIN, Place
+from tests.canbus_tools.stage import MAIN, MAIN_ID, Place, set_nodeid
 from tests.canbus_tools.test_doctor import findings, problems, run
-from tests.vcan.kernel import INTERFACE, control, set_down, tiny_queue, why_no_control
+from tests.vcan.kernel import (
+    INTERFACE,
+    bad_wire,
+    control,
+    netem_dropped,
+    set_down,
+    tiny_queue,
+    why_no_control,
+    why_no_netem,
+)
 
 controls_interface = pytest.mark.skipif(bool(why_no_control()), reason=why_no_control())
 has_ip = pytest.mark.skipif(shutil.which("ip") is None, reason="needs the package iproute2")
@@ -93,6 +102,21 @@ def test_a_send_queue_that_is_full(doctor: Command) -> None:
             said = run(doctor)
     assert said.status == 1
     assert "ENOBUFS" in findings(said)["send-queue-full"]["seen"]
+
+
+@pytest.mark.skipif(bool(why_no_netem()), reason=why_no_netem())
+def test_lost_frames(doctor: Command) -> None:
+    with KERNEL.start_node("mainboard", MAIN) as node:
+        node.wait_ready()
+        with closing(KERNEL.open()) as host:
+            set_nodeid(host, MAIN, MAIN_ID)
+        with bad_wire("loss 4%"):
+            said = run(doctor)
+            dropped = netem_dropped()
+    assert said.status == 1
+    assert "frames-lost" in problems(said)
+    ping = said.json["pings"][0]
+    assert 0 < ping["lost"] <= dropped
 
 
 @controls_interface

@@ -27,8 +27,9 @@ from canbus_tools.monitor_screen import KEPT, LINES_AT_ONCE, LOG_LINES, MonitorS
 from canbus_tools.monitor_text import read_filter
 from canbus_tools.open_bus import open_bus
 from canbus_tools.talk import NodeTalk
+from coordinator.cli import main
 from nodes.option_values import UsageError
-from tests.canbus_tools.stage import MAIN, MAIN_ID, PATIENCE_S, Place, set_nodeid
+from tests.canbus_tools.stage import BOOT, MAIN, MAIN_ID, PATIENCE_S, Place, Stage, set_nodeid
 
 if TYPE_CHECKING:
     from textual.pilot import Pilot
@@ -111,7 +112,7 @@ def test_traffic_is_shown_by_names(node: Place) -> None:
         await stand.until(lambda: stand.row(MAIN_ID)["mcu"] == "virtual-mainboard")
         row = stand.row(MAIN_ID)
         assert row["node"] == "4"
-        assert row["repeated"] == "0"
+        assert int(row["repeated"]) < 3  # a busy computer may take its time with an ack
         assert int(row["bad"]) < 64  # it may have begun to listen in the middle of a block
         assert float(row["rtt"]) > 0
         assert "uuid" not in row  # no room at 80 columns
@@ -249,12 +250,12 @@ class Terminal:
     def type(self, *keys: str) -> None:
         self("send-keys", "-t", "test", *keys)
 
-    def until(self, wanted: str, meanwhile: Callable[[], object]) -> str:
-        """Return the screen once WANTED is on it."""
+    def until(self, meanwhile: Callable[[], object], *wanted: str) -> str:
+        """Return the screen once all WANTED is on it."""
         end_s = time.monotonic() + PATIENCE_S
         shown = ""
-        while wanted not in shown:
-            assert time.monotonic() < end_s, f"{wanted!r} did not come:\n{shown}"
+        while not all(words in shown for words in wanted):
+            assert time.monotonic() < end_s, f"{wanted} did not come:\n{shown}"
             meanwhile()
             shown = self("capture-pane", "-p", "-t", "test")
         return shown
@@ -262,27 +263,32 @@ class Terminal:
 
 @pytest.mark.skipif(shutil.which("tmux") is None, reason="tmux is not installed")
 @pytest.mark.parametrize("ending", ["q", "SIGTERM"])
-def test_in_a_terminal_which_is_left_as_it_was(node: Place, tmp_path: Path, ending: str) -> None:
+def test_in_a_terminal_which_is_left_as_it_was(stage: Stage, tmp_path: Path, ending: str) -> None:
+    place = stage.place
     terminal = Terminal(tmp_path)
     try:
         entry = "import sys; from coordinator.entry import main; sys.exit(main())"
-        words = shlex.join([sys.executable, "-c", entry, "can", "monitor", *node.words, "-b", "1000000"])
+        words = shlex.join([sys.executable, "-c", entry, "can", "monitor", *place.words, "-b", "1000000"])
         (tmp_path / "run").write_text(f"echo $$ > {tmp_path}/pid; exec {words}\n")
         terminal.type("-l", f"sh {tmp_path}/run; echo ended $?")
         terminal.type("Enter")
 
         def talk() -> None:
-            asyncio.run(_ask(node))
+            asyncio.run(_ask(place))
 
-        lines = terminal.until("uptime high=", talk).splitlines()
+        lines = terminal.until(talk, "uptime high=", " q Quit ").splitlines()
         assert lines[0].startswith(" load ")
         assert lines[2].split()[:2] == ["node", "MCU"]
         assert lines[-1].split()[:2] == ["q", "Quit"]
+        shown = terminal.until(lambda: main(["can", "query", *place.words]), f"need_nodeid uuid={BOOT}")
+        assert any(line.split()[:2] == [str(MAIN_ID), "virtual-mainboard"] for line in shown.splitlines())
+        assert " ← need_nodeid uuid=" in shown
+        assert " → query_unassigned" in shown
         if ending == "q":
             terminal.type("q")
         else:
             os.kill(int((tmp_path / "pid").read_text()), signal.SIGTERM)
-        left = terminal.until("\nended ", lambda: None)
+        left = terminal.until(lambda: None, "\nended ")
         assert f"\nended {0 if ending == 'q' else 143}" in left
         assert " load " not in left
     finally:

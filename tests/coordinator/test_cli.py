@@ -80,6 +80,19 @@ def test_demo_options(runners: Runners, files: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("words", "interfaces"),
+    [
+        ("--socketcan vcan0", {"": "vcan0"}),
+        ("--socketcan can0=vcan0 --socketcan can1=vcan1", {"can0": "vcan0", "can1": "vcan1"}),
+        ("--socketcan can0=vcan0 --socketcan vcan1", {"can0": "vcan0", "": "vcan1"}),
+    ],
+)
+def test_demo_on_interfaces(runners: Runners, words: str, interfaces: dict[str, str]) -> None:
+    assert cli.main(["demo", *words.split()]) == 0
+    assert runners.asked == [DemoOptions(socketcan=interfaces)]
+
+
 def test_demo_defaults(runners: Runners) -> None:
     assert cli.main(["demo"]) == 0
     assert runners.asked == [DemoOptions()]
@@ -185,6 +198,10 @@ USAGE = {
     "demo --loss 60%": "--loss is '60%', must be a share from 0 to 0.5, or a percentage such as 1%",
     "demo --loss nan": "--loss is 'nan', must be a share from 0 to 0.5, or a percentage such as 1%",
     "demo --loss much": "--loss is 'much', must be a share from 0 to 0.5, or a percentage such as 1%",
+    "demo --socketcan vcan0 --socketcan vcan1": "--socketcan names two interfaces for every bus",
+    "demo --socketcan can0=a --socketcan can0=b": "--socketcan is given twice for 'can0'",
+    "demo --socketcan =vcan0": "--socketcan takes NAME=VALUE, not '=vcan0'",
+    "demo --socketcan vcan0 --loss 1%": "--loss is of virtual buses; an interface loses frames by 'tc",
     "demo --rate-ppm 5": "--rate-ppm takes NAME=VALUE, not '5'",
     "demo --rate-ppm a=b": "--rate-ppm for 'a' is 'b', must be a number in ppm, from -10000 to 10000",
     "demo --rate-ppm a=nan": "--rate-ppm for 'a' is 'nan', must be a number in ppm, from -10000 to 10000",

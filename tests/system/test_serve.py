@@ -156,7 +156,7 @@ def test_the_command_line_drives_a_machine_that_runs(machine: Hardware, tmp_path
 
     async def go(client: Client, _: Command) -> None:
         def run(*words: object) -> str:
-            ended = canductor(*words, "--at", client.address)
+            ended = canductor(*words, "--at", str(client.address))
             assert ended.status == 0, ended.stderr
             return ended.stdout
 

@@ -92,8 +92,14 @@ def processes() -> Iterator[list[NodeProcess]]:
         yield started
 
 
-def run_print(folder: Path, gcode: str, see: Callable[[Progress], None] = lambda _: None) -> Outcome:
-    (folder / "machine.cfg").write_text(MACHINE)
+def run_print(
+    folder: Path,
+    gcode: str,
+    see: Callable[[Progress], None] = lambda _: None,
+    *,
+    interface: str = INTERFACE,
+) -> Outcome:
+    (folder / "machine.cfg").write_text(MACHINE.replace(INTERFACE, interface))
     description = load_machine(str(folder / "machine.cfg"))
     with Program.from_lines(gcode.splitlines(keepends=True)) as program:
         return asyncio.run(run_job(description, program, see, on_told=lambda _: None))
