@@ -155,7 +155,7 @@ def test_the_command_line_drives_a_machine_that_runs(machine: Hardware, tmp_path
     part.write_text(SQUARE, encoding="utf-8")
 
     async def go(client: Client, _: Command) -> None:
-        def run(*words: object) -> str:
+        def run(*words: str | Path) -> str:
             ended = canductor(*words, "--at", str(client.address))
             assert ended.status == 0, ended.stderr
             return ended.stdout
