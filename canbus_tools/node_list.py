@@ -9,7 +9,7 @@ from typing import Final
 from canbus_tools.census import Application
 from canbus_tools.discovery import declare_listen, listen_option, where
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.survey import PROBED, Entry, State, SurveyResult, survey_and_overhear
+from canbus_tools.survey import PROBED, Entry, State, SurveyResult, survey_all
 from canbus_tools.table import count, paragraph, table
 from canbus_tools.talk import LISTEN_S, BusTalk
 from nodes.assign import LAST_NODEID
@@ -84,7 +84,7 @@ def list_nodes(options: BusOptions, *, probed: range = PROBED, listen_s: float =
 
     async def find() -> SurveyResult:
         async with BusTalk.open(options) as bus:
-            return await survey_and_overhear(bus, probed=probed, listen_s=listen_s)
+            return await survey_all(bus, options, probed=probed, listen_s=listen_s)
 
     return NodesReport(options, asyncio.run(find()))
 
@@ -120,7 +120,7 @@ class NodesReport:
 
 def entry_json(entry: Entry) -> dict[str, object]:
     """Return one node with all that it said."""
-    facts = entry.facts or entry.overheard
+    facts = entry.facts or entry.told or entry.overheard
     return {
         "nodeid": entry.nodeid,
         "uuid": None if entry.uuid is None else str(entry.uuid),
@@ -128,6 +128,7 @@ def entry_json(entry: Entry) -> dict[str, object]:
         "state": entry.state.value,
         "several_boards": entry.twins,
         "trouble": entry.trouble or None,
+        "told_by_host": entry.told is not None,
         "guessed": entry.overheard is not None,
         "firmware": None if facts is None else asdict(facts.firmware),
         "uptime_s": None if facts is None else facts.uptime_s,
@@ -144,7 +145,7 @@ def _row(entry: Entry) -> list[str]:
         NAMES[entry.application],
         STATES[entry.state] + (", two boards!" if entry.twins else ""),
     ]
-    facts = entry.facts or entry.overheard
+    facts = entry.facts or entry.told or entry.overheard
     if facts is None:
         return row + [""] * (len(HEADINGS) - len(row))
     firmware, can = facts.firmware, facts.can
@@ -189,8 +190,8 @@ def _notes(found: SurveyResult, bus: BusOptions) -> list[str]:
             notes.append(f"Node {_name(entry)} runs no firmware: flash it, or reset it.")
     if any(entry.state is State.IN_USE for entry in entries):
         notes.append(
-            "Nodes in use were not asked, so as not to disturb their host; a uuid is known of those whose "
-            "firmware is canductor's."
+            "Nodes in use were not asked, so as not to disturb their host. The coordinator that drives them "
+            "tells what they are; of nodes of other hosts a uuid is known when their firmware is canductor's."
         )
     if any(entry.overheard for entry in entries):
         notes.append(

@@ -7,14 +7,16 @@ the next block, executes nothing and changes nothing. Those that answer are aske
 
 import asyncio
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from enum import Enum
 from typing import Final
 
+from canbus_tools.ask_host import ask_hosts
 from canbus_tools.census import ROUNDS, Application, CensusResult, NodeHere, WaitingNode
 from canbus_tools.discovery import take_census
 from canbus_tools.interview import Facts, interview
+from canbus_tools.open_bus import BusOptions
 from canbus_tools.overhear import Overhearing
 from canbus_tools.talk import DATA_IDS, LISTEN_S, BusTalk, data_ids
 from nodes.assign import FIRST_NODEID, Uuid
@@ -66,6 +68,8 @@ class Entry:
     facts: Facts | None = None
     twins: bool = False
     """Another board has the same uuid."""
+    told: Facts | None = None
+    """Of a node in use: what the coordinator says that drives it."""
     overheard: Facts | None = None
     """Of a node in use: what its traffic tells by a dictionary of the cache that explains it."""
     trouble: str = ""
@@ -117,16 +121,20 @@ async def survey(
     return SurveyResult(_mark_twins(entries), census, candidates)
 
 
-async def survey_and_overhear(bus: BusTalk, *, probed: Iterable[int], listen_s: float) -> SurveyResult:
-    """Find all nodes as ``survey`` does, and tell of nodes in use what their traffic does."""
+async def survey_all(
+    bus: BusTalk, options: BusOptions, *, probed: Iterable[int], listen_s: float
+) -> SurveyResult:
+    """Find all nodes as ``survey`` does, and of nodes in use what their host or else their traffic tells."""
     overhearing = Overhearing(bus.cache)
     end = bus.on_frame(overhearing.frame)
     try:
         found = await survey(bus, probed=probed, listen_s=listen_s)
-        await _hear_out(bus, frozenset(bus.hosted), overhearing)
+        told = await ask_hosts(options)
+        await _hear_out(bus, frozenset(bus.hosted - told.keys()), overhearing)
     finally:
         end()
-    return replace(found, entries=_mark_twins([_overheard(entry, overhearing) for entry in found.entries]))
+    entries = [_in_use(entry, told, overhearing) for entry in found.entries]
+    return replace(found, entries=_mark_twins(entries))
 
 
 async def _hear_out(bus: BusTalk, hosted: Iterable[int], overhearing: Overhearing) -> None:
@@ -137,9 +145,11 @@ async def _hear_out(bus: BusTalk, hosted: Iterable[int], overhearing: Overhearin
         await bus.wait(HEAR_OUT_S)
 
 
-def _overheard(entry: Entry, overhearing: Overhearing) -> Entry:
+def _in_use(entry: Entry, told: Mapping[int, Facts], overhearing: Overhearing) -> Entry:
     if entry.state is not State.IN_USE or entry.nodeid is None:
         return entry
+    if said := told.get(entry.nodeid):
+        return replace(entry, told=said, uuid=entry.uuid or said.uuid)
     facts = overhearing.facts(entry.nodeid)
     uuid = entry.uuid or (facts.uuid if facts else None)
     return replace(entry, overheard=facts, uuid=uuid)

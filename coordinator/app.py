@@ -217,6 +217,15 @@ class Machine:
             return time_base.primary_map(print_time)
         return time_base.secondary_map(node.best_clock, node.dictionary.clock_freq_hz, print_time)
 
+    def address(self, node: Node) -> tuple[str, int | None, str | None]:
+        """Return the name of NODE's bus and, on CAN, the id that it has there and its uuid."""
+        bus = self._bus_of[node]
+        described = next(found for found in self.description.nodes if found.name == node.name)
+        if isinstance(bus, CanBus) and isinstance(described.connection, CanConnection):
+            uuid = Uuid.parse(described.connection.uuid)
+            return bus.name, bus.nodeid(uuid), str(uuid)
+        return bus.name, None, None
+
     def bus_stats(self) -> dict[str, IOStats]:
         """Return the counters of every bus that is open, by its name."""
         return {o.bus.name: o.bus.io.stats() for o in self._open if o.bus.closed_because is None}

@@ -1,11 +1,10 @@
 """Where a machine is found: its address in words."""
 
-import os
-import tempfile
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from nodes.errors import CanductorError
+from nodes.host_sockets import host_sockets, socket_folder
 from nodes.records import record
 
 
@@ -22,12 +21,6 @@ class Address:
         if self.path is not None:
             return str(self.path)
         return f"{'tls' if self.tls else 'tcp'}://{self.host}:{self.port}"
-
-
-def socket_folder() -> Path:
-    """Return where this user's machines have their sockets."""
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    return Path(base) / "canductor" if base else Path(tempfile.gettempdir()) / f"canductor-{os.geteuid()}"
 
 
 def read_address(text: str | None) -> Address:
@@ -51,8 +44,7 @@ def read_address(text: str | None) -> Address:
 
 
 def _only_machine() -> Address:
-    folder = socket_folder()
-    found = sorted(path for path in folder.glob("*.sock") if path.is_socket())
+    folder, found = socket_folder(), host_sockets()
     if len(found) == 1:
         return Address(path=found[0])
     if not found:

@@ -145,8 +145,12 @@ def lead_edge_ms(index: int) -> float:
 
 def node_figures(machine: "Machine", node: Node, recent: _RecentLead) -> dict[str, Value]:
     """Return what the host knows of a node without asking it."""
+    bus, nodeid, uuid = machine.address(node)
     figures: dict[str, Value] = {
         "name": node.name,
+        "bus": bus,
+        "nodeid": nodeid,
+        "uuid": uuid,
         "state": node.state.name.lower(),
         "state_text": node.state.value,
         "failure": str(node.failure) if node.failure is not None else None,
@@ -170,6 +174,7 @@ def _firmware(node: Node) -> dict[str, Value]:
     try:
         return {
             "mcu": dictionary.str_constant("MCU", "unknown"),
+            "firmware": dictionary.app,
             "firmware_version": dictionary.version,
             "clock_freq_hz": dictionary.clock_freq_hz,
             "move_count": node.move_count,

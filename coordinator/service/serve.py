@@ -8,7 +8,6 @@ from pathlib import Path
 from coordinator.commands import RunOptions, ServeOptions
 from coordinator.host import LinuxHost
 from coordinator.interrupts import run_to_end
-from coordinator.ipc.address import socket_folder
 from coordinator.ipc.methods import Registry
 from coordinator.ipc.server import IpcServer
 from coordinator.ipc.settings import IpcSettings, TcpSettings
@@ -20,6 +19,7 @@ from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
 from coordinator.service.typed import Typed
 from nodes.dictionary_cache import DictionaryCache
+from nodes.host_sockets import socket_folder
 
 
 @dataclass(frozen=True, slots=True)

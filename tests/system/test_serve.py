@@ -1,8 +1,10 @@
 """``canductor run --ipc`` as a process of its own, virtual nodes, and real clients over the Unix socket."""
 
 import asyncio
+import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Coroutine
@@ -14,7 +16,17 @@ import pytest
 from coordinator.ipc.client import Client
 from coordinator.ipc.methods import ApiError
 from tests.system.service_stage import zigzag
-from tests.system.stage import CANDUCTOR, ROOT, SQUARE, Command, Hardware, canductor, write_gcode
+from tests.system.stage import (
+    CANDUCTOR,
+    MCU_UUID,
+    ROOT,
+    SQUARE,
+    TOOLHEAD_UUID,
+    Command,
+    Hardware,
+    canductor,
+    write_gcode,
+)
 
 LIMIT_S = 60.0
 
@@ -25,19 +37,19 @@ def with_client(machine: Hardware, go: Callable[[Client, Command], Coroutine[Any
     jobs.mkdir()
     (jobs / "square.gcode").write_text(SQUARE, encoding="utf-8")
     (jobs / "zigzag.gcode").write_text(zigzag(150, 1), encoding="utf-8")
-    socket = machine.folder / "run.sock"
-    with Command("run", machine.config, "--ipc", socket, "--jobs", jobs) as command:
+    path = machine.folder / "run.sock"
+    with Command("run", machine.config, "--ipc", path, "--jobs", jobs) as command:
         command.stdout.wait_for("ready")
 
         async def main() -> None:
-            async with asyncio.timeout(LIMIT_S), Client.connect(str(socket)) as client:
+            async with asyncio.timeout(LIMIT_S), Client.connect(str(path)) as client:
                 await go(client, command)
 
         asyncio.run(main())
         command.signal(signal.SIGTERM)
         ended = command.end()
         assert "Traceback" not in ended.stderr, ended.stderr
-        assert not socket.exists()
+        assert not path.exists()
         return ended.status
 
 
@@ -134,12 +146,12 @@ def test_emergency_stop_while_it_prints_then_restart(machine: Hardware) -> None:
 
 
 def test_the_demo_is_served_without_hardware(tmp_path: Path) -> None:
-    socket = tmp_path / "demo.sock"
-    with Command("demo", "--serve", "--ipc", socket) as command:
+    path = tmp_path / "demo.sock"
+    with Command("demo", "--serve", "--ipc", path) as command:
         command.stdout.wait_for("ready")
 
         async def main() -> None:
-            async with asyncio.timeout(LIMIT_S), Client.connect(str(socket)) as client:
+            async with asyncio.timeout(LIMIT_S), Client.connect(str(path)) as client:
                 assert (await client.call("job.list"))["files"][0]["name"] == "part.gcode"
                 await client.call("gcode.run", {"script": "G28\nG1 X5 F6000"})
                 told = await client.call("position.get", {"ask_nodes": True})
@@ -169,6 +181,30 @@ def test_the_command_line_drives_a_machine_that_runs(machine: Hardware, tmp_path
         await until(client, "machine.state", "shutdown")
 
     assert with_client(machine, go) == 0
+
+
+def test_the_can_tools_ask_the_coordinator_what_its_nodes_are(
+    machine: Hardware, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(machine.folder))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(machine.folder / "empty"))  # nothing to guess by
+    sockets = machine.folder / "canductor"
+    sockets.mkdir(mode=0o700)
+    with socket.socket(socket.AF_UNIX) as nobody:
+        nobody.bind(str(sockets / "left-behind.sock"))  # and nobody listens
+    with Command("run", machine.config, "--ipc", sockets / "mine.sock") as command:
+        command.stdout.wait_for("ready")
+        words = ("can", "nodes", "-i", "canductor", "-c", machine.folder / "bus", "--json")
+        ended = canductor(*words)
+        assert ended.status == 0, ended.stderr
+        found = {node["uuid"]: node for node in json.loads(ended.stdout.splitlines()[-1])["nodes"]}
+        assert found.keys() == {MCU_UUID, TOOLHEAD_UUID}
+        for uuid, mcu in ((MCU_UUID, "virtual-mainboard"), (TOOLHEAD_UUID, "virtual-toolhead")):
+            node = found[uuid]
+            assert (node["state"], node["told_by_host"], node["guessed"]) == ("in use", True, False)
+            assert (node["firmware"]["mcu"], node["configured"], node["shut_down"]) == (mcu, True, False)
+        command.signal(signal.SIGTERM)
+        assert command.end().status == 0
 
 
 def test_a_motion_that_is_cut_off_stops_the_nodes(machine: Hardware) -> None:
