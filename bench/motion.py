@@ -86,7 +86,7 @@ def plan_once(config: Path, gcode: Path) -> Cost:
     report: dict[str, Any] = json.loads(text.splitlines()[-1])
     return Cost(
         usage.ru_utime + usage.ru_stime,
-        usage.ru_maxrss / 1024,
+        report["peak_rss_mb"],
         report["steps"],
         report["queue_steps"],
         report["bytes_to_nodes"],

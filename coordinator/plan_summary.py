@@ -75,7 +75,7 @@ class Made:
             queue_steps=sum(s.queue_steps for s in stats.steppers),
             bytes_to_nodes=sum(n.framed_bytes for n in stats.nodes),
             cpu_s=usage.ru_utime + usage.ru_stime,
-            peak_rss_mb=usage.ru_maxrss / 1024,
+            peak_rss_mb=_peak_rss_mb(),
             path_speed=self.figures.path_speed,
             flow=replace(flow, value=flow.value * self._filament_mm2),
             axes=tuple(
@@ -205,3 +205,9 @@ def _write(path: Path, text: str) -> None:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise CanductorError(f"cannot write {path}: {error.strerror}; name another file") from None
+
+
+def _peak_rss_mb() -> float:
+    """Return the most memory that this process had. What getrusage tells includes that of who started it."""
+    with Path("/proc/self/status").open(encoding="ascii", errors="replace") as status:
+        return next(int(line.split()[1]) / 1024 for line in status if line.startswith("VmHWM:"))
