@@ -17,7 +17,7 @@ from canbus_tools.bus_load import (
 )
 from canbus_tools.frame import Frame, FrameKind
 from nodes.errors import CanductorError
-from tests.canbus_tools.wire_bits import bits_on_wire, crc15
+from tests.nodes.wire_bits import bits_on_wire, crc15
 
 BITRATE = 100_000
 EMPTY = bits_on_wire(0x555, b"")

@@ -18,7 +18,7 @@ from coordinator.cli import main
 from nodes.transport import CanFrame
 from tests.canbus_tools.command import Command, Said
 from tests.canbus_tools.stage import MAIN, MAIN_ID, PATIENCE_S, Place, set_nodeid
-from tests.canbus_tools.wire_bits import bits_on_wire
+from tests.nodes.wire_bits import bits_on_wire
 
 BITRATE = "1000000"
 QUESTIONS = 200

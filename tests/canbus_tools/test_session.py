@@ -19,7 +19,7 @@ from coordinator.cli import main
 from nodes.virtual.firmware import MAINBOARD, firmware_path
 from tests.canbus_tools.command import Command
 from tests.canbus_tools.stage import BED, BOOT, MAIN, MAIN_ID, PATIENCE_S, TOOL, TOOL_ID, TWIN, Place, Stage
-from tests.canbus_tools.wire_bits import bits_on_wire
+from tests.nodes.wire_bits import bits_on_wire
 
 QUICK = ("--listen", "0.2")
 BED_ID = 17

@@ -334,7 +334,10 @@ def test_too_many_connections(tmp_path: Path) -> None:
         writer.close()
         kept[0].writer.close()
         await kept[0].writer.wait_closed()
-        await asyncio.sleep(0.05)  # for the server to notice, which nothing tells
+        left = served.server._connections
+        while len(left) > 1:  # until the server has noticed
+            await asyncio.sleep(0)
+            left = served.server._connections
         assert "result" in await (await served.script()).ask("machine.info")
 
     run(tmp_path, body, connections_max=2)
