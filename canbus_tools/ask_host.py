@@ -57,7 +57,7 @@ async def _ask(path: Path) -> list[object]:
             finally:
                 writer.close()
     # A socket that nobody serves any more, or a program that speaks otherwise: then nobody is there to ask.
-    except (OSError, TimeoutError, ValueError, LookupError, TypeError, AttributeError):
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return []
     return []
 
@@ -71,9 +71,9 @@ def _facts(node: Mapping[str, object]) -> Facts:
     state = node.get("state")
     return Facts(
         firmware=Firmware(
-            mcu=str(node.get("mcu", "")),
-            version=str(node.get("firmware_version", "")),
-            app=str(node.get("firmware", "")),
+            mcu=_text(node, "mcu"),
+            version=_text(node, "firmware_version"),
+            app=_text(node, "firmware"),
             build="",
             clock_hz=clock_hz if isinstance(clock_hz, int) else None,
             bitrate=None,
@@ -83,3 +83,8 @@ def _facts(node: Mapping[str, object]) -> Facts:
         configured=state == "ready",
         shut_down=state == "shutdown",
     )
+
+
+def _text(node: Mapping[str, object], name: str) -> str:
+    value = node.get(name)
+    return value if isinstance(value, str) else ""
