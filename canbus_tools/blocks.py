@@ -13,7 +13,9 @@ from canbus_tools.traffic import Way
 from nodes._wire import ffi, lib
 
 GAP_S: Final = 0.1
-"""A block whose bytes stop coming for so long was cut off; hosts and nodes give it up then too."""
+"""A block whose bytes stop coming for so long was cut off if what comes then begins another one; hosts and
+nodes give it up then anyway, but an onlooker's times are those of its own machine, which may have been busy.
+"""
 NOISE_SHOWN: Final = 64
 """Bytes of noise that are told at once."""
 _MIN: Final[int] = lib.WIRE_BLOCK_MIN
@@ -23,6 +25,10 @@ _BLOCK: Final[int] = lib.WIRE_BLOCK
 _MORE: Final[int] = lib.WIRE_MORE
 _SYNC: Final = bytes((lib.WIRE_SYNC,))
 _scan: Final = lib.wire_scan
+
+
+def _begins_block(data: bytes) -> bool:
+    return len(data) > 1 and _MIN <= data[0] <= _MAX and data[1] >> 4 == _MARK
 
 
 class Noise(bytes):
@@ -52,7 +58,7 @@ class BlockStream:
         way.bytes += len(data)
         held = self._held
         if held:
-            if frame[0] - self._last[0] > GAP_S:
+            if frame[0] - self._last[0] > GAP_S and _begins_block(data):
                 return self._feed_behind_gap(frame)
             data = held + data
         self._last = frame

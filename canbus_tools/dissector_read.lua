@@ -92,10 +92,18 @@ local function cut(stream, data, last)
   return found
 end
 
+local function begins_block(data)
+  if #data < 2 then
+    return false
+  end
+  local length, mark = data:byte(1, 2)
+  return length >= BLOCK_MIN and length <= BLOCK_MAX and mark - mark % 16 == D.block.sequence_mark
+end
+
 -- Takes a frame's payload; returns what it completed.
 local function feed(stream, data, now_s)
   local found = {}
-  if stream.held ~= "" and now_s - stream.held_s > GAP_S then
+  if stream.held ~= "" and now_s - stream.held_s > GAP_S and begins_block(data) then
     found = cut(stream, stream.held, true)
     if stream.noise ~= "" then
       tell_noise(stream, found)

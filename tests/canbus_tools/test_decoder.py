@@ -236,6 +236,16 @@ def test_a_block_cut_off_does_not_hold_the_next_one_back() -> None:
     assert decoder.nodes[4].from_node.frames == len(cut + later.frames)
 
 
+def test_a_pause_within_a_block_is_the_onlookers_own() -> None:
+    """A machine that was busy reads the second half late: nothing is lost of it."""
+    first, *rest = Talk().response(2, "clock", clock=0x5A5A5A5A).frames
+    assert rest
+    late = [frame._replace(time_s=frame.time_s + 0.4) for frame in rest]
+    decoder = knowing()
+    said = [item for frame in (first, *late) for item in decoder.feed(frame)]
+    assert [(item.name, item.params) for item in said] == [("clock", {"clock": 0x5A5A5A5A})]
+
+
 def test_sequence_numbers_wrap_without_a_miss() -> None:
     talk = Talk()
     for n in range(100):

@@ -77,10 +77,13 @@ def test_a_real_session_reads_as_our_decoder_reads_it(tmp_path: Path) -> None:
 
 
 def test_damaged_traffic_reads_as_our_decoder_reads_it(tmp_path: Path) -> None:
-    """Frames lost, doubled and changed: noise, repeats, naks and what can still be read are the same."""
+    """Frames lost, doubled, changed and late: noise, repeats, naks and what can still be read are the same."""
     chance = random.Random(5)
     frames = []
-    for frame in recorded.frames():
+    late_s = 0.0
+    for sent in recorded.frames():
+        late_s += 0.3 if chance.random() < 0.02 else 0.0
+        frame = sent._replace(time_s=sent.time_s + late_s)
         fate = chance.random()
         if fate < 0.03:
             continue

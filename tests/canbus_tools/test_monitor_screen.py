@@ -69,7 +69,8 @@ class Stand:
     async def until(self, told: Callable[[], bool]) -> None:
         end_s = time.monotonic() + PATIENCE_S
         while not told():
-            assert time.monotonic() < end_s, (self.text("#state"), self.text("#load"), self.log()[-20:])
+            if time.monotonic() > end_s:
+                pytest.fail("\n".join([self.text("#state"), self.text("#load"), *self.log()]))
             await self.pilot.pause(0.01)
 
 
