@@ -77,7 +77,7 @@ def test_a_real_session_reads_as_our_decoder_reads_it(tmp_path: Path) -> None:
 
 
 def test_damaged_traffic_reads_as_our_decoder_reads_it(tmp_path: Path) -> None:
-    """Frames lost, doubled, changed and late: noise, repeats, naks and what can still be read are the same."""
+    """Frames lost, doubled, changed, late: noise, repeats, naks and what can still be read are the same."""
     chance = random.Random(5)
     frames = []
     late_s = 0.0
