@@ -122,7 +122,13 @@ async def _print(
         )
 
     described = machine.description
-    job = Job(program, Planner(described.limits), described.homed_position, machine_state(described))
+    job = Job(
+        program,
+        Planner(described.limits),
+        described.homed_position,
+        machine_state(described),
+        machine.modules.vocabulary,
+    )
     streamer = Streamer(machine, job, record=record, on_told=on_told, on_state=show)
     streamer.began_at = await machine.stepper_positions()
     await streamer.run()

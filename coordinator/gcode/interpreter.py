@@ -61,7 +61,14 @@ class _Inner:
     name: str
     data: bytes
     start: int = 0
-    line: int = 1
+    """Of the line that comes next."""
+    at: int = 0
+    """Of the line that is being carried out."""
+
+    @property
+    def line(self) -> int:
+        """Number of that."""
+        return self.data.count(b"\n", 0, self.at) + 1
 
     def line_end(self) -> int:
         end = self.data.find(b"\n", self.start)
@@ -178,6 +185,7 @@ class Job:
             if not self._inner:
                 self.planner.line_done()
             return
+        inner.at = inner.start
         end = inner.line_end()
         lines = self.planner.lines
         feed = self.planner.feed(inner.data, inner.start, end, final=True)
@@ -190,7 +198,6 @@ class Job:
             self._refused(feed)
             return
         inner.start = end + 1
-        inner.line += 1
 
     def _do(self, line: bytes, hint: str = "") -> bool:
         """Carry out a line that is no move; False: the planner has to be emptied first."""
@@ -247,7 +254,7 @@ class Job:
         if event.moved and event.done is None:
             self.planner.homed = ""
         if event.failure:
-            raise self._error(event.failure)
+            raise self._error(event.failure, event.line)
         if event.done is not None:
             self.take(event.done)
 
@@ -269,9 +276,9 @@ class Job:
 
     # ---- For the handlers ----
 
-    def _error(self, problem: str) -> GCodeError:
+    def _error(self, problem: str, line: int | None = None) -> GCodeError:
         within = "".join(f"{inner.name}:{inner.line}: " for inner in self._inner)
-        return GCodeError(self.program.name, self.line, f"{within}{problem}")
+        return GCodeError(self.program.name, line or self.line, f"{within}{problem}")
 
     def notice(self, what: str, remark: str) -> None:
         """Tell about WHAT, but only once in this job."""

@@ -27,7 +27,12 @@ class Motion:
         self, machine: Machine, *, on_told: Callable[[Told], None], on_cycle: Callable[[], None]
     ) -> None:
         described = machine.description
-        self.feeder = Feeder(Planner(described.limits), described.homed_position, machine_state(described))
+        self.feeder = Feeder(
+            Planner(described.limits),
+            described.homed_position,
+            machine_state(described),
+            machine.modules.vocabulary,
+        )
         self.trace = MotionTrace(len(machine.moving))
         self.planned = UNMOVED
         self.streamer = Streamer(
