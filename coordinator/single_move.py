@@ -11,6 +11,7 @@ import numpy as np
 
 from coordinator.app import Machine, link_of
 from coordinator.machine.description import StepperDescription
+from coordinator.motion.specs import StepKinematics
 from coordinator.motion.steps import StepGenerator
 from coordinator.motion.trapezoid_array import TRAPEZOID
 
@@ -23,6 +24,8 @@ SEND_AHEAD_S: Final = 0.25
 """Steps are made so far ahead of now: late enough that little has to be dropped."""
 BATCH_ROOM: Final = 1 << 16
 AXES: Final = ("x", "y", "z")
+_UPRIGHT: Final = (StepKinematics.DELTA, StepKinematics.DELTESIAN)
+"""Steppers of towers: they go up and down with the head."""
 
 Ratio = tuple[float, float, float, float]
 """What each of X Y Z E moves per mm of way."""
@@ -91,7 +94,7 @@ class SingleMove:
         self.ramp = ramp
         self.ratio = ratio
         self.steppers: Sequence[StepperDescription] = [
-            s for s in machine.description.steppers if np.dot(s.weights, ratio) != 0
+            s for s in machine.description.steppers if self.along(s) != 0
         ]
         """Those it moves."""
         now = self.print_time_now()
@@ -137,6 +140,12 @@ class SingleMove:
                     link_of(node).send_batch(batch)
         self._machine.check_load()
 
+    def along(self, stepper: StepperDescription) -> float:
+        """Return how many mm a stepper moves per mm of way; 0 where that is not the same all the way."""
+        if stepper.function.kinematics in _UPRIGHT and not any(self.ratio[:2]):
+            return self.ratio[2]
+        return float(np.dot(stepper.weights, self.ratio))
+
     def planned_steps(self, stepper: StepperDescription, way_mm: float) -> float:
         """Return where a stepper is after WAY_MM, in steps from the begin; a step is due at every half."""
-        return float(np.dot(stepper.weights, self.ratio)) * way_mm / stepper.step_distance
+        return self.along(stepper) * way_mm / stepper.step_distance
