@@ -4,6 +4,7 @@ It has step generation of its own, which begins with a reset of the steppers' cl
 anything, and whatever is left of it when the steppers are stopped on their nodes is simply dropped.
 """
 
+import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -22,6 +23,9 @@ START_LEAD_S: Final = 0.25
 """From now to the first step: time to arm what has to stop it, and for the steps to reach the nodes."""
 SEND_AHEAD_S: Final = 0.25
 """Steps are made so far ahead of now: late enough that little has to be dropped."""
+CYCLE_S: Final = 0.05
+SETTLE_S: Final = 0.05
+"""After the last step is due, before it is believed to be done."""
 BATCH_ROOM: Final = 1 << 16
 AXES: Final = ("x", "y", "z")
 _UPRIGHT: Final = (StepKinematics.DELTA, StepKinematics.DELTESIAN)
@@ -123,6 +127,14 @@ class SingleMove:
         """Return a node's clock (64 bits) at a print time."""
         node = self._machine.nodes[node_name]
         return node.best_clock.ticks_at(self._time_base.host_ns_at(print_time))
+
+    async def run(self) -> None:
+        """Make the whole move and return when its last step is done; raises CanductorError."""
+        while self.print_time_now() < self.end_s + SETTLE_S:
+            self.stream()
+            await asyncio.sleep(CYCLE_S)
+            if self._machine.stopped is not None:
+                raise self._machine.stopped
 
     def stream(self) -> None:
         """Make and send what is due by now; CanductorError when a node cannot take it."""

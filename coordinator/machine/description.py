@@ -86,7 +86,6 @@ def load_machine(path: str) -> MachineDescription:
     )
     followers = read_extruder_steppers(reading, extruders)
     shapers = read_shapers(reading)
-    modules = _read_modules(reading)
     description = MachineDescription(
         path=config.path,
         nodes=nodes,
@@ -99,26 +98,25 @@ def load_machine(path: str) -> MachineDescription:
         extruders=extruders,
         extruder_steppers=followers,
         shapers=shapers,
-        modules=modules,
-        not_yet_acting=(*later, *_later_sections(reading, kinematics)),
+        modules=_module_sources(reading),
+        not_yet_acting=(),
         notes=tuple(config.notes),
     )
     _check_names(description)
     check_policies(description.nodes, description.steppers)
-    return description
+    reading.pins = description.modules.build(description).pins  # made once to find mistakes
+    return replace(description, not_yet_acting=(*later, *_later_sections(reading, kinematics)))
 
 
-def _read_modules(reading: Reading) -> ModuleSources:
-    """Return what the modules are made from, made once to find mistakes; raises ConfigError."""
+def _module_sources(reading: Reading) -> ModuleSources:
+    """Return what the modules are made from; raises ConfigError."""
     sources: list[ModuleSource] = []
     for section in reading.config.sections.values():
         sources += [ModuleSource(section, kind, whole=False) for kind in modules_beside(section.name)]
         if not _is_acting(section) and (kind := module_for(section.kind, section.place)) is not None:
             sources.append(ModuleSource(section, kind, whole=True))
             reading.used.add(section.name)
-    modules = ModuleSources(tuple(sources), reading.pins)
-    reading.pins = modules.build().pins
-    return modules
+    return ModuleSources(tuple(sources), reading.pins)
 
 
 def _named(limits: MotionLimits, frame: Frame) -> MotionLimits:

@@ -2,18 +2,20 @@
 
 import contextlib
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
-from coordinator.gcode.commands import Call, GCodeCommand, Reading, Vocabulary
+from coordinator.gcode.commands import GCodeCommand, Vocabulary
 from coordinator.machine.config_file import RawSection
 from coordinator.machine.pins import PinRegistry
 from coordinator.machine.problem import ConfigError, Place
 from coordinator.modules.base import Build, Device, Module, Value
+from coordinator.modules.homing import Homing
 from nodes.node_config import NodeConfig
 from nodes.records import record
 
 if TYPE_CHECKING:
+    from coordinator.machine.model import MachineDescription
     from coordinator.modules.live import Live
     from nodes.node import Node
 
@@ -38,9 +40,9 @@ class ModuleSources:
     pins: PinRegistry
     """As the machine's own sections left it."""
 
-    def build(self) -> "ModuleSet":
-        """Make them, linked with each other; raises ConfigError."""
-        built = ModuleSet(copy.deepcopy(self.pins))
+    def build(self, machine: "MachineDescription") -> "ModuleSet":
+        """Make those of MACHINE, linked with each other; raises ConfigError."""
+        built = ModuleSet(machine, copy.deepcopy(self.pins))
         for source in self.sources:
             built.build(source)
         built.link()
@@ -50,19 +52,21 @@ class ModuleSources:
 class ModuleSet:
     """The modules, by the names of their sections; also what they are to each other."""
 
-    def __init__(self, pins: PinRegistry) -> None:
+    def __init__(self, machine: "MachineDescription", pins: PinRegistry) -> None:
         self.pins = pins
+        self._machine = machine
         self._modules: list[Module] = []
         self._devices: dict[str, list[Device]] = {}
         self._commands: dict[str, GCodeCommand] = {}
         self._owners: dict[str, str] = {}
         self._live: Live | None = None
-        self.home: Callable[[Call, str], Reading] | None = None
-        """Reads G28."""
+        self._homing = self._share(Homing)
 
     def build(self, source: ModuleSource) -> Module:
         """Make the module of SOURCE; raises ConfigError."""
-        build = Build(source.section, source.kind.SPEC, self.pins, whole=source.whole, share=self._share)
+        build = Build(
+            source.section, source.kind.SPEC, self.pins, self._machine, whole=source.whole, share=self._share
+        )
         module = source.kind(build)
         build.reader.finish()
         self._add(module, build)
@@ -112,7 +116,9 @@ class ModuleSet:
     @property
     def vocabulary(self) -> Vocabulary:
         """What programs know through them."""
-        return Vocabulary(self._commands, self.home)
+        homing = self._homing
+        assert isinstance(homing, Homing)
+        return Vocabulary(self._commands, homing.read if homing.acts else None)
 
     @property
     def nodes(self) -> Sequence[str]:
