@@ -67,6 +67,10 @@ class Figures:
             prefix = f"buses.{field_name(name)}"
             shown.add(prefix)
             self._tree.update(prefix, bus_figures(name, stats))
+        for name, status in machine.modules.status().items():
+            prefix = f"modules.{field_name(name)}"
+            shown.add(prefix)
+            self._tree.update(prefix, status)
         for prefix in self._shown - shown:
             self._tree.remove(prefix)
         self._shown = shown
