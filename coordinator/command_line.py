@@ -41,6 +41,10 @@ FRONT_END_COMMANDS = {
     "completion": "Write what makes a shell complete the words of canductor.",
 }
 """Commands whose words are read by ``coordinator.front_end_words``."""
+OTHER_COMMANDS = {
+    "config": "Check a configuration, or print what one may contain.",
+}
+"""Commands whose words are read by a module of their own, ``coordinator.NAME_words``."""
 
 
 class Answered(Exception):  # noqa: N818 (no failure: the words asked for help or the version, and got it)
@@ -69,6 +73,8 @@ def read_words(words: Sequence[str]) -> Job:
         return _tool(words)
     if words[0] in FRONT_END_COMMANDS:
         return _front_end(words)
+    if words[0] in OTHER_COMMANDS:
+        return _other(words)
     arguments = _parser().parse_args(list(words))
     if arguments.version:
         sys.stdout.write(f"canductor {version()}\n")
@@ -111,6 +117,8 @@ def whole_parser() -> argparse.ArgumentParser:
     (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
     for name, summary in FRONT_END_COMMANDS.items():
         _declare_front_end(commands, name, summary)
+    for name in OTHER_COMMANDS:
+        _declare_other(commands, name)
     can = commands.add_parser("can", allow_abbrev=False, help=_in_list(TOOL_COMMANDS["can"]))
     add_tools(can, all_tools=True)
     declare_tool(commands, "console")
@@ -136,6 +144,23 @@ def _declare_front_end(commands: Any, name: str, summary: str) -> None:
     declare(commands.add_parser(name, help=_in_list(summary), description=summary, allow_abbrev=False), name)
 
 
+def _other(words: Sequence[str]) -> Job:
+    """Read the words of a command that has a module of its own."""
+    parser = _Parser(prog="canductor", allow_abbrev=False)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    _declare_other(commands, words[0])
+    arguments = parser.parse_args(list(words))
+    if "make_job" not in arguments:
+        raise UsageError(f"what '{words[0]}' shall do is missing")
+    return cast("Job", arguments.make_job(arguments))
+
+
+def _declare_other(commands: Any, name: str) -> None:
+    summary = OTHER_COMMANDS[name]
+    command = commands.add_parser(name, help=_in_list(summary), description=summary, allow_abbrev=False)
+    importlib.import_module(f"coordinator.{name}_words").declare(command)
+
+
 def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
     """Return the parser; WHOLE: without the commands that others declare."""
     parser = _Parser(
@@ -146,7 +171,7 @@ def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version")
     parser.set_defaults(make_job=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for name, summary in () if whole else (TOOL_COMMANDS | FRONT_END_COMMANDS).items():
+    for name, summary in () if whole else (TOOL_COMMANDS | FRONT_END_COMMANDS | OTHER_COMMANDS).items():
         commands.add_parser(name, help=_in_list(summary))
     for name, summary, declare, make_job in (
         ("demo", "print on virtual nodes and compare every stepper with the plan", _declare_demo, _demo),

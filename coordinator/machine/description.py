@@ -70,7 +70,14 @@ def load_machine(path: str) -> MachineDescription:
 
     Raises ConfigError, one sentence that begins with file and line, for the first mistake found.
     """
-    config = parse_config(str(path))
+    return describe(parse_config(str(path)))
+
+
+def describe(config: ConfigFile) -> MachineDescription:
+    """Return the machine that CONFIG speaks of; raises ConfigError for the first mistake found.
+
+    Where the file collects mistakes it is raised only for those that leave nothing to go on with.
+    """
     later: list[NotYetActing] = []
     _check_section_names(config)
     nodes = read_nodes(config, later)
@@ -158,12 +165,12 @@ def _check_section_names(config: ConfigFile) -> None:
         if section.kind in known_kinds():  # asked for last: it looks through all packages
             continue
         if section.kind in _SINGLE_SECTIONS:
-            raise ConfigError(
-                section.place, f"[{section.name}] must be [{section.kind}]: there is only one of it"
-            )
+            error = f"[{section.name}] must be [{section.kind}]: there is only one of it"
+            section.report(ConfigError(section.place, error))
+            continue
         valid = (*_SINGLE_SECTIONS, *_NAMED_SECTIONS, *known_kinds(), *sorted(LATER_SECTIONS))
         hint = nearest(section.kind, valid, pattern="[{}]") or "; remove it or correct its name"
-        raise ConfigError(section.place, f"there is no section [{section.name}]{hint}")
+        section.report(ConfigError(section.place, f"there is no section [{section.name}]{hint}"))
 
 
 def _later_sections(reading: Reading, kinematics: str) -> list[NotYetActing]:
@@ -181,11 +188,11 @@ def _later_sections(reading: Reading, kinematics: str) -> list[NotYetActing]:
             reading.pins.check_unclaimed(section.options.values(), section.name)
             continue
         if section.name not in reading.used and section.kind not in ("printer", *_NAMED_SECTIONS):
-            raise ConfigError(
-                section.place,
+            useless = (
                 f"[{section.name}] has no place in a machine of kinematics {kinematics}; remove it, or"
-                " correct its name or 'kinematics' of [printer]",
+                " correct its name or 'kinematics' of [printer]"
             )
+            section.report(ConfigError(section.place, useless))
         options = [option for name, option in section.options.items() if (section.name, name) in waiting]
         reading.pins.check_unclaimed(options, section.name)
     return result

@@ -22,6 +22,7 @@ from coordinator.machine import (
 from coordinator.machine.options import Option, SectionSpec
 from coordinator.machine.printer_options import PRINTER_SPECS
 from coordinator.machine.well_known import LATER_SECTIONS
+from coordinator.modules.registry import own_beside, own_modules
 
 SECTIONS: dict[str, SectionSpec] = {
     "[mcu], [mcu NAME]": read_nodes.MCU,
@@ -47,9 +48,41 @@ SECTIONS: dict[str, SectionSpec] = {
 }
 
 
+def sections() -> list[str]:
+    """Return the titles of all sections: the machine's own, then those of our modules."""
+    return [*SECTIONS, *_module_sections()]
+
+
+def _module_sections() -> dict[str, SectionSpec]:
+    beside = {f"{title}, further options": module.SPEC for title, module in own_beside()}
+    return beside | {title: module.SPEC for title, module in own_modules()}
+
+
+def _spec(title: str) -> SectionSpec:
+    return SECTIONS.get(title) or _module_sections()[title]
+
+
+def section_json(title: str) -> dict[str, object]:
+    """Return one section's purpose and options."""
+    spec = _spec(title)
+    return {
+        "help": spec.help,
+        "options": [
+            {
+                "name": option.name,
+                "value": option.rule(),
+                "unit": option.unit,
+                "default": option.default,
+                "help": option.help,
+            }
+            for option in spec.options
+        ],
+    }
+
+
 def section_table(title: str) -> str:
     """Return one section's heading, purpose and options in Markdown."""
-    spec = SECTIONS[title]
+    spec = _spec(title)
     lines = [
         f"### `{title}`",
         "",
@@ -80,7 +113,7 @@ def _row(option: Option[object]) -> str:
 
 def main() -> None:
     """Print all tables."""
-    sys.stdout.write("\n".join(section_table(title) for title in SECTIONS) + "\n" + later_sections())
+    sys.stdout.write("\n".join(section_table(title) for title in sections()) + "\n" + later_sections())
 
 
 if __name__ == "__main__":

@@ -58,6 +58,10 @@ class Module:
 
     SPEC: ClassVar[SectionSpec]
     """All its options; the reference page is made from it."""
+    NAMED: ClassVar[bool] = False
+    """Whether there may be several, ``[kind NAME]``; else there is one, ``[kind]``."""
+    TITLE: ClassVar[str] = ""
+    """Which sections it reads a part of: ``[extruder], [extruder1] …``; else it has its own."""
 
     def __init__(self, build: "Build") -> None:
         """Read all options; no I/O. Raises ConfigError."""
