@@ -23,8 +23,6 @@ HOLD_S: Final = 30.0
 HOLD_K: Final = 1.0
 LIMIT_S: Final = 3600.0
 """No phase may take longer."""
-FIRST_TRANSFER_S: Final = 300.0
-"""A first guess: a heater that is off cools with this time constant."""
 
 
 class TunePhase(Enum):
@@ -112,13 +110,12 @@ class MpcTune:
         if measured_c < self.target_c:
             return self.max_power
         heat_w = self.max_power * self.heater_w
-        loss_s = FIRST_TRANSFER_S
-        capacity, responsiveness = fit_rise(self._rise, heat_w, self.ambient_c, loss_per_s=1 / loss_s)
+        found = fit_rise(self._rise, heat_w, self.ambient_c)
         model = HeaterModel(
             power_w=self.heater_w,
-            capacity_j_per_k=capacity,
-            transfer_w_per_k=capacity / loss_s,
-            responsiveness_per_s=responsiveness,
+            capacity_j_per_k=found.capacity_j_per_k,
+            transfer_w_per_k=found.capacity_j_per_k * found.loss_per_s,
+            responsiveness_per_s=found.responsiveness_per_s,
         )
         self._holder = Mpc(model, max_power=self.max_power)
         self._holder.set_ambient(self.ambient_c)
@@ -162,12 +159,12 @@ class MpcTune:
     def _result(self) -> HeaterModel:
         transfer = self._transfers[0]
         heat_w = self.max_power * self.heater_w
-        capacity, responsiveness = fit_rise(self._rise, heat_w, self.ambient_c, transfer_w_per_k=transfer)
+        found = fit_rise(self._rise, heat_w, self.ambient_c, transfer_w_per_k=transfer)
         return HeaterModel(
             power_w=self.heater_w,
-            capacity_j_per_k=capacity,
+            capacity_j_per_k=found.capacity_j_per_k,
             transfer_w_per_k=transfer,
-            responsiveness_per_s=responsiveness,
+            responsiveness_per_s=found.responsiveness_per_s,
             fan_transfer_w_per_k=tuple(self._transfers) if self.fan_steps > 1 else (),
         )
 

@@ -1,23 +1,31 @@
 """The capacity and the sensor's lag that explain how a heater got hot at a constant power.
 
 The model's rise above the ambient, with power P, capacity C, loss rate λ and responsiveness k, is in closed
-form  P / (C λ) · (1 - (k e^{-λt} - λ e^{-kt}) / (k - λ)).  C and k are found by Gauss and Newton's method on
-their logarithms, so that both stay positive.
+form  P / (C λ) · (1 - (k e^{-λt} - λ e^{-kt}) / (k - λ)).  The values are found by Gauss and Newton's
+method on their logarithms, so that all stay positive.
 """
 
 import math
-from collections.abc import Callable
+import operator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from coordinator.heat.pid_tune import TuneError
+from nodes.records import record
 
 MAX_POINTS: Final = 2000
 TRIES: Final = 60
 ENOUGH: Final = 1e-7
 LONGEST_STEP: Final = 0.5
 """Of a logarithm: by how much a try may change a value."""
+HIGHEST_LOG: Final = 25.0
 MIN_POINTS: Final = 12
+SINGULAR: Final = 1e-10
+USUAL_LOSS_S: Final = 300.0
+"""A heater that is off cools with about this time constant, and a loss is taken as this …"""
+PULL_K: Final = 0.01
+"""… unless every point of the rise would be so much nearer for each e-fold of difference."""
 
 
 @dataclass(slots=True)
@@ -42,35 +50,50 @@ class Rise:
             self._stride *= 2
 
 
-def fit_rise(
-    rise: Rise,
-    heat_w: float,
-    ambient_c: float,
-    *,
-    transfer_w_per_k: float | None = None,
-    loss_per_s: float = 0.0,
-) -> tuple[float, float]:
-    """Return capacity (J/K) and responsiveness (1/s) for a rise at HEAT_W.
+@record
+class Fit:
+    """What explains a rise."""
 
-    The loss is TRANSFER_W_PER_K, or where that is not known yet LOSS_PER_S times the capacity. Raises
+    capacity_j_per_k: float
+    responsiveness_per_s: float
+    loss_per_s: float
+    """Loss over capacity: 1/s."""
+
+
+def fit_rise(rise: Rise, heat_w: float, ambient_c: float, *, transfer_w_per_k: float | None = None) -> Fit:
+    """Return what explains a rise at HEAT_W.
+
+    Where the loss TRANSFER_W_PER_K is not known yet it is found too, as far as the rise tells it. Raises
     TuneError when nothing fits.
     """
     if len(rise.points) < MIN_POINTS:
         raise TuneError("the heater is too fast for its sensor to be measured; choose a higher target")
+    pull = PULL_K * math.sqrt(len(rise.points))
 
-    def errors(log_capacity: float, log_k: float) -> list[float]:
-        capacity, k = math.exp(log_capacity), math.exp(log_k)
-        loss = loss_per_s if transfer_w_per_k is None else transfer_w_per_k / capacity
-        return [ambient_c + risen(heat_w / capacity, loss, k, at) - c for at, c in rise.points]
+    def unpack(logs: Sequence[float]) -> Fit:
+        capacity, k = math.exp(logs[0]), math.exp(logs[1])
+        return Fit(
+            capacity, k, math.exp(logs[2]) if transfer_w_per_k is None else transfer_w_per_k / capacity
+        )
+
+    def errors(logs: Sequence[float]) -> list[float]:
+        fit = unpack(logs)
+        rate, loss, k = heat_w / fit.capacity_j_per_k, fit.loss_per_s, fit.responsiveness_per_s
+        found = [ambient_c + risen(rate, loss, k, at) - c for at, c in rise.points]
+        return found if transfer_w_per_k is not None else [*found, pull * math.log(loss * USUAL_LOSS_S)]
 
     span_s = rise.points[-1][0]
     gained = max(rise.points[-1][1] - ambient_c, 1.0)
-    x, y = math.log(heat_w * span_s / gained), math.log(10 / span_s)
+    logs = [math.log(heat_w * span_s / gained), math.log(10 / span_s)]
+    if transfer_w_per_k is None:
+        logs.append(-math.log(USUAL_LOSS_S))
     for _ in range(TRIES):
-        dx, dy = _newton(errors, x, y)
-        x, y = x + dx, y + dy
-        if abs(dx) + abs(dy) < ENOUGH:
-            return math.exp(x), math.exp(y)
+        steps = _newton(errors, logs)
+        logs = [value + step for value, step in zip(logs, steps, strict=True)]
+        if max(map(abs, logs)) > HIGHEST_LOG:
+            break
+        if max(map(abs, steps)) < ENOUGH:
+            return unpack(logs)
     raise TuneError("the heater's rise looks like that of no heater; check that its sensor is fixed to it")
 
 
@@ -78,24 +101,36 @@ def risen(rate: float, loss: float, k: float, at_s: float) -> float:
     """Return by how much the sensor has risen AT_S after a heating of RATE (K/s without loss) began."""
     if abs(k - loss) < 1e-9 * k:
         k *= 1 + 1e-6
-    fast, slow = -math.expm1(-k * at_s) / k, -math.expm1(-loss * at_s) / loss if loss > 0 else at_s
+    fast, slow = -math.expm1(-k * at_s) / k, -math.expm1(-loss * at_s) / loss
     return rate * k * (slow - fast) / (k - loss)
 
 
-def _newton(errors: Callable[[float, float], list[float]], x: float, y: float) -> tuple[float, float]:
+def _newton(errors: Callable[[Sequence[float]], list[float]], at: Sequence[float]) -> list[float]:
     """Return the step towards the least squares, no longer than allowed."""
     small = 1e-5
-    here = errors(x, y)
-    by_x = [(there - e) / small for there, e in zip(errors(x + small, y), here, strict=True)]
-    by_y = [(there - e) / small for there, e in zip(errors(x, y + small), here, strict=True)]
-    xx = sum(v * v for v in by_x)
-    yy = sum(v * v for v in by_y)
-    xy = sum(v * w for v, w in zip(by_x, by_y, strict=True))
-    ex = sum(v * e for v, e in zip(by_x, here, strict=True))
-    ey = sum(v * e for v, e in zip(by_y, here, strict=True))
-    determinant = xx * yy - xy * xy
-    if determinant <= 1e-12 * xx * yy:
-        raise TuneError("the heater's rise is too short to tell its capacity from its sensor's lag")
-    dx, dy = (xy * ey - yy * ex) / determinant, (xy * ex - xx * ey) / determinant
-    longest = max(abs(dx), abs(dy), LONGEST_STEP)
-    return dx * LONGEST_STEP / longest, dy * LONGEST_STEP / longest
+    here = errors(at)
+    slopes = []
+    for index in range(len(at)):
+        moved = [value + small * (place == index) for place, value in enumerate(at)]
+        slopes.append([(there - e) / small for there, e in zip(errors(moved), here, strict=True)])
+    normal = [[sum(map(operator.mul, row, column)) for column in slopes] for row in slopes]
+    steps = _solve(normal, [-sum(map(operator.mul, row, here)) for row in slopes])
+    shorter = LONGEST_STEP / max(LONGEST_STEP, *map(abs, steps))
+    return [step * shorter for step in steps]
+
+
+def _solve(matrix: list[list[float]], right: list[float]) -> list[float]:
+    """Solve a symmetric positive system by elimination; TuneError when it is singular."""
+    size = len(right)
+    rows = [[*row, value] for row, value in zip(matrix, right, strict=True)]
+    for pivot in range(size):
+        if rows[pivot][pivot] <= SINGULAR * matrix[pivot][pivot]:
+            raise TuneError("the heater's rise is too short to tell its capacity from its sensor's lag")
+        for below in range(pivot + 1, size):
+            factor = rows[below][pivot] / rows[pivot][pivot]
+            rows[below] = [x - factor * y for x, y in zip(rows[below], rows[pivot], strict=True)]
+    solution = [0.0] * size
+    for row in reversed(range(size)):
+        known = sum(rows[row][column] * solution[column] for column in range(row + 1, size))
+        solution[row] = (rows[row][size] - known) / rows[row][row]
+    return solution

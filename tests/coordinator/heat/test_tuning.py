@@ -119,7 +119,13 @@ def test_the_fit_recovers_a_simulated_rise(capacity: float, k: float, loss: floa
         block += (heat_w - loss * (block - ambient)) / capacity / 1000
         sensor += k * (block - sensor) / 1000
     found = fit_rise(rise, heat_w, ambient, transfer_w_per_k=loss)
-    assert found == pytest.approx((capacity, k), rel=0.01)
+    assert found.capacity_j_per_k == pytest.approx(capacity, rel=0.01)
+    assert found.responsiveness_per_s == pytest.approx(k, rel=0.02)
+    assert found.loss_per_s == loss / found.capacity_j_per_k
+    guessed = fit_rise(rise, heat_w, ambient)
+    assert guessed.capacity_j_per_k == pytest.approx(capacity, rel=0.02)
+    assert guessed.responsiveness_per_s == pytest.approx(k, rel=0.05)
+    assert guessed.loss_per_s == pytest.approx(loss / capacity, rel=0.1)
 
 
 def test_a_long_rise_stays_bounded() -> None:
