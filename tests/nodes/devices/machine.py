@@ -22,7 +22,7 @@ class Device(Protocol):
 
 
 class DeviceMachine:
-    """DEVICES on a node whose clock rolls over ROLLS_OVER_S after it has power (it is ready after some 2.5)."""
+    """DEVICES on a node whose clock rolls over ROLLS_OVER_S after it has power (ready after some 2.5)."""
 
     def __init__(self, *devices: Device, rolls_over_s: float = 3.0, seed: int = 1) -> None:
         self.devices = devices
@@ -66,7 +66,7 @@ class DeviceMachine:
     async def shut_down(self, limit_s: float = 60.0) -> str:
         """Wait until the node is shut down; return why."""
         async with asyncio.timeout(limit_s):
-            while self.node.state is not NodeState.SHUTDOWN:
+            while self.node.state is not NodeState.SHUTDOWN:  # noqa: ASYNC110  virtual time
                 await asyncio.sleep(0.01)
         return str(self.node.failure)
 

@@ -1,6 +1,7 @@
 """Analog inputs and counters on a node of the real firmware."""
 
 import asyncio
+from itertools import pairwise
 
 import pytest
 
@@ -31,7 +32,7 @@ def test_measurements_come_with_their_time_over_the_rollover() -> None:
 
     machine.run(main)
     assert {round(value.ratio * 4095) for value in seen} >= {0, 1000, 4095}
-    steps = {(b.clock32 - a.clock32) % (1 << 32) for a, b in zip(seen, seen[1:], strict=False)}
+    steps = {(b.clock32 - a.clock32) % (1 << 32) for a, b in pairwise(seen)}
     assert steps == {round(0.3 * HZ)}
     assert len(seen) >= 13
     assert 0 <= (clocks[-1] - seen[-1].clock32) % (1 << 32) < 0.4 * HZ
