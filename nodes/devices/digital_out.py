@@ -1,0 +1,60 @@
+"""A digital output on a node."""
+
+from typing import TYPE_CHECKING, Final
+
+from nodes.devices.timed_output import TimedOutput
+from nodes.node_config import NodeConfig
+from nodes.node_errors import NodeError
+
+if TYPE_CHECKING:
+    from nodes.node import Node  # planning needs no node, which draws in asyncio
+
+COMMANDS: Final = ("config_digital_out", "queue_digital_out", "update_digital_out")
+
+
+class DigitalOut(TimedOutput):
+    """The output for NAME on PIN; INVERT: on is low. It begins with START; SHUTDOWN is for a node that stops.
+
+    See timed_output.py for MAX_DURATION_S.
+    """
+
+    command = "queue_digital_out"
+    value_parameter = "on_ticks"
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        pin: str,
+        invert: bool = False,
+        start: bool = False,
+        shutdown: bool = False,
+        max_duration_s: float = 0.0,
+    ) -> None:
+        super().__init__(name, max_duration_s=max_duration_s)
+        self._pin = pin
+        self._invert = invert
+        self._start, self._shutdown = start, shutdown
+
+    def configure(self, config: NodeConfig) -> None:
+        """Add it to its node's CONFIG; NodeConfigError when firmware or pin do not allow it."""
+        config.require(f"the output of {self.name}", COMMANDS)
+        self.oid = config.create_oid()
+        config.add_config(
+            self.name,
+            f"config_digital_out oid={self.oid} pin={self._pin} value={self._level(self._start)}"
+            f" default_value={self._level(self._shutdown)} max_duration={self._duration_ticks(config)}",
+        )
+
+    def set(self, node: "Node", clock: int, on: bool) -> None:
+        """Switch it at CLOCK (64 bits, ahead of now by the way to the node)."""
+        self._queue(node, clock, self._level(on))
+
+    def set_now(self, node: "Node", on: bool) -> None:
+        """Switch it when the command arrives; not while a value of ``set`` is still to come."""
+        if self.oid is None:
+            raise NodeError(f"the output of {self.name} is not configured on any node")
+        node.send("update_digital_out", oid=self.oid, value=self._level(on))
+
+    def _level(self, on: bool) -> int:
+        return int(on != self._invert)

@@ -1,0 +1,31 @@
+"""Seconds to a node's ticks, bounded as the commands carry them."""
+
+from typing import TYPE_CHECKING, Final
+
+from nodes.node_config import NodeConfig, NodeConfigError
+
+if TYPE_CHECKING:
+    from nodes.node import Node  # planning needs no node, which draws in asyncio
+
+LONGEST_TICKS: Final = (1 << 31) - 1
+"""Clocks further apart than this cannot be told from the past."""
+START_AHEAD_S: Final = 0.5
+"""What begins when a node is ready begins so much later: commands may wait behind others on the bus."""
+
+
+def ticks_for(config: NodeConfig, what: str, seconds: float) -> int:
+    """Return SECONDS in ticks of the node, at least 1; NodeConfigError when its clock cannot count that."""
+    ticks = max(1, round(seconds * config.dictionary.clock_freq_hz))
+    if ticks > LONGEST_TICKS:
+        longest_s = LONGEST_TICKS / config.dictionary.clock_freq_hz
+        raise NodeConfigError(
+            f"{what} on node {config.name}: {seconds:g} s is longer than the {longest_s:.0f} s its clock can "
+            "count; choose a shorter time"
+        )
+    return ticks
+
+
+def start_clock(node: "Node") -> int:
+    """Return a clock (64 bits) for what begins on a NODE that has just become ready."""
+    estimate = node.clock.estimate()
+    return estimate.at_ticks + round(START_AHEAD_S * estimate.freq_hz)
