@@ -101,6 +101,7 @@ class SingleMove:
             s for s in machine.description.steppers if self.along(s) != 0
         ]
         """Those it moves."""
+        machine.modules.before_motion()
         now = self.print_time_now()
         self.begin_s = now + START_LEAD_S
         self.end_s = self.begin_s + ramp.duration_s

@@ -234,6 +234,8 @@ class Streamer:
         self._begin()
 
     def _hand_over(self, cycle: _Cycle) -> None:
+        if cycle.batches:
+            self._machine.modules.before_motion()
         for node, batch in cycle.batches:
             link_of(self._nodes[node]).send_batch(batch)
             if self._witness is not None:

@@ -11,6 +11,7 @@ from coordinator.machine.pins import PinRegistry
 from coordinator.machine.problem import ConfigError, Place
 from coordinator.modules.base import Build, Device, Module, Value
 from coordinator.modules.homing import Homing
+from coordinator.modules.motor_power import MotorPower
 from nodes.node_config import NodeConfig
 from nodes.records import record
 
@@ -60,7 +61,8 @@ class ModuleSet:
         self._commands: dict[str, GCodeCommand] = {}
         self._owners: dict[str, str] = {}
         self._live: Live | None = None
-        self._homing = self._share(Homing)
+        self._homing = self.shared(Homing)
+        self._motors = self.shared(MotorPower)
 
     def build(self, source: ModuleSource) -> Module:
         """Make the module of SOURCE; raises ConfigError."""
@@ -71,6 +73,12 @@ class ModuleSet:
         build.reader.finish()
         self._add(module, build)
         return module
+
+    def shared(self, kind: type[M]) -> M:
+        """Return the one module of KIND that has no section."""
+        found = self._share(kind)
+        assert isinstance(found, kind)
+        return found
 
     def _share(self, kind: type[Module]) -> Module:
         for module in self._modules:
@@ -116,9 +124,7 @@ class ModuleSet:
     @property
     def vocabulary(self) -> Vocabulary:
         """What programs know through them."""
-        homing = self._homing
-        assert isinstance(homing, Homing)
-        return Vocabulary(self._commands, homing.read if homing.acts else None)
+        return Vocabulary(self._commands, self._homing.read if self._homing.acts else None)
 
     @property
     def nodes(self) -> Sequence[str]:
@@ -144,6 +150,10 @@ class ModuleSet:
             await module.connect(live)
         for module in self._modules:
             module.ready()
+
+    def before_motion(self) -> None:
+        """Get ready for steps, which follow no sooner than a start from standstill takes."""
+        self._motors.on()
 
     def stopped(self, cause: str) -> None:
         """Tell all that the machine is stopped."""

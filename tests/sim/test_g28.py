@@ -153,3 +153,18 @@ def test_two_homings_in_one_program(tmp_path: Path) -> None:
     printer.run("G28", "G1 X30 Y200 Z10 F6000", "G28 X", "G1 X12.5", "G28 Z", "G1 Z3")
     for axis, endstop_mm, wanted in (("x", 0, 12.5), ("y", 250, 200), ("z", -0.5, 3)):
         assert printer.true_mm(axis, endstop_mm) == pytest.approx(wanted, abs=1.1 / STEPS_PER_MM[axis]), axis
+
+
+def test_motors_are_switched_on_before_they_move_and_off_by_m84(tmp_path: Path) -> None:
+    text = MACHINE.replace("dir_pin: PB1\n", "dir_pin: PB1\nenable_pin: !PC0\n")
+    printer = Printer(tmp_path, {"x": -20.0, "y": 15.0, "z": -4.0}, machine=text)
+    with pytest.raises(GCodeError, match=r"^part\.gcode:4: X is to move before it is homed"):
+        printer.run("G28", "G1 X30 F6000", "M84", "G1 X31")
+    pins = printer.stage.pins("mcu")
+    edges = printer.stage._boards["mcu"].node.edges()
+    enable = edges[edges["pin"] == pins["PC0"]]
+    steps = edges[edges["pin"] == pins["PB0"]]
+    assert [int(level) for level in enable["level"][-2:]] == [0, 1]
+    on, off = (int(time) for time in enable["true_ps"][-2:])
+    assert on < steps["true_ps"].min()
+    assert off > steps["true_ps"].max()
