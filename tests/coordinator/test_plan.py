@@ -221,7 +221,7 @@ def test_a_machine_without_an_extruder(tmp_path: Path, line: str) -> None:
     sections = (DEMO_MACHINE.parents[1] / "cartesian.cfg").read_text().split("\n[")
     config.write_text("\n[".join(part for part in sections if not part.startswith("extruder")))
     assert plan(tmp_path, "G28\nG1 X10 F6000\n", config=config).moves == 1
-    with pytest.raises(CanductorError, match="square.gcode:2: the move pushes filament, .* no extruder"):
+    with pytest.raises(CanductorError, match=r"square\.gcode:2: the move pushes filament, .* no extruder"):
         plan(tmp_path, f"G28\n{line} F600\n", config=config)
 
 
