@@ -76,7 +76,7 @@ void sim_plant_update(struct sim_board *board) {
 }
 
 void *sim_plant_page(struct sim_board *board, size_t *size) {
-    *size = sizeof(board->plant->page);
+    *size = sizeof(struct plant_page);
     return board->plant ? &board->plant->page : NULL;
 }
 
