@@ -1,8 +1,8 @@
 """Describes the plant of a virtual node: what its pins are connected with, as the node's process reads it.
 
-Parts are named; names are words without blanks of at most 31 characters. Lengths are in mm (of an angle: rad),
-temperatures in °C, powers in W, capacities in J/K, conductances in W/K, resistances in ohm, times in s. The
-text's format and what each part does: docs/plant.md.
+Parts are named; names are words without blanks of at most 31 characters. Lengths are in mm (of an angle:
+rad), temperatures in °C, powers in W, capacities in J/K, conductances in W/K, resistances in ohm, times in s.
+The text's format and what each part does: docs/plant.md.
 """
 
 import dataclasses
@@ -108,7 +108,7 @@ class Heater:
 
 @record(kw_only=True)
 class Fan:
-    """A fan, at full duty with so many turns per minute, which it follows with a lag; perhaps a tachometer."""
+    """A fan, at full duty with RPM turns per minute, which it follows with a lag; perhaps a tachometer."""
 
     name: str
     pin: str

@@ -32,7 +32,9 @@ _STEPPER: Final = np.dtype(
         ("history", _STEP, (_HISTORY,)),
     ]
 )
-_PAGE: Final = np.dtype([("head", _HEADER), ("items", _ITEM, (_ITEMS,)), ("steppers", _STEPPER, (_STEPPERS,))])
+_PAGE: Final = np.dtype(
+    [("head", _HEADER), ("items", _ITEM, (_ITEMS,)), ("steppers", _STEPPER, (_STEPPERS,))]
+)
 
 
 class Kind(IntEnum):
@@ -108,7 +110,9 @@ class PlantPage:
         self._name = name
         self._page = np.frombuffer(buffer, _PAGE, 1)
         if int(self._head["magic"]) != _MAGIC:
-            raise CanductorError(f"{name}: this is no page of a running plant; was its node started with one?")
+            raise CanductorError(
+                f"{name}: this is no page of a running plant; was its node started with one?"
+            )
 
     @classmethod
     def at(cls, folder: Path, node: str) -> Self:
