@@ -56,7 +56,7 @@ class Fault(IntEnum):
     SHORTED = 2
     """A sensor's wires touch."""
     FALLEN = 3
-    """A sensor fell out of its body: it has the temperature of the surroundings, as soon as its lag lets it."""
+    """A sensor fell out of its body: it gets as warm as the surroundings, as fast as its lag lets it."""
     STUCK_ON = 4
     """A heater that is on whatever its pin says."""
     DEAD = 5
@@ -94,9 +94,9 @@ class Item:
     kind: Kind
     fault: Fault
     value: float
-    """Of a body °C; of a heater or a fan its duty, 0 to 1; of a sensor the °C it has; of a switch 1: pressed."""
+    """Of a body °C; of a heater or fan its duty, 0 to 1; of a sensor its own °C; of a switch 1: pressed."""
     extra: float
-    """Of a heater J given in all; of a fan turns; of a sensor what was last sampled; of a switch its changes."""
+    """Of a heater J given in all; of a fan turns; of a sensor its last sample; of a switch its changes."""
 
 
 class PlantPage:
@@ -155,7 +155,7 @@ class PlantPage:
         return tuple(row["name"].decode() for row in self._rows() if row["kind"] == kind)
 
     def set_fault(self, kind: Kind, name: str, fault: Fault) -> None:
-        """Let FAULT be so from now on; SOUND repairs. Raises CanductorError when there is nothing of the kind.
+        """Let FAULT be so from now on; SOUND repairs. Raises CanductorError for what cannot be.
 
         The plant takes it to heart when it is worked out next.
         """

@@ -1,4 +1,4 @@
-"""The plant of a simulated board (firmware/boards/sim): started, connected with those of other boards, read."""
+"""The plant of a simulated board (firmware/boards/sim): started, connected with others, read."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,7 +17,9 @@ class SimPlant:
         self.board = board
         text, error = plant.text().encode(), ffi.new("char[]", lib.SIM_ERROR)
         if lib.sim_plant_start(board, text, len(text), error):
-            raise CanductorError(f"the plant of node {plant.node}: {ffi.string(error).decode()}")
+            said = ffi.string(error)
+            assert isinstance(said, bytes)
+            raise CanductorError(f"the plant of node {plant.node}: {said.decode()}")
         size = ffi.new("size_t *")
         page = lib.sim_plant_page(board, size)
         self._page = PlantPage(f"the plant of node {plant.node}", ffi.buffer(page, size[0]))
