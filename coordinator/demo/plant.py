@@ -181,7 +181,7 @@ def _stops(rail: RailDescription, at: float, beyond: float) -> tuple[float, floa
 
 
 def _axis_terms(description: MachineDescription, rail: RailDescription) -> tuple[Term, ...]:
-    """Return how the place of RAIL's axis follows from steppers that are sums of axes; empty: not from those."""
+    """Return how the place of RAIL's axis follows from steppers that are sums of axes; empty: it does not."""
     motors = _motors(description)
     weights = np.array([motor.weights[:3] for motor in motors]).reshape(-1, 3)
     axis = np.zeros(3)

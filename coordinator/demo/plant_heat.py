@@ -105,7 +105,7 @@ def machine_heat(description: MachineDescription, settings: HeatSettings) -> dic
 
 
 def steinhart(*points: tuple[float, float], pullup: float = PULLUP_OHM) -> Curve:
-    """Return the thermistor through three points (°C, ohm); where none goes, that by Beta of the outer two."""
+    """Return the thermistor through three points (°C, ohm); where none goes, by Beta of the outer two."""
     (t1, r1), (t2, r2), (t3, r3) = sorted(points)
     y1, y2, y3 = (1 / (t + ZERO_C) for t in (t1, t2, t3))
     l1, l2, l3 = (math.log(r) for r in (r1, r2, r3))
