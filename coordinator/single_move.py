@@ -19,10 +19,10 @@ from coordinator.motion.trapezoid_array import TRAPEZOID
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-START_LEAD_S: Final = 0.25
+START_LEAD_S: Final = 0.3
 """From now to the first step: time to arm what has to stop it, and for the steps to reach the nodes."""
-SEND_AHEAD_S: Final = 0.25
-"""Steps are made so far ahead of now: late enough that little has to be dropped."""
+SEND_AHEAD_S: Final = 0.6
+"""Steps are made so far ahead of now: a busy host may pause that long, and what is left over is dropped."""
 CYCLE_S: Final = 0.05
 SETTLE_S: Final = 0.05
 """After the last step is due, before it is believed to be done."""

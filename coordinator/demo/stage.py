@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from coordinator.commands import DemoOptions
+from coordinator.demo.plant import PlantSettings, machine_plants, start_point
 from coordinator.machine.description import (
     CanConnection,
     MachineDescription,
@@ -26,13 +27,15 @@ RATES_PPM = (-20.0, 60.0, -110.0, 35.0)
 ROLLOVER_AFTER_S = (1000.0, 20.0, 10.0, 35.0)
 """When the nodes' 32-bit clocks roll over: offsets that make some do it during the demo."""
 JITTER_US = 40
+START_MM = 8.0
+"""How far from where homing leaves it the head begins."""
 
 
 class Stage:
     """Virtual hardware for DESCRIPTION; a context manager that leaves no process behind.
 
     Every bus of the configuration becomes a virtual one in FOLDER, or the SocketCAN interface that the
-    options name for it; every UART becomes a pseudo-terminal.
+    options name for it; every UART becomes a pseudo-terminal. The nodes' pins are connected with a plant.
     """
 
     def __init__(self, description: MachineDescription, options: DemoOptions, folder: Path) -> None:
@@ -44,6 +47,9 @@ class Stage:
         self.processes: dict[str, NodeProcess] = {}
         self._stack = ExitStack()
         self._described = description
+        self._plants = machine_plants(
+            description, PlantSettings(seed=options.seed, start=start_point(description, START_MM))
+        )
         self.description = dataclasses.replace(
             description, nodes=tuple(self._virtual(node) for node in description.nodes)
         )
@@ -138,6 +144,7 @@ class Stage:
             % 2**47,
             jitter_us=JITTER_US,
             seed=self._options.seed + index,
+            plant=self._plants[node.name].write(self._folder),
             edge_log=None if self._options.serve is not None else self.edge_log_path(node.name),
         )
 

@@ -142,6 +142,10 @@ class PinRegistry:
             self._check_shared(claimed, share, user, other_share)
         return claimed
 
+    def claimed(self, node: str) -> list[str]:
+        """Return the names of NODE's pins that are in use."""
+        return [name for other, name in self._users if other == node]
+
     def check_unclaimed(self, options: Iterable[RawOption], section: str) -> None:
         """Raise ConfigError when a section that does not act yet names a pin that is not to be shared.
 
