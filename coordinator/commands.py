@@ -53,6 +53,8 @@ class ServeOptions:
     certificate: Path | None = None
     private_key: Path | None = None
     plain_on_loopback: bool = False
+    announce: bool | None = None
+    """Announce the machine on the network; None: if its TCP port can be reached from there."""
 
 
 @record(kw_only=True)

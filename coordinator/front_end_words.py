@@ -44,7 +44,9 @@ def declare(command: argparse.ArgumentParser, name: str) -> None:
         add("--no-start", action="store_true", help="only send it")
     elif name == "completion":
         add("shell", choices=SHELLS, help="for which shell")
-    if name != "completion":
+    elif name == "discover":
+        add("--timeout", default="3", metavar="S", help="for machines to answer; 3 if not given")
+    if name not in ("completion", "discover"):
         add("--at", metavar="ADDRESS", help="socket, tcp://HOST:PORT or tls://HOST:PORT")
         add("--token-file", type=Path, metavar="FILE", help="file that holds the token, for TCP")
         add("--certificate", type=Path, metavar="PEM", help="certificate that the server must have")
@@ -120,6 +122,11 @@ def _estop(given: argparse.Namespace) -> Callable[[], Report]:
     return lambda: _run("estop", target)
 
 
+def _discover(given: argparse.Namespace) -> Callable[[], Report]:
+    timeout_s = number("--timeout", given.timeout, 0.1, 60, "s")
+    return lambda: _run("discover", timeout_s)
+
+
 def _completion(given: argparse.Namespace) -> Callable[[], Report]:
     return lambda: _run("completion", given.shell)
 
@@ -131,4 +138,5 @@ _MAKERS: Final = {
     "send": _send,
     "estop": _estop,
     "completion": _completion,
+    "discover": _discover,
 }

@@ -5,8 +5,9 @@ One object owns it. All of it runs on the control loop; clients' methods only ch
 
 import asyncio
 import contextlib
+import secrets
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Final
@@ -54,6 +55,8 @@ class ServiceSettings:
     """The folder of files that may be printed; None: there are no jobs."""
     node_commands: bool = False
     """Whether ``node.command`` may send raw commands."""
+    id: str = field(default_factory=lambda: secrets.token_hex(8))
+    """Of this life of the service: tells whether two addresses lead to the same one."""
 
 
 class MachineService:
