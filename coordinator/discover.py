@@ -101,9 +101,9 @@ def _table(machines: Sequence[Found]) -> list[str]:
 async def find_machines(timeout_s: float) -> Discovered:
     """Return the machines that answer within TIMEOUT_S."""
     paths = host_sockets()[:SOCKETS_MAX]
-    (announced, skipped, problem), *asked = await asyncio.gather(
-        _browse(timeout_s), *(_ask(path, timeout_s) for path in paths)
-    )
+    asking = asyncio.gather(*(_ask(path, timeout_s) for path in paths))
+    announced, skipped, problem = await _browse(timeout_s)
+    asked = await asking
     found = [machine for machine in asked if machine is not None]
     silent = [path for path, machine in zip(paths, asked, strict=True) if machine is None]
     own = {str(place.address) for place in places()}
@@ -154,7 +154,7 @@ async def _ask(path: Path, timeout_s: float) -> Found | None:
         async with asyncio.timeout(timeout_s):
             async with Client.connect(str(path), scope=Scope.WATCH, timeout_s=timeout_s) as client:
                 info: dict[str, Any] = await client.call("machine.info")
-                api = 0 if client.hello is None else client.hello.version
+                api = 0 if client.hello is None else int(client.hello.version)
                 return Found(
                     name=_word(info["name"]),
                     state=_word(info["state"]),

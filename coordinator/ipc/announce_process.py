@@ -3,8 +3,8 @@
 A process of its own: whatever strangers send to the port of multicast DNS costs the coordinator nothing, and
 when that dies of anything at all, its end of standard input closes and the network is told good-bye.
 
-Lines of JSON. In: first the machine (name, host, version, state, api, tls, id) with ``bound``, the addresses
-of its sockets, and ``port``; then ``{"state": …}``. Out: ``{"announced": …}`` or ``{"failed": …}``, sentences.
+Lines of JSON. In: first the machine (name, host, version, state, api, tls, id, port) with ``bound``, the
+addresses of its sockets; then ``{"state": …}``. Out: ``{"announced": …}`` or ``{"failed": …}``, sentences.
 """
 
 import asyncio

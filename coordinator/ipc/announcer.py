@@ -1,4 +1,4 @@
-"""The coordinator's side of announcing its machine: starts the process that does it, and tells it the state."""
+"""The coordinator's side of announcing its machine: starts the process that does it, tells it the state."""
 
 import asyncio
 import contextlib
