@@ -44,7 +44,7 @@ class Browser:
         return sum(1 for machine in self._told.values() if machine is None) + len(self._beyond)
 
     async def change(self) -> None:
-        """Wait for ``machines`` to be others than when this was last waited for."""
+        """Wait for ``machines`` or ``skipped`` to be others than when this was last waited for."""
         await self._changed.wait()
         self._changed.clear()
 
@@ -74,8 +74,11 @@ class Browser:
         if name not in self._told and len(self._told) >= INSTANCES_MAX:
             if len(self._beyond) < INSTANCES_MAX:
                 self._beyond.add(name)
+                self._changed.set()
             return
-        self._told.setdefault(name, None)
+        if name not in self._told:
+            self._told[name] = None
+            self._changed.set()
         self._stale.add(name)
         if name not in self._asking:
             self._asking[name] = asyncio.ensure_future(self._ask(name))
@@ -85,8 +88,8 @@ class Browser:
             task.cancel()
         self._stale.discard(name)
         self._beyond.discard(name)
-        if self._told.pop(name, None) is not None:
-            self._changed.set()
+        self._told.pop(name, None)
+        self._changed.set()
 
     async def _ask(self, name: str) -> None:
         """Learn what the instance NAME says, and again whatever it says meanwhile."""

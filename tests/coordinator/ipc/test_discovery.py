@@ -26,6 +26,7 @@ from coordinator.ipc.discovery import INSTANCES_MAX, Browser
 from coordinator.ipc.multicast import Place, reached_at, spoken_on
 from tests.coordinator.ipc.served import Served, serving
 
+EVERYWHERE = "0.0.0.0"  # noqa: S104 (the word, not a socket)
 LIMIT_S = 60.0
 """Patience for a busy machine; it takes a twentieth of it."""
 
@@ -112,7 +113,8 @@ def test_a_bad_word_makes_it_no_machine(key: bytes, value: bytes | None) -> None
 def test_without_port_or_address_it_is_no_machine() -> None:
     one = machine("mini")
     txt = {key.encode(): value.encode() for key, value in one.txt().items()}
-    for port, addresses in ((0, ["10.0.0.7"]), (None, ["10.0.0.7"]), (65536, ["10.0.0.7"]), (1, ["0.0.0.0"])):
+    good = ["10.0.0.7"]
+    for port, addresses in ((0, good), (None, good), (65536, good), (1, [EVERYWHERE])):
         assert Announcement.read(txt, port, addresses) is None
     useless = ["fe80::1%eth0", "fe80::1", "224.0.0.251", "::", "nonsense", "", "fd00::2%eth0"]
     assert usable_addresses(useless) == ()
@@ -139,9 +141,9 @@ HERE = tuple(
     [
         (["127.0.0.1"], ["127.0.0.1"], ["127.0.0.1", "::1"]),
         (["::1"], ["::1"], ["127.0.0.1", "::1"]),
-        (["0.0.0.0"], ["10.0.0.2", "10.0.1.2"], ["10.0.0.2", "10.0.1.2", "fd00::2"]),
+        ([EVERYWHERE], ["10.0.0.2", "10.0.1.2"], ["10.0.0.2", "10.0.1.2", "fd00::2"]),
         (["::"], ["fd00::2"], ["10.0.0.2", "fd00::2"]),
-        (["0.0.0.0", "::"], ["10.0.0.2", "10.0.1.2", "fd00::2"], ["10.0.0.2", "10.0.1.2", "fd00::2"]),
+        ([EVERYWHERE, "::"], ["10.0.0.2", "10.0.1.2", "fd00::2"], ["10.0.0.2", "10.0.1.2", "fd00::2"]),
         (["10.0.1.2"], ["10.0.1.2"], ["10.0.1.2"]),
         (["192.168.7.7"], [], []),
     ],
@@ -205,37 +207,39 @@ def test_nonsense_is_skipped_and_counted() -> None:
         ({}, ["127.0.0.1"]),
         (txt | {"name": "x" * 200, "more": "y" * 200}, ["127.0.0.1"]),
         (txt | {"state": b"\x00\xff\x1b[2J"}, ["127.0.0.1"]),
-        (txt, ["0.0.0.0"]),
+        (txt, [EVERYWHERE]),
     ]
 
     async def body() -> None:
         strangers = AsyncZeroconf(interfaces=["127.0.0.1"])
         try:
-            registering = [
-                await strangers.async_register_service(
-                    ServiceInfo(
-                        SERVICE_TYPE,
-                        f"stranger-{number}-{one.id}.{SERVICE_TYPE}",
-                        port=9,
-                        properties=properties,
-                        parsed_addresses=addresses,
-                        server=f"stranger-{number}-{one.id}.local.",
-                    )
+            infos = [
+                ServiceInfo(
+                    SERVICE_TYPE,
+                    f"stranger-{number}-{one.id}.{SERVICE_TYPE}",
+                    port=9,
+                    properties=properties,
+                    parsed_addresses=addresses,
+                    server=f"stranger-{number}-{one.id}.local.",
                 )
                 for number, (properties, addresses) in enumerate(nonsense)
             ]
-            await asyncio.gather(*registering)
+            await asyncio.gather(*(_register(strangers, info) for info in infos))
             async with Browser() as browser, announced(one):
                 _send_noise()
                 await until(browser, one)
                 while browser.skipped < len(nonsense):
-                    await asyncio.sleep(0.02)
+                    await browser.change()
                 assert all("stranger" not in seen.name for seen in browser.machines)
         finally:
             await strangers.async_unregister_all_services()
             await strangers.async_close()
 
     run(body)
+
+
+async def _register(mdns: AsyncZeroconf, info: ServiceInfo) -> None:
+    await (await mdns.async_register_service(info))
 
 
 def _send_noise() -> None:
@@ -367,7 +371,7 @@ async def main():
     told = asyncio.Queue()
     machine = Announcement(name="m", host="h", version="1", state="ready", api=1, tls=False, id="0" * 16,
                            port=7125, addresses=())
-    announcer = Announcer(machine, ["0.0.0.0"], told.put_nowait)
+    announcer = Announcer(machine, [EVERYWHERE], told.put_nowait)
     announcer.start()
     print(await told.get())
     announcer.state("printing")
