@@ -371,7 +371,7 @@ async def main():
     told = asyncio.Queue()
     machine = Announcement(name="m", host="h", version="1", state="ready", api=1, tls=False, id="0" * 16,
                            port=7125, addresses=())
-    announcer = Announcer(machine, [EVERYWHERE], told.put_nowait)
+    announcer = Announcer(machine, ["0.0.0.0"], told.put_nowait)
     announcer.start()
     print(await told.get())
     announcer.state("printing")

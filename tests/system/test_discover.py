@@ -1,0 +1,121 @@
+"""Two coordinators in processes of their own, found on the loopback, seen to stop and to go."""
+
+import asyncio
+import json
+import signal
+import socket
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+
+from coordinator.ipc.discovery import Browser
+from tests.system.stage import Command, Hardware, canductor
+
+if TYPE_CHECKING:
+    from coordinator.ipc.announcement import Announcement
+
+LIMIT_S = 90.0
+TOKEN = "a-token-for-tests-that-is-long-enough"  # noqa: S105 (of this test)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+        assert isinstance(port, int)
+        return port
+
+
+def secrets_of(folder: Path) -> tuple[Path, Path]:
+    """Return the file of tokens for the server, and that of one for a client."""
+    tokens, token = folder / "tokens", folder / "token"
+    tokens.write_text(f"operate me {TOKEN}\n", encoding="utf-8")
+    tokens.chmod(0o600)
+    token.write_text(TOKEN, encoding="utf-8")
+    return tokens, token
+
+
+def found_by_command(*names: str) -> Mapping[str, Any]:
+    """Return what ``canductor discover`` tells, by name, once it tells of all NAMES and their TCP ports."""
+    until_s = time.monotonic() + LIMIT_S
+    while time.monotonic() < until_s:  # a busy machine may answer late
+        ended = canductor("discover", "--timeout", "1", "--json")
+        assert ended.status == 0, ended.stderr
+        machines = {each["name"]: each for each in ended.json["machines"]}
+        if all(len(machines.get(name, {"at": ()})["at"]) == 2 for name in names):
+            return machines
+    raise AssertionError(f"{names} were not found, but {machines}")
+
+
+def test_two_coordinators(machine: Hardware, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    tokens, token = secrets_of(tmp_path)
+
+    def words(name: str, *config: str | Path) -> tuple[str | Path, ...]:
+        at = f"127.0.0.1:{free_port()}"
+        return (
+            *config,
+            "--name",
+            name,
+            "--tcp",
+            at,
+            "--tokens",
+            tokens,
+            "--no-tls-on-loopback",
+            "--announce",
+        )
+
+    async def go(real: Command, demo: Command) -> None:
+        seen: dict[str, Announcement] = {}
+
+        async def until(browser: Browser, **states: str | None) -> None:
+            while True:
+                seen.clear()
+                seen.update({each.name: each for each in browser.machines if each.name in states})
+                told = {name: seen[name].state if name in seen else None for name in states}
+                if told == states:
+                    return
+                await browser.change()
+
+        async with asyncio.timeout(LIMIT_S), Browser() as browser:
+            await until(browser, found_real="ready", found_demo="ready")
+            machines = await asyncio.to_thread(found_by_command, "found_real", "found_demo")
+            for name in ("found_real", "found_demo"):
+                assert (machines[name]["state"], machines[name]["here"]) == ("ready", True)
+                assert machines[name]["at"] == [f"{tmp_path}/canductor/{name}.sock", *seen[name].at]
+            at = machines["found_real"]["at"][1]
+            ended = await asyncio.to_thread(canductor, "estop", "--at", at, "--token-file", token)
+            assert ended.status == 0, ended.stderr
+            await until(browser, found_real="shutdown", found_demo="ready")
+            demo.signal(signal.SIGTERM)
+            await until(browser, found_real="shutdown", found_demo=None)
+            real.signal(signal.SIGKILL)
+            await until(browser, found_real=None, found_demo=None)
+
+    with (
+        Command("run", *words("found_real", machine.config)) as real,
+        Command("demo", *words("found_demo", "--serve")) as demo,
+    ):
+        asyncio.run(go(real, demo))
+        assert demo.end().status == 0
+        real.end()
+    left = tmp_path / "canductor" / "found_real.sock"
+    assert str(left) in json.loads(canductor("discover", "--timeout", "1", "--json").stdout)["silent_sockets"]
+
+
+def test_nothing_is_announced_unless_it_can_be_reached(machine: Hardware, tmp_path: Path) -> None:
+    ended = canductor("run", machine.config, "--ipc", tmp_path / "s", "--announce")
+    assert "--announce needs --tcp" in ended.sentence(2)
+    tokens, _ = secrets_of(tmp_path)
+    words = ("--tcp", f"127.0.0.1:{free_port()}", "--tokens", tokens, "--no-tls-on-loopback")
+    with Command("run", machine.config, "--ipc", tmp_path / "s", *words) as command:
+        command.stdout.wait_for("ready")
+        command.signal(signal.SIGTERM)
+        ended = command.end()
+    assert ended.status == 0
+    assert "announced as" not in ended.stdout
+    assert not ended.stderr
