@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-
 from coordinator.ipc.discovery import Browser
 from tests.system.stage import Command, Hardware, canductor
 
