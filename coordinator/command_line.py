@@ -20,7 +20,7 @@ from coordinator.commands import (
     SimulateOptions,
     find_machine,
 )
-from coordinator.network_words import declare_network, read_announce
+from coordinator.network_words import declare_network, read_announce, read_metrics
 from nodes.option_values import UsageError, assignments, existing_file, share, whole
 
 Job = Callable[[], Report]
@@ -256,7 +256,7 @@ def _declare_run(command: argparse.ArgumentParser) -> None:
 
 def _run(given: argparse.Namespace) -> Job:
     existing_file(given.config)
-    asked = given.ipc is not None or given.tcp is not None
+    asked = any(word is not None for word in (given.ipc, given.tcp, given.metrics))
     if asked and given.gcode is not None:
         raise UsageError("--gcode prints a file and ends; leave it out to serve front ends")
     serves = asked or (given.gcode is None and sys.stdin is not None and sys.stdin.isatty())
@@ -304,6 +304,8 @@ def _serving(given: argparse.Namespace, config: Path, announce: bool | None = No
         private_key=existing_file(given.tls_key),
         plain_on_loopback=given.no_tls_on_loopback,
         announce=read_announce(given, announce),
+        metrics=read_metrics(given),
+        metrics_open=given.metrics_open,
     )
 
 

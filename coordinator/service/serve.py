@@ -6,14 +6,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from coordinator.command_line import version
 from coordinator.commands import RunOptions, ServeOptions
 from coordinator.host import LinuxHost
 from coordinator.interrupts import run_to_end
-from coordinator.ipc.announcement import Announcement, host_word
+from coordinator.ipc.announcement import Announcement, bracketed, host_word
 from coordinator.ipc.announcer import Announcer
-from coordinator.ipc.methods import Registry
+from coordinator.ipc.methods import Registry, Value
 from coordinator.ipc.server import IpcServer
 from coordinator.ipc.session_methods import API_VERSION
 from coordinator.ipc.settings import IpcSettings, TcpSettings
@@ -26,6 +27,9 @@ from coordinator.service.methods import add_methods
 from coordinator.service.typed import Typed
 from nodes.dictionary_cache import DictionaryCache
 from nodes.host_sockets import socket_folder
+
+if TYPE_CHECKING:
+    from coordinator.metrics.server import MetricsServer
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +109,7 @@ class _Hall:
         self._server = IpcServer(registry, tree, _ipc_settings(self._options, self.path))
         await self._server.start()
         _say(f"serving at {self.path}")
+        metrics = await self._open_metrics(tree)
         self._announcer = self._announce(service)
         typed = Typed(service, _say) if sys.stdin is not None and sys.stdin.isatty() else None
         try:
@@ -116,7 +121,30 @@ class _Hall:
             self.cut_off = service.cut_off
             if self._announcer is not None:
                 await self._announcer.close()
+            if metrics is not None:
+                await metrics.close()
             await self._server.close()
+
+    async def _open_metrics(self, tree: StateTree) -> "MetricsServer | None":
+        """Open the endpoint for Prometheus if asked for; raises CanductorError with the server closed."""
+        if self._options.metrics is None:
+            return None
+        from coordinator.metrics.server import MetricsServer, MetricsSettings  # noqa: PLC0415 (if needed)
+
+        def fields() -> dict[str, Value]:
+            figures = {f"api.{name}": value for name, value in self._server.figures().items()}
+            return tree.snapshot().values | figures
+
+        host, port = self._options.metrics
+        about = {"name": self._options.name, "version": version(), "api": str(API_VERSION)}
+        metrics = MetricsServer(fields, about, MetricsSettings(host, port, open=self._options.metrics_open))
+        try:
+            await metrics.start()
+        except BaseException:
+            await self._server.close()
+            raise
+        _say(f"metrics are at http://{bracketed(host)}:{metrics.port}/metrics")
+        return metrics
 
     def _announce(self, service: MachineService) -> Announcer | None:
         """Have the network told of the machine, if it is to be."""
