@@ -1,5 +1,6 @@
 """From a snapshot of the state tree to what Prometheus reads; sans-IO, in any thread."""
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
@@ -114,8 +115,20 @@ def _number(metric: Metric, fields: Fields) -> Iterator[Sample]:
     value = fields.get(metric.field)
     if metric.field == "waits_for":
         yield [], float(value is not None)
-    elif isinstance(value, (bool, int, float)):
-        yield [], value * metric.scale
+    elif (figure := _figure(value, metric)) is not None:
+        yield [], figure
+
+
+def _figure(value: Value, metric: Metric) -> float | None:
+    """Return VALUE in base units; None when it is no figure that Prometheus would take."""
+    if not isinstance(value, (bool, int, float)):
+        return None
+    try:
+        figure = float(value) * metric.scale
+    except OverflowError:
+        return None
+    sound = math.isfinite(figure) and (figure >= 0 or metric.kind is not Kind.COUNTER)
+    return figure if sound else None
 
 
 def _state(metric: Metric, fields: Fields) -> Iterator[Sample]:
@@ -131,16 +144,16 @@ def _state(metric: Metric, fields: Fields) -> Iterator[Sample]:
 def _by_key(metric: Metric, fields: Fields) -> Iterator[Sample]:
     if metric.field == "load":
         for name, share in fields.items():
-            if name.startswith("load_") and name != "load_total" and isinstance(share, (int, float)):
-                yield [name.removeprefix("load_")], share
+            figure = _figure(share, metric)
+            if name.startswith("load_") and name != "load_total" and figure is not None:
+                yield [name.removeprefix("load_")], figure
         return
     value = fields.get(metric.field)
     if isinstance(value, str):
         value = dict.fromkeys(value.lower(), 1)
     if isinstance(value, Mapping):
-        for key, figure in list(value.items())[:ENTITIES_MAX]:
-            if isinstance(figure, (int, float)):
-                yield [_label(key)], figure * metric.scale
+        figures = {_label(key): _figure(part, metric) for key, part in list(value.items())[:ENTITIES_MAX]}
+        yield from (([key], figure) for key, figure in figures.items() if figure is not None)
 
 
 def _info(metric: Metric, fields: Fields) -> Iterator[Sample]:
@@ -167,7 +180,7 @@ def lead_buckets(histogram: Value) -> list[tuple[str, float]]:
     """Return cumulative buckets, in s, of counts by lead: late, < 1 ms, < 2 ms, < 4 ms, …, the rest."""
     if not isinstance(histogram, list) or len(histogram) < 2:
         return []
-    counts = [count for count in histogram if isinstance(count, int)]
+    counts = [count for count in histogram if isinstance(count, int) and 0 <= count < 2**63]
     if len(counts) != len(histogram):
         return []
     edges = ["0.0", *(str(2**k * 1e-3) for k in range(len(counts) - 2)), "+Inf"]

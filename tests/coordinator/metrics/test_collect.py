@@ -62,10 +62,10 @@ FIELDS: dict[str, Value] = {
 
 def read(fields: dict[str, Value]) -> Samples:
     """Write FIELDS and read them back; both forms must say the same."""
-    text = generate_latest(registry_of(fields)).decode()  # type: ignore[no-untyped-call]
-    other = generate_openmetrics(registry_of(fields), version="1.0.0").decode()
-    samples = _samples(list(text_string_to_metric_families(text)))  # type: ignore[no-untyped-call]
-    assert samples == _samples(list(parse_openmetrics(other)))
+    text = generate_latest(registry_of(fields)).decode()
+    other = generate_openmetrics(registry_of(fields), version="1.0.0").decode()  # type: ignore[no-untyped-call]
+    samples = _samples(list(text_string_to_metric_families(text)))
+    assert samples == _samples(list(parse_openmetrics(other)))  # type: ignore[no-untyped-call]
     return samples
 
 
