@@ -66,6 +66,8 @@ class Announcement:
                 return None
             words[key] = word
         usable = usable_addresses(addresses)
+        if words["tls"] == "0":  # no machine has such a port beyond its loopback: a token would be read there
+            usable = tuple(address for address in usable if ip_address(address).is_loopback)
         if port is None or not 0 < port < 65536 or not usable:
             return None
         return cls(

@@ -2,8 +2,10 @@
 
 import asyncio
 import json
+import shutil
 import signal
 import socket
+import subprocess
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coordinator.ipc.discovery import Browser
-from tests.system.stage import Command, Hardware, canductor
+from tests.coordinator.ipc.test_discovery import need_own_networks
+from tests.system.stage import CANDUCTOR, ROOT, Command, Hardware, canductor
 
 if TYPE_CHECKING:
     from coordinator.ipc.announcement import Announcement
@@ -104,6 +107,27 @@ def test_two_coordinators(machine: Hardware, tmp_path: Path, monkeypatch: pytest
         real.end()
     left = tmp_path / "canductor" / "found_real.sock"
     assert str(left) in json.loads(canductor("discover", "--timeout", "1", "--json").stdout)["silent_sockets"]
+
+
+def test_a_port_for_others_is_announced_without_being_asked(machine: Hardware, tmp_path: Path) -> None:
+    if (openssl := shutil.which("openssl")) is None:
+        pytest.skip("openssl is not installed, which makes the certificate for this test")
+    need_own_networks()
+    pem, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    how = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -subj /CN=x"
+    subprocess.run([openssl, *how.split(), "-out", pem, "-keyout", key], check=True, capture_output=True)
+    tokens, _ = secrets_of(tmp_path)
+    words = [*CANDUCTOR, "run", machine.config, "--ipc", tmp_path / "s", "--tcp", "0.0.0.0:7125"]
+    words += ["--tokens", tokens, "--tls-certificate", pem, "--tls-key", key]
+    command = subprocess.Popen(["unshare", "-rn", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    try:
+        assert command.stdout is not None
+        said = next((line for line in command.stdout if "to announce" in line), "")
+    finally:
+        command.terminate()
+        command.communicate(timeout=LIMIT_S)
+    assert said == "there is no network to announce the machine on; it will be when there is\n"
+    assert command.returncode == 0
 
 
 def test_nothing_is_announced_unless_it_can_be_reached(machine: Hardware, tmp_path: Path) -> None:

@@ -113,9 +113,13 @@ def test_a_bad_word_makes_it_no_machine(key: bytes, value: bytes | None) -> None
 def test_without_port_or_address_it_is_no_machine() -> None:
     one = machine("mini")
     txt = {key.encode(): value.encode() for key, value in one.txt().items()}
-    good = ["10.0.0.7"]
+    good = ["127.0.0.1"]
+    assert Announcement.read(txt, 1, good) is not None
     for port, addresses in ((0, good), (None, good), (65536, good), (1, [EVERYWHERE])):
         assert Announcement.read(txt, port, addresses) is None
+    there = Announcement.read(txt, 1, ["10.0.0.7", "127.0.0.1"])
+    assert there is not None
+    assert there.at == ("tcp://127.0.0.1:1",)  # nobody is told to send a token in the clear
     useless = ["fe80::1%eth0", "fe80::1", "224.0.0.251", "::", "nonsense", "", "fd00::2%eth0"]
     assert usable_addresses(useless) == ()
     assert len(usable_addresses(f"10.0.0.{n}" for n in range(100))) == ADDRESSES_MAX
@@ -322,12 +326,17 @@ def test_sockets_and_announcements_in_one_table(tmp_path: Any, monkeypatch: pyte
 # ------------------------------------------------------------------------- computers with other networks
 
 
-def on_other_networks(code: str) -> str:
-    """Run CODE where there is only a loopback that is down; return what it prints."""
+def need_own_networks() -> None:
+    """Skip the test where nobody may make networks of his own, without any interface that is up."""
     if shutil.which("unshare") is None:
         pytest.skip("unshare is not installed: it makes a computer without networks")
     if subprocess.run(["unshare", "-rn", "true"], check=False, capture_output=True).returncode:
         pytest.skip("this system lets nobody make networks of his own (unshare -rn)")
+
+
+def on_other_networks(code: str) -> str:
+    """Run CODE where there is only a loopback that is down; return what it prints."""
+    need_own_networks()
     ended = subprocess.run(
         ["unshare", "-rn", sys.executable, "-c", code],
         capture_output=True,
