@@ -117,7 +117,15 @@ def test_a_port_for_others_is_announced_without_being_asked(machine: Hardware, t
     how = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -subj /CN=x"
     subprocess.run([openssl, *how.split(), "-out", pem, "-keyout", key], check=True, capture_output=True)
     tokens, _ = secrets_of(tmp_path)
-    words = [*CANDUCTOR, "run", machine.config, "--ipc", tmp_path / "s", "--tcp", "0.0.0.0:7125"]
+    words: list[str | Path] = [
+        *CANDUCTOR,
+        "run",
+        machine.config,
+        "--ipc",
+        tmp_path / "s",
+        "--tcp",
+        "0.0.0.0:7125",
+    ]
     words += ["--tokens", tokens, "--tls-certificate", pem, "--tls-key", key]
     command = subprocess.Popen(["unshare", "-rn", *words], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     try:
