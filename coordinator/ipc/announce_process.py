@@ -3,8 +3,8 @@
 A process of its own: whatever strangers send to the port of multicast DNS costs the coordinator nothing, and
 when that dies of anything at all, its end of standard input closes and the network is told good-bye.
 
-Lines of JSON. In: first the machine (name, host, version, state, api, tls, id, port) with ``bound``, the
-addresses of its sockets; then ``{"state": …}``. Out: ``{"announced": …}`` or ``{"failed": …}``, sentences.
+Lines of JSON. In: first the machine (all of Announcement but ``addresses``) with ``bound``, the addresses of
+its sockets; then ``{"state": …, "change": …}``. Out: ``{"announced": …}`` or ``{"failed": …}``, sentences.
 """
 
 import asyncio
@@ -42,9 +42,9 @@ class Announcing:
         self._woken = asyncio.Event()
         self._said = ""
 
-    def state(self, state: str) -> None:
+    def state(self, state: str, change: int) -> None:
         """Have STATE announced; states that follow fast are merged."""
-        self._machine = dataclasses.replace(self._machine, state=state)
+        self._machine = dataclasses.replace(self._machine, state=state, change=change)
         self._woken.set()
 
     async def run(self) -> None:
@@ -148,7 +148,7 @@ async def _main() -> None:
     running = asyncio.ensure_future(announcing.run())
     running.add_done_callback(_end_with)
     async for line in lines:
-        announcing.state(line["state"])
+        announcing.state(line["state"], line["change"])
     running.remove_done_callback(_end_with)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)

@@ -1,7 +1,7 @@
 """What a machine says of itself on the network: one DNS-SD service of type ``_canductor._tcp``.
 
-The TXT record has ``name``, ``host``, ``version``, ``state``, ``api``, ``tls`` and ``id``. Everybody on the
-network can say anything, so reading is total: an announcement, or None.
+docs/ipc.md tells what its TXT record has. Everybody on the network can say anything, so reading is total: an
+announcement, or None.
 """
 
 import re
@@ -21,6 +21,7 @@ _WORDS: Final = {
     "api": re.compile(r"[1-9][0-9]{0,2}"),
     "tls": re.compile(r"[01]"),
     "id": re.compile(r"[0-9a-f]{16}"),
+    "change": re.compile(r"[0-9]{1,12}"),
 }
 
 
@@ -41,6 +42,8 @@ class Announcement:
     port: int
     addresses: tuple[str, ...]
     """IP addresses, IPv4 first."""
+    change: int = 0
+    """Rises with each change: some keep an old record for seconds, and miss a state that comes back to it."""
 
     def txt(self) -> dict[str, str]:
         """Return the TXT record."""
@@ -52,6 +55,7 @@ class Announcement:
             "api": str(self.api),
             "tls": "1" if self.tls else "0",
             "id": self.id,
+            "change": str(self.change),
         }
 
     @classmethod
@@ -78,6 +82,7 @@ class Announcement:
             api=int(words["api"]),
             tls=words["tls"] == "1",
             id=words["id"],
+            change=int(words["change"]),
             port=port,
             addresses=usable,
         )

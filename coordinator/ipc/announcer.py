@@ -42,7 +42,7 @@ class Announcer:
 
     def state(self, state: str) -> None:
         """Have STATE announced."""
-        self._machine = dataclasses.replace(self._machine, state=state)
+        self._machine = dataclasses.replace(self._machine, state=state, change=self._machine.change + 1)
         self._news.set()
 
     async def close(self) -> None:
@@ -92,7 +92,7 @@ class Announcer:
                 await process.stdin.drain()
                 await self._news.wait()
                 self._news.clear()
-                line = {"state": self._machine.state}
+                line = {"state": self._machine.state, "change": self._machine.change}
 
     async def _hear_it(self, process: asyncio.subprocess.Process) -> None:
         assert process.stdout is not None

@@ -136,17 +136,3 @@ def test_a_port_for_others_is_announced_without_being_asked(machine: Hardware, t
         command.communicate(timeout=LIMIT_S)
     assert said == "there is no network to announce the machine on; it will be when there is\n"
     assert command.returncode == 0
-
-
-def test_nothing_is_announced_unless_it_can_be_reached(machine: Hardware, tmp_path: Path) -> None:
-    ended = canductor("run", machine.config, "--ipc", tmp_path / "s", "--announce")
-    assert "--announce needs --tcp" in ended.sentence(2)
-    tokens, _ = secrets_of(tmp_path)
-    words = ("--tcp", f"127.0.0.1:{free_port()}", "--tokens", tokens, "--no-tls-on-loopback")
-    with Command("run", machine.config, "--ipc", tmp_path / "s", *words) as command:
-        command.stdout.wait_for("ready")
-        command.signal(signal.SIGTERM)
-        ended = command.end()
-    assert ended.status == 0
-    assert "announced as" not in ended.stdout
-    assert not ended.stderr

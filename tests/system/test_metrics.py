@@ -12,8 +12,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from coordinator.ipc.client import Client
 from coordinator.metrics.catalog import GROUPS, NOT_SHOWN, Kind, Metric, full_name
 from coordinator.service.figures import field_name
-from tests.system.stage import SQUARE, Command, Hardware, canductor
-from tests.system.test_discover import free_port
+from tests.system.stage import SQUARE, Command, Hardware
+from tests.system.test_discover import free_port, secrets_of
 
 LIMIT_S = 60.0
 Samples = dict[str, dict[frozenset[tuple[str, str]], float]]
@@ -91,13 +91,17 @@ def test_the_figures_are_those_of_the_state(machine: Hardware, tmp_path: Path) -
         assert samples["canductor_api_clients"] == {frozenset(): 1.0}
         assert samples["canductor_api_requests_total"][frozenset()] >= 2
 
-    with Command("run", machine.config, "--ipc", path, "--jobs", jobs, "--metrics", str(port)) as command:
+    tokens, _ = secrets_of(tmp_path)
+    quiet = ("--tcp", f"127.0.0.1:{free_port()}", "--tokens", tokens, "--no-tls-on-loopback")
+    words = ("run", machine.config, "--ipc", path, "--jobs", jobs, "--metrics", str(port), *quiet)
+    with Command(*words) as command:
         command.stdout.wait_for(f"metrics are at http://127.0.0.1:{port}/metrics")
         command.stdout.wait_for("ready")
         asyncio.run(go())
         command.signal(signal.SIGTERM)
         ended = command.end()
     assert (ended.status, ended.stderr) == (0, "")
+    assert "announced as" not in ended.stdout  # nobody else could reach the port
 
 
 def compare(state: dict[str, Any], samples: Samples) -> tuple[int, dict[str, Any]]:
@@ -137,11 +141,3 @@ def forgotten(state: dict[str, Any]) -> set[str]:
         for prefix, field in left
         if field not in labels and not (prefix == "buses" and field.startswith("load_"))
     }
-
-
-def test_words_that_make_no_endpoint(machine: Hardware, tmp_path: Path) -> None:
-    run = ("run", machine.config, "--ipc", tmp_path / "sock")
-    for word in ("http", "0", "65536", "printer.example:9177", "[::1]", "1.2.3:5", "127.0.0.1:-1"):
-        assert "must be a port, or an IP address and one" in canductor(*run, "--metrics", word).sentence(2)
-    assert "needs --metrics-open" in canductor(*run, "--metrics", "0.0.0.0:9177").sentence(2)
-    assert "goes with --metrics" in canductor(*run, "--metrics-open").sentence(2)

@@ -14,7 +14,7 @@ from ipaddress import ip_address
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from zeroconf import ServiceInfo
 from zeroconf.asyncio import AsyncZeroconf
@@ -69,7 +69,7 @@ async def announced(*machines: Announcement) -> AsyncIterator[list[Announcer]]:
 async def until(browser: Browser, *wanted: Announcement) -> None:
     """Wait until BROWSER sees exactly those of WANTED, and none of the same ids that are others."""
     ids = {each.id for each in wanted}
-    while {each for each in browser.machines if each.id in ids} != set(wanted):
+    while {dataclasses.replace(each, change=0) for each in browser.machines if each.id in ids} != set(wanted):
         await browser.change()
 
 
@@ -99,6 +99,7 @@ def test_what_is_written_is_read() -> None:
         (b"api", b"9" * 250),
         (b"tls", b"yes"),
         (b"id", b"0123"),
+        (b"change", b"-1"),
     ],
 )
 def test_a_bad_word_makes_it_no_machine(key: bytes, value: bytes | None) -> None:
@@ -125,6 +126,7 @@ def test_without_port_or_address_it_is_no_machine() -> None:
     assert len(usable_addresses(f"10.0.0.{n}" for n in range(100))) == ADDRESSES_MAX
 
 
+@settings(max_examples=50, deadline=None)
 @given(
     st.dictionaries(st.sampled_from(sorted(machine("m").txt())), st.none() | st.binary(max_size=300)),
     st.none() | st.integers(),
@@ -163,7 +165,8 @@ def test_it_is_announced_where_its_sockets_are_reached(
 # ------------------------------------------------------------------------------------- on the loopback
 
 
-def test_machines_come_change_and_go() -> None:
+def test_machines_come_change_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("coordinator.ipc.announcer.RESTART_S", 0.0)
     one, other = machine("same"), machine("same", port=7126)  # of one name, and stay apart
 
     async def body() -> None:
@@ -175,6 +178,10 @@ def test_machines_come_change_and_go() -> None:
             await second.close()
             await until(browser, dataclasses.replace(one, state="shutdown"))
             assert all(seen.id != other.id for seen in browser.machines)
+            assert first.process is not None
+            first.process.kill()  # and is begun again, with the state of now
+            first.state("startup")
+            await until(browser, one)
 
     run(body)
 
@@ -243,7 +250,7 @@ def test_nonsense_is_skipped_and_counted() -> None:
 
 
 async def _register(mdns: AsyncZeroconf, info: ServiceInfo) -> None:
-    await (await mdns.async_register_service(info))
+    await (await mdns.async_register_service(info, cooperating_responders=True))
 
 
 def _send_noise() -> None:

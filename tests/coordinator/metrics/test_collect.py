@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from prometheus_client import Metric as Family
 from prometheus_client import generate_latest
@@ -119,6 +119,7 @@ def test_of_a_machine_that_has_not_started_there_is_little() -> None:
     assert {name for name, _ in read({})} == {"canductor_machine_waiting", "canductor_metrics_left_out"}
 
 
+@settings(max_examples=50, deadline=None)
 @given(
     st.dictionaries(
         st.sampled_from(
