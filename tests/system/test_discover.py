@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import shutil
 import signal
 import socket
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from coordinator.ipc.announcement import Announcement
 
 LIMIT_S = 90.0
+REAL, DEMO = f"real_{os.getpid()}", f"demo_{os.getpid()}"
+"""Others may test on this loopback at the same time."""
 TOKEN = "a-token-for-tests-that-is-long-enough"  # noqa: S105 (of this test)
 
 
@@ -74,7 +77,7 @@ def test_two_coordinators(machine: Hardware, tmp_path: Path, monkeypatch: pytest
     async def go(real: Command, demo: Command) -> None:
         seen: dict[str, Announcement] = {}
 
-        async def until(browser: Browser, **states: str | None) -> None:
+        async def until(browser: Browser, states: Mapping[str, str | None]) -> None:
             while True:
                 seen.clear()
                 seen.update({each.name: each for each in browser.machines if each.name in states})
@@ -84,28 +87,28 @@ def test_two_coordinators(machine: Hardware, tmp_path: Path, monkeypatch: pytest
                 await browser.change()
 
         async with asyncio.timeout(LIMIT_S), Browser() as browser:
-            await until(browser, found_real="ready", found_demo="ready")
-            machines = await asyncio.to_thread(found_by_command, "found_real", "found_demo")
-            for name in ("found_real", "found_demo"):
+            await until(browser, {REAL: "ready", DEMO: "ready"})
+            machines = await asyncio.to_thread(found_by_command, REAL, DEMO)
+            for name in (REAL, DEMO):
                 assert (machines[name]["state"], machines[name]["here"]) == ("ready", True)
                 assert machines[name]["at"] == [f"{tmp_path}/canductor/{name}.sock", *seen[name].at]
-            at = machines["found_real"]["at"][1]
+            at = machines[REAL]["at"][1]
             ended = await asyncio.to_thread(canductor, "estop", "--at", at, "--token-file", token)
             assert ended.status == 0, ended.stderr
-            await until(browser, found_real="shutdown", found_demo="ready")
+            await until(browser, {REAL: "shutdown", DEMO: "ready"})
             demo.signal(signal.SIGTERM)
-            await until(browser, found_real="shutdown", found_demo=None)
+            await until(browser, {REAL: "shutdown", DEMO: None})
             real.signal(signal.SIGKILL)
-            await until(browser, found_real=None, found_demo=None)
+            await until(browser, {REAL: None, DEMO: None})
 
     with (
-        Command("run", *words("found_real", machine.config)) as real,
-        Command("demo", *words("found_demo", "--serve")) as demo,
+        Command("run", *words(REAL, machine.config)) as real,
+        Command("demo", *words(DEMO, "--serve")) as demo,
     ):
         asyncio.run(go(real, demo))
         assert demo.end().status == 0
         real.end()
-    left = tmp_path / "canductor" / "found_real.sock"
+    left = tmp_path / "canductor" / f"{REAL}.sock"
     assert str(left) in json.loads(canductor("discover", "--timeout", "1", "--json").stdout)["silent_sockets"]
 
 
