@@ -1,4 +1,4 @@
-"""MT on the wire: the words of a transmission and how transports carry them; firmware/objects/mt.h explains it.
+"""MT on the wire: the words of a transmission, and how transports carry them. See firmware/objects/mt.h.
 
 A word is an integer of 32 bits, here 0..2^32-1; the values of a table are signed.
 """
@@ -21,8 +21,8 @@ COMMAND_MASK: Final = 0xF0000000
 AXLES: Final = range(1, 29)
 """The bits of a mask; the command's own begin above them."""
 VALUES: Final = range(-(1 << 28), 1 << 28)
-"""What a sender sends. None of it looks like a command, ESC or LIT to a receiver that lost its place, and none
-gets lost in a register that shows changes only."""
+"""What a sender sends. None of it looks like a command, ESC or LIT to a receiver that lost its place, and
+none gets lost in a register that shows changes only."""
 PAIRS_MAX: Final = DATA_MASK
 MT_CAN_ID: Final = 0x3F2
 WORD_BYTES: Final = 4

@@ -38,8 +38,8 @@ class PacedWords:
 class PacedFrames:
     """CAN frames within a budget of bits: those behind have to wait, so that motion does not.
 
-    COSTS[i] is what frame i costs in bits; BITS_PER_S what the frames may have of the bus. Up to BURST_BITS are
-    sent at once after a pause.
+    COSTS[i] is what frame i costs in bits; BITS_PER_S what the frames may have of the bus. Up to BURST_BITS
+    are sent at once after a pause.
     """
 
     def __init__(self, costs: Iterable[int], bits_per_s: float, burst_bits: int, now_ns: int) -> None:
