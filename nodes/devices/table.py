@@ -68,7 +68,8 @@ class ActiveTable:
 class AxleTable:
     """The table for AXLE (1..28) with room for CAPACITY pairs; in use or not, while STEPPER stands.
 
-    NAME is what messages call it, such as "axis x forward". Raises NodeConfigError for a bad axle or capacity.
+    NAME is what messages call it, such as "axis x forward". NodeConfigError for an axle or capacity that
+    cannot be.
     """
 
     def __init__(self, name: str, axle: int, capacity: int, stepper: "Stepper | None" = None) -> None:
@@ -85,14 +86,15 @@ class AxleTable:
         self._stepper = stepper
 
     def configure(self, config: NodeConfig) -> None:
-        """Add it to its node's CONFIG, after its stepper; NodeConfigError when the firmware keeps no tables."""
+        """Add it to its node's CONFIG, after its stepper; NodeConfigError when firmware keeps no tables."""
         config.require(self.name, COMMANDS)
         stepper_oid = _NO_STEPPER if self._stepper is None else self._stepper.oid
         assert stepper_oid is not None
         self.oid = config.create_oid()
         config.add_config(
             self.name,
-            f"config_table oid={self.oid} axle={self.axle} capacity={self.capacity} stepper_oid={stepper_oid}",
+            f"config_table oid={self.oid} axle={self.axle} capacity={self.capacity}"
+            f" stepper_oid={stepper_oid}",
         )
 
     async def state(self, node: "Node") -> TableState:

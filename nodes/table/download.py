@@ -22,7 +22,7 @@ LINK_TRIES: Final = 2
 BUS_SHARE: Final = 0.2
 """Of a CAN bus, for broadcasts; nodes on it go on moving meanwhile."""
 BURST_FRAMES: Final = 8
-"""What a board takes in its interrupt between two rounds of its tasks, and an interface's queue beside motion."""
+"""What an interface's queue takes beside motion."""
 LINK_BYTES: Final = 48
 """Of the stream in one command: twelve words."""
 LINK_WINDOW_WORDS: Final = 2048
@@ -61,14 +61,19 @@ class Outcome:
 
     place: Place
     ok: bool
-    generation: int
-    """Of the table that the node keeps now; 0 when not even that is known."""
+    state: TableState | None
+    """What the node keeps now; None when it does not answer."""
     broadcasts: int
     """How many it took part in."""
     by_link: int
     """How often it was sent through the node's link."""
     problem: str
     """A sentence; empty when it is ok."""
+
+    @property
+    def generation(self) -> int:
+        """Of the table that the node keeps; 0 when that is not known."""
+        return 0 if self.state is None else self.state.generation
 
 
 @record
@@ -109,7 +114,7 @@ class _Aim:
         return self.state
 
     async def judge(self, pairs: Sequence[Pair], before: TableState | None) -> None:
-        """Is the table there, and of a later generation than BEFORE?"""
+        """Find out whether the table is there, of a later generation than BEFORE."""
         state = await self.look()
         if state is None:
             return
@@ -118,8 +123,7 @@ class _Aim:
         self.problem = "" if self.done else _why(self.place, state, fresh=fresh)
 
     def outcome(self) -> Outcome:
-        generation = 0 if self.state is None else self.state.generation
-        return Outcome(self.place, self.done, generation, self.broadcasts, self.by_link, self.problem)
+        return Outcome(self.place, self.done, self.state, self.broadcasts, self.by_link, self.problem)
 
 
 def _why(place: Place, state: TableState, *, fresh: bool) -> str:
@@ -196,7 +200,7 @@ class _Caster:
         self._share = share
 
     async def reach(self, aims: Sequence[_Aim], bus: Bus, tries: int) -> None:
-        """Broadcast on BUS to AIMS, again for those that missed it as long as that serves a node each time."""
+        """Broadcast on BUS to AIMS; again for those that missed it, while that serves a node each time."""
         for _ in range(tries):
             groups = _by_node(aims)
             if not groups:
@@ -243,7 +247,7 @@ class _Caster:
 
 
 async def _by_link(pairs: Sequence[Pair], aims: Sequence[_Aim]) -> None:
-    """Send to AIMS, all of one node, through its link; for those that did not hear the broadcast at all too."""
+    """Send to AIMS, all of one node, through its link."""
     for _ in range(LINK_TRIES):
         left = [aim for aim in aims if not aim.done]
         await _look_all(left)
@@ -281,6 +285,6 @@ async def _stream(pairs: Sequence[Pair], aims: Sequence[_Aim]) -> None:
         heard = now_heard
         if silent_s > STUCK_S:
             raise MtError(
-                f"node {node.name} took {heard} of {len(words)} words of {first.place.table.name} in {STUCK_S:g} s;"
-                " its bus may be too busy: send it again when the machine is idle"
+                f"node {node.name} took {heard} of {len(words)} words of {first.place.table.name} and no more"
+                f" for {STUCK_S:g} s; its bus may be too busy: send it again when the machine is idle"
             )

@@ -91,7 +91,7 @@ def test_a_busy_bus_that_loses_frames(seed: int) -> None:
 
 
 def test_a_long_table_on_a_lossy_bus_goes_through_the_links() -> None:
-    """Hardly any node hears 500 frames in a row when one in 50 is lost: the links repeat only what is lost."""
+    """Hardly any node hears 500 frames when one in 50 is lost: the links repeat only what is lost."""
     machine = TableMachine(4, nodes=3, axles=3, capacity=500)
     table = wavy(500)
 
@@ -156,7 +156,7 @@ def test_a_node_that_restarts_meanwhile_is_named() -> None:
 
 
 def test_other_words_on_the_bus_do_not_pass_for_a_table() -> None:
-    """A second sender in the middle of a broadcast: what is kept is whole, and asked for again until it is."""
+    """A second sender in the middle of a broadcast: what is kept is whole, and sent again until it is."""
     machine = TableMachine(9, nodes=2, axles=2)
     mine = wavy(250, 1)
 
@@ -210,7 +210,7 @@ def test_a_bus_that_ends_is_told_for_each_axle() -> None:
 
 @pytest.mark.parametrize(("axle", "capacity"), [(0, 4), (29, 4), (1, 0), (1, 65536)])
 def test_axles_and_capacities_that_cannot_be(axle: int, capacity: int) -> None:
-    with pytest.raises(NodeConfigError, match="give an axle of 1..28 and 1..65535 points"):
+    with pytest.raises(NodeConfigError, match=r"give an axle of 1\.\.28 and 1\.\.65535 points"):
         AxleTable("x", axle, capacity)
 
 
