@@ -37,11 +37,11 @@ class Checked:
 
     def to_text(self) -> str:
         """Return them for a reader."""
-        f = self.figures
+        f, unit = self.figures, self.figures["unit"]
         lines = [
-            f"axis {f['axis']}: {f['points']} points from {f['first']:g} to {f['last']:g} {f['unit']}",
-            f"  corrections {f['least_correction']:g} to {f['greatest_correction']:g} {f['unit']}, "
-            f"greatest slope {f['greatest_slope']:.3g}, greatest backlash {f['greatest_backlash']:g} {f['unit']}",
+            f"axis {f['axis']}: {f['points']} points from {f['first']:g} to {f['last']:g} {unit}",
+            f"  corrections from {f['least_correction']:g} to {f['greatest_correction']:g} {unit}",
+            f"  greatest slope {f['greatest_slope']:.3g}, backlash up to {f['greatest_backlash']:g} {unit}",
             *(f"  note: {note}" for note in self.notes),
         ]
         if self.output is not None:
@@ -140,7 +140,8 @@ def _answer(result: Any, lines: list[str]) -> Answer:
 
 
 def _side(side: dict[str, Any]) -> str:
-    text = f"{side['stepper']} {side['direction']} on node {side['node']} (axle {side['axle']}): {side['status']}"
+    where = f"{side['stepper']} {side['direction']} on node {side['node']} (axle {side['axle']})"
+    text = f"{where}: {side['status']}"
     if "generation" in side:
         used = "in use" if side["active"] else "not in use yet"
         text += f", generation {side['generation']}, {side['points']} points, {used}"

@@ -37,7 +37,7 @@ static void begin(struct mt_receiver *receiver, uint32_t pairs) {
         return;
     receiver->status = MT_TRANSMITTING;
     receiver->announced = pairs;
-    receiver->values = receiver->sum = 0;
+    receiver->values = receiver->sum = receiver->running_digest = 0;
 }
 
 static void take_command(struct mt_receiver *receiver, uint32_t word) {
@@ -71,6 +71,7 @@ static void store(struct mt_receiver *receiver, uint32_t word) {
         *(receiver->values % 2 ? &pair->y : &pair->x) = (int32_t)word;
     }
     receiver->sum += word;
+    receiver->running_digest = receiver->running_digest * MT_DIGEST_FACTOR + word;
     receiver->values += receiver->values != UINT32_MAX;
 }
 
@@ -95,6 +96,7 @@ static int end(struct mt_receiver *receiver) {
     receiver->table = kept;
     receiver->length = receiver->announced;
     receiver->checksum = receiver->sum;
+    receiver->digest = receiver->running_digest;
     receiver->generation++;
     return 1;
 }

@@ -23,6 +23,8 @@
 // cffi: begin
 enum { MT_AXLE_MIN = 1, MT_AXLE_MAX = 28, MT_WORD_SIZE = 4 };
 
+enum { MT_DIGEST_FACTOR = 0x01000193 };
+
 enum mt_status { MT_OK, MT_TRANSMITTING, MT_CHECKSUM_ERROR, MT_LENGTH_ERROR };
 enum mt_mode { MT_COMMAND, MT_VALUE, MT_LITERAL };
 
@@ -30,14 +32,16 @@ struct mt_pair {
     int32_t x, y;
 };
 
-// One axle's receiver. `table` holds `length` pairs; `generation` and `checksum` are the table's.
+// One axle's receiver. `table` holds `length` pairs; `generation`, `checksum` and `digest` are the table's.
+// The digest is not MT's: begun with 0, each value makes it digest * MT_DIGEST_FACTOR + value. Unlike a sum
+// it tells tables apart that differ in the order of their values.
 struct mt_receiver {
     struct mt_pair *table, *shadow; // of `capacity` pairs each
     uint32_t capacity;
-    uint32_t length, generation, checksum;
+    uint32_t length, generation, checksum, digest;
     uint8_t axle, status, mode;
     uint8_t selected, halves; // halves of the checksum that came since the mask
-    uint32_t announced_checksum, sum;
+    uint32_t announced_checksum, sum, running_digest;
     uint32_t announced; // pairs
     uint32_t values;    // so far; stays at its highest instead of rolling over
 };

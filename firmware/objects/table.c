@@ -30,7 +30,7 @@ DECL_ENUMERATION("table_activation", "replaced", 5);
 DECL_STATIC_STRING(invalid_axle, "Not a valid axle or size of a table");
 
 DECL_RESPONSE(table_state,
-              "table_state oid=%c table_status=%c generation=%u length=%hu checksum=%u words=%u");
+              "table_state oid=%c table_status=%c generation=%u length=%hu checksum=%u digest=%u words=%u");
 DECL_RESPONSE(table_active, "table_active oid=%c table_activation=%c generation=%u length=%hu clock=%u");
 DECL_RESPONSE(table_pair, "table_pair oid=%c index=%hu x=%i y=%i");
 
@@ -152,7 +152,7 @@ void command_table_query(struct node *node, const struct wire_arg *args) {
     uint32_t words = table->words;
     board_irq_restore(node, irq);
     RESPOND(node, table_state, INT(args[0].value), INT(state.status), INT(state.generation),
-            INT(state.length), INT(state.checksum), INT(words));
+            INT(state.length), INT(state.checksum), INT(state.digest), INT(words));
 }
 DECL_COMMAND(command_table_query, "table_query oid=%c", ALLOWED_IN_SHUTDOWN);
 

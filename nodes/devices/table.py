@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 from nodes.node_config import NodeConfig, NodeConfigError
 from nodes.node_errors import NodeError
 from nodes.records import record
-from nodes.table.mt import AXLES, MtStatus, Pair, checksum
+from nodes.table.mt import AXLES, MtStatus, Pair, checksum, digest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,12 +31,14 @@ class TableState:
     """How many tables it has kept since it was configured; 0: none, whatever the status."""
     length: int
     checksum: int
+    digest: int
     words: int
     """How many words of MT it has heard, modulo 2^32."""
 
     def holds(self, pairs: "Sequence[Pair]") -> bool:
         """Tell whether the table kept can only be PAIRS."""
-        return self.generation > 0 and (self.length, self.checksum) == (len(pairs), checksum(pairs))
+        found = (self.length, self.checksum, self.digest)
+        return self.generation > 0 and found == (len(pairs), checksum(pairs), digest(pairs))
 
 
 class Activation(IntEnum):
@@ -108,6 +110,7 @@ class AxleTable:
             answer.integer("generation"),
             answer.integer("length"),
             answer.integer("checksum"),
+            answer.integer("digest"),
             answer.integer("words"),
         )
 

@@ -26,6 +26,7 @@ none gets lost in a register that shows changes only."""
 PAIRS_MAX: Final = DATA_MASK
 MT_CAN_ID: Final = 0x3F2
 WORD_BYTES: Final = 4
+DIGEST_FACTOR: Final = 0x01000193
 CLOSING: Final = (ESC, ESC, C_MASK)
 
 _WORD: Final = 0xFFFFFFFF
@@ -62,6 +63,14 @@ def mask_of(axles: Iterable[int]) -> int:
 def checksum(pairs: Iterable[Pair]) -> int:
     """Return the sum of all values modulo 2^32."""
     return sum(x + y for x, y in pairs) & _WORD
+
+
+def digest(pairs: Iterable[Pair]) -> int:
+    """Return what receivers of ours say besides: another order of the same values is another digest."""
+    total = 0
+    for value in _flat(pairs):
+        total = (total * DIGEST_FACTOR + value) & _WORD
+    return total
 
 
 def transmission(pairs: Sequence[Pair], axles: Iterable[int]) -> list[int]:

@@ -19,6 +19,7 @@ from nodes.table.mt import (
     MtError,
     MtStatus,
     Pair,
+    digest,
 )
 
 _HALF: Final = 0xFFFF
@@ -30,8 +31,8 @@ _SIGN: Final = 1 << 31
 class MtReceiver:
     """The receiver of AXLE (1..28), with room for CAPACITY pairs; raises MtError for another axle.
 
-    ``pairs``, ``checksum`` and ``generation`` are those of the table it keeps; ``status`` is about the last
-    transmission to it.
+    ``pairs``, ``checksum``, ``digest`` and ``generation`` are those of the table it keeps; ``status`` is
+    about the last transmission to it.
     """
 
     def __init__(self, axle: int, capacity: int) -> None:
@@ -42,6 +43,7 @@ class MtReceiver:
         self.status = MtStatus.OK
         self.pairs: tuple[Pair, ...] = ()
         self.checksum = 0
+        self.digest = 0
         self.generation = 0
         self._in_values = self._literal = False
         self._selected = False
@@ -96,6 +98,7 @@ class MtReceiver:
             return False
         self.pairs = tuple(zip(self._shadow[::2], self._shadow[1::2], strict=True))
         self.checksum = self._sum
+        self.digest = digest(self.pairs)
         self.generation = (self.generation + 1) & _WORD
         return True
 

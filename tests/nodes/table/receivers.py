@@ -19,6 +19,8 @@ class Receiver(Protocol):
     def generation(self) -> int: ...
     @property
     def checksum(self) -> int: ...
+    @property
+    def digest(self) -> int: ...
 
     def word(self, word: int) -> bool: ...
 
@@ -47,6 +49,10 @@ class FirmwareReceiver:
     @property
     def checksum(self) -> int:
         return int(self.raw.checksum)
+
+    @property
+    def digest(self) -> int:
+        return int(self.raw.digest)
 
     def word(self, word: int) -> bool:
         return bool(lib.mt_word(self.raw, word))

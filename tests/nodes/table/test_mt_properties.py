@@ -15,6 +15,7 @@ from nodes.table.mt import (
     VALUES,
     MtStatus,
     Pair,
+    digest,
     from_bytes,
     mask_of,
     to_bytes,
@@ -85,6 +86,7 @@ def test_both_of_ours_agree_on_anything(stream: list[int], room: int) -> None:
         assert python.word(word) == firmware.word(word)
         assert (python.status, python.generation) == (firmware.status, firmware.generation)
     assert (python.pairs, python.checksum) == (firmware.pairs, firmware.checksum)
+    assert python.digest == firmware.digest == digest(python.pairs)
 
 
 @given(before=st.lists(words, max_size=60), table=tables, only_changes=st.booleans())

@@ -14,6 +14,7 @@ from nodes.table.mt import (
     MtStatus,
     Pair,
     checksum,
+    digest,
     mask_of,
     transmission,
 )
@@ -244,6 +245,16 @@ def test_a_wrong_value_is_a_checksum_error(ours: Ours) -> None:
     receiver = ours(1, ROOM)
     feed(receiver, raw([1, 2, 3, 4], announced=2, total=11))
     assert (receiver.status, receiver.generation) == (MtStatus.CHECKSUM_ERROR, 0)
+
+
+@ours
+def test_values_in_another_order_have_another_digest(ours: Ours) -> None:
+    receiver = ours(1, ROOM)
+    feed(receiver, transmission(((0, 1), (2, 3)), [1]))
+    before = receiver.checksum, receiver.digest
+    feed(receiver, transmission(((0, 3), (2, 1)), [1]))
+    assert receiver.checksum == before[0]
+    assert receiver.digest == digest(receiver.pairs) != before[1]
 
 
 # ------------------------------------------------------------------------------------------------- length
