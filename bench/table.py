@@ -1,12 +1,13 @@
 """Tables to 14 axes on 6 nodes of a simulated bus: how long it takes, and how well they act together.
 
-The real host, links and firmware under virtual time with true bit timing; times are what a real bus would take.
+The real host, links and firmware under virtual time with true bit timing: times are those of a real bus.
 """
 
 import asyncio
 import sys
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,24 +20,24 @@ from nodes.table.mt import transmission
 from nodes.virtual.world import run
 from tests.nodes.table.machines import TableMachine, wavy
 
+T = TypeVar("T")
+
 FRAME_BITS_MAX = 135
 POLL_DELAY_S = 0.002
 """T of an old drive that polls its register a thousand times a second."""
-CASES = (("idle bus", 0.0, 0.0), ("70 % load", 0.7, 0.0), ("70 % load, 1 % loss", 0.7, 0.01))
+BUSY, LOSS = 0.7, 0.01
+CASES = (("idle bus", 0.0, 0.0), ("70 % load", BUSY, 0.0), ("70 % load, 1 % loss", BUSY, LOSS))
 
 
 def main() -> None:
     """Print all figures."""
-    say(
-        f"28 axles (14 axes, forward and reverse) on 6 nodes at 1 Mbit/s, broadcasts with {BUS_SHARE:.0%} of it"
-    )
+    say(f"28 axles (14 axes, both directions) on 6 nodes, 1 Mbit/s; broadcasts with {BUS_SHARE:.0%} of it")
     for points in (32, 128, 256):
         words = len(transmission(wavy(points), [1]))
         bits = -(-words // 2) * FRAME_BITS_MAX
-        say(
-            f"{points} points: {words} words; at most {bits} bits, {bits / 1e6 / BUS_SHARE * 1e3:.0f} ms at that share;"
-            f" by polled register with T = {POLL_DELAY_S * 1e3:g} ms: {words * POLL_DELAY_S * 1e3:.0f} ms"
-        )
+        bound_ms = bits / 1e6 / BUS_SHARE * 1e3
+        say(f"{points} points: {words} words, at most {bits} bits: {bound_ms:.0f} ms with that share")
+        say(f"  polled register, T = {POLL_DELAY_S * 1e3:g} ms: {words * POLL_DELAY_S * 1e3:.0f} ms")
         for name, load, loss in CASES:
             one_table(points, name, load, loss)
     own_tables(64)
@@ -45,17 +46,17 @@ def main() -> None:
 
 def one_table(points: int, name: str, load: float, loss: float) -> None:
     """One table for all axles."""
-    machine = prepared(1, load, loss, points)
+    machine = TableMachine(1, capacity=points)
 
     async def act() -> list[Report]:
         return [await download(wavy(points), machine.places, now_ns=machine.now_ns)]
 
-    told(f"  {name}: one table for all", performed(machine, act))
+    told(f"  {name}: one table for all", performed(machine, act, load, loss))
 
 
 def own_tables(points: int) -> None:
     """Each axle its own."""
-    machine = prepared(2, 0.7, 0.01, points)
+    machine = TableMachine(2, capacity=points)
 
     async def act() -> list[Report]:
         return [
@@ -63,17 +64,14 @@ def own_tables(points: int) -> None:
             for number, place in enumerate(machine.places)
         ]
 
-    told(f"70 % load, 1 % loss: 28 tables of {points} points, one after the other", performed(machine, act))
+    told(f"70 % load, 1 % loss: 28 tables of {points} points in turn", performed(machine, act, BUSY, LOSS))
 
 
 def skew() -> None:
     """All use their tables from one moment on."""
     machine = TableMachine(3, ppm=30, capacity=32)
-    machine.world.run_for(0.01)
 
     async def act() -> tuple[float, float]:
-        machine.burden(0.7)
-        machine.lose(0.01)
         report = await download(wavy(32), machine.places, now_ns=machine.now_ns)
         await asyncio.sleep(10)
         at_ns = HostTime(machine.now_ns() + 200_000_000)
@@ -92,28 +90,17 @@ def skew() -> None:
             errors.append((place.node.clock_error_s or 0.0) * 1e6)
         return max(moments) - min(moments), max(errors)
 
-    between_us, error_us = performed(machine, act)
-    say(
-        f"activation on 6 nodes, clocks within 30 ppm, 70 % load, 1 % loss: {between_us:.2f} us between first and "
-        f"last; stated clock error {error_us:.2f} us"
-    )
+    between_us, error_us = performed(machine, act, BUSY, LOSS)
+    say("activation on 6 nodes, clocks within 30 ppm, 70 % load, 1 % loss:")
+    say(f"  {between_us:.2f} us between first and last; stated clock error {error_us:.2f} us")
 
 
-def prepared(seed: int, load: float, loss: float, capacity: int) -> TableMachine:
-    """Return a machine on such a bus."""
-    machine = TableMachine(seed, capacity=capacity)
-    machine.faults = (load, loss)
-    return machine
+def performed(machine: TableMachine, act: Callable[[], Awaitable[T]], load: float, loss: float) -> T:
+    """Run ACT on MACHINE's bus, which carries LOAD besides and loses LOSS of its frames."""
 
-
-def performed(machine: TableMachine, act):  # noqa: ANN001, ANN201
-    """Run ACT on MACHINE's bus."""
-
-    async def body():  # noqa: ANN202
+    async def body() -> T:
         await machine.bus.start()
-        load, loss = getattr(machine, "faults", (0.0, 0.0))
-        if load:
-            machine.burden(load)
+        machine.burden(load)
         machine.lose(loss)
         try:
             return await act()
@@ -130,10 +117,8 @@ def told(what: str, reports: Sequence[Report]) -> None:
     broadcasts = max(outcome.broadcasts for outcome in outcomes)
     by_link = sum(outcome.by_link > 0 for outcome in outcomes)
     ok = sum(outcome.ok for outcome in outcomes)
-    say(
-        f"{what}: {ok} of {len(outcomes)} axles ok in {elapsed_ms:.0f} ms, up to {broadcasts} broadcasts each,"
-        f" {by_link} through links"
-    )
+    say(f"{what}: {ok} of {len(outcomes)} axles ok in {elapsed_ms:.0f} ms")
+    say(f"    at most {broadcasts} broadcasts each, {by_link} axles through links")
 
 
 def say(line: str) -> None:

@@ -1,5 +1,7 @@
 """What carries the words: bytes with pauses, a polled register, pace; ours in Python and in C alike."""
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,14 +21,12 @@ class FirmwareBytes:
     """The firmware's stream of bytes."""
 
     def __init__(self) -> None:
-        self.raw = ffi.new("struct mt_bytes *", {"gap": GAP})
+        self.raw: Any = ffi.new("struct mt_bytes *", {"gap": GAP})
 
     def receive(self, data: bytes, now: int) -> list[int]:
-        word, found = ffi.new("uint32_t *"), []
-        for byte in data:
-            if lib.mt_byte(self.raw, byte, now & 0xFFFFFFFF, word):
-                found.append(int(word[0]))
-        return found
+        word: Any = ffi.new("uint32_t *")
+        now32 = now & 0xFFFFFFFF
+        return [int(word[0]) for byte in data if lib.mt_byte(self.raw, byte, now32, word)]
 
 
 @given(bursts, st.integers(0, 1 << 33))
