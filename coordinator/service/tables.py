@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 CARE_S: Final = 0.5
 """How often the nodes are looked at for one that came back, and tables for one that is not in use yet."""
+RETRY_S: Final = 10.0
+"""Until what did not arrive is sent again."""
 ACTIVATE_IN_S: Final = 0.2
 ACTIVATED_S: Final = 0.05
 """After the moment itself, until the nodes are asked."""
@@ -100,7 +102,11 @@ class TableService:
             missing: dict[tuple[Pair, ...], list[Place]] = {}
             for place, pairs in self._wanted(machine, set(axes)):
                 side = self._at.setdefault(place.table, _Side())
-                if await side.look(place) and not side.has(pairs):
+                if not await side.look(place):
+                    continue
+                if side.has(pairs):
+                    side.problem = ""
+                else:
                     missing.setdefault(tuple(pairs), []).append(place)
             for table, places in missing.items():
                 await self._send(table, places, machine)
@@ -111,13 +117,17 @@ class TableService:
             report = await download(pairs, places, now_ns=machine.host.now)
         except CanductorError as error:  # kept from when there was more room
             for place in places:
-                self._at[place.table].problem = str(error)
-            self._say(f"a table was not sent: {error}")
+                self._tell_once(self._at[place.table], str(error))
             return
         for outcome in report.outcomes:
-            self._at[outcome.place.table].took(outcome)
-            if not outcome.ok:
-                self._say(f"a table did not arrive: {outcome.problem}")
+            side = self._at[outcome.place.table]
+            side.took(outcome)
+            self._tell_once(side, outcome.problem)
+
+    def _tell_once(self, side: "_Side", problem: str) -> None:
+        if problem and problem != side.problem:
+            self._say(f"a table did not arrive: {problem}")
+        side.problem = problem
 
     async def put_to_use(self, machine: Machine, stands: Callable[[], bool]) -> None:
         """Have the nodes use what they keep, all at one moment, if the machine STANDS; else it waits."""
@@ -142,20 +152,36 @@ class TableService:
         if not machine.devices.tables:
             return
         ready: set[Node] = set()
+        retry_s = float("-inf")
         while True:
             now = {node for node in machine.nodes.values() if node.state is NodeState.READY}
             fresh, ready = now - ready, now
-            axes = {place.axis for place in machine.devices.tables if machine.nodes[place.node] in fresh}
-            for place in machine.devices.tables:
-                if machine.nodes[place.node] in fresh:
-                    for table in place.sides.values():
-                        self._at.pop(table, None)
-            if axes:
-                await self.bring(machine, axes)
+            self._forget(machine, fresh)
+            now_s = asyncio.get_running_loop().time()
+            behind = self._behind(machine)
+            if behind and (fresh or now_s >= retry_s):
+                await self.bring(machine, behind)
+                retry_s = now_s + RETRY_S
             await self.put_to_use(machine, stands)
             await asyncio.sleep(CARE_S)
 
     # ------------------------------------------------------------------------------------------- inside
+
+    def _forget(self, machine: Machine, nodes: set["Node"]) -> None:
+        """Forget what was known of NODES: they may have lost it."""
+        for place in machine.devices.tables:
+            if machine.nodes[place.node] in nodes:
+                for table in place.sides.values():
+                    self._at.pop(table, None)
+
+    def _behind(self, machine: Machine) -> set[str]:
+        """Return the axes of which not every node is known to keep what it should."""
+        wanted = {stepper.axis: self._wanted(machine, {stepper.axis}) for stepper in machine.devices.tables}
+        return {
+            axis
+            for axis, places in wanted.items()
+            if not all(p.table in self._at and self._at[p.table].has(pairs) for p, pairs in places)
+        }
 
     def _check(self, table: AxisTable, machine: Machine) -> list[str]:
         places = self._of(machine, table.axis)
@@ -243,7 +269,6 @@ class _Side:
         try:
             self._state = await place.table.state(place.node)
             self._active = await place.table.active(place.node)
-            self.problem = ""
         except CanductorError as error:
             self._state, self.problem = None, str(error)
         return self._state is not None
@@ -256,7 +281,6 @@ class _Side:
 
     def took(self, outcome: Outcome) -> None:
         """Take note of a download."""
-        self.problem = outcome.problem
         if outcome.state is not None:
             self._state = outcome.state
 

@@ -157,6 +157,21 @@ def test_nodes_that_lost_them_get_them_again(tmp_path: Path) -> None:
     world.live(first, second)
 
 
+def test_what_a_client_breaks_off_arrives_all_the_same(tmp_path: Path) -> None:
+    """It was accepted: whether its sender is still there makes no difference."""
+
+    async def act(served: Served) -> None:
+        sending = asyncio.ensure_future(served.call("table.send", **TABLE))
+        await served.until(lambda: bool(served.service.tables.tables), "acceptance")
+        await asyncio.sleep(0.002)
+        sending.cancel()
+        await asyncio.gather(sending, return_exceptions=True)
+        assert sending.cancelled()
+        await in_use(served, 1)
+
+    World(tmp_path).live(act)
+
+
 def test_tables_change_only_while_the_machine_stands(tmp_path: Path) -> None:
     async def act(served: Served) -> None:
         await served.call("gcode.run", script="G28\nG1 X20 F6000")
@@ -225,7 +240,9 @@ def test_damaged_and_oversized_tables_do_not_keep_the_machine_from_starting(tmp_
     async def act(served: Served) -> None:
         await served.until(lambda: bool(served.tree.get("tables.x.problem")), "x")
         assert any("y.table.json is no kept table" in line for line in served.lines)
-        assert any("a table was not sent: stepper_x forward has room for 32" in line for line in served.lines)
+        assert any(
+            "a table did not arrive: stepper_x forward has room for 32" in line for line in served.lines
+        )
         assert str(served.service.state) == "ready"
 
     world.live(act)
