@@ -62,7 +62,7 @@ def test_one_broadcast_reaches_28_axles_on_6_nodes() -> None:
     perform(machine, act)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_busy_bus_that_loses_frames(seed: int) -> None:
     """14 axes, each with its own table, forward and reverse; 70 % load, 1 % loss: all arrive."""
     machine = TableMachine(seed, capacity=64)
