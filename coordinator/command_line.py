@@ -40,6 +40,7 @@ FRONT_END_COMMANDS = {
     "send": "Send a file to a machine that runs, and print it.",
     "estop": "Stop a machine that runs, at once.",
     "discover": "List the machines that run here or are announced on the network.",
+    "table": "Check compensation tables of axes, and give them to a machine that runs.",
     "completion": "Write what makes a shell complete the words of canductor.",
 }
 """Commands whose words are read by ``coordinator.front_end_words``."""

@@ -25,6 +25,7 @@ from coordinator.service.log_ring import Entry
 from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
 from coordinator.service.typed import Typed
+from coordinator.table.store import table_folder
 from nodes.dictionary_cache import DictionaryCache
 from nodes.host_sockets import socket_folder
 
@@ -93,7 +94,10 @@ class _Hall:
         """Be there for front ends until cancelled."""
         registry, tree = Registry(), StateTree()
         settings = ServiceSettings(
-            name=self._options.name, jobs=self._options.jobs, node_commands=self._options.node_commands
+            name=self._options.name,
+            jobs=self._options.jobs,
+            node_commands=self._options.node_commands,
+            tables=table_folder(self._options.name),
         )
         service = MachineService(
             self._load,
