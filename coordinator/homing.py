@@ -190,6 +190,7 @@ class HomingMove:
         for leg in legs:
             for node, sync in leg.syncs:
                 self._arm_node(move, leg, node, sync)
+        move.stream()  # the steps are on their way, too, before anything is waited for
         for node in {node for leg in legs for node, _ in leg.syncs}:
             await node.link.drained()
         if move.print_time_now() > move.begin_s:

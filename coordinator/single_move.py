@@ -19,7 +19,7 @@ from coordinator.motion.trapezoid_array import TRAPEZOID
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-START_LEAD_S: Final = 0.3
+START_LEAD_S: Final = 0.4
 """From now to the first step: time to arm what has to stop it, and for the steps to reach the nodes."""
 SEND_AHEAD_S: Final = 0.6
 """Steps are made so far ahead of now: a busy host may pause that long, and what is left over is dropped."""

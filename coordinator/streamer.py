@@ -323,7 +323,7 @@ class Streamer:
             speed_factor=planner.speed_factor,
             extrude_factor=planner.extrude_factor,
             stands_from_s=self.pipeline.moved_until + self.steps.lag_s if stands else None,
-            steps_sent=tuple(stepper.issued for stepper in self.steps.stats().steppers),
+            steps_sent=tuple(s.issued + self.began_at.get(s.name, 0) for s in self.steps.stats().steppers),
         )
 
     def _still_waiting(self, event: Event | None, now: float) -> bool:
