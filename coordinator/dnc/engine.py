@@ -86,6 +86,8 @@ class Engine:
         self._deadline_s: float | None = None
         self._held = False
         self._listing = bytearray()
+        self._last_content = b""
+        """Of the block that was taken last."""
         self._last_ack = False
         """The last answer given was ACK: after NAK no end can come."""
 
@@ -360,7 +362,12 @@ class Engine:
         self._wait(State.ETX_SENT, self.options.answer_s)
 
     def _confirmed(self, sign: Sign) -> None:
-        if not self._too_early(sign):
+        if self._too_early(sign):
+            return
+        if sign.at_s - self._left_s > self.options.answer_s / 2:
+            # The control that gives up says the same as the one that has all.
+            self._end(events.Failed("the control ended the transfer late: whether it has the file is not known"))
+        else:
             self._end(events.Sent(confirmed=True))
 
     def _given_up(self, _: Sign) -> None:
@@ -371,6 +378,14 @@ class Engine:
         if self.state is State.HEADER_SENT and self.header is not None and self.header.mode == OUTPUT:
             self._out_of_step(sign)
             return
+        if not self._last_ack and self.lines and sign.content == self._last_content:
+            # NAK may have gone to noise, while the ACK of the line before got lost: then this is that line again.
+            self.fail(
+                f"line {self.lines} came once more after noise on the line: whether the program has it twice"
+                " cannot be told; send the file again"
+            )
+            return
+        self._last_content = sign.content
         self._tries = 0
         self._wait(State.LINE_GIVEN, None)
         self._events.append(

@@ -115,6 +115,8 @@ class Scanner:
         self._block_like = False
         self._unit_ended = False
         """An ETB and a check character have gone by."""
+        self._etx_stands = False
+        """What is junk now followed an ETX."""
         self._ends_with_eot = False
         self._signs: list[Sign] = []
         self.expects_blocks = True
@@ -197,6 +199,9 @@ class Scanner:
             self._emit(Kind.EOT)
         elif self._block_like:
             self._emit(Kind.DAMAGED, reason=reason)
+        elif self._etx_stands:
+            self.noise_bytes += self._junk_bytes
+            self._emit(Kind.ETX)
         else:
             self._emit(Kind.NOISE)
 
@@ -225,7 +230,7 @@ class Scanner:
 
     def _begin(self, character: int) -> None:
         self._reason = ""
-        self._unit_ended = self._ends_with_eot = False
+        self._unit_ended = self._ends_with_eot = self._etx_stands = False
         self._block_like = False
         if character in STARTS:
             self._start = character
@@ -289,7 +294,8 @@ class Scanner:
             self._noise(len(self._data))
             self._begin(character)
         elif not gap or first == ETX:
-            self.noise_bytes += len(self._data)
+            self._etx_stands = gap  # after a pause, what begins no block is noise behind the end
+            self.noise_bytes += not gap
             self._to_junk("does not begin with STX", character)
         else:
             self._noise(len(self._data))
