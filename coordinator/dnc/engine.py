@@ -85,6 +85,8 @@ class Engine:
         self._busy_until_s = now_s
         self._deadline_s: float | None = None
         self._held = False
+        self._maybe_acked = False
+        """There was an ACK in the noise since the block was sent."""
         self._listing = bytearray()
         self._last_content = b""
         """Of the block that was taken last."""
@@ -242,6 +244,7 @@ class Engine:
 
     def _repeat(self) -> None:
         self._tries += 1
+        self._maybe_acked = False
         self._say(self._sent)
         # The tolerance is for two clocks that differ; an answer before DC1 is one.
         block_s = (len(self._sent) - self.options.dc1) * self.options.character_time_s
@@ -302,6 +305,7 @@ class Engine:
         for sign in signs:
             if sign.kind not in _QUIET and not self.options.paced:
                 self._busy_until_s = min(self._busy_until_s, self._now_s)  # a fast line: it has left
+            self._maybe_acked = self._maybe_acked or (sign.kind is Kind.NOISE and bool(sign.content))
             act = self._ACTS.get((self.state, sign.kind))
             if act is not None:
                 act(self, sign)
@@ -331,6 +335,9 @@ class Engine:
         what = {State.HEADER_SENT: "the header", State.ERROR_SENT: "the error"}.get(
             self.state, f"line {self.lines + 1}"
         )
+        if self._maybe_acked and self.state is State.BLOCK_SENT:
+            self.fail(f"{what} was refused, but noise before may have been its ACK; send the file again")
+            return
         if self._tries >= self.options.transmissions:
             self.fail(f"{what} was refused {self._tries} times; check baud rate, parity and the cable")
             return
@@ -366,7 +373,9 @@ class Engine:
             return
         if sign.at_s - self._left_s > self.options.answer_s / 2:
             # The control that gives up says the same as the one that has all.
-            self._end(events.Failed("the control ended the transfer late: whether it has the file is not known"))
+            self._end(
+                events.Failed("the control ended the transfer late: whether it has the file is not known")
+            )
         else:
             self._end(events.Sent(confirmed=True))
 

@@ -64,6 +64,7 @@ class Kind(Enum):
     CONFLICT = auto()
     """NAK and another answer to one block: one of them is noise."""
     NOISE = auto()
+    """What means nothing; CONTENT is an ACK if one was in it."""
 
 
 _SIMPLE: Final = {ACK: Kind.ACK, NAK: Kind.NAK, ETX: Kind.ETX, EOT: Kind.EOT}
@@ -108,6 +109,7 @@ class Scanner:
         self._dc1_seen = False
         self._reason = ""
         self._junk_bytes = 0
+        self._holds_ack = False
         self._awaits_check = False
         """The next character of what is damaged follows an ETB."""
         self._pause_s = 0.0
@@ -338,6 +340,7 @@ class Scanner:
             self._begin(character)
             return
         self._junk_bytes += 1
+        self._holds_ack = self._holds_ack or character == ACK
         if self._awaits_check:
             self._unit_ended = True
             self._awaits_check = False
@@ -365,6 +368,7 @@ class Scanner:
     def _to_junk(self, reason: str, character: int) -> None:
         if self._state is not _State.JUNK:
             self._junk_bytes = 0
+            self._holds_ack = self._state is _State.SIMPLE and self._data[0] == ACK
             self._reason = reason
         self._junk_bytes += 1
         self._awaits_check = character == ETB
@@ -377,5 +381,6 @@ class Scanner:
 
     def _emit(self, kind: Kind, content: bytes = b"", check: int = 0, reason: str = "") -> None:
         if kind is Kind.NOISE:
+            content = bytes((ACK,)) if self._holds_ack else b""
             self._noise(self._junk_bytes)
         self._signs.append(Sign(kind, self._last_s, content, check, reason))

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from coordinator.dnc import events
-from coordinator.dnc.blocks import ETX, SOH, STX, Header
+from coordinator.dnc.blocks import ACK, ETX, NAK, SOH, STX, Header
 from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.options import DncOptions
 
-ANSWERS = (0x04, 0x06, 0x15)
 LIMIT_S = 100_000.0
 
 
@@ -29,7 +28,8 @@ class Faults:
     delay_s: float = 0.0
     """An adapter's delay, at most."""
     visible: bool = True
-    """No damage that cancels out in the block check, and no lone ETX as noise: no receiver can see those."""
+    """No damage that nobody can see: such that cancels out in the block check; a lone character of noise that is
+    by chance an ETX, or an ACK or NAK in place of an answer that got lost."""
 
 
 class End(Protocol):
@@ -52,6 +52,8 @@ class Wire:
     def __init__(self, faults: Faults, options: DncOptions, chance: random.Random) -> None:
         self.faults, self.options, self.chance = faults, options, chance
         self.busy_until_s = 0.0
+        self.lost_answer = False
+        """The last answer did not arrive as it was sent."""
         self.damage = 0
         """XOR of what was changed since the block began."""
         self.log: list[tuple[float, str]] = []
@@ -67,6 +69,7 @@ class Wire:
             got = None if lost_answer else self._carry(character)
             if got is not None:
                 arrived.append((at_s, got))
+        self.lost_answer = len(data) == 1 and bytes(c for _, c in arrived) != data
         self.busy_until_s = at_s
         self.log.append((now_s, f"{data!r} -> {bytes(c for _, c in arrived)!r}"))
         return self._in_chunks(arrived)
@@ -78,7 +81,7 @@ class Wire:
         data = self.chance.randbytes(self.chance.choice((1, 1, 2, 3, 8)))
         if self.options.frame.data_bits == 7:
             data = bytes(c & 0x7F if c < 0x80 else 0 for c in data)
-        if self.faults.visible and data == bytes((ETX,)):
+        if self.faults.visible and (data == bytes((ETX,)) or (self.lost_answer and data[0] in (ACK, NAK))):
             return []
         time_s = self.options.character_time_s
         self.busy_until_s = now_s + len(data) * time_s
@@ -174,6 +177,7 @@ class Line:
     chance: random.Random
     now_s: float = 0.0
     _due: list[tuple[float, int, int, bytes | None]] = field(default_factory=list)
+    _last_s: list[float] = field(default_factory=lambda: [0.0, 0.0])
     _number: "itertools.count[int]" = field(default_factory=itertools.count)
 
     def run(self, until_s: float = LIMIT_S) -> None:
@@ -210,13 +214,13 @@ class Line:
             if output := end.take_output():
                 to = 1 - who
                 faults = self.wires[to].faults
-                last_s = 0.0
                 for at_s, data in self.wires[to].send(output, now_s):
-                    last_s = max(last_s, at_s + self.chance.random() * faults.delay_s)
-                    self._push(last_s, to, data)
+                    self._push(at_s + self.chance.random() * faults.delay_s, to, data)
                 if self.chance.random() < faults.noise:
                     pause_s = self.chance.choice((0.0, 0.002, 0.05, 0.5)) * self.chance.random()
                     self._push(self.wires[to].busy_until_s + pause_s, self.chance.randrange(2), None)
 
     def _push(self, at_s: float, to: int, data: bytes | None) -> None:
+        if data is not None:  # nothing overtakes on a wire
+            self._last_s[to] = at_s = max(at_s, self._last_s[to])
         heapq.heappush(self._due, (at_s, next(self._number), to, data))
