@@ -41,6 +41,8 @@ FRONT_END_COMMANDS = {
     "completion": "Write what makes a shell complete the words of canductor.",
 }
 """Commands whose words are read by ``coordinator.front_end_words``."""
+DNC_COMMANDS = {"dnc": "Exchange programs and tables with machine-shop peripherals over a serial line."}
+"""Commands whose words are read by ``coordinator.dnc.command_line``."""
 
 
 class Answered(Exception):  # noqa: N818 (no failure: the words asked for help or the version, and got it)
@@ -69,6 +71,8 @@ def read_words(words: Sequence[str]) -> Job:
         return _tool(words)
     if words[0] in FRONT_END_COMMANDS:
         return _front_end(words)
+    if words[0] in DNC_COMMANDS:
+        return _dnc(words)
     arguments = _parser().parse_args(list(words))
     if arguments.version:
         sys.stdout.write(f"canductor {version()}\n")
@@ -114,6 +118,7 @@ def whole_parser() -> argparse.ArgumentParser:
     can = commands.add_parser("can", allow_abbrev=False, help=_in_list(TOOL_COMMANDS["can"]))
     add_tools(can, all_tools=True)
     declare_tool(commands, "console")
+    _declare_dnc(commands)
     return parser
 
 
@@ -136,6 +141,21 @@ def _declare_front_end(commands: Any, name: str, summary: str) -> None:
     declare(commands.add_parser(name, help=_in_list(summary), description=summary, allow_abbrev=False), name)
 
 
+def _dnc(words: Sequence[str]) -> Job:
+    """Read the words of a transfer over a serial line."""
+    parser = _Parser(prog="canductor", allow_abbrev=False)
+    _declare_dnc(parser.add_subparsers(title="commands", metavar="COMMAND"))
+    arguments = parser.parse_args(list(words))
+    return cast("Job", arguments.make_job(arguments))
+
+
+def _declare_dnc(commands: Any) -> None:
+    from coordinator.dnc.command_line import declare  # noqa: PLC0415 (start-up time)
+
+    summary = DNC_COMMANDS["dnc"]
+    declare(commands.add_parser("dnc", help=_in_list(summary), description=summary, allow_abbrev=False))
+
+
 def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
     """Return the parser; WHOLE: without the commands that others declare."""
     parser = _Parser(
@@ -146,7 +166,7 @@ def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version")
     parser.set_defaults(make_job=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for name, summary in () if whole else (TOOL_COMMANDS | FRONT_END_COMMANDS).items():
+    for name, summary in () if whole else (TOOL_COMMANDS | FRONT_END_COMMANDS | DNC_COMMANDS).items():
         commands.add_parser(name, help=_in_list(summary))
     for name, summary, declare, make_job in (
         ("demo", "print on virtual nodes and compare every stepper with the plan", _declare_demo, _demo),

@@ -73,7 +73,7 @@ class Engine:
         """Of that transfer, acknowledged."""
         self.repeats = 0
         """Blocks sent or asked for again since the engine was made."""
-        self._peripheral = peripheral
+        self.is_peripheral = peripheral
         self._scanner = Scanner(options)
         self._now_s = now_s
         self._output = bytearray()
@@ -198,7 +198,7 @@ class Engine:
         """Say that the line before was the last."""
         assert self.state is State.LINE_WANTED
         self._tries = 1
-        if self._peripheral:
+        if self.is_peripheral:
             self._say_etx()
         else:
             self._say(bytes((ETX, EOT)))
@@ -213,7 +213,7 @@ class Engine:
     def file_kept(self) -> None:
         """Answer ``Ended``: the file is safe."""
         assert self.state is State.END_GIVEN
-        if not self._peripheral:
+        if not self.is_peripheral:
             self._say(bytes((EOT,)))
         self._idle()
 
@@ -416,7 +416,7 @@ class Engine:
                 self._wait(State.RECEIVING, self.options.answer_s)
 
     def _damaged_idle(self, _: Sign) -> None:
-        if self._peripheral:
+        if self.is_peripheral:
             self._say(bytes((NAK,)))
 
     def _ended(self, sign: Sign) -> None:
@@ -430,7 +430,7 @@ class Engine:
         self._events.append(events.Ended())
 
     def _header_came(self, sign: Sign) -> None:
-        if not self._peripheral:
+        if not self.is_peripheral:
             self._error_came(sign)
             return
         header = read_header(sign.content)

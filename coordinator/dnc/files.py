@@ -70,7 +70,7 @@ def check_name(name: str) -> str:
         or _RESERVED.fullmatch(name)
     ):
         raise FileRefused(
-            f"{ascii(name[:NAME_MAX])} is no name for a file: 1 to {NAME_MAX} ASCII characters without"
+            f"{name[:NAME_MAX]!a} is no name for a file: 1 to {NAME_MAX} ASCII characters without"
             ' / \\ : * ? " < > |, not beginning with . or -, and no name that systems reserve',
             "BAD FILE NAME",
         )
@@ -141,7 +141,7 @@ class Folder:
         if found is None:
             found = next((k for k in sorted(known) if k.lower() in {w.lower() for w in wanted}), None)
         if found is None:
-            raise FileRefused(f"there is no file {ascii(name)} in {self.path}", "NO SUCH FILE")
+            raise FileRefused(f"there is no file {name!a} in {self.path}", "NO SUCH FILE")
         try:
             fd = os.open(found, _READ, dir_fd=self._fd)
         except OSError as error:
@@ -265,7 +265,7 @@ def read_lines(content: IO[bytes], line_max: int) -> Iterator[bytes]:
 def check_lines(content: IO[bytes], name: str, line_max: int, data_bits: int) -> int:
     """Return how many lines CONTENT has if all can be sent, and go back to its start; raises BadText."""
     number = 0
-    for number, line in enumerate(read_lines(content, line_max), 1):  # noqa: B007 (it is counted)
+    for number, line in enumerate(read_lines(content, line_max), 1):
         if b"\r" in line or not is_text(line, data_bits):
             odd = next(c for c in line if c < 0x20 or c == 0x7F or (data_bits == 7 and c > 0x7F))
             raise BadText(
