@@ -118,7 +118,7 @@ class Header:
 
 
 def read_header(content: bytes) -> Header | None:
-    """Return the header in CONTENT, or None. One stuffed space goes first, then CR LF, then the mode is read."""
+    """Return the header in CONTENT, or None: one stuffed space goes first, then CR LF, then the mode."""
     bare = content.removesuffix(b" ").removesuffix(CRLF)
     try:
         text = bare.decode("ascii")

@@ -1,4 +1,4 @@
-"""The folder that the other side's files go to and come from: names are checked, files appear whole or not at all."""
+"""The folder that files go to and come from: names are checked, files appear whole or not at all."""
 
 import contextlib
 import errno
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Final
 
-from coordinator.dnc.blocks import CODES, BadText, is_text
+from coordinator.dnc.blocks import BadText, is_text
 from nodes.errors import CanductorError
 from nodes.records import record
 
@@ -79,13 +79,12 @@ def check_name(name: str) -> str:
 
 def stored_name(code: str, name: str) -> str:
     """Return what a file that came as NAME with CODE is called here; raises FileRefused."""
-    return check_name(
-        name if "." in name else name + SUFFIXES.get(code, f".{code.lower()}" if code in CODES else "")
-    )
+    suffix = SUFFIXES.get(code, "")
+    return check_name(name if "." in name else name + suffix)
 
 
 class Folder:
-    """Files below PATH, none in folders of it; links are not followed. Opened once: it stays the same folder."""
+    """Files below PATH, none in folders of it; links are not followed. It is opened once, and stays the same."""
 
     def __init__(
         self,
@@ -237,7 +236,7 @@ class Incoming:
     def _show(self) -> None:
         names = {"src_dir_fd": self._folder_fd, "dst_dir_fd": self._folder_fd}
         if self._folder.overwrite:
-            os.rename(self._partial, self.name, **names)
+            os.rename(self._partial, self.name, **names)  # noqa: PTH104 (in an open folder)
             return
         try:
             os.link(self._partial, self.name, **names, follow_symlinks=False)
@@ -246,13 +245,13 @@ class Incoming:
                 raise
             # No hard links on this disk: an empty file takes the name, or fails to if there is one.
             os.close(os.open(self.name, _CREATE, 0o644, dir_fd=self._folder_fd))
-            os.rename(self._partial, self.name, **names)
+            os.rename(self._partial, self.name, **names)  # noqa: PTH104 (likewise)
             return
         os.unlink(self._partial, dir_fd=self._folder_fd)
 
 
 def read_lines(content: IO[bytes], line_max: int) -> Iterator[bytes]:
-    """Yield lines without LF or CR LF, one at a time whatever the length of CONTENT; raises BadText, OSError."""
+    """Yield lines without LF or CR LF; holds one at a time. Raises BadText, OSError."""
     number = 0
     while line := content.readline(line_max + 3):
         number += 1

@@ -1,7 +1,7 @@
 """The directory as a peripheral tells it: lines of text, without a block check.
 
-Four lines that mean nothing, then on each line six characters that mean nothing, a name, blanks, the sectors it
-takes and whatever follows; at last ``FREE:`` and a number of sectors.
+Four lines that mean nothing; then on each line six characters that mean nothing, a name, blanks, the sectors
+it takes and whatever follows; at last ``FREE:`` and a number of sectors.
 """
 
 from collections.abc import Iterable

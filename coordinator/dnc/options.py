@@ -47,7 +47,7 @@ class DncOptions:
     dc1: bool = True
     """Send DC1 after each check character; received, it may be there or not."""
     avoid_control: bool = False
-    """Send no check character below 20 hex; 
+    """Send no check character below 20 hex;
     a received space for that, after CR LF, is taken off in any case."""
     transmissions: int = TRANSMISSIONS_MAX
     """Of one block, the first included; old controls send 3 times."""

@@ -49,9 +49,7 @@ class Port:
         if self._fd is not None and self._is_tty:
             _mark_parity_errors(self._fd, on=options.frame.parity != "N")
             with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
-                self._port.set_low_latency_mode(
-                    low_latency_settings=True
-                )  # else adapters hold bytes for 16 ms
+                self._port.set_low_latency_mode(low_latency_settings=True)
         if self._fd is not None:
             os.set_blocking(self._fd, False)
         self._closing = threading.Event()
@@ -62,7 +60,7 @@ class Port:
 
     @property
     def is_paced(self) -> bool:
-        """Whether characters leave at the baud rate for certain: not of sockets, pseudo-terminals, USB modems."""
+        """Whether characters leave at the baud rate: not those of sockets, pseudo-terminals, USB modems."""
         if self._fd is None or not self._is_tty:
             return False
         device = os.fstat(self._fd)
@@ -150,11 +148,11 @@ def _descriptor(port: Any) -> int | None:
 
 
 def _mark_parity_errors(fd: int, *, on: bool) -> None:
-    """Have a character of wrong parity come as NUL, which no block holds; pyserial lets it come as if right."""
+    """Have a character of wrong parity come as NUL, which no block holds; pyserial lets it pass as right."""
     settings = termios.tcgetattr(fd)
     mask = termios.INPCK if on else 0
     settings[0] = (settings[0] & ~(termios.INPCK | termios.PARMRK | termios.IGNPAR)) | mask
-    # Not ended, when nothing is there: reads return at once with an error instead.
+    # A read with nothing there fails, then; else it would look like the end.
     settings[6][termios.VMIN] = 1
     settings[6][termios.VTIME] = 0
     termios.tcsetattr(fd, termios.TCSANOW, settings)
@@ -169,4 +167,5 @@ def _cannot_open(name: str, options: DncOptions, error: Exception) -> str:
         return f"there is no serial port {name}; check its plug ('ls /dev/serial/by-id')"
     if code in (11, 16):
         return f"{name} is in use by another program; close that first"
-    return f"{name} cannot be opened at {options.baud} baud {options.frame}: {why.lower()}; check name and settings"
+    settings = f"{options.baud} baud {options.frame}"
+    return f"{name} cannot be opened at {settings}: {why.lower()}; check name and settings"
