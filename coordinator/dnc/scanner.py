@@ -5,7 +5,7 @@ beside the block check, and the stronger one: a 7 that a flipped bit made an ETB
 block's rest then follows without a pause. So each sign counts only when the line is silent behind it:
 
     sign                   silence
-    block, header, ACK     1.5 characters: the next one would be there
+    block, header, ACK     1.5 characters: the next one would be there; behind a block's DC1 none at all
     NAK, EOT               NAK: ``nak_quiet_s``, since to repeat what was taken doubles a line; EOT as a block
     ETX                    ``character_s``: a damaged STX is an ETX, too, and the block's rest follows
     anything damaged       ``character_s``
@@ -183,8 +183,7 @@ class Scanner:
         state, self._state = self._state, _State.IDLE
         match state:
             case _State.DONE if self._good:
-                kind = Kind.HEADER if self._start == SOH else Kind.BLOCK
-                self._emit(kind, content=bytes(self._data[1:-1]), check=self._check)
+                self._end_block()
             case _State.DONE:
                 self._emit(Kind.DAMAGED, reason="did not match its check character")
             case _State.SIMPLE:
@@ -195,6 +194,11 @@ class Scanner:
                 self._noise(len(self._data))
             case _:
                 self._end_unfinished(self._reason)
+
+    def _end_block(self) -> None:
+        self._state = _State.IDLE
+        kind = Kind.HEADER if self._start == SOH else Kind.BLOCK
+        self._emit(kind, content=bytes(self._data[1:-1]), check=self._check)
 
     def _end_unfinished(self, reason: str) -> None:
         if self._ends_with_eot:
@@ -271,7 +275,9 @@ class Scanner:
             self._data.append(character)
 
     def _behind_block(self, character: int, gap: bool) -> None:
-        if character == DC1 and not self._dc1_seen:
+        if character == DC1 and self._good:
+            self._end_block()  # no text holds DC1: this is the end, there is nothing to wait for
+        elif character == DC1 and not self._dc1_seen:
             self._dc1_seen = True
         elif character in STARTS:
             self._restart(character, gap)
