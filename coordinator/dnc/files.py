@@ -80,11 +80,11 @@ def check_name(name: str) -> str:
 def stored_name(code: str, name: str) -> str:
     """Return what a file that came as NAME with CODE is called here; raises FileRefused."""
     suffix = SUFFIXES.get(code, "")
-    return check_name(name if "." in name else name + suffix)
+    return check_name(check_name(name) if "." in name else check_name(name) + suffix)
 
 
 class Folder:
-    """Files below PATH, none in folders of it; links are not followed. It is opened once, and stays the same."""
+    """Files below PATH, none in folders of it; links are not followed. Opened once: it stays the same."""
 
     def __init__(
         self,

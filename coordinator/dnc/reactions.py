@@ -91,7 +91,7 @@ class Reactions(Conversation):
         )
 
     def _too_early(self, sign: Sign) -> bool:
-        """End a transfer in which an answer came before its block can have: it is that of the block before."""
+        """End a transfer in which an answer came before its block can have: it was the one before's."""
         early = self.options.paced and sign.at_s < self._left_s
         if early:
             self.fail("an answer came before its block was sent: one before was noise; nothing is kept")

@@ -110,6 +110,8 @@ class Scanner:
         self._reason = ""
         self._junk_bytes = 0
         self._holds_ack = False
+        self._is_told = False
+        """What is junk now is the rest of what was told as OVERRUN."""
         self._awaits_check = False
         """The next character of what is damaged follows an ETB."""
         self._pause_s = 0.0
@@ -203,7 +205,7 @@ class Scanner:
     def _end_unfinished(self, reason: str) -> None:
         if self._ends_with_eot:
             self._emit(Kind.EOT)
-        elif self._block_like:
+        elif self._block_like and not self._is_told:
             self._emit(Kind.DAMAGED, reason=reason)
         elif self._etx_stands:
             self.noise_bytes += self._junk_bytes
@@ -236,7 +238,7 @@ class Scanner:
 
     def _begin(self, character: int) -> None:
         self._reason = ""
-        self._unit_ended = self._ends_with_eot = self._etx_stands = False
+        self._unit_ended = self._ends_with_eot = self._etx_stands = self._is_told = False
         self._block_like = False
         if character in STARTS:
             self._start = character
@@ -360,8 +362,9 @@ class Scanner:
             self._emit(Kind.NOISE)
             self._begin(character)
         elif self.expects_blocks and (self._unit_ended or (gap and self._block_like)):
-            self._state = _State.IDLE
             self._emit(Kind.OVERRUN)
+            self._to_junk("came before the last was answered", character)
+            self._is_told = True
         elif gap:
             self._emit(Kind.NOISE)
             self._begin(character)

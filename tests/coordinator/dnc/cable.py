@@ -10,6 +10,7 @@ import time
 import tty
 from collections import deque
 from collections.abc import Callable
+from typing import Self
 
 FIFO = 16
 Change = Callable[[int, bytes], bytes]
@@ -33,7 +34,7 @@ class Cable:
         self._thread = threading.Thread(target=self._run, name="cable")
         self._thread.start()
 
-    def __enter__(self) -> "Cable":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from coordinator.dnc import events
-from coordinator.dnc.blocks import ACK, ETX, NAK, SOH, STX, Header
+from coordinator.dnc.blocks import ACK, EOT, ETX, NAK, SOH, STX, Header
 from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.options import DncOptions
 
@@ -28,8 +28,8 @@ class Faults:
     delay_s: float = 0.0
     """An adapter's delay, at most."""
     visible: bool = True
-    """No damage that nobody can see: such that cancels out in the block check; a lone character of noise that is
-    by chance an ETX, or an ACK or NAK in place of an answer that got lost."""
+    """No damage that nobody can see: such that cancels out in the block check; a lone character of noise that
+    is by chance an ETX or EOT, or an ACK or NAK in place of an answer that got lost."""
 
 
 class End(Protocol):
@@ -81,7 +81,9 @@ class Wire:
         data = self.chance.randbytes(self.chance.choice((1, 1, 2, 3, 8)))
         if self.options.frame.data_bits == 7:
             data = bytes(c & 0x7F if c < 0x80 else 0 for c in data)
-        if self.faults.visible and (data == bytes((ETX,)) or (self.lost_answer and data[0] in (ACK, NAK))):
+        if self.faults.visible and (
+            data in (bytes((ETX,)), bytes((EOT,))) or (self.lost_answer and data[0] in (ACK, NAK))
+        ):
             return []
         time_s = self.options.character_time_s
         self.busy_until_s = now_s + len(data) * time_s

@@ -1,9 +1,10 @@
 """Transfers over a line that flips bits, loses characters and answers, and makes noise, in virtual time.
 
-Each ends with the identical file or with a sentence and no file; no line is ever doubled or missing, and whoever
-is told that his file was kept has told the truth.
+Each ends with the identical file or with a sentence and no file; no line is ever doubled or missing, and
+whoever is told that his file was kept is told the truth.
 
-Usage, from the project's root: python -m tests.coordinator.dnc.ordeal [--transfers N] [--seed N] [--any-damage] [--trace]
+Usage, from the project's root: python -m tests.coordinator.dnc.ordeal
+[--transfers N] [--seed N] [--any-damage] [--trace]
 """
 
 import argparse
