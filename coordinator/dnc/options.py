@@ -80,7 +80,7 @@ class DncOptions:
                 raise CanductorError(f"{name} is {value}, must be from {low} to {high}")
         if self.answer_s <= self.character_s or self.answer_s <= self.nak_quiet_s:
             raise CanductorError(
-                f"answer_s is {self.answer_s:g}, must be longer than the silence that ends a block"
+                f"an answer may take {self.answer_s:g} s, must be longer than the silence that ends a block"
                 f" ({self.character_s:g} s) and the wait after NAK ({self.nak_quiet_s:g} s)"
             )
 

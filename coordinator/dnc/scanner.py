@@ -13,6 +13,7 @@ block's rest then follows without a pause. So each sign counts only when the lin
 Sans-IO. Times are seconds of any clock that does not jump. A scanner never raises and holds one block.
 """
 
+import re
 from enum import Enum, auto
 from typing import Final
 
@@ -67,6 +68,7 @@ class Kind(Enum):
     """What means nothing; CONTENT is an ACK if one was in it."""
 
 
+_TEXT: Final = re.compile(rb"[\r\n -\xff]+")
 _SIMPLE: Final = {ACK: Kind.ACK, NAK: Kind.NAK, ETX: Kind.ETX, EOT: Kind.EOT}
 
 
@@ -141,8 +143,15 @@ class Scanner:
         self._pause_s = first_s - self._last_s
         gap = self._pause_s >= self._options.settle_s * 0.99
         self._last_s = max(self._last_s, now_s)
-        for character in data:
-            self._feed(character, gap)
+        at = 0
+        while at < len(data):
+            text = self._text_from(data, at)
+            if text == at:
+                self._feed(data[at], gap)
+                at += 1
+            else:
+                self._data += data[at:text]
+                at = text
             gap, self._pause_s = False, 0.0
         return self._take()
 
@@ -159,6 +168,14 @@ class Scanner:
     def _take(self) -> list[Sign]:
         signs, self._signs = self._signs, []
         return signs
+
+    def _text_from(self, data: bytes, at: int) -> int:
+        """Return where the text ends that goes into the block as it is: most of what comes."""
+        if self._state is not _State.BLOCK:
+            return at
+        room = self._options.block_max + 2 - len(self._data)  # its first character, and a stuffed space
+        text = _TEXT.match(data, at, at + max(room, 0))
+        return text.end() if text is not None else at
 
     # ------------------------------------------------------------------------------------------ silence
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.fuzz.dnc_target import PIECES, run_engine
 
 choices = st.integers(0, 2**31 - 1)
-short = settings(max_examples=300, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
+short = settings(max_examples=150, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
 
 
 @short
@@ -48,7 +48,7 @@ def test_mutated_talks() -> None:
     chance = random.Random(seed)
     until = time.monotonic() + seconds
     runs = 0
-    while runs < 1500 or time.monotonic() < until:
+    while runs < 700 or time.monotonic() < until:
         data, choice = mutated(chance), chance.randrange(2**31)
         try:
             run_engine(data, choice)

@@ -1,8 +1,8 @@
 """The protocol as the manual's page tells it, both sides, word by word and nothing more.
 
-No time-outs, no noise, no bounds: a witness for what goes over the line, not a program to use. The page shows the
-control sending to the peripheral; a file's way back is the same with the roles of its blocks exchanged: the
-control sends the header with mode E, the peripheral acknowledges it, sends the blocks and ETX, the control says EOT.
+No time-outs, no noise, no bounds: a witness for what goes over the line, not for use. The page shows the
+control sending to the peripheral. A file's way back is the same with the blocks' roles exchanged: the control
+sends the header with mode E, the peripheral acknowledges it, sends the blocks and ETX, the control says EOT.
 """
 
 from collections.abc import Generator, Sequence

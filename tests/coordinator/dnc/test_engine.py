@@ -377,11 +377,16 @@ def test_flow_control_is_the_answer_withheld() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"baud": 1}, {"transmissions": 0}, {"block_max": 1}, {"answer_s": 0.2}, {"character_s": 0.0}],
+    [{"baud": 1}, {"transmissions": 0}, {"block_max": 1}, {"character_s": 0.0}],
 )
 def test_options_are_checked(wrong: dict[str, Any]) -> None:
     with pytest.raises(CanductorError, match=next(iter(wrong))):
         DncOptions(**wrong)
+
+
+def test_patience_is_longer_than_silence() -> None:
+    with pytest.raises(CanductorError, match=r"an answer may take 0\.2 s, must be longer than the silence"):
+        DncOptions(answer_s=0.2)
 
 
 def test_frames_have_their_times() -> None:

@@ -16,7 +16,7 @@ from tests.coordinator.dnc.line import Faults, Line, Owner, Wire
 
 texts = st.binary(max_size=60).map(lambda t: bytes(c for c in t if 0x20 <= c < 0x7F))
 programs = st.lists(texts, max_size=12)
-quick = settings(max_examples=60, deadline=None, derandomize=True)
+quick = settings(max_examples=40, deadline=None, derandomize=True)
 
 
 class TextWire(Wire):
@@ -67,7 +67,7 @@ def test_blocks_are_the_same(first: int, text: bytes, dc1: bool) -> None:
 @quick
 @given(**cases)
 def test_our_control_sends_to_the_page(
-    program: list[bytes], dc1: bool, avoid: bool, frame: str, share: float, seed: int
+    *, program: list[bytes], dc1: bool, avoid: bool, frame: str, share: float, seed: int
 ) -> None:
     options = options_of(dc1, avoid, frame)
     headers: list[bytes] = []
@@ -91,7 +91,7 @@ def test_our_control_sends_to_the_page(
 @quick
 @given(**cases)
 def test_the_page_sends_to_our_peripheral(
-    program: list[bytes], dc1: bool, avoid: bool, frame: str, share: float, seed: int
+    *, program: list[bytes], dc1: bool, avoid: bool, frame: str, share: float, seed: int
 ) -> None:
     options = options_of(dc1, avoid, frame)
     peripheral = Owner(Engine(options, 0.0, peripheral=True), None)
@@ -108,7 +108,7 @@ def test_the_page_sends_to_our_peripheral(
 @quick
 @given(**cases)
 def test_our_control_fetches_from_the_page(
-    program: list[bytes], dc1: bool, avoid: bool, frame: str, share: float, seed: int
+    *, program: list[bytes], dc1: bool, avoid: bool, frame: str, share: float, seed: int
 ) -> None:
     options = options_of(dc1, avoid, frame)
     headers: list[bytes] = []
@@ -129,7 +129,7 @@ def test_our_control_fetches_from_the_page(
 @quick
 @given(**cases)
 def test_the_page_fetches_from_our_peripheral(
-    program: list[bytes], dc1: bool, avoid: bool, frame: str, share: float, seed: int
+    *, program: list[bytes], dc1: bool, avoid: bool, frame: str, share: float, seed: int
 ) -> None:
     options = options_of(dc1, avoid, frame)
     lines: list[bytes] = []

@@ -4,7 +4,7 @@ import pytest
 
 from tests.coordinator.dnc.ordeal import judge, make_case
 
-BLOCKS = 8
+BLOCKS = 5
 EACH = 60
 
 
@@ -19,5 +19,5 @@ def test_transfers_end_whole_or_not_at_all(block: int) -> None:
 
 
 def test_damage_that_no_check_sees_is_damage_within_lines() -> None:
-    for number in range(100):
+    for number in range(60):
         judge(make_case(number, visible=False))
