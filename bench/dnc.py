@@ -1,11 +1,11 @@
 """How much of a serial line's rate BCC uses: a file through two pseudo-terminals with a cable between.
 
 The cable is a process of its own that keeps to the line's rate: it hands characters on when their last
-bit would have come (10 bits each for 8N1 and 7E1), in pieces of at most 16, as a UART's FIFO does. Both sides
-are processes, too, with the driver of the commands. Measured is from the first block's STX to the last block's
-ACK, against what the text alone takes on the line. Each run comes after one of plain blocks and one-character
-answers without any protocol, over the same cable: what this computer makes of it at that moment. At last the
-same in virtual time: what the protocol takes of itself.
+bit would have come (10 bits each for 8N1 and 7E1), in pieces of at most 16, as a UART's FIFO does. Both
+sides are processes, too, with the driver of the commands. Measured is from the first block's STX to the
+last block's ACK, against what the text alone takes on the line. Each run comes after one of plain blocks
+and one-character answers without any protocol, over the same cable: what this computer makes of it at
+that moment. At last the same in virtual time: what the protocol takes of itself.
 
 Usage: python bench/dnc.py [--baud N] [--lines N] [--characters N] [--frame F] [--runs N]
 """

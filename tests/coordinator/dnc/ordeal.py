@@ -129,7 +129,7 @@ def main() -> int:
     parser.add_argument("--any-damage", action="store_true", help="also damage that nobody can see; counted")
     parser.add_argument("--trace", action="store_true", help="show what went over the line")
     given = parser.parse_args()
-    tally: collections.Counter[str] = collections.Counter()
+    tally: collections.Counter[str] = collections.Counter(kept=0, failed=0, wrong=0)
     why: collections.Counter[str] = collections.Counter()
     for number in range(given.seed, given.seed + given.transfers):
         case = make_case(number, visible=not given.any_damage)

@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import serial
+from serial import rfc2217
 
 from coordinator.cli import main
 from tests.coordinator.dnc.cable import Cable
@@ -186,14 +188,18 @@ def test_drip_from_a_pipe(folders: tuple[Path, Path]) -> None:
     assert (theirs / "JOB.nc").read_bytes() == PROGRAM + b"M30\n"
 
 
-def test_over_tcp(folders: tuple[Path, Path]) -> None:
+@pytest.mark.parametrize("scheme", ["socket", "rfc2217"])
+def test_over_tcp(folders: tuple[Path, Path], scheme: str) -> None:
     ours, theirs = folders
+    bridge_of = {"socket": _bridge, "rfc2217": _rfc2217_server}
     with socket.create_server(("127.0.0.1", 0)) as listener, Cable() as cable:
         port = listener.getsockname()[1]
-        bridge = threading.Thread(target=_bridge, args=(listener, cable.names[1]))
+        bridge = threading.Thread(target=bridge_of[scheme], args=(listener, cable.names[1]))
         bridge.start()
-        with started("serve", ".", "-p", cable.names[0], *FAST, folder=ours):
-            fetched = run("receive", "PART", "-p", f"socket://127.0.0.1:{port}", *FAST, folder=theirs)
+        frame = ("--frame", "8N1")  # all that a pseudo-terminal lets a serial server set
+        with started("serve", ".", "-p", cable.names[0], *FAST, *frame, folder=ours):
+            url = f"{scheme}://127.0.0.1:{port}"
+            fetched = run("receive", "PART", "-p", url, *FAST, *frame, folder=theirs)
             assert (fetched.returncode, fetched.stderr) == (0, "")
         bridge.join(PATIENCE_S)
     assert (theirs / "PART.nc").read_bytes() == PROGRAM
@@ -214,6 +220,50 @@ def _bridge(listener: socket.socket, name: str) -> None:
         backward.start()
         while data := connection.recv(4096):
             tty.write(data)
+
+
+class _PseudoTerminal(serial.Serial):  # type: ignore[misc]
+    """A port without modem lines."""
+
+    cts = dsr = ri = cd = False
+
+    def _update_dtr_state(self) -> None:
+        pass
+
+    def _update_rts_state(self) -> None:
+        pass
+
+
+def _rfc2217_server(listener: socket.socket, name: str) -> None:
+    """A serial server that takes baud rate and frame from its client, made of pyserial's own parts."""
+    connection, _ = listener.accept()
+
+    class Locked:
+        """What the port manager answers with."""
+
+        lock = threading.Lock()
+
+        def write(self, data: bytes) -> None:
+            with self.lock, contextlib.suppress(OSError):
+                connection.sendall(data)
+
+    with connection, _PseudoTerminal(name, timeout=0.02) as port:
+        client = Locked()
+        manager = rfc2217.PortManager(port, client)
+        ended = threading.Event()
+
+        def back() -> None:
+            while not ended.is_set():
+                if data := port.read(max(port.in_waiting, 1)):
+                    client.write(b"".join(manager.escape(data)))
+
+        backward = threading.Thread(target=back)
+        backward.start()
+        with contextlib.suppress(OSError):
+            while data := connection.recv(4096):
+                port.write(b"".join(manager.filter(data)))
+        ended.set()
+        backward.join()
 
 
 @pytest.mark.parametrize(
