@@ -144,7 +144,9 @@ class Conversation:
         self._wait(State.IDLE, None)
 
     def _end(self, event: events.Event) -> None:
+        """End the transfer; what the owner has not yet heard of it and could no longer answer, is void."""
         self._idle()
+        self._events = [e for e in self._events if isinstance(e, events.Failed | events.Sent)]
         self._events.append(event)
 
     def _time_out(self) -> None:

@@ -168,7 +168,8 @@ class Reactions(Conversation):
 
     def _header_came(self, sign: Sign) -> None:
         if not self.is_peripheral:
-            self._error_came(sign)
+            if self.state is not State.IDLE:
+                self._error_came(sign)
             return
         header = read_header(sign.content)
         again = self.state is State.RECEIVING and self.lines == 0 and header == self.header
@@ -191,6 +192,8 @@ class Reactions(Conversation):
         self._end(events.Failed(f"the peripheral says: {text or 'an error'}"))
 
     def _directory_asked(self, _: Sign) -> None:
+        if not self.is_peripheral:
+            return
         self._begin(None)
         self._wait(State.ASKED, None)
         self._events.append(events.DirectoryAsked())

@@ -77,19 +77,19 @@ def _own(engine: Engine, lines: list[bytes], choice: int) -> None:
             return
         for event in happened:
             match event:
-                case events.Asked() if engine.state is State.ASKED:
+                case events.Asked():
                     lines.clear()
                     engine.accept() if choice & 0x3000 else engine.refuse("NO\x07 SUCH FILE" * 9)
-                case events.DirectoryAsked() if engine.state is State.ASKED:
+                case events.DirectoryAsked():
                     engine.give_directory(b"\r\n" * 4)
-                case events.LineWanted() if engine.state is State.LINE_WANTED:
+                case events.LineWanted():
                     _give(engine, choice)
-                case events.Line(text=text) if engine.state is State.LINE_GIVEN:
+                case events.Line(text=text):
                     assert len(text) <= engine.options.block_max
                     assert not any(c < 0x20 and c not in b"\r\n" for c in text)
                     lines.append(text)
                     engine.line_taken()
-                case events.Ended() if engine.state is State.END_GIVEN:
+                case events.Ended():
                     assert engine.lines == len(lines)
                     engine.file_kept()
                 case events.Failed(sentence=sentence):

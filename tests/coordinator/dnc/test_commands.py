@@ -150,7 +150,7 @@ def test_a_cut_cable_leaves_nothing(folders: tuple[Path, Path]) -> None:
             cut.set()
         return b"" if cut.is_set() else data
 
-    short = ("--answer-timeout", "1")
+    short = ("--answer-timeout", "4")
     with (
         Cable(change=once_cut) as cable,
         started("receive", "-p", cable.names[1], *FAST, *short, folder=theirs) as receiver,

@@ -265,6 +265,20 @@ def test_a_block_before_the_last_was_answered() -> None:
     assert "before the last one was answered" in bench.failure()
 
 
+def test_two_blocks_at_once_end_the_transfer() -> None:
+    """Also for an owner that hears of it late: what it can no longer answer it is not told."""
+    bench = receiving()
+    assert bench.come(block(b"X1") + block(b"X2"), 0.0) == bytes([EOT])
+    assert "the two are out of step" in bench.failure()
+
+
+def test_an_idle_control_answers_nothing() -> None:
+    bench = Bench(peripheral=False)
+    for data in (write_block(SOH, b"DPARTA"), block(b"X1"), DIRECTORY_REQUEST, b"\x06", b"\x15", b"\x04"):
+        assert bench.come(data, 1.0) == b""
+    assert bench.happened() == []
+
+
 @pytest.mark.parametrize("text", [b"A\tB", b"\x1b[", b"\x7f", b"A\x00"])
 def test_control_characters_are_refused_when_sent(text: bytes) -> None:
     bench = sending()
