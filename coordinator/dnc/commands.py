@@ -16,6 +16,7 @@ from coordinator.dnc.engine import Engine
 from coordinator.dnc.feeds import MachineSink, SlowSource
 from coordinator.dnc.files import Check, Entry, Folder, check_lines
 from coordinator.dnc.port import Port
+from coordinator.dnc.tables import check_table
 from nodes.errors import CanductorError
 from nodes.records import record
 
@@ -98,7 +99,7 @@ def _sentence(outcome: Outcome) -> str:
     return f"{outcome.name}: {outcome.sentence}" if outcome.name else outcome.sentence
 
 
-def receive(job: DncJob, check: Check | None = None) -> DncReport:
+def receive(job: DncJob, check: Check = check_table) -> DncReport:
     """Take one file into a folder, and print it if asked to; raises CanductorError. CHECK is for tables."""
     assert job.folder is not None
     folder = Folder(job.folder, overwrite=job.overwrite, newline=job.newline, check=check)
@@ -140,7 +141,7 @@ def send(job: DncJob) -> DncReport:
     return _report(outcome, f"{job.file}: {outcome.lines} lines; the file {how}")
 
 
-def serve(job: DncJob, check: Check | None = None) -> DncReport:
+def serve(job: DncJob, check: Check = check_table) -> DncReport:
     """Be a file server until Ctrl-C; raises CanductorError when the port is gone. CHECK is for tables."""
     assert job.folder is not None
     outcome = Outcome(did="nothing")

@@ -14,6 +14,7 @@ from coordinator.dnc.files import (
     read_lines,
     stored_name,
 )
+from coordinator.dnc.tables import check_table
 from nodes.errors import CanductorError
 
 
@@ -159,6 +160,20 @@ def test_tables_are_checked_before_they_are_kept(tmp_path: Path) -> None:
     with pytest.raises(FileRefused, match="gets longer than"):
         huge.write(b"0" * CHECKED_MAX)
     huge.drop()
+
+
+def test_a_table_is_validated_like_an_imported_one(tmp_path: Path) -> None:
+    folder = Folder(tmp_path, check=check_table)
+    for name, rows in (("GOOD", (b"0 0 0", b"100 100.01 100.02")), ("BAD", (b"100 100 100", b"0 0 0"))):
+        incoming = folder.take("S", name)
+        for row in rows:
+            incoming.write(row)
+        if name == "GOOD":
+            incoming.keep()
+        else:
+            with pytest.raises(CanductorError, match=r"BAD\.comp"):
+                incoming.keep()
+    assert names(tmp_path) == ["GOOD.comp"]
 
 
 def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
