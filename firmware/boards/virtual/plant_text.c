@@ -132,7 +132,7 @@ static int read_value(const struct plant *plant, const struct field *field, void
 }
 
 static void describe(const struct field *field, char *out) {
-    static const char *const words[] = {[NAME] = "a name of 1 to 31 characters",
+    static const char *const words[] = {[NAME] = "a name of 1 to 63 characters",
                                         [PIN] = "a pin, PA0 to PI15",
                                         [NO_PIN] = "a pin, PA0 to PI15",
                                         [FLAG] = "0 or 1",

@@ -325,7 +325,7 @@ static void test_what_is_no_plant(void) {
         {"plant node=n\nbody name=b capacity=1 loss=1 loss=2\n", "loss=2: given twice"},
         {"plant node=n\nbody name=b capacity=1 loss=1 colour=2\n", "colour=2: there is no such field here"},
         {"plant node=n\nbody name capacity=1 loss=1\n", "name: there is no such field here"},
-        {"plant node=a-name-that-is-longer-than-a-name-may-be\n", "expected a name of 1 to 31 characters"},
+        {"plant node=a-name-that-is-longer-than-a-name-may-be-and-was-made-so-to-see-what-is-said\n", "expected a name of 1 to 63 characters"},
         {"plant node=n\nheater name=h pin=PA0 body=b power=1\n", "body=b: expected a body described above"},
         {"plant node=n\nfan name=f pin=PJ0\n", "pin=PJ0: expected a pin, PA0 to PI15"},
         {"plant node=n\nfan name=f pin=PA16\n", "expected a pin"},
