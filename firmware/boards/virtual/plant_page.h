@@ -71,7 +71,8 @@ struct plant_page {
 };
 
 _Static_assert(sizeof(struct plant_page_item) == PLANT_NAME + 24, "plant_page.py reads it");
-_Static_assert(sizeof(struct plant_page_stepper) == PLANT_NAME + 32 + 16 * PLANT_HISTORY, "plant_page.py reads it");
+_Static_assert(sizeof(struct plant_page_stepper) == PLANT_NAME + 32 + 16 * PLANT_HISTORY,
+               "plant_page.py reads it");
 
 // Puts a step to the others.
 void plant_page_step(struct plant_page_stepper *stepper, uint64_t ns, int64_t count);
