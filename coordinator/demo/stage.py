@@ -147,6 +147,7 @@ class Stage:
             seed=self._options.seed + index,
             edge_log=None if self._options.serve is not None else self.edge_log_path(node.name),
             plant=self._plants[node.name].write(self._folder),
+            plant_log=self._options.serve is None,
         )
 
     def plant_page(self, node: str) -> PlantPage:
