@@ -10,6 +10,7 @@ from coordinator.motion.planner import Planner
 from coordinator.move_source import Planned
 from coordinator.program_machine import machine_state
 from coordinator.service.feeder import Feeder, Ticket
+from coordinator.service.toolpath import Toolpath
 from coordinator.service.trace import KEEP_S, Moment, MotionTrace
 from coordinator.service.work import LinesWork, Work
 from coordinator.streamer import JobState, Streamer, Told
@@ -29,6 +30,7 @@ class Motion:
         described = machine.description
         self.feeder = Feeder(Planner(described.limits), described.homed_position, machine_state(described))
         self.trace = MotionTrace(len(machine.moving))
+        self.toolpath = Toolpath()
         self.planned = UNMOVED
         self.streamer = Streamer(
             machine, self.feeder, witness=self.trace, on_told=on_told, on_state=self._cycle_ended
@@ -105,6 +107,9 @@ class Motion:
         self.planned = state.planned
         now_s = self.now_s
         self.trace.forget_before_s = now_s - KEEP_S
+        with contextlib.suppress(IndexError):
+            while True:
+                self.toolpath.add(self.trace.fresh.popleft())
         with contextlib.suppress(IndexError):
             while True:
                 self._ending.append(self.feeder.finished.popleft())

@@ -16,6 +16,7 @@ from nodes.records import record
 KEEP_S: Final = 10.0
 MOVES_MAX: Final = 20_000
 PIECE_MOVES: Final = 256
+FRESH_MAX: Final = 256
 BATCH_BYTES_MAX: Final = 1 << 20
 """Per node."""
 
@@ -44,12 +45,15 @@ class MotionTrace:
         self._batch_bytes = [0] * nodes
         self.forget_before_s = 0.0
         """Print time; set by the control loop."""
+        self.fresh: deque[Moves] = deque(maxlen=FRESH_MAX)
+        """What came since the control loop last took it; when it does not, the oldest goes."""
 
     # ------------------------------------------------------------------------------------ as a witness
 
     def see_moves(self, trapezoids: Any, count: int) -> None:
         """Copy moves; in the worker's thread."""
         new = np.frombuffer(ffi_memory(trapezoids, count), TRAPEZOID).copy()
+        self.fresh.append(new)
         kept = list(self._pieces)
         while len(kept) > 1 and _end_s(kept[0][-1]) < self.forget_before_s:
             del kept[0]  # the last one stays: it is where the machine stands
