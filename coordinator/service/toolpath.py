@@ -1,5 +1,7 @@
 """Where the tool has been since the job began, for front ends that draw: as many points as can be drawn, no more."""
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,8 @@ POINTS_MAX = 20_000
 KEEP_SHARE = 0.75
 """When it is full, the points that matter least go until this share is left."""
 _SAME_MM = 1e-6
+_GENERATIONS = itertools.count(1)
+"""Of all paths of this process: one that begins anew is not taken for the one before."""
 
 Floats = NDArray[np.float64]
 
@@ -19,14 +23,14 @@ class Toolpath:
     def __init__(self, points_max: int = POINTS_MAX) -> None:
         self._points_max = points_max
         self._put(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=bool))
-        self.generation = 1
+        self.generation = next(_GENERATIONS)
 
     def __len__(self) -> int:
         return len(self._at)
 
     def clear(self) -> None:
         """Begin anew."""
-        self.generation += 1
+        self.generation = next(_GENERATIONS)
         self._put(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=bool))
 
     def add(self, moves: Moves) -> None:
@@ -76,7 +80,7 @@ class Toolpath:
         kept[1 + 2 * order] = False
         if kept.sum() > self._points_max:  # all corners matter: the oldest go
             kept[: len(self) - int(KEEP_SHARE * self._points_max)] = False
-        self.generation += 1
+        self.generation = next(_GENERATIONS)
         self._put(self._at[kept], self._time_s[kept], self._extrudes[kept])
 
 

@@ -1,7 +1,7 @@
 // One card for each bus: load by class over time, and what went wrong.
 
 import { SPAN_S, StackChart } from "./charts.js";
-import { count, make, mark, percent, put } from "./dom.js";
+import { count, make, mark, percent, put, show } from "./dom.js";
 import { Series } from "./fields.js";
 import { Cards } from "./nodes.js";
 
@@ -43,6 +43,7 @@ class BusCard {
       this.#figures[key] = make("dd", {}, "–");
       figures.append(make("div", {}, make("dt", {}, label), this.#figures[key]));
     }
+    this.keys = keys;
     const head = make("header", {}, this.title, this.about);
     this.element = make("article", { class: "card unit bus" }, head, this.chart.element, keys, figures);
   }
@@ -57,7 +58,10 @@ class BusCard {
     put(this.title, name.split("/").at(-1) || name);
     this.title.title = name;
     const bitrate = get("bitrate");
-    put(this.about, bitrate ? `${name} · ${count(bitrate / 1000)} kbit/s` : `${name} · bit rate not known, no load`);
+    put(this.about, bitrate ? `${name} · ${count(bitrate / 1000)} kbit/s` : `${name} · its bit rate is not known, so there is no load`);
+    show(this.chart.element, Boolean(bitrate));
+    show(this.keys, Boolean(bitrate));
+    this.element.style.order = bitrate ? 0 : 1;
     this.chart.tell(bitrate ? percent(get("load_total"), 1) : "–");
     for (const [key] of CLASSES) put(this.#keys[key], bitrate ? percent(get(`load_${key}`), 1) : "–");
     for (const [key, , is_bad] of COUNTERS) {

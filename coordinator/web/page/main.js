@@ -22,7 +22,7 @@ const login = new Login((token) => {
   link.connect(token);
   stop.connect(token);
 });
-const link = new Link("live page", login.token);
+const link = new Link("the live page", login.token);
 const stop = new Stop(link, login.token);
 const fields = new Fields();
 const path = new Path(link);
@@ -142,7 +142,9 @@ function show_position() {
   put($("homed"), fields.get("position.homed") || "none");
   const [speed, flow] = [fields.get("position.speed_factor"), fields.get("position.extrude_factor")];
   put($("factors"), `speed ${percent(speed)}, flow ${percent(flow)}`);
-  if (at) view.head(at, fields.get("position.print_time_s", 0), fields.get("position.moving", false));
+  const stopped = ["shutdown", "error"].includes(fields.get("machine.state"));
+  const motion = stopped ? "stopped" : fields.get("position.moving") ? "moving" : "standing";
+  if (at) view.head(at, fields.get("position.print_time_s", 0), motion);
 }
 
 function show_down() {

@@ -25,9 +25,9 @@ class NodeCard {
     this.about = make("small");
     this.failure = make("p", { class: "told", hidden: "" });
     this.charts = {
-      drift: new LineChart("Clock drift, ppm", this.drift, { span: 2 }, 1, "c2"),
-      offset: new LineChart("Clock offset, ms", this.offset, { span: 1 }, 1, "c2"),
-      queue: new LineChart("Queue, commands", this.queue, { low: 0, span: 10 }, 0, "c1"),
+      drift: new LineChart("Drift, ppm", this.drift, { span: 2 }, 1, "c2"),
+      offset: new LineChart("Offset gained, ms", this.offset, { span: 1 }, 2, "c2"),
+      queue: new LineChart("Queue", this.queue, { low: 0, span: 10 }, 0, "c1"),
       load: new LineChart("Load, %", this.load, { low: 0, span: 10 }, 0, "c4"),
       lead: new Histogram("Lead of commands, ms", LABELS, 1, 5),
     };
@@ -94,8 +94,9 @@ class NodeCard {
     const { charts } = this;
     charts.drift.tell(figure(get("clock_drift_ppm"), 1));
     const offset_s = get("clock_offset_s");
-    charts.offset.tell(offset_s === null ? "–" : `${figure(offset_s, 3)} s`);
-    charts.queue.tell(`${count(get("queue_commands"))} of ${count(get("queue_commands_max"))} at most`);
+    charts.offset.tell(offset_s === null ? "–" : `${figure((offset_s - this.#offset_s) * 1e3, 2)}`);
+    charts.offset.element.title = offset_s === null ? "" : `since the page was opened; in all its clock is ${offset_s.toFixed(6)} s ahead of the computer's`;
+    charts.queue.tell(`${count(get("queue_commands"))}, most ${count(get("queue_commands_max"))}`);
     charts.load.tell(percent(get("load_awake"), 1));
     const all = this.#bins.at(-1) ?? [];
     const before = this.#bins[0] ?? [];

@@ -18,6 +18,7 @@ export class Path {
 
   constructor(link) {
     this.#link = link;
+    link.addEventListener("up", () => (this.#generation = 0)); // another coordinator may count as the last one did
     setInterval(() => {
       if (!document.hidden && link.up) this.ask();
     }, ASK_MS);
@@ -67,7 +68,12 @@ export class Path {
     this.times_s[at] = told.print_time_s[i];
     this.extrudes[at] = told.extrudes[i] ? 1 : 0;
     if (!told.extrudes[i]) return;
-    const point = [told.x[i], told.y[i], told.z[i]];
+    if (at > 0) this.#widen(at - 1);
+    this.#widen(at);
+  }
+
+  #widen(at) {
+    const point = [this.x[at], this.y[at], this.z[at]];
     this.box ??= [...point, ...point];
     for (let axis = 0; axis < 3; axis++) {
       this.box[axis] = Math.min(this.box[axis], point[axis]);

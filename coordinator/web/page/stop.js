@@ -17,7 +17,7 @@ export class Stop {
 
   constructor(other, token) {
     this.#other = other;
-    this.#own = new Link("live page, emergency stop", token);
+    this.#own = new Link("the live page", token);
     this.#own.addEventListener("up", (event) => {
       this.may = event.detail.scope !== "watch";
       this.#show();
@@ -59,7 +59,7 @@ export class Stop {
     this.#pressed_ms = null;
     if (began_ms === null || performance.now() - began_ms > GIVE_UP_MS) return;
     const links = [this.#own, this.#other].filter((link) => link.up);
-    const asked = links.map((link) => link.call("machine.emergency_stop", { who: "the live page" }));
+    const asked = links.map((link) => link.call("machine.emergency_stop"));
     Promise.any(asked).then(
       () => this.#tell("done", `All nodes were told to stop, ${Math.ceil(performance.now() - began_ms)} ms after you asked.`),
       (failure) => this.#tell("unsent", `NOT confirmed: ${failure.errors[0].message}. Use the switch on the machine.`),

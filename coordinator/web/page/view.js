@@ -15,7 +15,8 @@ export class View {
   #path;
   #axes = null; // [low x, y, z, high x, y, z]
   #head = null;
-  #moving = false;
+  #now_s = 0;
+  #state = "standing";
   #passed = 0;
   #painted = { key: "", count: 0 };
   #due = false;
@@ -44,11 +45,11 @@ export class View {
     this.redraw();
   }
 
-  /** Show the head at PLACE ({x, y, z}) at print time NOW_S. */
-  head(place, now_s, moving) {
+  /** Show the head at PLACE ({x, y, z}) at print time NOW_S. STATE: moving, standing (all is done) or stopped. */
+  head(place, now_s, state) {
     this.#head = place;
-    this.#moving = moving;
-    this.#passed = moving ? this.#path.passed(now_s) : this.#path.count;
+    this.#now_s = now_s;
+    this.#state = state;
     this.redraw();
   }
 
@@ -88,6 +89,7 @@ export class View {
   #draw() {
     const { context, width, height } = this.sheet;
     const box = this.#box();
+    this.#passed = this.#state === "standing" ? this.#path.count : this.#path.passed(this.#now_s);
     this.camera.fit(box, width, height);
     const m = this.camera.matrix(width, height);
     context.clearRect(0, 0, width, height);
@@ -200,7 +202,7 @@ export class View {
   /** Paint what is planned and not passed yet, from the head on. */
   #ahead(context, m) {
     const path = this.#path;
-    if (!this.#moving || !this.#head || this.#passed >= path.count) return;
+    if (this.#state !== "moving" || !this.#head || this.#passed >= path.count) return;
     context.strokeStyle = this.#colours["path-ahead"];
     context.lineWidth = 1.6;
     context.beginPath();
