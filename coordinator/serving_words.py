@@ -74,7 +74,7 @@ def _web_address(given: argparse.Namespace) -> tuple[str, int] | None:
         raise UsageError(f"--web at {host} needs --tokens FILE: who comes over the network has to show one")
     if beyond and not given.web_without_tls and (given.tls_certificate is None or given.tls_key is None):
         raise UsageError(
-            f"--web at {host} needs --tls-certificate and --tls-key; or --web-without-tls, where nobody listens"
+            f"--web at {host} needs --tls-certificate and --tls-key; or --web-without-tls, if nobody listens"
         )
     return host, port
 

@@ -19,6 +19,7 @@ from coordinator.service.log_ring import Entry
 from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
 from coordinator.service.typed import Typed
+from coordinator.web.settings import WebSettings
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 from nodes.host_sockets import socket_folder
@@ -145,7 +146,7 @@ async def _open_page(server: IpcServer, options: ServeOptions) -> "WebServer | N
     host, port = options.web
     try:
         try:
-            from coordinator.web.server import WebServer, WebSettings  # noqa: PLC0415 (the extra web)
+            from coordinator.web.server import WebServer  # noqa: PLC0415 (the extra web)
         except ModuleNotFoundError as error:
             raise CanductorError(
                 f"the live page needs {error.name}, which is not installed; run: pip install 'canductor[web]'"

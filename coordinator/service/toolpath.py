@@ -1,4 +1,4 @@
-"""Where the tool has been since the job began, for front ends that draw: as many points as can be drawn, no more."""
+"""Where the tool has been since the job began, for front ends that draw: as many points as can be drawn."""
 
 import itertools
 

@@ -1,12 +1,13 @@
 """Who is at the other end: the user whose program connects over loopback, and the names we answer to.
 
-A page of any website can make its visitor's browser connect to loopback. So the browser's word on where the page
-comes from is checked (Origin), and the name by which it found us (Host): a foreign name that was made to point
-here ("DNS rebinding") is not ours.
+A page of any website can make its visitor's browser connect to loopback. So the browser's word on where the
+page comes from is checked (Origin), and the name by which it found us (Host): a foreign name that was made to
+point here ("DNS rebinding") is not ours.
 """
 
 import os
 import socket
+import sys
 from collections.abc import Iterable
 from ipaddress import IPv4Address, IPv6Address, ip_address
 from pathlib import Path
@@ -78,8 +79,5 @@ def _uid_of(local: str, remote: str, table: Path) -> int | None:
 def _words(address: IPv4Address | IPv6Address, port: int) -> str:
     """Write an address as the kernel's tables do: words of 32 bits in the computer's own order."""
     packed = address.packed
-    words = (int.from_bytes(packed[at : at + 4], _ORDER) for at in range(0, len(packed), 4))
+    words = (int.from_bytes(packed[at : at + 4], sys.byteorder) for at in range(0, len(packed), 4))
     return "".join(f"{word:08X}" for word in words) + f":{port:04X}"
-
-
-_ORDER = "little" if socket.htons(1) != 1 else "big"

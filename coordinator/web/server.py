@@ -10,7 +10,7 @@ from aiohttp import WSMsgType, web
 
 from coordinator.ipc.methods import Scope
 from coordinator.ipc.server import IpcServer, tls_context
-from coordinator.web.files import page_files
+from coordinator.web.files import PageFile, page_files
 from coordinator.web.peers import is_own_host, is_own_origin, is_own_program, own_names
 from coordinator.web.pipe import Pipe
 from coordinator.web.settings import WebSettings
@@ -20,22 +20,14 @@ SOCKET_PATH: Final = "/socket"
 CONNECTIONS_MAX: Final = 256
 """Open at a time, WebSockets included; further ones are closed."""
 REQUEST_S: Final = 30.0
-"""A connection that has not become a WebSocket after so long is closed: who only fetches files is done by then."""
+"""A connection that is no WebSocket is closed after so long: who only fetches files is done by then."""
 HEARTBEAT_S: Final = 15.0
 """Between looks at whether a browser is still there."""
 HANDSHAKE_S: Final = 10.0
-POLICY: Final = "; ".join((
-    "default-src 'none'",
-    "script-src 'self'",
-    "style-src 'self'",
-    "img-src 'self'",
-    "manifest-src 'self'",
-    "connect-src 'self'",
-    "base-uri 'none'",
-    "form-action 'none'",
-    "frame-ancestors 'none'",
-    "require-trusted-types-for 'script'",
-))
+POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'"
+)
 """Nothing from elsewhere, nothing inline, in no other page's frame."""
 HEADERS: Final = {
     "Content-Security-Policy": POLICY,
@@ -126,17 +118,12 @@ class WebServer:
             return self._refuse(f"this is not {request.host!r}; use the computer's name or address")
         if request.path == SOCKET_PATH:
             return await self._serve_socket(request)
+        if request.method not in ("GET", "HEAD"):
+            return web.Response(status=405, headers={**HEADERS, "Allow": "GET, HEAD"})
         file = self._files.get(request.path)
         if file is None:
             return web.Response(status=404, text="there is no such page\n", headers=HEADERS)
-        if request.method not in ("GET", "HEAD"):
-            return web.Response(status=405, headers={**HEADERS, "Allow": "GET, HEAD"})
-        headers = {**HEADERS, "ETag": file.tag, "Content-Type": file.content_type, "Vary": "Accept-Encoding"}
-        if request.headers.get("If-None-Match") == file.tag:
-            return web.Response(status=304, headers=headers)
-        if "gzip" in request.headers.get("Accept-Encoding", ""):
-            return web.Response(body=file.packed, headers={**headers, "Content-Encoding": "gzip"})
-        return web.Response(body=file.content, headers=headers)
+        return _send(file, request)
 
     def _refuse(self, sentence: str) -> web.Response:
         self.refused += 1
@@ -193,10 +180,18 @@ class WebServer:
                 await sending
 
 
+def _send(file: PageFile, request: web.BaseRequest) -> web.Response:
+    headers = {**HEADERS, "ETag": file.tag, "Content-Type": file.content_type, "Vary": "Accept-Encoding"}
+    if request.headers.get("If-None-Match") == file.tag:
+        return web.Response(status=304, headers=headers)
+    if "gzip" in request.headers.get("Accept-Encoding", ""):
+        return web.Response(body=file.packed, headers={**headers, "Content-Encoding": "gzip"})
+    return web.Response(body=file.content, headers=headers)
+
+
 class _Refusal(asyncio.Protocol):
     """Takes no connection."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         transport.abort()
-
