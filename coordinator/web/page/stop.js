@@ -6,12 +6,14 @@ import { $, mark, put, show } from "./dom.js";
 import { Link } from "./link.js";
 
 const GIVE_UP_MS = 10_000; // a stop that could not be sent is not sent later than this: it would surprise
+const CONFIRM_MS = 2000; // then the user is told not to rely on it
 const TOLD_MS = 8000;
 
 export class Stop {
   #own;
   #other;
   #pressed_ms = null; // a stop that could not be sent yet
+  #given_up = 0; // timer
   #told = 0; // timer
   may = true;
 
@@ -22,6 +24,7 @@ export class Stop {
       this.may = event.detail.scope !== "watch";
       this.#show();
       if (this.#pressed_ms !== null) this.#send();
+      else if ($("stop-told").dataset.state === "unsent") this.#fade();
     });
     this.#own.addEventListener("down", () => this.#show());
     this.#own.addEventListener("refused", () => this.#show());
@@ -43,7 +46,8 @@ export class Stop {
       this.#tell("refused", "This token may only watch: the stop was not sent.");
       return;
     }
-    this.#pressed_ms ??= performance.now();
+    this.#pressed_ms = performance.now();
+    clearTimeout(this.#given_up);
     this.#tell("sending", "Stopping…");
     if (this.#own.up || this.#other.up) {
       this.#send();
@@ -51,16 +55,24 @@ export class Stop {
     }
     this.#tell("unsent", "NOT stopped: the machine cannot be reached. Use the switch on the machine.");
     this.#own.connect();
-    setTimeout(() => (this.#pressed_ms = null), GIVE_UP_MS);
+    this.#given_up = setTimeout(() => {
+      this.#pressed_ms = null;
+      this.#tell("unsent", "NOT stopped: the machine could not be reached, and the stop is not sent any more. Press again.");
+    }, GIVE_UP_MS);
   }
 
   #send() {
     const began_ms = this.#pressed_ms;
     this.#pressed_ms = null;
+    clearTimeout(this.#given_up);
     if (began_ms === null || performance.now() - began_ms > GIVE_UP_MS) return;
     const links = [this.#own, this.#other].filter((link) => link.up);
     const asked = links.map((link) => link.call("machine.emergency_stop"));
-    Promise.any(asked).then(
+    const late = setTimeout(() => {
+      this.#tell("unsent", "NOT confirmed yet. Use the switch on the machine.");
+    }, CONFIRM_MS);
+    const settled = () => clearTimeout(late);
+    Promise.any(asked).finally(settled).then(
       () => this.#tell("done", `All nodes were told to stop, ${Math.ceil(performance.now() - began_ms)} ms after you asked.`),
       (failure) => this.#tell("unsent", `NOT confirmed: ${failure.errors[0].message}. Use the switch on the machine.`),
     );
@@ -72,7 +84,12 @@ export class Stop {
     put(line, text);
     mark(line, "state", state);
     show(line, true);
-    if (state !== "unsent") this.#told = setTimeout(() => show(line, false), TOLD_MS);
+    if (state === "done" || state === "refused") this.#fade();
+  }
+
+  #fade() {
+    clearTimeout(this.#told);
+    this.#told = setTimeout(() => show($("stop-told"), false), TOLD_MS);
   }
 
   #show() {

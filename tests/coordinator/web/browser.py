@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, BrowserContext, Page, ViewportSize, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, ViewportSize, sync_playwright
 
 from coordinator.ipc.blocking import BlockingClient
 from tests.system.stage import Command
@@ -110,10 +110,13 @@ class Visitor:
         self.context.on("request", lambda request: self.asked.append(request.url))
         self.page.on("websocket", lambda socket: self.asked.append(socket.url))
         self.page.on("pageerror", lambda error: self.wrong.append(str(error)))
-        self.page.on(
-            "console",
-            lambda said: self.wrong.append(said.text) if said.type in ("error", "warning") else None,
-        )
+        self.page.on("console", self._said)
+
+    def _said(self, said: ConsoleMessage) -> None:
+        if (
+            said.type in ("error", "warning") and "willReadFrequently" not in said.text
+        ):  # the tests read, not it
+            self.wrong.append(said.text)
 
     def visit(self) -> "Visitor":
         """Open the page and wait until it knows the machine."""
