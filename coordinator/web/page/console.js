@@ -11,6 +11,7 @@ export class Console {
   #history = [];
   #at = 0;
   #started = null;
+  #heard = []; // texts of the log since a line was sent
 
   constructor(link) {
     this.#link = link;
@@ -52,6 +53,8 @@ export class Console {
   #take(line) {
     if (line.number <= this.#last) return;
     this.#last = line.number;
+    this.#heard.push(line.text);
+    if (this.#heard.length > LINES_MAX) this.#heard.shift();
     this.#add(line.kind, line.text, new Date(line.time));
   }
 
@@ -71,8 +74,13 @@ export class Console {
     if (this.#history.length > HISTORY_MAX) this.#history.shift();
     this.#at = this.#history.length;
     this.#add("sent", `> ${script}`, new Date());
+    this.#heard = [];
     try {
-      await this.#link.call("gcode.run", { script }); // what it says comes with the log
+      const told = await this.#link.call("gcode.run", { script });
+      // The log has it already, unless the line ran beside a job.
+      const unheard = (text) => !this.#heard.includes(text);
+      for (const text of told.replies.filter(unheard)) this.#add("reply", text, new Date());
+      for (const text of told.notices.filter(unheard)) this.#add("notice", text, new Date());
     } catch (error) {
       this.#add("bad", error.message, new Date());
     }

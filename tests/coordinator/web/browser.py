@@ -14,6 +14,7 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, ViewportSize, sync_playwright
 
 from coordinator.ipc.blocking import BlockingClient
+from tests.system.service_stage import zigzag
 from tests.system.stage import Command
 
 PATIENCE_MS = 30_000
@@ -61,7 +62,10 @@ class Demo:
         return self.folder / "demo.sock"
 
     def start(self) -> None:
-        self.command = Command("demo", "--serve", "--ipc", self.path, "--web", str(self.port))
+        jobs = self.folder / "jobs"
+        jobs.mkdir(exist_ok=True)
+        (jobs / "part.gcode").write_text(zigzag(4000, 1))  # minutes: it does not end while a test looks at it
+        self.command = Command("demo", "--serve", "--ipc", self.path, "--web", str(self.port), "--jobs", jobs)
         self.command.stdout.wait_for("ready")
 
     def end(self) -> None:

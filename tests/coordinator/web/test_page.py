@@ -5,9 +5,9 @@ from collections.abc import Iterator
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, ViewportSize, WebSocketRoute
+from playwright.sync_api import Browser, WebSocketRoute
 
-from tests.coordinator.web.browser import DESKTOP, PATIENCE_MS, PHONE, Demo, Visitor, chromium, demo
+from tests.coordinator.web.browser import PATIENCE_MS, PHONE, Demo, Visitor, chromium, demo
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture(scope="module")
 def machine(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Demo]:
-    """One machine for all; each test leaves it ready and at rest."""
+    """One machine for all; each test leaves it ready, or printing."""
     del browser  # without one there is nothing to serve
     with demo(tmp_path_factory.mktemp("page")) as served:
         yield served
@@ -34,17 +34,11 @@ def visitor(browser: Browser, machine: Demo) -> Iterator[Visitor]:
         tab.close()
 
 
-def begin_print(tab: Visitor) -> None:
-    tab.page.get_by_role("button", name="Print").click()
-    tab.until_text("state", "printing")
-
-
-def end_print(tab: Visitor) -> None:
-    """Cancel, which a print asks for twice, and wait for rest."""
-    tab.page.get_by_role("button", name="Cancel").click()
-    tab.page.get_by_role("button", name="Really cancel?").click()
-    tab.until_text("job-state", "cancelled")
-    tab.until_text("state", "ready")
+@pytest.fixture
+def printing(machine: Demo) -> None:
+    """The machine prints, and may go on with it."""
+    if machine.ask("job.status")["state"] != "printing":
+        machine.ask("job.start", file="part.gcode")
 
 
 def start_again(tab: Visitor) -> None:
@@ -59,20 +53,20 @@ def test_a_print_from_start_to_cancel(visitor: Visitor, machine: Demo) -> None:
     tab = visitor
     tab.until_text("state", "ready")
     assert tab.text("about").startswith("canductor ")
-    begin_print(tab)
+    tab.page.get_by_role("button", name="Print").click()
+    tab.until_text("state", "printing")
     places = set()
     for _ in range(4):  # the head moves on: each time another place
         places.add((tab.text("pos-x"), tab.text("pos-y")))
         tab.until(f"document.getElementById('pos-x').textContent !== '{tab.text('pos-x')}'")
     assert len(places) >= 3
     tab.until("document.getElementById('speed').textContent > '0.0'")
-    progress = tab.page.locator("#job-progress")
-    before = float(progress.get_attribute("value") or progress.evaluate("e => e.value"))
-    tab.until(f"document.getElementById('job-progress').value > {before} + 0.005")
+    before = tab.page.locator("#job-progress").evaluate("(progress) => progress.value")
+    tab.until(f"document.getElementById('job-progress').value > {before}")
     assert tab.text("job-file") == "part.gcode" == tab.text("top-file")
     tab.until("document.getElementById('job-row').textContent.match(/^[1-9]/)")
-
     assert tab.page.get_by_role("button", name="Print", exact=True).is_disabled()
+
     tab.page.get_by_role("button", name="Pause").click()
     tab.until_text("state", "paused")
     assert machine.ask("job.status")["state"] == "paused"
@@ -87,9 +81,9 @@ def test_a_print_from_start_to_cancel(visitor: Visitor, machine: Demo) -> None:
     tab.until_text("state", "ready")
 
 
+@pytest.mark.usefixtures("printing")
 def test_every_node_and_bus_is_there_with_its_figures(visitor: Visitor) -> None:
     tab = visitor
-    begin_print(tab)
     cards = tab.page.locator(".node")
     tab.until("document.querySelectorAll('.node').length === 3")
     assert cards.locator("h3").all_text_contents() == ["mcu", "toolhead", "zboard"]
@@ -108,8 +102,6 @@ def test_every_node_and_bus_is_there_with_its_figures(visitor: Visitor) -> None:
     load.scroll_into_view_if_needed()
     tab.page.wait_for_function(PAINTED, arg=load.element_handle(), timeout=PATIENCE_MS)
     tab.until("document.querySelector('.bus .keys b').textContent > '0.0 %'")
-    tab.page.locator("#path").scroll_into_view_if_needed()
-    end_print(tab)
 
 
 NONE = "\u2013"
@@ -124,10 +116,9 @@ PAINTED = """(canvas) => {
 }"""
 
 
-def test_the_toolpath_from_above_and_turned(visitor: Visitor) -> None:
+@pytest.mark.usefixtures("printing")
+def test_the_toolpath_from_above_and_turned(browser: Browser, machine: Demo, visitor: Visitor) -> None:
     tab = visitor
-    begin_print(tab)
-    tab.until("document.getElementById('job-row').textContent.replace(',', '') > '100'")
     canvas = tab.page.locator("#path")
     tab.page.wait_for_function(PAINTED, arg=canvas.element_handle(), timeout=PATIENCE_MS)
     tab.page.get_by_role("button", name="Pause").click()
@@ -166,30 +157,25 @@ def test_the_toolpath_from_above_and_turned(visitor: Visitor) -> None:
     changed()
     tab.page.get_by_role("button", name="Travels").click()
     changed()
-    end_print(tab)
 
-
-def test_a_page_opened_in_the_middle_knows_the_path_so_far(
-    browser: Browser, machine: Demo, visitor: Visitor
-) -> None:
-    begin_print(visitor)
-    visitor.until("document.getElementById('job-row').textContent.replace(',', '') > '100'")
+    # A page that is opened now knows what was done before.
     late = Visitor(browser, machine.url)
     points: list[int] = []
     late.page.on("websocket", lambda s: s.on("framereceived", lambda data: points.extend(path_points(data))))
     late.visit()
-    late.until_text("state", "printing")
     while not points:
         late.page.wait_for_timeout(50)
     assert points[0] > 20
     late.close()
-    end_print(visitor)
+    tab.page.get_by_role("button", name="Resume").click()
+    tab.until_text("state", "printing")
 
 
 def path_points(data: str | bytes) -> list[int]:
     return [int(n) for n in re.findall(r'"generation":\d+,"first":0,"count":(\d+)', str(data))]
 
 
+@pytest.mark.usefixtures("printing")
 def test_console(visitor: Visitor) -> None:
     tab = visitor
     line = tab.page.get_by_label("G-code", exact=True)
@@ -206,12 +192,33 @@ def test_console(visitor: Visitor) -> None:
     assert tab.page.locator("#log [data-kind=sent]").all_text_contents()[-2].endswith("> M114")
 
 
+def test_a_reply_is_shown_once(visitor: Visitor, machine: Demo) -> None:
+    """It comes in the log, and with the answer."""
+    tab = visitor
+    if machine.ask("job.status")["state"] == "printing":
+        machine.ask("job.cancel")
+    tab.until_text("state", "ready")
+    line = tab.page.get_by_label("G-code", exact=True)
+    replies = tab.page.locator("#log [data-kind=reply]")
+    before = replies.count()
+    for number in (1, 2):
+        line.fill("M114")
+        line.press("Enter")
+        tab.page.wait_for_function(
+            "(n) => document.querySelectorAll('#log [data-kind=reply]').length >= n", arg=before + number
+        )
+    line.fill("G1 X9999")
+    line.press("Enter")
+    tab.page.locator("#log [data-kind=bad]").last.wait_for()
+    assert replies.count() == before + 2
+
+
 # --------------------------------------------------------------------------------------------------- stopping
 
 
+@pytest.mark.usefixtures("printing")
 def test_emergency_stop_stops(visitor: Visitor, machine: Demo) -> None:
     tab = visitor
-    begin_print(tab)
     tab.until("document.getElementById('speed').textContent !== '0.0'")
     tab.page.get_by_role("button", name="Emergency stop").click()
     tab.until_text("state", "shutdown")
@@ -225,18 +232,6 @@ def test_emergency_stop_stops(visitor: Visitor, machine: Demo) -> None:
     assert set(told["machine.stop_confirmed_ms"]) == {"mcu", "toolhead", "zboard"}
     start_again(tab)
     assert machine.ask("machine.state")["state"] == "ready"
-
-
-def test_the_stop_by_keyboard(visitor: Visitor, machine: Demo) -> None:
-    visitor.page.keyboard.press("Control+Shift+.")
-    visitor.until_text("state", "shutdown")
-    assert machine.ask("machine.state")["state"] == "shutdown"
-    start_again(visitor)
-    visitor.page.get_by_label("Colours").focus()
-    visitor.page.keyboard.press("Tab")
-    visitor.page.keyboard.press("Enter")
-    visitor.until_text("state", "shutdown")
-    start_again(visitor)
 
 
 def test_the_stop_has_a_way_of_its_own(browser: Browser, machine: Demo) -> None:
@@ -253,25 +248,30 @@ def test_the_stop_has_a_way_of_its_own(browser: Browser, machine: Demo) -> None:
     tab.page.goto(machine.url)
     tab.until("document.getElementById('stop').dataset.line === 'up'")
     assert tab.text("state") == "connecting"
-    tab.page.get_by_role("button", name="Emergency stop").click()
+    tab.page.keyboard.press("Control+Shift+.")
     tab.page.get_by_text("All nodes were told to stop").wait_for()
     assert machine.ask("machine.state")["state"] == "shutdown"
     tab.close()
-    machine.ask("machine.restart")
     other = Visitor(browser, machine.url).visit()
-    other.until_text("state", "ready")
+    start_again(other)
     other.close()
 
 
 def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, machine: Demo) -> None:
     """It says so at once, goes on trying for 10 s, and then leaves the next life of the machine alone."""
     tab = Visitor(browser, machine.url)
-    way_is_open, sent = False, []
+    way_is_open = False
+    sent: list[str] = []
 
     def route(socket: WebSocketRoute) -> None:
         if way_is_open:
             server = socket.connect_to_server()
-            socket.on_message(lambda text: (sent.append(str(text)), server.send(text)))
+
+            def pass_on(text: str | bytes) -> None:
+                sent.append(str(text))
+                server.send(text)
+
+            socket.on_message(pass_on)
         else:
             socket.close()
 
@@ -290,7 +290,9 @@ def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, 
 
     way_is_open = False
     tab.page.reload()
-    stop.click()
+    tab.page.get_by_label("Colours").focus()
+    tab.page.keyboard.press("Tab")
+    tab.page.keyboard.press("Enter")
     tab.page.get_by_text("NOT stopped: the machine cannot be reached").wait_for()
     way_is_open = True
     tab.page.get_by_text("All nodes were told to stop").wait_for()
@@ -314,8 +316,7 @@ def test_it_comes_back_when_the_coordinator_does(visitor: Visitor, machine: Demo
     tab.until("document.getElementById('offline').hidden")
     tab.until_text("state", "ready")
     tab.page.get_by_text("the coordinator was started again").wait_for()
-    begin_print(tab)
-    end_print(tab)
+    assert tab.page.get_by_role("button", name="Print", exact=True).is_enabled()
     tab.wrong = [text for text in tab.wrong if "ERR_CONNECTION_REFUSED" not in text]
 
 
@@ -366,36 +367,35 @@ def test_nothing_is_asked_of_anybody_else(browser: Browser, machine: Demo) -> No
     tab.close()
 
 
-@pytest.mark.parametrize(
-    "viewport",
-    [
-        DESKTOP,
-        PHONE,
-        ViewportSize(width=844, height=390),
-        ViewportSize(width=1024, height=768),
-        ViewportSize(width=320, height=640),
-    ],
-    ids=lambda v: f"{v['width']}x{v['height']}",
-)
-def test_layout(browser: Browser, machine: Demo, viewport: ViewportSize) -> None:
-    tab = Visitor(browser, machine.url, viewport, touch=viewport["width"] < 500).visit()
+def test_layout(browser: Browser, machine: Demo) -> None:
+    tab = Visitor(browser, machine.url, PHONE, touch=True).visit()
     tab.until("document.querySelectorAll('.node').length === 3")
     tab.until("[...document.querySelectorAll('.node dd')].every((e) => e.textContent !== '')")
-    assert tab.page.evaluate("document.documentElement.scrollWidth") <= viewport["width"]
-    assert tab.page.evaluate(OVERFLOWING) == []
-    for at in (0, 500, 5000):  # wherever one is, the stop is there, and large
-        tab.page.evaluate("(y) => scrollTo(0, y)", at)
-        box = tab.page.locator("#stop").bounding_box()
-        assert box is not None
-        assert box["y"] >= 0
-        assert box["y"] + box["height"] <= viewport["height"]
-        assert box["x"] + box["width"] <= viewport["width"]
-        assert box["height"] >= 44
-        assert box["width"] >= 80
-        assert tab.page.evaluate(
-            "([x, y]) => document.elementFromPoint(x, y).closest('#stop') !== null",
-            [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2],
-        )
+    for width, height in (
+        (390, 844),
+        (844, 390),
+        (320, 640),
+        (768, 1024),
+        (1024, 768),
+        (1440, 900),
+        (2560, 1300),
+    ):
+        tab.page.set_viewport_size({"width": width, "height": height})
+        assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
+        assert tab.page.evaluate(OVERFLOWING) == [], width
+        for at in (0, 500, 5000):  # wherever one is, the stop is there, and large
+            tab.page.evaluate("(y) => scrollTo(0, y)", at)
+            box = tab.page.locator("#stop").bounding_box()
+            assert box is not None
+            assert box["y"] >= 0
+            assert box["y"] + box["height"] <= height
+            assert box["x"] + box["width"] <= width
+            assert box["height"] >= 44
+            assert box["width"] >= 80
+            middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
+            assert tab.page.evaluate(
+                "([x, y]) => document.elementFromPoint(x, y).closest('#stop') !== null", middle
+            )
     assert tab.wrong == []
     tab.close()
 
@@ -418,27 +418,19 @@ def test_everything_has_a_name(visitor: Visitor) -> None:
     assert visitor.page.locator("#path").get_attribute("aria-describedby") == "path-keys"
 
 
-@pytest.mark.parametrize("colours", ["auto", "light", "dark", "night"])
-def test_colours_can_be_read(browser: Browser, machine: Demo, colours: str) -> None:
+def test_colours_can_be_read(browser: Browser, machine: Demo) -> None:
     tab = Visitor(browser, machine.url, color_scheme="light").visit()
+    for colours in ("auto", "light", "dark", "night"):
+        check_colours(tab, colours)
+    tab.close()
+
+
+def check_colours(tab: Visitor, colours: str) -> None:
     tab.page.get_by_label("Colours").select_option(colours)
     shown = "light" if colours == "auto" else colours
     assert tab.page.evaluate("document.documentElement.dataset.colours") == shown
-    names = [
-        "card",
-        "sunk",
-        "ground",
-        "text",
-        "dim",
-        "ok",
-        "warn",
-        "bad",
-        "main",
-        "stop",
-        "on-stop",
-        "on-main",
-        "edge",
-    ]
+    names = ["card", "sunk", "ground", "text", "dim", "ok", "warn", "bad", "main"]
+    names += ["stop", "on-stop", "on-main", "edge"]
     read = """(names) => {
       const style = getComputedStyle(document.documentElement);
       return names.map((name) => style.getPropertyValue("--" + name).trim());
@@ -452,7 +444,6 @@ def test_colours_can_be_read(browser: Browser, machine: Demo, colours: str) -> N
     assert contrast(colour["edge"], colour["card"]) >= 3
     tab.page.reload()
     assert tab.page.evaluate("document.documentElement.dataset.colours") == shown, "it is remembered"
-    tab.close()
 
 
 def contrast(one: str, other: str) -> float:

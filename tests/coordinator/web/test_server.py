@@ -138,24 +138,21 @@ def test_others_need_a_token(
 
     async def go(paged: Paged) -> None:
         async with paged.socket() as page:
-            told = await ask(page, "api.hello", version=1, **({"token": token} if token else {}))
+            told = await ask(page, "api.hello", version=1, token=token)
             if scope is None:
                 assert told["error"]["code"] == "no_token"
                 assert (await page.receive()).type is aiohttp.WSMsgType.CLOSE
                 return
             assert told["result"]["scope"] == scope
-            answers = {
-                name: (await ask(page, name, number, **params)).get("error", {}).get("code")
-                for number, (name, params) in enumerate(
-                    {
-                        "machine.info": {},
-                        "move.to": {"x_mm": 1.0},
-                        "machine.emergency_stop": {},
-                        "node.command": {"command": "x"},
-                    }.items(),
-                    2,
-                )
-            }
+            wanted: list[tuple[str, dict[str, Any]]] = [
+                ("machine.info", {}),
+                ("move.to", {"x_mm": 1.0}),
+                ("machine.emergency_stop", {}),
+                ("node.command", {"command": "x"}),
+            ]
+            answers = {}
+            for number, (name, params) in enumerate(wanted, 2):
+                answers[name] = (await ask(page, name, number, **params)).get("error", {}).get("code")
             no = "not_allowed"
             assert answers == {
                 "machine.info": None,
