@@ -17,13 +17,13 @@ from coordinator.host import Host
 from coordinator.ipc.methods import ApiError
 from coordinator.ipc.state import StateTree
 from coordinator.machine.description import MachineDescription
+from coordinator.move_source import Told
 from coordinator.service.figures import Figures
 from coordinator.service.job_folder import JobFolder
 from coordinator.service.jobs import JobPhase, JobRun
 from coordinator.service.log_ring import Entry, LogRing
 from coordinator.service.motion import Motion
 from coordinator.service.work import FileWork
-from coordinator.streamer import Told
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 
