@@ -193,7 +193,11 @@ def _declare_demo(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add("--machine", default="demo", help="configuration file or example; its nodes become virtual ones")
     add("--gcode", type=Path, metavar="FILE", help="g-code file to print")
-    add("--no-web", action="store_true", help="for scripts: no live page (that is, unless --serve --web)")
+    add(
+        "--no-web",
+        action="store_true",
+        help="for scripts: no live page, which is there only with --serve --web",
+    )
     add("--loss", default="0", metavar="SHARE", help="share of frames the bus loses: 0.01 or 1%%")
     add("--seed", default="1", metavar="N", help="decides which frames are lost")
     add("--rate-ppm", action="append", metavar="NAME=X", help="a node's clock error in ppm")

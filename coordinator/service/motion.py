@@ -112,9 +112,7 @@ class Motion:
         self.planned = state.planned
         now_s = self.now_s
         self.trace.forget_before_s = now_s - KEEP_S
-        with contextlib.suppress(IndexError):
-            while True:
-                self.toolpath.add(self.trace.fresh.popleft())
+        self.toolpath.add(self.trace.take_fresh())
         with contextlib.suppress(IndexError):
             while True:
                 self._ending.append(self.feeder.finished.popleft())

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
+from socket import gethostname
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,4 +27,6 @@ class WebSettings:
         """What to type into a browser."""
         scheme = "http" if self.certificate is None else "https"
         host = f"[{self.host}]" if ":" in self.host else self.host
+        if ip_address(self.host).is_unspecified:
+            host = gethostname()
         return f"{scheme}://{host}:{self.port}/"

@@ -1,13 +1,15 @@
 """The words about serving: the page beyond this computer only with what protects it."""
 
 import builtins
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from coordinator import cli
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
