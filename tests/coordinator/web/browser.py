@@ -14,7 +14,6 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, ViewportSize, sync_playwright
 
 from coordinator.ipc.blocking import BlockingClient
-from tests.system.service_stage import zigzag
 from tests.system.stage import Command
 
 PATIENCE_MS = 30_000
@@ -45,6 +44,16 @@ def free_port() -> int:
         return port
 
 
+def long_job() -> str:
+    """Return a job of a quarter of an hour, so that it does not end while a test looks at it; and not hard."""
+    lines = ["G28", "G90", "M83", "G1 Z1 F900"]
+    for n in range(4000):
+        row, column = n // 8 % 8, n % 8
+        x = 20 + 10 * (column if row % 2 == 0 else 7 - column)
+        lines.append(f"G1 X{x} Y{20 + 10 * row} Z{1 + n // 64 * 0.2:.1f} E0.3 F3000")
+    return "\n".join(lines) + "\n"
+
+
 @dataclass
 class Demo:
     """``canductor demo --serve --web``, which can be ended and started again at the same place."""
@@ -64,7 +73,7 @@ class Demo:
     def start(self) -> None:
         jobs = self.folder / "jobs"
         jobs.mkdir(exist_ok=True)
-        (jobs / "part.gcode").write_text(zigzag(4000, 1))  # minutes: it does not end while a test looks at it
+        (jobs / "part.gcode").write_text(long_job())
         self.command = Command("demo", "--serve", "--ipc", self.path, "--web", str(self.port), "--jobs", jobs)
         self.command.stdout.wait_for("ready")
 

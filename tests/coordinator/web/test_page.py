@@ -37,6 +37,7 @@ def visitor(browser: Browser, machine: Demo) -> Iterator[Visitor]:
 @pytest.fixture
 def printing(machine: Demo) -> None:
     """The machine prints, and may go on with it."""
+    assert machine.ask("machine.state")["cause"] == ""
     if machine.ask("job.status")["state"] != "printing":
         machine.ask("job.start", file="part.gcode")
 
