@@ -38,7 +38,10 @@ def visitor(browser: Browser, machine: Demo) -> Iterator[Visitor]:
 def printing(machine: Demo) -> None:
     """The machine prints, and may go on with it."""
     assert machine.ask("machine.state")["cause"] == ""
-    if machine.ask("job.status")["state"] != "printing":
+    state = machine.ask("job.status")["state"]
+    if state == "paused":
+        machine.ask("job.resume")
+    elif state != "printing":
         machine.ask("job.start", file="part.gcode")
 
 
@@ -196,7 +199,7 @@ def test_console(visitor: Visitor) -> None:
 def test_a_reply_is_shown_once(visitor: Visitor, machine: Demo) -> None:
     """It comes in the log, and with the answer."""
     tab = visitor
-    if machine.ask("job.status")["state"] == "printing":
+    if machine.ask("job.status")["state"] in ("printing", "paused"):
         machine.ask("job.cancel")
     tab.until_text("state", "ready")
     line = tab.page.get_by_label("G-code", exact=True)
