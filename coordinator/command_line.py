@@ -37,6 +37,8 @@ FRONT_END_COMMANDS = {
     "status": "Tell how a machine that runs is doing.",
     "send": "Send a file to a machine that runs, and print it.",
     "estop": "Stop a machine that runs, at once.",
+    "discover": "List the machines that run here or are announced on the network.",
+    "table": "Check compensation tables of axes, and give them to a machine that runs.",
     "completion": "Write what makes a shell complete the words of canductor.",
 }
 """Commands whose words are read by ``coordinator.front_end_words``."""
@@ -229,7 +231,7 @@ def _demo(given: argparse.Namespace) -> Job:
         rate_ppm=assignments("--rate-ppm", given.rate_ppm, _ppm),
         start_clock=assignments("--start-clock", given.start_clock, _ticks),
         keep=given.keep,
-        serve=read_serving(given, machine) if given.serve else None,
+        serve=read_serving(given, machine, announce=False) if given.serve else None,
         socketcan=_interfaces(given.socketcan),
     )
     if options.socketcan and options.loss:

@@ -57,6 +57,12 @@ class ServeOptions:
     """Address and port of the live page."""
     web_without_tls: bool = False
     """Serve the page without TLS beyond loopback, too."""
+    announce: bool | None = None
+    """Announce the machine on the network; None: if its TCP port can be reached from there."""
+    metrics: tuple[str, int] | None = None
+    """IP address and port of the figures for Prometheus."""
+    metrics_open: bool = False
+    """Whether others than this computer may read them."""
 
 
 @record(kw_only=True)

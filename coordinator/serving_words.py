@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 from coordinator.commands import ServeOptions
+from coordinator.network_words import declare_network, read_announce, read_metrics
 from nodes.option_values import UsageError, existing_file
 
 
@@ -26,15 +27,16 @@ def declare_serving(command: argparse.ArgumentParser) -> None:
         help="serve the live page; beyond this computer (0.0.0.0:PORT) it needs --tokens, and TLS",
     )
     add("--web-without-tls", action="store_true", help="the page beyond this computer, readable on the way")
+    declare_network(add)
 
 
 def is_asked_to_serve(given: argparse.Namespace) -> bool:
     """Tell whether the words ask for a service that stays."""
-    return any(word is not None for word in (given.ipc, given.tcp, given.web))
+    return any(word is not None for word in (given.ipc, given.tcp, given.web, given.metrics))
 
 
-def read_serving(given: argparse.Namespace, config: Path) -> ServeOptions:
-    """Return what the words ask for; raises UsageError."""
+def read_serving(given: argparse.Namespace, config: Path, announce: bool | None = None) -> ServeOptions:
+    """Return what the words ask for, ANNOUNCE unless they say so; raises UsageError."""
     name = given.name or (config.parent.name if config.stem == "machine" else config.stem)
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,48}", name):
         raise UsageError(f"--name is '{name}', must be 1 to 48 letters, digits, - and _")
@@ -52,6 +54,9 @@ def read_serving(given: argparse.Namespace, config: Path) -> ServeOptions:
         certificate=existing_file(given.tls_certificate),
         private_key=existing_file(given.tls_key),
         plain_on_loopback=given.no_tls_on_loopback,
+        announce=read_announce(given, announce),
+        metrics=read_metrics(given),
+        metrics_open=given.metrics_open,
         web=_web_address(given),
         web_without_tls=given.web_without_tls,
     )

@@ -17,6 +17,7 @@ from coordinator.machine import (
     read_rails,
     read_rotary_delta,
     read_shaper,
+    read_tables,
     read_winch,
 )
 from coordinator.machine.options import Option, SectionSpec
@@ -42,6 +43,7 @@ SECTIONS: dict[str, SectionSpec] = {
     "[extruder], [extruder1] …": read_extruder.EXTRUDER,
     "[extruder_stepper NAME]": read_extruder.EXTRUDER_STEPPER,
     "[input_shaper]": read_shaper.INPUT_SHAPER,
+    "[axis_tables]": read_tables.AXIS_TABLES,
     "[board_pins], [board_pins NAME]": read_nodes.BOARD_PINS,
     "[duplicate_pin_override]": read_nodes.DUPLICATE_PIN_OVERRIDE,
 }
