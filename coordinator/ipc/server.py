@@ -14,11 +14,11 @@ from typing import Final
 
 from coordinator.ipc.auth import FailureBrake, Grant, Tokens
 from coordinator.ipc.connection import Connection
-from coordinator.ipc.methods import Registry, Value
+from coordinator.ipc.methods import Registry, Scope, Value
 from coordinator.ipc.publisher import Publisher
 from coordinator.ipc.session import Common, Session, SessionCounters
 from coordinator.ipc.session_methods import add_session_methods
-from coordinator.ipc.settings import IpcSettings, TcpSettings
+from coordinator.ipc.settings import IpcSettings, Limits, TcpSettings
 from coordinator.ipc.state import StateTree
 from coordinator.ipc.wire import Encoder, Encoding, Fault
 from nodes.errors import CanductorError
@@ -56,6 +56,8 @@ class IpcServer:
     async def start(self) -> None:
         """Open the sockets; raises CanductorError with all closed."""
         try:
+            if self._settings.tokens is not None:
+                self._tokens = await asyncio.to_thread(Tokens.read, self._settings.tokens)
             if self._settings.unix_path is not None:
                 await self._open_unix(self._settings.unix_path)
             if self._settings.tcp is not None:
@@ -125,7 +127,7 @@ class IpcServer:
         self._servers.append(server)
 
     async def _open_tcp(self, tcp: TcpSettings) -> None:
-        context = await asyncio.to_thread(_tls_context, tcp)
+        context = await asyncio.to_thread(_tls_of_tcp, tcp)
         self._tokens = await asyncio.to_thread(Tokens.read, tcp.tokens)
         try:
             server = await asyncio.get_running_loop().create_server(
@@ -146,6 +148,28 @@ class IpcServer:
 
     # ---------------------------------------------------------------------------------------- clients
 
+    @property
+    def limits(self) -> Limits:
+        """What one client may cost."""
+        return self._common.limits
+
+    def adopt(self, transport: asyncio.Transport, address: str, granted: Scope | None) -> Connection:
+        """Take a client that came by another door, such as the live page's; TRANSPORT carries JSON lines.
+
+        Without a token it may do what is GRANTED; with nothing granted it is let in as one over TCP.
+        """
+
+        def admit(transport: asyncio.Transport, connection: Connection) -> Session:
+            if granted is None:
+                return self._admit_tcp(transport, connection, address)
+            session = self._session(connection, address, address)
+            session.granted = granted
+            return session
+
+        connection = Connection(admit, self._drop)
+        connection.connection_made(transport)
+        return connection
+
     def _admit_unix(self, transport: asyncio.Transport, connection: Connection) -> Session:
         opened = transport.get_extra_info("socket")
         pid, uid, _ = _PEER.unpack(opened.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
@@ -155,8 +179,11 @@ class IpcServer:
             self._refuse(session, Fault("not_allowed", f"this socket is not for the user with uid {uid}"))
         return session
 
-    def _admit_tcp(self, transport: asyncio.Transport, connection: Connection) -> Session:
-        address = str((transport.get_extra_info("peername") or ("unknown",))[0])
+    def _admit_tcp(
+        self, transport: asyncio.Transport, connection: Connection, address: str | None = None
+    ) -> Session:
+        if address is None:
+            address = str((transport.get_extra_info("peername") or ("unknown",))[0])
         session = self._session(connection, address, address)
         wait_s = self._brake.shut_out_s(address, asyncio.get_running_loop().time())
         others = self._connections - {connection}
@@ -222,18 +249,10 @@ def _make_way(path: Path) -> None:
     raise CanductorError(f"another coordinator serves at {path}; stop it, or choose another path")
 
 
-def _tls_context(tcp: TcpSettings) -> ssl.SSLContext | None:
+def _tls_of_tcp(tcp: TcpSettings) -> ssl.SSLContext | None:
     """Return how TCP is kept secret, None for plain loopback; raises CanductorError."""
     if tcp.certificate is not None and tcp.private_key is not None:
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.minimum_version = ssl.TLSVersion.TLSv1_2
-        try:
-            context.load_cert_chain(tcp.certificate, tcp.private_key)
-        except (OSError, ssl.SSLError) as error:
-            raise CanductorError(
-                f"the certificate {tcp.certificate} or its key cannot be used: {error}"
-            ) from None
-        return context
+        return tls_context(tcp.certificate, tcp.private_key)
     if not tcp.plain_on_loopback:
         raise CanductorError("TCP needs a certificate and its private key, or plain_on_loopback")
     if not _is_loopback(tcp.host):
@@ -241,6 +260,17 @@ def _tls_context(tcp: TcpSettings) -> ssl.SSLContext | None:
             f"TCP without TLS is for loopback only, and {tcp.host} is not: 127.0.0.1 or ::1 is"
         )
     return None
+
+
+def tls_context(certificate: Path, private_key: Path) -> ssl.SSLContext:
+    """Return TLS 1.2 or later with the chain and key of two PEM files; raises CanductorError."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(certificate, private_key)
+    except (OSError, ssl.SSLError) as error:
+        raise CanductorError(f"the certificate {certificate} or its key cannot be used: {error}") from None
+    return context
 
 
 def _is_loopback(host: str) -> bool:

@@ -218,6 +218,7 @@ class MachineService:
             raise ApiError(
                 "busy", "the machine is busy; wait for its moves, or cancel them, then start the job"
             )
+        motion.toolpath.clear()
         self.job = JobRun(motion, work, self.now_s)
         self.log.add("job", f"{self.job.file}: started")
         self.look()

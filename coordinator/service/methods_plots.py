@@ -5,12 +5,15 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Any, Final
 
+import numpy as np
+
 from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
 from coordinator.service.machine_service import MachineService
 from coordinator.service.motion import Motion
 from coordinator.service.trace import KEEP_S, Moves
 from nodes.dictionary import Dictionary
 
+POINTS_AT_ONCE: Final = 4000
 MOVES_MAX: Final = 4000
 COMMANDS_MAX: Final = 4000
 """Of each moving node."""
@@ -40,6 +43,38 @@ def plot_methods(service: MachineService) -> Iterator[Method]:
             # Reading commands one by one takes Python a while: not on the control loop.
             return await asyncio.to_thread(_dump, now_s, since_s, moves, senders, names)
 
+    def path(_caller: Caller, params: dict[str, Any]) -> Value:
+        motion = service.motion or service.ready_motion()  # also of a machine that has stopped
+        toolpath = motion.toolpath
+        first = params["first"] if params["generation"] == toolpath.generation else 0
+        at, time_s, extrudes = toolpath.after(first, POINTS_AT_ONCE)
+        return {
+            "generation": toolpath.generation,
+            "first": first,
+            "count": len(toolpath),
+            **{axis: np.round(at[:, i], 3).tolist() for i, axis in enumerate("xyz")},
+            "print_time_s": np.round(time_s, 3).tolist(),
+            "extrudes": extrudes.tolist(),
+        }
+
+    yield Method(
+        "motion.path",
+        Scope.WATCH,
+        f"Return corners of the tool's path since the job began, planned ones too; at most {POINTS_AT_ONCE}.",
+        path,
+        params=(
+            Param("generation", Kind.INT, "of the points known", required=False, default=0, low=0),
+            Param("first", Kind.INT, "number of the first one wanted", required=False, default=0, low=0),
+        ),
+        returns=(
+            Param("generation", Kind.INT, "another one than known: what was known is void"),
+            Param("first", Kind.INT, "number of the first point returned"),
+            Param("count", Kind.INT, "of all points"),
+            *(Param(axis, Kind.LIST, "of each point, in the machine's frame", "mm") for axis in "xyz"),
+            Param("print_time_s", Kind.LIST, "when the tool is there", "s"),
+            Param("extrudes", Kind.LIST, "whether it extrudes on the way there"),
+        ),
+    )
     yield Method(
         "motion.dump",
         Scope.WATCH,

@@ -10,6 +10,7 @@ from coordinator.motion.planner import Planner
 from coordinator.move_source import JobState, Planned, Told
 from coordinator.program_machine import machine_state
 from coordinator.service.feeder import Feeder, Ticket
+from coordinator.service.toolpath import Toolpath
 from coordinator.service.trace import KEEP_S, Moment, MotionTrace
 from coordinator.service.work import LinesWork, Work
 from coordinator.streamer import Streamer
@@ -34,6 +35,7 @@ class Motion:
             machine.modules.vocabulary,
         )
         self.trace = MotionTrace(len(machine.moving))
+        self.toolpath = Toolpath()
         self.planned = UNMOVED
         self.streamer = Streamer(
             machine, self.feeder, witness=self.trace, on_told=on_told, on_state=self._cycle_ended
@@ -110,6 +112,7 @@ class Motion:
         self.planned = state.planned
         now_s = self.now_s
         self.trace.forget_before_s = now_s - KEEP_S
+        self.toolpath.add(self.trace.take_fresh())
         with contextlib.suppress(IndexError):
             while True:
                 self._ending.append(self.feeder.finished.popleft())
