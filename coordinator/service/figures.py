@@ -48,8 +48,10 @@ class Figures:
             self._tree.update("position", position_figures(service.motion))
             waiting: Value = service.motion.streamer.held
             self._tree.set("machine.waits_for", waiting)
+            self._tree.update("machine", lead_figures(service.motion))
         else:
             self._tree.update("position", {"moving": False, "velocity_mm_s": 0.0, "homed": ""})
+            self._tree.set("machine.lead_ms", None)
         if service.confirmed_s:
             confirmed: Value = {name: round(s * 1e3, 1) for name, s in service.confirmed_s.items()}
             self._tree.set("machine.stop_confirmed_ms", confirmed)
@@ -84,6 +86,7 @@ def job_figures(job: "JobRun | None", now_s: float) -> dict[str, Value]:
         "file": job.file,
         "size_bytes": job.size_bytes,
         "done_bytes": job.done_bytes,
+        "read_bytes": job.read_bytes,
         "progress": round(job.progress, 4),
         "line": job.line,
         "lines_read": job.lines_read,
@@ -108,6 +111,16 @@ def position_figures(motion: "Motion") -> dict[str, Value]:
         "extrude_factor": planned.extrude_factor,
         "print_time_s": round(motion.now_s, 3),
     }
+
+
+def lead_figures(motion: "Motion") -> dict[str, Value]:
+    """Return how far ahead commands are made, in ms."""
+    lead = motion.lead
+    return {"lead_ms": _ms(lead.now_s), "lead_min_ms": _ms(lead.least_s)}
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else round(seconds * 1e3, 1)
 
 
 def axes(position: Position) -> Value:
@@ -196,7 +209,6 @@ def _clock(node: Node) -> dict[str, Value]:
 
 
 def _link(stats: LinkStats, recent: _RecentLead) -> dict[str, Value]:
-    least = stats.min_lead_s
     histogram: Value = list(stats.lead_histogram)
     return {
         "round_trip_ms": round(stats.srtt_s * 1e3, 3),
@@ -209,7 +221,7 @@ def _link(stats: LinkStats, recent: _RecentLead) -> dict[str, Value]:
         "retransmitted_bytes": stats.bytes_repeated,
         "invalid_bytes": stats.bytes_invalid,
         "lead_ms": recent.look(stats.lead_histogram),
-        "lead_min_ms": None if least is None else round(least * 1e3, 1),
+        "lead_min_ms": _ms(stats.min_lead_s),
         "lead_histogram": histogram,
     }
 

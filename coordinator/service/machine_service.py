@@ -17,6 +17,7 @@ from coordinator.host import Host
 from coordinator.ipc.methods import ApiError
 from coordinator.ipc.state import StateTree
 from coordinator.machine.description import MachineDescription
+from coordinator.pipeline import PlanRecord
 from coordinator.service.figures import Figures
 from coordinator.service.job_folder import JobFolder
 from coordinator.service.jobs import JobPhase, JobRun
@@ -59,7 +60,8 @@ class ServiceSettings:
 class MachineService:
     """Runs the machine that LOAD describes (called again at every restart; CanductorError).
 
-    ``run`` until it is cancelled. ON_LINE hears every line of the log.
+    ``run`` until it is cancelled. ON_LINE hears every line of the log. RECORD keeps all that is planned, for
+    a proof; memory grows with it.
     """
 
     def __init__(
@@ -70,6 +72,7 @@ class MachineService:
         settings: ServiceSettings,
         *,
         cache: DictionaryCache | None = None,
+        record: PlanRecord | None = None,
         on_line: Callable[[Entry], None],
     ) -> None:
         self.settings = settings
@@ -91,6 +94,7 @@ class MachineService:
         self._load = load
         self.tree = state
         self._cache = cache
+        self._record = record
         self._figures = Figures(state)
         self._restart = asyncio.Event()
         self._asked_to_stop: str | None = None
@@ -138,7 +142,7 @@ class MachineService:
 
     async def _move(self, machine: Machine) -> None:
         try:
-            self.motion = Motion(machine, on_told=self._told, on_cycle=self.look)
+            self.motion = Motion(machine, on_told=self._told, on_cycle=self.look, record=self._record)
             self._enter(ServiceState.READY)
             await self.motion.run()
         except CanductorError as error:
