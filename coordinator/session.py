@@ -125,10 +125,11 @@ async def _print(
     job = Job(program, Planner(described.limits), described.homed_position, machine_state(described))
     streamer = Streamer(machine, job, record=record, on_told=on_told, on_state=show)
     await streamer.run()
-    return await _outcome(machine, streamer, began_at)
+    return await outcome_of(machine, streamer, began_at)
 
 
-async def _outcome(machine: Machine, streamer: Streamer, began_at: dict[str, int]) -> Outcome:
+async def outcome_of(machine: Machine, streamer: Streamer, began_at: dict[str, int]) -> Outcome:
+    """Return what became of STREAMER's job, which has ended; BEGAN_AT: what the nodes counted before it."""
     ended_at = await machine.stepper_positions()
     stats = streamer.steps.stats()
     return Outcome(

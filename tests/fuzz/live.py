@@ -1,0 +1,217 @@
+"""Fuzzes the sockets of a machine while it prints, and proves that the print is none the worse.
+
+Usage, from the project's root: python -m tests.fuzz.live [--minutes M] [--gcode FILE] [--seed N]
+
+One service prints the same file again and again: now quietly, now under clients that do their worst. Every
+stepper must have moved by the same number of steps, and at the end the demo's proof looks at the position
+and the time of every step of all prints. Leads and memory are those of the service's process.
+"""
+
+import argparse
+import asyncio
+import json
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from coordinator.commands import DEMO_GCODE
+from coordinator.ipc.client import Client
+from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
+
+ROOT: Final = Path(__file__).resolve().parents[2]
+QUIET_EVERY: Final = 4
+"""Of so many prints one is quiet."""
+PATIENCE_S: Final = 120.0
+
+
+@dataclass
+class Printed:
+    """One print: under fuzzers or not."""
+
+    fuzzed: bool
+    took_s: float
+    steps: dict[str, int]
+    """By stepper: what its node counted, from the begin of the print to its end."""
+    memory_kib: int
+    """Of the service, at the end."""
+    lead_ms: float = 0.0
+
+
+@dataclass
+class Findings:
+    """What was found."""
+
+    prints: list[Printed] = field(default_factory=list)
+    counts: Counter[str] = field(default_factory=Counter)
+    problems: list[str] = field(default_factory=list)
+    proof: dict[str, Any] = field(default_factory=dict)
+
+    def of(self, *, fuzzed: bool) -> list[Printed]:
+        """Return the prints that were fuzzed, or not."""
+        return [p for p in self.prints if p.fuzzed == fuzzed]
+
+    @property
+    def lead_lost(self) -> float:
+        """The part of the lead that fuzzing cost: of the quiet prints' median."""
+        quiet = statistics.median(p.lead_ms for p in self.of(fuzzed=False))
+        return 1 - statistics.median(p.lead_ms for p in self.of(fuzzed=True)) / quiet
+
+    @property
+    def lead_lost_at_worst(self) -> float:
+        """The same for the worst of the fuzzed prints."""
+        quiet = statistics.median(p.lead_ms for p in self.of(fuzzed=False))
+        return 1 - min(p.lead_ms for p in self.of(fuzzed=True)) / quiet
+
+
+class Bench:
+    """The service in a process of its own, and its operator."""
+
+    def __init__(self, process: subprocess.Popen[str], folder: Path, port: int, client: Client) -> None:
+        self.process = process
+        self.path = folder / "open.sock"
+        self.port = port
+        self.client = client
+        self.findings = Findings()
+
+    async def print(self, file: str, *, seed: int | None) -> None:
+        """Print FILE, under fuzzers from SEED unless that is None."""
+        before = await self._positions()
+        begun_s = time.monotonic()
+        await self.client.call("job.start", {"file": file})
+        fuzzer = None if seed is None else self._fuzzer(seed)
+        await self._until_done()
+        took_s = time.monotonic() - begun_s
+        if fuzzer is not None:
+            told = json.loads((await asyncio.to_thread(fuzzer.communicate))[0])
+            self.findings.counts.update(told["counts"])
+            self.findings.problems += told["problems"]
+        after = await self._positions()
+        steps = {name: count - before[name] for name, count in after.items()}
+        self.findings.prints.append(Printed(fuzzer is not None, took_s, steps, memory_kib(self.process.pid)))
+
+    async def _until_done(self) -> None:
+        async for update in self.client.watch(["job.state", "machine.*"], rate_hz=5):
+            state = update.values.get("job.state")
+            if state not in (None, "printing"):
+                assert state == "done", update.values
+                return
+
+    async def _positions(self) -> dict[str, int]:
+        told = await self.client.call("position.get", {"ask_nodes": True})
+        assert told["nodes_steps"] == {n: s["steps_sent"] for n, s in told["steppers"].items()}
+        return dict(told["nodes_steps"])
+
+    def _fuzzer(self, seed: int) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "tests.fuzz.live_visits", str(self.path), str(self.port)]
+        return subprocess.Popen(
+            [*command, WATCH_TOKEN, str(seed)],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+
+def memory_kib(pid: int) -> int:
+    """Return what process PID has in memory."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(next(line for line in status.splitlines() if line.startswith("VmRSS")).split()[1])
+
+
+@contextmanager
+def _service(folder: Path, jobs: Path) -> Iterator[subprocess.Popen[str]]:
+    with (folder / "errors").open("w") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tests.fuzz.proved_service", str(folder), str(jobs)],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+        )
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+
+async def _drive(
+    process: subprocess.Popen[str], folder: Path, file: str, fuzz_s: float, seed: int
+) -> Findings:
+    assert process.stdout is not None
+    port = int(await asyncio.to_thread(process.stdout.readline) or "0")
+    assert port, (folder / "errors").read_text()
+    async with Client.connect(f"tcp://127.0.0.1:{port}", token=ADMIN_TOKEN) as client:
+        bench = Bench(process, folder, port, client)
+        fuzzed_s, turn = 0.0, 0
+        while fuzzed_s < fuzz_s or turn % QUIET_EVERY != 1:  # the last one is quiet, as the first one is
+            quiet = turn % QUIET_EVERY == 0
+            await bench.print(file, seed=None if quiet else seed + turn * 1_000_000)
+            fuzzed_s += 0.0 if quiet else bench.findings.prints[-1].took_s
+            turn += 1
+            _show(bench.findings.prints[-1])
+    proof, _ = await asyncio.to_thread(process.communicate, None, PATIENCE_S)
+    findings = bench.findings
+    errors = (folder / "errors").read_text()
+    if errors or process.returncode:
+        findings.problems.append(f"the service ended with {process.returncode} and said: {errors[-2000:]}")
+        return findings
+    findings.proof = json.loads(proof.splitlines()[-1])
+    for printed, lead_ms in zip(findings.prints, findings.proof["leads_ms"], strict=True):
+        printed.lead_ms = lead_ms
+    return findings
+
+
+def fuzz_a_print(gcode: Path, fuzz_s: float, seed: int) -> Findings:
+    """Print GCODE until fuzzers were at work for FUZZ_S."""
+    with tempfile.TemporaryDirectory(prefix="canductor-fuzz-") as name:
+        folder = Path(name)
+        jobs = folder / "jobs"
+        jobs.mkdir()
+        shutil.copy(gcode, jobs)
+        with _service(folder, jobs) as process:
+            return asyncio.run(_drive(process, folder, gcode.name, fuzz_s, seed))
+
+
+def _show(printed: Printed) -> None:
+    word = "fuzzed" if printed.fuzzed else "quiet"
+    sys.stderr.write(f"{word}: {printed.took_s:.1f} s, memory {printed.memory_kib:,} KiB\n")
+
+
+def main() -> None:
+    """Fuzz, print the findings; the exit status tells whether it held."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--gcode", type=Path, default=DEMO_GCODE)
+    parser.add_argument("--seed", type=int, default=int(time.time()))
+    given = parser.parse_args()
+    found = fuzz_a_print(given.gcode, given.minutes * 60, given.seed)
+    tell = sys.stdout.write
+    for printed in found.prints:
+        word = "fuzzed" if printed.fuzzed else "quiet "
+        tell(
+            f"{word} {printed.took_s:6.1f} s, lead {printed.lead_ms:6.1f} ms, "
+            f"memory {printed.memory_kib:,} KiB, steps {printed.steps}\n"
+        )
+    tell(f"seed {given.seed}: {json.dumps(found.counts, indent=1)}\n{json.dumps(found.proof, indent=1)}\n")
+    tell("".join(f"PROBLEM: {sentence}\n" for sentence in found.problems))
+    same = len({tuple(printed.steps.items()) for printed in found.prints}) == 1
+    tell(
+        f"lead lost: median {found.lead_lost:+.1%}, worst {found.lead_lost_at_worst:+.1%}; "
+        f"steps of all prints {'the same' if same else 'DIFFER'}; proof {found.proof.get('ok')}\n"
+    )
+    sys.exit(0 if found.proof.get("ok") and not found.problems and same else 1)
+
+
+if __name__ == "__main__":
+    main()
