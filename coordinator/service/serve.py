@@ -95,9 +95,16 @@ class _Hall:
         add_methods(service, registry)
         if settings.jobs is not None:
             registry.add(upload_method(settings.jobs))
-        self._server = IpcServer(registry, tree, _ipc_settings(self._options, self.path))
+        self._server = IpcServer(
+            registry,
+            tree,
+            _ipc_settings(self._options, self.path),
+            on_notice=lambda text: service.log.add("notice", text),
+        )
         await self._server.start()
         _say(f"serving at {self.path}")
+        if self._options.tcp is not None:
+            _say(f"serving at {_address(self._options, self._server.tcp_port)}")
         typed = Typed(service, _say) if sys.stdin is not None and sys.stdin.isatty() else None
         try:
             await service.run()
@@ -126,6 +133,13 @@ def _ipc_settings(options: ServeOptions, path: Path) -> IpcSettings:
             plain_on_loopback=options.plain_on_loopback,
         )
     return IpcSettings(unix_path=path, tcp=tcp)
+
+
+def _address(options: ServeOptions, port: int | None) -> str:
+    assert options.tcp is not None
+    host = options.tcp[0]
+    scheme = "tls" if options.certificate is not None else "tcp"
+    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 def _say(line: str) -> None:
