@@ -25,11 +25,12 @@ from typing import Any, Final
 
 from coordinator.commands import DEMO_GCODE
 from coordinator.ipc.client import Client
+from nodes.errors import CanductorError
 from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 QUIET_EVERY: Final = 4
-"""Of so many prints one is quiet."""
+"""Of so many prints one is quiet, and the last one is."""
 PATIENCE_S: Final = 120.0
 
 
@@ -99,11 +100,14 @@ class Bench:
         self.findings.prints.append(Printed(fuzzer is not None, took_s, steps, memory_kib(self.process.pid)))
 
     async def _until_done(self) -> None:
-        async for update in self.client.watch(["job.state", "machine.*"], rate_hz=5):
+        async for update in self.client.watch(["job.state"], rate_hz=5):
             state = update.values.get("job.state")
             if state not in (None, "printing"):
-                assert state == "done", update.values
-                return
+                break
+        if state != "done":
+            why = await self.client.call("machine.state")
+            leads = await self.client.call("state.get", {"fields": ["*lead*"]})
+            raise CanductorError(f"the print {state}: {why['cause']}; {leads['values']}")
 
     async def _positions(self) -> dict[str, int]:
         told = await self.client.call("position.get", {"ask_nodes": True})
@@ -154,12 +158,15 @@ async def _drive(
     async with Client.connect(f"tcp://127.0.0.1:{port}", token=ADMIN_TOKEN) as client:
         bench = Bench(process, folder, port, client)
         fuzzed_s, turn = 0.0, 0
-        while fuzzed_s < fuzz_s or turn % QUIET_EVERY != 1:  # the last one is quiet, as the first one is
-            quiet = turn % QUIET_EVERY == 0
+        while True:
+            over = fuzzed_s >= fuzz_s
+            quiet = over or turn % QUIET_EVERY == 0
             await bench.print(file, seed=None if quiet else seed + turn * 1_000_000)
             fuzzed_s += 0.0 if quiet else bench.findings.prints[-1].took_s
             turn += 1
             _show(bench.findings.prints[-1])
+            if over:  # the last one is quiet, as the first one is
+                break
     proof, _ = await asyncio.to_thread(process.communicate, None, PATIENCE_S)
     findings = bench.findings
     errors = (folder / "errors").read_text()
