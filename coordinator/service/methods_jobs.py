@@ -123,7 +123,7 @@ def job_methods(service: MachineService) -> Iterator[Method]:
         (
             "job.pause",
             jobs.pause,
-            "Come to a standstill between two moves; what is planned (some 4 s) is carried out.",
+            "Come to a standstill between two moves; what is planned (some 2 s) is carried out.",
         ),
         ("job.resume", jobs.resume, "Go on exactly where the job stands."),
         (
