@@ -15,6 +15,7 @@ from coordinator.machine.description import (
     UartConnection,
 )
 from coordinator.machine_devices import MachineDevices, stream_specs
+from coordinator.modules.live import Live
 from coordinator.motion.specs import NodeStreamSpec
 from coordinator.node_care import JobGate, NodeCare
 from coordinator.timebase import ClockMap, TimeBase
@@ -69,7 +70,8 @@ class Machine:
         self.description = description
         self.host = host
         self.policies = {node.name: node.policy for node in description.nodes}
-        self.devices = MachineDevices(description)
+        self.modules = description.modules.build()
+        self.devices = MachineDevices(description, self.modules)
         self.nodes: dict[str, Node] = {}
         self.stopped: MachineStopped | None = None
         self._on_notice = on_notice
@@ -102,15 +104,23 @@ class Machine:
                 raise _first_cause(error) from None
             raise
         self._ready = True
-        for node in self.nodes.values():
-            self._node_changed(node)  # one may have failed while others still started
-        if self.stopped is not None:
+        try:
+            await self._begin()
+        except BaseException:
             await self.close()
+            raise
+
+    async def _begin(self) -> None:
+        for node in self.nodes.values():
+            self._check_gone(node)  # one may have failed while others still started
+        if self.stopped is not None:
             raise self.stopped
+        await self.modules.connect(Live(self, self._on_notice))
 
     async def close(self) -> None:
         """Leave the nodes as they are and release everything."""
         self._ready = False
+        self.modules.close()
         await self._care.close()
         for opened in self._open:
             await opened.bus.close()
@@ -127,6 +137,7 @@ class Machine:
         for opened in self._open:
             opened.bus.emergency_stop()
         self._failed.set()
+        self.modules.stopped(cause)
 
     async def sleep(self, name: str) -> None:
         """Let go of node NAME, so that its power can be switched off: it is not missed until ``wake``.
@@ -299,6 +310,11 @@ class Machine:
         await node.restart()
 
     def _node_changed(self, node: Node) -> None:
+        if node.state is NodeState.READY:
+            self.modules.node_started(node)
+        self._check_gone(node)
+
+    def _check_gone(self, node: Node) -> None:
         gone = node.state in (NodeState.LOST, NodeState.SHUTDOWN)
         if not self._ready or not gone or node in self._waking:
             return

@@ -9,6 +9,7 @@ from coordinator.machine.description import (
     RailDescription,
     StepperDescription,
 )
+from coordinator.modules.module_set import ModuleSet
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from nodes.devices.endstop import Endstop
 from nodes.devices.stepper import Stepper
@@ -19,13 +20,14 @@ from nodes.vocabulary import KNOWS_BUS_STOP
 
 
 class MachineDevices:
-    """The steppers of a machine, shared by the real and the offline one.
+    """The steppers and endstops of a machine and what its MODULES have; of the real and the offline one.
 
     Call ``build_config`` for every node with its dictionary first; the specs are known afterwards.
     """
 
-    def __init__(self, description: MachineDescription) -> None:
+    def __init__(self, description: MachineDescription, modules: ModuleSet) -> None:
         self.description = description
+        self.modules = modules
         self.steppers: dict[str, Stepper] = {s.name: _stepper(s) for s in description.steppers}
         self.endstops: dict[str, Endstop] = {
             rail.axis: _endstop(rail) for rail in description.rails if rail.homing.endstop_pin is not None
@@ -47,6 +49,7 @@ class MachineDevices:
                 stepper.dir_pin.number(numbers)
                 self.steppers[stepper.name].configure(config)
         self._add_homing(config, numbers)
+        self.modules.configure(config)
         self._spread_shutdown(config)
         return config
 

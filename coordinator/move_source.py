@@ -2,10 +2,12 @@
 
 from typing import Any, Protocol
 
-from coordinator.gcode.events import Event
+from coordinator.gcode.events import Event, Notice, Reply
 from coordinator.gcode.machine_state import MachineState
 from coordinator.motion.planner import Planner, Position
 from nodes.records import record
+
+Told = Reply | Notice
 
 
 class MoveSource(Protocol):
@@ -67,3 +69,15 @@ class Planned:
     """Print time from which nothing moves any more; None: there is more to plan."""
     steps_sent: tuple[int, ...] = ()
     """By stepper: steps from the start that its commands add up to."""
+
+
+@record
+class JobState:
+    """How far a job is."""
+
+    done_bytes: int
+    size_bytes: int | None
+    print_time_s: float
+    """Seconds of the job executed."""
+    moves: int
+    planned: Planned

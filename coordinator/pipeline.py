@@ -4,15 +4,18 @@ The batch planner and the real-time streamer both drive this; it does no I/O bey
 program and keeps no clock. Not thread-safe: one thread at a time.
 """
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from coordinator.gcode.events import (
+    AS_SOON_AS_POSSIBLE,
     MachineChange,
     PositionSet,
     ShaperChange,
     SmoothTimeChange,
+    Timed,
     WeightsChange,
 )
 from coordinator.gcode.machine_state import SHAPER_AXES, Shaper
@@ -70,6 +73,13 @@ class PlanRecord:
     count: int = 0
     acting: list[tuple[int, Acting]] = field(default_factory=list)
     """What acts from trapezoid number N on."""
+
+    def restart(self) -> None:
+        """Forget all: something else has moved the machine."""
+        self.pieces.clear()
+        self.declared.clear()
+        self.acting.clear()
+        self.count = 0
 
     def add(self, trapezoids: "NDArray[np.void]") -> None:
         """Keep a copy."""
@@ -136,6 +146,10 @@ class Pipeline:
         """Trapezoids handed to step generation."""
         self.moved_until = 0.0
         """Print time at which the last of them ends, in s."""
+        self.due: list[tuple[float, Timed]] = []
+        """Events with the print time at which they take effect, for the owner to take out."""
+        self._timed: deque[Timed] = deque()
+        self._moves_before = job.planner.moves
         self._begin()
 
     @property
@@ -211,6 +225,20 @@ class Pipeline:
         if self._record is not None:
             self._record.declared.append((self._record.count, position))
 
+    def at_next_move(self, event: Timed) -> None:
+        """Keep EVENT until it is known when the move behind it begins: see ``due``."""
+        if event.after_moves == AS_SOON_AS_POSSIBLE:
+            self.due.append((0.0, event))
+        else:
+            self._timed.append(event)
+
+    def _find_due(self, moves: Any, count: int) -> None:
+        """Look for the begin of waiting events among MOVES, the next COUNT."""
+        first = self._moves_before + self.moves
+        while self._timed and self._timed[0].after_moves < first + count:
+            event = self._timed.popleft()
+            self.due.append((float(moves[max(0, event.after_moves - first)].print_time), event))
+
     def transfer(self) -> bool:
         """Hand planned moves to step generation while it has room; return whether all were handed over."""
         while (waiting := self.planner.take()).count:
@@ -219,6 +247,8 @@ class Pipeline:
                 last = waiting.pointer[taken - 1]
                 end = last.print_time + last.accel_s + last.cruise_s + last.decel_s
                 self._appended_until = self.moved_until = float(end)
+                if self._timed:
+                    self._find_due(waiting.pointer, taken)
                 self.moves += taken
                 if self._watch is not None:
                     self._watch(waiting.pointer, taken)
@@ -228,6 +258,9 @@ class Pipeline:
             if taken < waiting.count:
                 return False
         self._appended_until = max(self._appended_until, self.planner.print_time_end_s)
+        if self._timed and self.planner.at_standstill:  # no move comes behind them for now
+            self.due += [(self._appended_until, event) for event in self._timed]
+            self._timed.clear()
         return True
 
     def generate(self, until: float, *, flush: bool = False) -> None:

@@ -41,7 +41,8 @@ ASSUMED_MOVE_COUNT = 1024
 def plan_file(options: PlanOptions) -> PlanReport:
     """Plan OPTIONS.gcode for OPTIONS.config; raises CanductorError."""
     description = load_machine(str(options.config))
-    devices = MachineDevices(description)
+    modules = description.modules.build()
+    devices = MachineDevices(description, modules)
     dictionaries = _dictionaries(description, options)
     for node in description.nodes:
         devices.build_config(node.name, dictionaries[node.name])
@@ -52,7 +53,11 @@ def plan_file(options: PlanOptions) -> PlanReport:
         program = stack.enter_context(Program.open(options.gcode))
         files = [stack.enter_context(f) for f in _output_files(options, devices.moving_nodes)]
         job = Job(
-            program, Planner(description.limits), description.homed_position, machine_state(description)
+            program,
+            Planner(description.limits),
+            description.homed_position,
+            machine_state(description),
+            modules.vocabulary,
         )
         pipeline = Pipeline(
             job,

@@ -11,10 +11,11 @@ from coordinator.gcode.program import Program
 from coordinator.host import Host, LinuxHost
 from coordinator.machine.description import MachineDescription
 from coordinator.motion.planner import Planner
+from coordinator.move_source import JobState, Told
 from coordinator.pipeline import PlanRecord
 from coordinator.program_machine import machine_state
 from coordinator.progress import NodeFigures, Progress
-from coordinator.streamer import JobState, Streamer, Told
+from coordinator.streamer import Streamer
 from coordinator.timebase import ClockMap
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
@@ -120,16 +121,22 @@ async def _print(
             )
         )
 
-    began_at = await machine.stepper_positions()
     described = machine.description
-    job = Job(program, Planner(described.limits), described.homed_position, machine_state(described))
+    job = Job(
+        program,
+        Planner(described.limits),
+        described.homed_position,
+        machine_state(described),
+        machine.modules.vocabulary,
+    )
     streamer = Streamer(machine, job, record=record, on_told=on_told, on_state=show)
+    streamer.began_at = await machine.stepper_positions()
     await streamer.run()
-    return await outcome_of(machine, streamer, began_at)
+    return await outcome_of(machine, streamer)
 
 
-async def outcome_of(machine: Machine, streamer: Streamer, began_at: dict[str, int]) -> Outcome:
-    """Return what became of STREAMER's job, which has ended; BEGAN_AT: what the nodes counted before it."""
+async def outcome_of(machine: Machine, streamer: Streamer) -> Outcome:
+    """Return what became of STREAMER's job, which has ended."""
     ended_at = await machine.stepper_positions()
     stats = streamer.steps.stats()
     return Outcome(
@@ -138,7 +145,7 @@ async def outcome_of(machine: Machine, streamer: Streamer, began_at: dict[str, i
         span=(streamer.began_s, streamer.ended_s),
         steps=sum(s.steps for s in stats.steppers),
         queue_steps=sum(s.queue_steps for s in stats.steppers),
-        positions={name: ended_at[name] - began for name, began in began_at.items()},
+        positions={name: ended_at[name] - began for name, began in streamer.began_at.items()},
         issued={s.name: s.issued for s in stats.steppers},
         maps={node.name: m for node, m in zip(machine.moving, streamer.maps, strict=True)},
         nodes=tuple(

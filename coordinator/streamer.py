@@ -22,12 +22,16 @@ from coordinator.gcode.events import (
     PositionSet,
     Progress,
     Reply,
+    Resting,
+    Timed,
     Wait,
 )
 from coordinator.motion.planner import Planner
 from coordinator.motion.steps import StepGenerator
-from coordinator.move_source import MoveSource, Planned, Witness
+from coordinator.move_source import JobState, MoveSource, Planned, Told, Witness
 from coordinator.pipeline import Pipeline, PlanRecord
+from coordinator.resting import RestTask
+from nodes.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.timebase import ClockMap
@@ -52,20 +56,6 @@ SETTLE_S: Final = 0.05
 """After the last step is due, before it is believed to be done."""
 CAUSE_WAIT_S: Final = 0.1
 
-Told = Reply | Notice
-
-
-@dataclass(frozen=True, slots=True)
-class JobState:
-    """How far a job is."""
-
-    done_bytes: int
-    size_bytes: int | None
-    print_time_s: float
-    """Seconds of the job executed."""
-    moves: int
-    planned: Planned
-
 
 @dataclass(frozen=True, slots=True)
 class _Cycle:
@@ -76,6 +66,7 @@ class _Cycle:
     event: Event | None
     """What the job waits for; None: it has more."""
     planned: Planned
+    due: list[tuple[float, Timed]]
 
 
 class Streamer:
@@ -95,6 +86,8 @@ class Streamer:
         on_state: Callable[[JobState], None],
     ) -> None:
         self._machine = machine
+        self.began_at: dict[str, int] = {}
+        """By stepper: where its node says that it stood when motion was last begun anew; for the owner."""
         self._job = job
         self._on_told = on_told
         self._on_state = on_state
@@ -102,25 +95,32 @@ class Streamer:
         self._keeps_maps = record is not None
         self._nodes = machine.moving
         self._time_base = machine.time_base()
+        self._record = record
         self._batches: list[tuple[int, bytes]] = []
-        self.steps = StepGenerator(machine.devices.stepper_specs(), machine.stream_specs())
-        self.pipeline = Pipeline(
-            job,
-            self.steps,
-            lambda n, b: self._batches.append((n, b)),
-            nodes=len(self._nodes),
-            record=record,
-            watch=None if witness is None else witness.see_moves,
-        )
+        self._set_up()
         self.maps: list[ClockMap] = []
         """Per moving node: print time to ticks, as the steps were timed; without a record only its end."""
         self.began_s = 0.0
-        """Print time at which the job began."""
+        """Print time at which the job began, or went on after something else had moved the machine."""
         self.ended_s = 0.0
+        self._resting: RestTask | None = None
         self._done = Progress(0, 0, None)
         self._failure: GCodeError | None = None
         self._held: str | None = None
         self._start_lead_s = START_LEAD_S
+
+    def _set_up(self) -> None:
+        """Make step generation, which begins anew whenever something else has moved the steppers."""
+        machine, witness = self._machine, self._witness
+        self.steps = StepGenerator(machine.devices.stepper_specs(), machine.stream_specs())
+        self.pipeline = Pipeline(
+            self._job,
+            self.steps,
+            lambda n, b: self._batches.append((n, b)),
+            nodes=len(self._nodes),
+            record=self._record,
+            watch=None if witness is None else witness.see_moves,
+        )
 
     @property
     def _planner(self) -> Planner:
@@ -170,6 +170,8 @@ class Streamer:
             for task in (work, watch):
                 task.cancel()
             await asyncio.gather(work, watch, return_exceptions=True)
+            if self._resting is not None:
+                await self._resting.close()
 
     async def _stop_after(self, error: BaseException | None, watch: asyncio.Future[MachineStopped]) -> None:
         """Stop the machine after ERROR of the stream, unless it is that of a program and all stands still."""
@@ -186,6 +188,7 @@ class Streamer:
         self._look_at_load()
         self.began_s = self.print_time_now() + self._start_lead_s
         self._planner.begin_at(self.began_s)
+        self.maps = []
         for index, node in enumerate(self._nodes):
             clock_map = self._machine.clock_map(self._time_base, node, self.print_time_now())
             piece = clock_map.last
@@ -203,12 +206,33 @@ class Streamer:
                 if isinstance(event, Emergency):
                     self._machine.stop(f"{self._job.name}:{event.line}: M112 stopped the machine")
                     return
+                if isinstance(event, Resting):
+                    await self._attend(event)
                 if event is not None or self._held is not None:
                     await asyncio.sleep(CYCLE_S)
             self.ended_s = self._planner.print_time_end_s
             await self._settle(worker)
         if self._failure is not None:
             raise self._failure
+
+    async def _attend(self, event: Resting) -> None:
+        """Have EVENT performed once all moves before it are executed."""
+        if self._resting is None:
+            if self.print_time_now() < event.print_time_s + self.steps.lag_s + SETTLE_S:
+                return
+            self._resting = RestTask(event)
+        if self._resting.look():
+            self._resting = None
+            if event.moved:
+                await self._begin_again()
+
+    async def _begin_again(self) -> None:
+        """Go on where something else has left the steppers."""
+        self.began_at = await self._machine.stepper_positions()
+        if self._record is not None:
+            self._record.restart()
+        self._set_up()
+        self._begin()
 
     def _hand_over(self, cycle: _Cycle) -> None:
         for node, batch in cycle.batches:
@@ -220,6 +244,11 @@ class Streamer:
         self._look_at_load()
         for told in cycle.told:
             self._on_told(told)
+        for print_time_s, timed in cycle.due:
+            try:
+                timed.act(print_time_s)
+            except CanductorError as error:  # such as the loss of a node that may be missing
+                self._on_told(Notice(timed.line, f"{self._job.name}:{timed.line}: {error}"))
         self._report(cycle.planned)
 
     def _look_at_load(self) -> None:
@@ -279,7 +308,8 @@ class Streamer:
 
     def _cycle(self, told: Sequence[Told], event: Event | None) -> _Cycle:
         batches, self._batches = self._batches, []
-        return _Cycle(batches, list(told), event, self._planned())
+        due, self.pipeline.due = self.pipeline.due, []
+        return _Cycle(batches, list(told), event, self._planned(), due)
 
     def _planned(self) -> Planned:
         planner = self._planner
@@ -300,6 +330,8 @@ class Streamer:
             return now < event.print_time_s
         if isinstance(event, PositionSet | MachineChange):
             return not self._acted(event)
+        if isinstance(event, Resting):
+            return not event.over
         return False
 
     def _acted(self, event: PositionSet | MachineChange) -> bool:
@@ -324,6 +356,8 @@ class Streamer:
                 told.append(event)
             elif isinstance(event, Progress):
                 self._done = event
+            elif isinstance(event, Timed):
+                self.pipeline.at_next_move(event)
             elif isinstance(event, PositionSet | MachineChange) and self._acted(event):
                 continue
             else:

@@ -20,10 +20,10 @@ from coordinator.gcode.program import Program
 from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, StepperDescription, load_machine
 from coordinator.motion.specs import StepperSpec
+from coordinator.move_source import Told
 from coordinator.pipeline import PlanRecord
 from coordinator.progress import ProgressDisplay
 from coordinator.session import Outcome, run_job
-from coordinator.streamer import Told
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import firmware_dictionary
 

@@ -12,14 +12,19 @@ ShaperChange,   takes all trapezoids, generates their steps up to PRINT_TIME_S w
 WeightsChange,  generation what changed; the machine has been at rest for longer than every shaper and every
 SmoothTime-     smoothing window is wide
 Change
+Timed           calls ACT with the print time at which the next move begins; goes on meanwhile
+Resting         takes all trapezoids; in real time, waits until PRINT_TIME_S has been executed, has it
+                performed and keeps what came of it in the event
 Reply, Notice   shows the text
 Emergency       stops the machine at once; the job is over
 End             takes all trapezoids; the job is over
 ==============  ==========================================================================================
 """
 
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 
+from coordinator.gcode.commands import Done
 from nodes.records import record
 
 
@@ -96,6 +101,41 @@ class SmoothTimeChange:
     print_time_s: float
 
 
+AS_SOON_AS_POSSIBLE = -1
+
+
+@record
+class Timed:
+    """Something that takes effect at its place among the moves, without stopping them."""
+
+    line: int
+    after_moves: int
+    """It does so behind the planner's first so many moves, or AS_SOON_AS_POSSIBLE."""
+    act: Callable[[float], None]
+    """On the control loop, with the print time; 0: as soon as possible."""
+
+
+@dataclass(eq=False, slots=True)
+class Resting:
+    """Something that is done while the machine stands, from PRINT_TIME_S on; the program waits for it.
+
+    A driver that performs it fills in what came of it; one that only plans leaves ``done`` as it is.
+    """
+
+    line: int
+    print_time_s: float
+    perform: Callable[[], Awaitable[Done | None]]
+    done: Done | None
+    over: bool = False
+    """Whether it was performed, to whatever end."""
+    failure: str = ""
+    """Why it could not be done, a sentence."""
+    moved: bool = False
+    """Whether steppers may have been moved past the program's moves."""
+    cancelled: bool = False
+    """Set by whoever does not want it any more; the driver then ends it."""
+
+
 @record
 class Reply:
     """An answer that the program asked for (M114)."""
@@ -129,4 +169,17 @@ class End:
 
 MachineChange = ShaperChange | WeightsChange | SmoothTimeChange
 """Changes of what step generation does with the same moves."""
-Event = Progress | Idle | Full | Wait | PositionSet | MachineChange | Reply | Notice | Emergency | End
+Event = (
+    Progress
+    | Idle
+    | Full
+    | Wait
+    | PositionSet
+    | MachineChange
+    | Timed
+    | Resting
+    | Reply
+    | Notice
+    | Emergency
+    | End
+)

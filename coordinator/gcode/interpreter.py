@@ -1,17 +1,27 @@
-"""Runs a G-code program: moves go through the planner's hot path, every other line through the table here.
+"""Runs a G-code program: moves go the planner's hot path, other lines through tables of commands.
 
 ``Job`` does no I/O but reading its program, keeps no clock and never sleeps: the batch planner and the
 real-time streamer drive the same ``step`` and act on its events (events.py).
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from coordinator.gcode import machine_commands
+from coordinator.gcode import basic_commands, machine_commands
+from coordinator.gcode.commands import (
+    NO_WORDS,
+    AtOnce,
+    AtRest,
+    Call,
+    Done,
+    InTime,
+    Lines,
+    Reading,
+    Vocabulary,
+)
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import (
-    Emergency,
     End,
     Event,
     Full,
@@ -20,20 +30,18 @@ from coordinator.gcode.events import (
     PositionSet,
     Progress,
     Reply,
-    Wait,
+    Resting,
+    Timed,
 )
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
-from coordinator.gcode.words import Command, WordError, number, parse, quoted
-from coordinator.motion.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus, Planner
+from coordinator.gcode.words import Command, WordError, parse, quoted
+from coordinator.motion.planner import Feed, FeedStatus, Planner
 
 MAX_NOTICES = 100
 """Different notices a job gives; a file of garbage must not flood the screen."""
-MAX_DWELL_S = 86400.0
-
-Handler = Callable[["Job", Command], bool]
-"""Acts on a command; False when the planner must be emptied first and the line comes again. Before it returns
-False it changes nothing but the planner's queue."""
+MAX_DEPTH = 30
+"""Commands that stand in for a command that stands in for a command ..."""
 
 
 @dataclass(slots=True)
@@ -46,10 +54,32 @@ class Recorded:
     last_text: str
 
 
+@dataclass(slots=True)
+class _Inner:
+    """The lines that take a command's place; read one by one, they count as the line of that command."""
+
+    name: str
+    data: bytes
+    start: int = 0
+    """Of the line that comes next."""
+    at: int = 0
+    """Of the line that is being carried out."""
+
+    @property
+    def line(self) -> int:
+        """Number of that."""
+        return self.data.count(b"\n", 0, self.at) + 1
+
+    def line_end(self) -> int:
+        end = self.data.find(b"\n", self.start)
+        return len(self.data) if end < 0 else end
+
+
 class Job:
     """One run of PROGRAM through PLANNER.
 
-    HOMED_POSITION: where each axis (letter) stands after G28, mm; these are the axes that exist.
+    HOMED_POSITION: where each axis (letter) stands after G28, mm; these are the axes that exist. VOCABULARY:
+    what the machine's modules add.
     ``step`` raises GCodeError at a line that cannot be carried out, and again when called again; the moves
     before that line are still in the planner, to be flushed or dropped by the driver.
     """
@@ -60,15 +90,19 @@ class Job:
         planner: Planner,
         homed_position: Mapping[str, float],
         machine: MachineState | None = None,
+        vocabulary: Vocabulary = NO_WORDS,
     ) -> None:
         self.program = program
         self.planner = planner
         self.machine = machine or MachineState()
         """What the program may change; it is changed in place."""
+        self.vocabulary = vocabulary
         self.homed_position = dict(homed_position)
         self.recorded: dict[str, Recorded] = {}
         """By command name."""
         self._events: deque[Event] = deque()
+        self._inner: list[_Inner] = []
+        self._resting: Resting | None = None
         self._over: Event | GCodeError | None = None
         self._told: set[str] = set()
         machine_commands.begin(self)
@@ -80,7 +114,7 @@ class Job:
 
     @property
     def line(self) -> int:
-        """Number of the line that comes next."""
+        """Number of the line that comes next, or is being carried out."""
         return self.planner.lines + 1
 
     def step(self) -> Event:
@@ -94,7 +128,12 @@ class Job:
             if self._over is not None:
                 return self._over
             try:
-                self._advance()
+                if self._resting is not None:
+                    self._rested(self._resting)
+                elif self._inner:
+                    self._advance_inner(self._inner[-1])
+                else:
+                    self._advance()
             except GCodeError as error:
                 self._over = error
         return self._events.popleft()
@@ -107,10 +146,8 @@ class Job:
         program.start = feed.offset
         if feed.status is FeedStatus.OTHER_LINE:
             self._other_line()
-        elif feed.status is FeedStatus.FULL:
-            self._events.append(Full())
-        elif feed.status is FeedStatus.LIMIT:
-            raise self._error(str(self.planner.fault))
+        elif feed.status is not FeedStatus.NEED_DATA:
+            self._refused(feed)
         elif program.final:
             self._end()
         else:
@@ -118,6 +155,11 @@ class Job:
             more = program.refill()
             progress = Progress(self.planner.lines, program.done_bytes, program.size_bytes)
             self._events.append(progress if more else Idle())
+
+    def _refused(self, feed: Feed) -> None:
+        if feed.status is FeedStatus.LIMIT:
+            raise self._error(str(self.planner.fault))
+        self._events.append(Full())
 
     def _end(self) -> None:
         if not self.planner.flush():
@@ -128,21 +170,48 @@ class Job:
     def _other_line(self) -> None:
         program = self.program
         end = program.line_end()
-        try:
-            command = parse(program.data[program.start : end])
-            done = command is None or self._act(command)
-        except (WordError, ValueError) as problem:
-            cut = program.final and end == len(program.data)
-            hint = "; the file ends within this line: it is cut short, copy it again" if cut else ""
-            raise self._error(f"{problem}{hint}") from None
-        if not done:
+        cut = program.final and end == len(program.data)
+        hint = "; the file ends within this line: it is cut short, copy it again" if cut else ""
+        if not self._do(program.data[program.start : end], hint):
             self._events.append(Full())
             return
         program.start = min(end + 1, len(program.data))
-        self.planner.line_done()
+        if not self._inner:  # else its line is done when they are
+            self.planner.line_done()
+
+    def _advance_inner(self, inner: _Inner) -> None:
+        if inner.start >= len(inner.data):
+            self._inner.pop()
+            if not self._inner:
+                self.planner.line_done()
+            return
+        inner.at = inner.start
+        end = inner.line_end()
+        lines = self.planner.lines
+        feed = self.planner.feed(inner.data, inner.start, end, final=True)
+        self.planner.lines = lines
+        if feed.status is FeedStatus.OTHER_LINE:
+            if not self._do(inner.data[inner.start : end]):
+                self._events.append(Full())
+                return
+        elif feed.status is not FeedStatus.NEED_DATA:
+            self._refused(feed)
+            return
+        inner.start = end + 1
+
+    def _do(self, line: bytes, hint: str = "") -> bool:
+        """Carry out a line that is no move; False: the planner has to be emptied first."""
+        try:
+            command = parse(line)
+            return command is None or self._act(command)
+        except (WordError, ValueError) as problem:
+            raise self._error(f"{problem}{hint}") from None
 
     def _act(self, command: Command) -> bool:
-        handler = _HANDLERS.get(command.name)
+        known = self.vocabulary.commands.get(command.name)
+        if known is not None:
+            return self.follow(command, known.read(self.call(command)))
+        handler = basic_commands.HANDLERS.get(command.name)
         if handler:
             return handler(self, command)
         if machine_commands.is_tool(command.name):
@@ -151,10 +220,65 @@ class Job:
         self.notice(f"unknown command {what}", "unknown commands are skipped")
         return True
 
+    # ---- What modules make of a command ----
+
+    def call(self, command: Command) -> Call:
+        """Return COMMAND with what holds where it stands."""
+        planner = self.planner
+        callers = tuple(inner.name for inner in self._inner)
+        return Call(command, self.line, planner.toolhead_position, planner.homed, callers)
+
+    def follow(self, command: Command, reading: Reading) -> bool:
+        """Do what READING says; False: the planner has to be emptied first."""
+        match reading:
+            case AtOnce():
+                if reading.act is not None:
+                    reading.act()
+                self._reply(reading.replies)
+            case InTime():
+                self._events.append(Timed(self.line, self.planner.moves, reading.act))
+            case AtRest():
+                if not machine_commands.come_to_rest(self):
+                    return False
+                end_s = self.planner.print_time_end_s
+                self._resting = Resting(self.line, end_s, reading.perform, reading.planned)
+                self._events.append(self._resting)
+            case Lines():
+                if len(self._inner) >= MAX_DEPTH:
+                    raise WordError(f"{command.name} stands in for itself, {MAX_DEPTH} levels deep; end that")
+                self._inner.append(_Inner(command.name, reading.text.encode(errors="replace")))
+        return True
+
+    def _rested(self, event: Resting) -> None:
+        self._resting = None
+        if event.moved and event.done is None:
+            self.planner.homed = ""
+        if event.failure:
+            raise self._error(event.failure, event.line)
+        if event.done is not None:
+            self.take(event.done)
+
+    def take(self, done: Done) -> None:
+        """Take over what was done at rest."""
+        planner = self.planner
+        self._reply(done.replies)
+        planner.homed = "".join(axis for axis in planner.homed if axis not in done.unhomed)
+        if done.position is None:
+            return
+        planner.set_position(done.position)
+        planner.clear_gcode_base(done.homed)
+        planner.homed = planner.homed + done.homed
+        machine_commands.home_carriages(self, done.homed)
+        self._events.append(PositionSet(self.line, done.homed, done.position, planner.print_time_end_s))
+
+    def _reply(self, texts: tuple[str, ...]) -> None:
+        self._events.extend(Reply(self.line, text) for text in texts)
+
     # ---- For the handlers ----
 
-    def _error(self, problem: str) -> GCodeError:
-        return GCodeError(self.program.name, self.line, problem)
+    def _error(self, problem: str, line: int | None = None) -> GCodeError:
+        within = "".join(f"{inner.name}:{inner.line}: " for inner in self._inner)
+        return GCodeError(self.program.name, line or self.line, f"{within}{problem}")
 
     def notice(self, what: str, remark: str) -> None:
         """Tell about WHAT, but only once in this job."""
@@ -180,220 +304,3 @@ class Job:
     def end_with(self, event: Event) -> None:
         """End the job with EVENT."""
         self._over = event
-
-
-# ---- The commands ----------------------------------------------------------------------------------------
-
-
-def _numbers(command: Command, allowed: str) -> dict[str, float]:
-    """Read COMMAND's words, all with numbers, and no others than ALLOWED."""
-    words = command.words()
-    for letter in words:
-        if letter not in allowed:
-            raise WordError(f"{command.name} has the word {letter}; it takes {' '.join(allowed)}")
-    return {letter: number(command.name, words, letter) for letter in words}
-
-
-def _positive(command: Command, words: Mapping[str, float]) -> None:
-    for letter, value in words.items():
-        if value <= 0:
-            raise WordError(f"{letter} of {command.name} is {value:g}; it must be above 0")
-
-
-def _move(job: Job, command: Command) -> bool:
-    """G0, G1 that the hot path refused: unusual words, or numbers of many digits."""
-    words = command.words()
-    for letter in words.keys() - set(MOVE_LETTERS):
-        job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
-    numbers = {letter: number(command.name, words, letter) for letter in words if letter in MOVE_LETTERS}
-    status = job.planner.move(numbers)
-    if status is FeedStatus.LIMIT:
-        raise WordError(str(job.planner.fault))
-    return status is not FeedStatus.FULL
-
-
-def _dwell(job: Job, command: Command) -> bool:
-    words = _numbers(command, "PS")
-    seconds = words.get("P", 0.0) / 1000 + words.get("S", 0.0)
-    if not 0 <= seconds <= MAX_DWELL_S:
-        raise WordError(f"G4 is to wait {seconds:g} s; 0 to {MAX_DWELL_S:g} s are possible")
-    if not job.planner.flush():
-        return False
-    job.planner.dwell(seconds)
-    return True
-
-
-def _unit(unit_mm: float) -> Handler:
-    def handle(job: Job, _command: Command) -> bool:
-        job.planner.unit_mm = unit_mm
-        return True
-
-    return handle
-
-
-def _relative(*, relative: bool) -> Handler:
-    def handle(job: Job, _command: Command) -> bool:
-        job.planner.relative = relative
-        return True
-
-    return handle
-
-
-def _relative_extrusion(*, relative: bool) -> Handler:
-    def handle(job: Job, _command: Command) -> bool:
-        job.planner.relative_extrusion = relative
-        return True
-
-    return handle
-
-
-def _home(job: Job, command: Command) -> bool:
-    named = [axis for axis in command.words() if axis in "XYZ"]
-    axes = "".join(sorted(named or job.homed_position))
-    for axis in axes:
-        if axis not in job.homed_position:
-            raise WordError(f"G28 names the axis {axis}, which this machine does not have")
-    planner = job.planner
-    if not machine_commands.come_to_rest(job):
-        return False
-    x, y, z, e = (
-        job.homed_position[letter] if letter in axes else now
-        for letter, now in zip(AXIS_LETTERS, planner.toolhead_position, strict=True)
-    )
-    planner.set_position((x, y, z, e))
-    planner.clear_gcode_base(axes)
-    planner.homed = planner.homed + axes
-    machine_commands.home_carriages(job, axes)
-    job.notice("G28", "there are no endstops to look for; the axes are taken as already home")
-    job.emit(PositionSet(job.line, axes, (x, y, z, e), planner.print_time_end_s))
-    return True
-
-
-def _set_origin(job: Job, command: Command) -> bool:
-    words = _numbers(command, AXIS_LETTERS)
-    job.planner.set_gcode_position(words or dict.fromkeys(AXIS_LETTERS, 0.0))
-    return True
-
-
-def _set_accel(job: Job, command: Command) -> bool:
-    """M204 that the hot path refused: above what is configured, or of unusual words."""
-    words = _numbers(command, "SPTR")
-    words.pop("R", None)
-    _positive(command, words)
-    if "S" in words:
-        words = {"S": words["S"]}
-    for accel in words.values():
-        _cap(job, "the acceleration", accel, job.planner.limits.max_accel)
-    job.planner.set_accel_words(words)
-    return True
-
-
-def _cap(job: Job, what: str, asked: float, limit: float) -> None:
-    if asked > limit:
-        job.notice(f"{what} {asked:g} is above the configured {limit:g}", f"{limit:g} is used")
-
-
-def _set_velocity_limit(job: Job, command: Command) -> bool:
-    planner, limits = job.planner, job.planner.limits
-    values = command.parameters()
-    known = {"VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"}
-    for key in values.keys() - known:
-        raise WordError(
-            f"SET_VELOCITY_LIMIT has no parameter {quoted(key)}; it takes {' '.join(sorted(known))}"
-        )
-    numbers = {key: number(command.name, values, key) for key in values}
-    for key, value in numbers.items():
-        low = 0.0 if key in {"SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"} else 1e-3
-        high = 0.999 if key == "MINIMUM_CRUISE_RATIO" else 1e9
-        if not low <= value <= high:
-            raise WordError(f"{key} of SET_VELOCITY_LIMIT is {value:g}; {low:g} to {high:g} are possible")
-    if "VELOCITY" in numbers:
-        _cap(job, "the velocity", numbers["VELOCITY"], limits.max_velocity)
-        planner.max_velocity = numbers["VELOCITY"]
-    if "ACCEL" in numbers:
-        _cap(job, "the acceleration", numbers["ACCEL"], limits.max_accel)
-        planner.accel = numbers["ACCEL"]
-    if "SQUARE_CORNER_VELOCITY" in numbers:
-        asked = numbers["SQUARE_CORNER_VELOCITY"]
-        _cap(job, "the square corner velocity", asked, limits.square_corner_velocity)
-        planner.square_corner_velocity = asked
-    if "MINIMUM_CRUISE_RATIO" in numbers:
-        planner.minimum_cruise_ratio = numbers["MINIMUM_CRUISE_RATIO"]
-    return True
-
-
-def _factor(job: Job, command: Command) -> bool:
-    """M220, M221: percent in S; without it, nothing changes."""
-    percent = _numbers(command, "S").get("S")
-    if percent is None:
-        return True
-    if not 1 <= percent <= 1000:
-        raise WordError(f"S of {command.name} is {percent:g} %; 1 to 1000 % are possible")
-    if command.name == "M220":
-        job.planner.speed_factor = percent / 100
-    else:
-        job.planner.extrude_factor = percent / 100
-    return True
-
-
-def _wait_for_moves(job: Job, _command: Command) -> bool:
-    if not job.planner.flush():
-        return False
-    job.emit(Wait(job.line, job.planner.print_time_end_s))
-    return True
-
-
-def _tell_position(job: Job, _command: Command) -> bool:
-    position = zip(AXIS_LETTERS, job.planner.gcode_position, strict=True)
-    job.emit(Reply(job.line, " ".join(f"{letter}:{value:.3f}" for letter, value in position)))
-    return True
-
-
-def _emergency(job: Job, _command: Command) -> bool:
-    job.end_with(Emergency(job.line))
-    return True
-
-
-def _without_module(what: str) -> Handler:
-    def handle(job: Job, command: Command) -> bool:
-        job.record(command)
-        job.notice(what, "accepted and recorded, but without effect: no module acts on them yet")
-        return True
-
-    return handle
-
-
-def _ignore(_job: Job, _command: Command) -> bool:
-    return True
-
-
-def _refuse_arc(_job: Job, command: Command) -> bool:
-    raise WordError(f"{command.name} curves are not supported; have the slicer write straight moves (G1)")
-
-
-_heat = _without_module("heater and fan commands")
-_motors_off = _without_module("motor-off commands")
-_HANDLERS: Mapping[str, Handler] = {
-    "G0": _move,
-    "G1": _move,
-    **dict.fromkeys(("G2", "G3", "G5"), _refuse_arc),
-    "G4": _dwell,
-    "G20": _unit(25.4),
-    "G21": _unit(1.0),
-    "G28": _home,
-    "G90": _relative(relative=False),
-    "G91": _relative(relative=True),
-    "G92": _set_origin,
-    **dict.fromkeys(("M18", "M84"), _motors_off),
-    **dict.fromkeys(("M73", "M117", "M118"), _ignore),
-    "M82": _relative_extrusion(relative=False),
-    "M83": _relative_extrusion(relative=True),
-    **dict.fromkeys(("M104", "M105", "M106", "M107", "M109", "M140", "M190"), _heat),
-    "M112": _emergency,
-    "M114": _tell_position,
-    "M204": _set_accel,
-    **dict.fromkeys(("M220", "M221"), _factor),
-    "M400": _wait_for_moves,
-    "SET_VELOCITY_LIMIT": _set_velocity_limit,
-    **machine_commands.HANDLERS,
-}

@@ -31,6 +31,8 @@ from coordinator.machine.read_shaper import read_shapers
 from coordinator.machine.read_steppers import is_extra_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_SECTIONS
+from coordinator.modules.module_set import ModuleSource, ModuleSources
+from coordinator.modules.registry import known_kinds, module_for, modules_beside, own_kinds
 from coordinator.motion.specs import MotionLimits
 
 __all__ = [
@@ -84,6 +86,7 @@ def load_machine(path: str) -> MachineDescription:
     )
     followers = read_extruder_steppers(reading, extruders)
     shapers = read_shapers(reading)
+    modules = _read_modules(reading)
     description = MachineDescription(
         path=config.path,
         nodes=nodes,
@@ -96,12 +99,26 @@ def load_machine(path: str) -> MachineDescription:
         extruders=extruders,
         extruder_steppers=followers,
         shapers=shapers,
+        modules=modules,
         not_yet_acting=(*later, *_later_sections(reading, kinematics)),
         notes=tuple(config.notes),
     )
     _check_names(description)
     check_policies(description.nodes, description.steppers)
     return description
+
+
+def _read_modules(reading: Reading) -> ModuleSources:
+    """Return what the modules are made from, made once to find mistakes; raises ConfigError."""
+    sources: list[ModuleSource] = []
+    for section in reading.config.sections.values():
+        sources += [ModuleSource(section, kind, whole=False) for kind in modules_beside(section.name)]
+        if not _is_acting(section) and (kind := module_for(section.kind, section.place)) is not None:
+            sources.append(ModuleSource(section, kind, whole=True))
+            reading.used.add(section.name)
+    modules = ModuleSources(tuple(sources), reading.pins)
+    reading.pins = modules.build().pins
+    return modules
 
 
 def _named(limits: MotionLimits, frame: Frame) -> MotionLimits:
@@ -138,13 +155,15 @@ def _is_acting(section: RawSection) -> bool:
 
 def _check_section_names(config: ConfigFile) -> None:
     for section in config.sections.values():
-        if _is_acting(section) or section.kind in LATER_SECTIONS:
+        if _is_acting(section) or section.kind in LATER_SECTIONS or section.kind in own_kinds():
+            continue
+        if section.kind in known_kinds():  # asked for last: it looks through all packages
             continue
         if section.kind in _SINGLE_SECTIONS:
             raise ConfigError(
                 section.place, f"[{section.name}] must be [{section.kind}]: there is only one of it"
             )
-        valid = (*_SINGLE_SECTIONS, *_NAMED_SECTIONS, *sorted(LATER_SECTIONS))
+        valid = (*_SINGLE_SECTIONS, *_NAMED_SECTIONS, *known_kinds(), *sorted(LATER_SECTIONS))
         hint = nearest(section.kind, valid, pattern="[{}]") or "; remove it or correct its name"
         raise ConfigError(section.place, f"there is no section [{section.name}]{hint}")
 
@@ -157,6 +176,8 @@ def _later_sections(reading: Reading, kinematics: str) -> list[NotYetActing]:
     waiting = {(entry.section, name) for entry in reading.later for name in entry.options}
     result = []
     for section in reading.config.sections.values():
+        if section.name in reading.used and not _is_acting(section):
+            continue
         if not _is_acting(section):
             result.append(NotYetActing(section.name, section.place, ()))
             reading.pins.check_unclaimed(section.options.values(), section.name)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
 from coordinator.machine.pins import PinDescription
 from coordinator.machine.problem import Place
+from coordinator.modules.module_set import ModuleSources
 from coordinator.motion.specs import MotionLimits
 from nodes.records import record
 
@@ -219,6 +220,7 @@ class MachineDescription:
     """By number."""
     extruder_steppers: tuple[ExtruderStepperDescription, ...]
     shapers: tuple[ShaperDescription, ...]
+    modules: ModuleSources
     not_yet_acting: tuple[NotYetActing, ...]
     notes: tuple[str, ...]
     """Sentences about what has no effect."""

@@ -224,6 +224,8 @@ class SectionSpec:
     options: tuple[Option[Any], ...]
     later: tuple[str, ...] = ()
     """Options of modules that are not built yet: recognised, recorded, not acting."""
+    elsewhere: tuple[str, ...] = ()
+    """Options that another specification of the same section has."""
 
 
 @dataclass(slots=True)
@@ -235,10 +237,15 @@ class SectionReader:
 
     section: RawSection
     spec: SectionSpec
+    whole: bool = field(default=True, kw_only=True)
+    """Whether the specification covers the section; else other options are another reader's."""
     _read: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        valid = (*(option.name for option in self.spec.options), *self.spec.later)
+        if not self.whole:
+            return
+        spec = self.spec
+        valid = (*(option.name for option in spec.options), *spec.later, *spec.elsewhere)
         for raw in self.section.options.values():
             if raw.name not in valid:
                 hint = nearest(raw.name, valid, pattern="'{}'") or "; remove it or correct its name"
@@ -295,7 +302,12 @@ class SectionReader:
 
     def finish(self) -> tuple[RawOption, ...]:
         """Return the options that wait for their module; raises ConfigError for one of no use here."""
-        unread = [option for name, option in self.section.options.items() if name not in self._read]
+        own = {option.name for option in self.spec.options}
+        unread = [
+            option
+            for name, option in self.section.options.items()
+            if name not in self._read and name not in self.spec.elsewhere and (self.whole or name in own)
+        ]
         for option in unread:
             if option.name not in self.spec.later:
                 raise ConfigError(

@@ -6,10 +6,23 @@ passes between them are single attributes and deques, whose operations are atomi
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
-from coordinator.gcode.events import Emergency, End, Event, Full, Idle, Notice, Progress, Reply
+from coordinator.gcode.commands import NO_WORDS, Vocabulary
+from coordinator.gcode.events import (
+    AS_SOON_AS_POSSIBLE,
+    Emergency,
+    End,
+    Event,
+    Full,
+    Idle,
+    Notice,
+    Progress,
+    Reply,
+    Resting,
+    Timed,
+)
 from coordinator.gcode.machine_state import MachineState
 from coordinator.motion.planner import Planner
 from coordinator.service.work import NO_PROGRESS, LinesWork, Rest, Setting, Work
@@ -46,17 +59,26 @@ class Ticket:
     """Print time at which its last move ends, once it is known; 0: there is nothing to wait for."""
     done: bool = False
     """Whether that has passed."""
+    resting: Resting | None = None
+    """What it waits for while the machine stands."""
 
 
 class Feeder:
     """A ``MoveSource`` that never ends until ``close``: idles while nothing is to do."""
 
-    def __init__(self, planner: Planner, homed_position: Mapping[str, float], machine: MachineState) -> None:
+    def __init__(
+        self,
+        planner: Planner,
+        homed_position: Mapping[str, float],
+        machine: MachineState,
+        vocabulary: Vocabulary = NO_WORDS,
+    ) -> None:
         self.planner = planner
         self.machine = machine
-        self._setting = Setting(planner, machine, dict(homed_position))
+        self._setting = Setting(planner, machine, dict(homed_position), vocabulary)
         self._waiting: deque[Ticket] = deque()
         self._asides: deque[Ticket] = deque()
+        self._aside_events: deque[Event] = deque()
         self._now: Ticket | None = None
         self._paused = False
         self._closed = False
@@ -111,8 +133,10 @@ class Feeder:
         self._paused = False
 
     def cancel(self, ticket: Ticket) -> None:
-        """End TICKET before its next line; what is planned of it is carried out, to a standstill."""
+        """End TICKET before its next line, also while it waits; what is planned of it is carried out."""
         ticket.cancelled = True
+        if (resting := ticket.resting) is not None:
+            resting.cancelled = True
 
     def close(self) -> None:
         """End: ``step`` answers End once all is planned."""
@@ -132,8 +156,9 @@ class Feeder:
     def step(self) -> Event:
         """Go on with the work at hand, or the next one."""
         while self._asides:
-            if (event := self._do_aside(self._asides.popleft())) is not None:
-                return event
+            self._do_aside(self._asides.popleft())
+        if self._aside_events:
+            return self._aside_events.popleft()
         if self._now is None and (event := self._take_next()) is not None:
             return event
         ticket = self._now
@@ -162,6 +187,7 @@ class Feeder:
         if ticket.begun_at_s is None:
             ticket.begun_at_s = self.planner.print_time_end_s
             ticket.work.begin(self._setting)
+        ticket.resting = None
         return ticket.work.step()
 
     def _pass_on(self, ticket: Ticket, event: Event) -> Event:
@@ -170,6 +196,9 @@ class Feeder:
             ticket.read = True
             return self._finish(ticket)
         ticket.progress = ticket.work.progress()
+        if isinstance(event, Resting):
+            ticket.resting = event
+            event.cancelled = ticket.cancelled  # since the last look
         if isinstance(event, Reply | Notice):
             _keep(ticket, event)
         return event
@@ -177,6 +206,8 @@ class Feeder:
     def _finish(self, ticket: Ticket) -> Event:
         """Let TICKET go once its moves are planned as far as they have to be."""
         early = ticket.cancelled or ticket.error is not None
+        if ticket.resting is not None and ticket.resting.moved:
+            self.planner.homed = ""  # nobody takes over any more where that left the machine
         if (early or ticket.work.rest is Rest.STANDSTILL) and not self.planner.flush():
             return Full()
         ticket.read = True
@@ -188,24 +219,24 @@ class Feeder:
         self.finished.append(ticket)
         return ticket.progress
 
-    def _do_aside(self, ticket: Ticket) -> Event | None:
-        """Act on lines that neither move nor wait, and leave the work's own count of lines as it was.
-
-        Returns what the streamer has to act on.
-        """
-        lines, event = self.planner.lines, None
+    def _do_aside(self, ticket: Ticket) -> None:
+        """Act on lines that neither move nor wait, and leave the work's own count of lines as it was."""
+        lines = self.planner.lines
         try:
             ticket.work.begin(self._setting)
             while not isinstance(event := ticket.work.step(), End | Emergency):
                 if isinstance(event, Reply | Notice):
                     _keep(ticket, event)
+                elif isinstance(event, Timed):  # it does not belong to any place among the work's moves
+                    self._aside_events.append(replace(event, after_moves=AS_SOON_AS_POSSIBLE))
+            if isinstance(event, Emergency):
+                self._aside_events.appendleft(event)
         except CanductorError as error:
             ticket.error = error
         self.planner.lines = lines
         ticket.read = True
         ticket.ends_at_s = 0.0
         self.finished.append(ticket)
-        return event if isinstance(event, Emergency) else None
 
 
 def _keep(ticket: Ticket, event: Reply | Notice) -> None:

@@ -17,6 +17,7 @@ from coordinator.host import Host
 from coordinator.ipc.methods import ApiError
 from coordinator.ipc.state import StateTree
 from coordinator.machine.description import MachineDescription
+from coordinator.move_source import Told
 from coordinator.pipeline import PlanRecord
 from coordinator.service.figures import Figures
 from coordinator.service.job_folder import JobFolder
@@ -24,7 +25,6 @@ from coordinator.service.jobs import JobPhase, JobRun
 from coordinator.service.log_ring import Entry, LogRing
 from coordinator.service.motion import Motion
 from coordinator.service.work import FileWork
-from coordinator.streamer import Told
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 

@@ -7,14 +7,14 @@ from collections.abc import Callable, Sequence
 from coordinator.app import Machine
 from coordinator.gcode.events import Notice
 from coordinator.motion.planner import Planner
-from coordinator.move_source import Planned
+from coordinator.move_source import JobState, Planned, Told
 from coordinator.pipeline import PlanRecord
 from coordinator.program_machine import machine_state
 from coordinator.service.feeder import Feeder, Ticket
 from coordinator.service.motion_lead import MotionLead
 from coordinator.service.trace import KEEP_S, Moment, MotionTrace
 from coordinator.service.work import LinesWork, Work
-from coordinator.streamer import JobState, Streamer, Told
+from coordinator.streamer import Streamer
 
 UNMOVED = Planned((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, "", 1.0, 1.0, 0.0)
 
@@ -35,7 +35,12 @@ class Motion:
         record: PlanRecord | None = None,
     ) -> None:
         described = machine.description
-        self.feeder = Feeder(Planner(described.limits), described.homed_position, machine_state(described))
+        self.feeder = Feeder(
+            Planner(described.limits),
+            described.homed_position,
+            machine_state(described),
+            machine.modules.vocabulary,
+        )
         self.trace = MotionTrace(len(machine.moving))
         self.planned = UNMOVED
         self.lead = MotionLead()

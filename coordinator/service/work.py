@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, Protocol
 
+from coordinator.gcode.commands import Vocabulary
 from coordinator.gcode.events import End, Event, Full, Idle, Progress
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import MachineState
@@ -38,6 +39,11 @@ class Setting:
     planner: Planner
     machine: MachineState
     homed_position: Mapping[str, float]
+    vocabulary: Vocabulary
+
+    def job(self, program: Program) -> Job:
+        """Return what reads PROGRAM."""
+        return Job(program, self.planner, self.homed_position, self.machine, self.vocabulary)
 
 
 class Rest(Enum):
@@ -108,7 +114,7 @@ class LinesWork:
         text = "".join(line.rstrip("\r\n") + "\n" for line in self.lines)
         program = Program(_Text(text.encode(errors="replace")), self.name, size_bytes=None)
         setting.planner.lines = 0
-        self._job = Job(program, setting.planner, setting.homed_position, setting.machine)
+        self._job = setting.job(program)
 
     def step(self) -> Event:
         """Go on."""
@@ -141,7 +147,7 @@ class FileWork:
         """Begin at the first line."""
         setting.planner.reset_modes()
         setting.planner.lines = 0
-        self._job = Job(self.program, setting.planner, setting.homed_position, setting.machine)
+        self._job = setting.job(self.program)
 
     def step(self) -> Event:
         """Go on."""

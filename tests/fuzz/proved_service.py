@@ -8,12 +8,12 @@ each job the smallest lead of motion.
 
 import asyncio
 import json
+import os
 import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from coordinator.app import Machine
 from coordinator.commands import DemoOptions
 from coordinator.demo.run import Prover, report_of
 from coordinator.demo.stage import Stage
@@ -33,6 +33,7 @@ from coordinator.session import Outcome, outcome_of
 
 WATCH_TOKEN, ADMIN_TOKEN = "watch" * 8, "admin" * 8
 LOOK_S = 0.02
+NODES_NICE = -10
 
 
 class Proved:
@@ -72,8 +73,7 @@ class Proved:
         await self.server.start()
         life = asyncio.ensure_future(self.service.run())
         try:
-            machine = await self._ready(life)
-            began_at = await machine.stepper_positions()
+            await self._ready(life)
             _say(str(self.server.tcp_port))
             noting = asyncio.ensure_future(self._note_leads())
             await asyncio.wait(
@@ -88,14 +88,15 @@ class Proved:
                 assert self.service.state != "shutdown", self.service.cause
                 await asyncio.sleep(LOOK_S)
             self._note_lead(motion.lead)
-            return await outcome_of(machine, motion.streamer, began_at)
+            assert self.service.machine is not None
+            return await outcome_of(self.service.machine, motion.streamer)
         finally:
             life.cancel()
             with suppress(asyncio.CancelledError):
                 await life
             await self.server.close()
 
-    async def _ready(self, life: asyncio.Future[None]) -> Machine:
+    async def _ready(self, life: asyncio.Future[None]) -> None:
         while self.service.motion is None:
             assert not life.done(), life
             assert self.service.state != "error", self.service.cause
@@ -103,7 +104,7 @@ class Proved:
         assert self.service.machine is not None
         steppers = self.service.machine.devices.steppers
         self.both_edges |= {name: stepper.steps_on_both_edges for name, stepper in steppers.items()}
-        return self.service.machine
+        self.service.motion.streamer.began_at = await self.service.machine.stepper_positions()
 
     async def _note_leads(self) -> None:
         """Note the smallest lead of each job when the next one begins."""
@@ -141,6 +142,9 @@ def main() -> None:
     options = DemoOptions()
     description = load_machine(str(options.machine))
     with Stage(description, options, folder) as stage:
+        for node in stage.processes.values():  # boards do not compete with clients for a processor
+            with suppress(PermissionError):
+                os.setpriority(os.PRIO_PROCESS, node.pid, NODES_NICE)
         proved = Proved(stage, folder, jobs)
         outcome = asyncio.run(_serve(proved))
         figures = stage.stop_nodes()

@@ -11,7 +11,8 @@ from coordinator.gcode.program import Program
 from coordinator.host import LinuxHost
 from coordinator.machine.description import load_machine
 from coordinator.motion.planner import Planner
-from coordinator.streamer import JobState, Streamer
+from coordinator.move_source import JobState
+from coordinator.streamer import Streamer
 from nodes.virtual.processes import NodeProcess
 from tests.system.stage import Command, Hardware, write_config, write_gcode
 

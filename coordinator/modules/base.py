@@ -1,0 +1,168 @@
+"""The seam between the machine and its modules.
+
+A section ``[heater_fan hotend]`` of the configuration becomes one object of a subclass of ``Module``:
+
+1. It is built from its section, when the configuration is read, also where nothing is connected: it reads all
+   of its options, claims its pins, adds its devices and its commands. A user's mistake is a ConfigError.
+2. ``link``: all modules are built; it finds the others it depends upon.
+3. ``connect``: its nodes are configured and their clocks known; it may talk to them, and may fail.
+4. ``ready``: everything is connected. It must not fail.
+5. ``stopped``: a node or the host stopped the machine for safety; nodes have put their outputs to defaults.
+6. ``close``: it is over, whether it was ever connected or not.
+
+A restart makes new modules: all state is in the object. Everything happens on the control loop, except that
+``GCodeCommand.read`` runs where the program is read (coordinator/gcode/commands.py).
+"""
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, ClassVar, Protocol, TypeVar
+
+from coordinator.gcode.commands import GCodeCommand
+from coordinator.machine.config_file import RawSection
+from coordinator.machine.options import Option, SectionReader, SectionSpec
+from coordinator.machine.pins import PinDescription, PinOption, PinRegistry
+from coordinator.machine.problem import ConfigError, Place, nearest, shown
+from nodes.node_config import NodeConfig
+
+if TYPE_CHECKING:  # planning needs neither, and they draw in asyncio
+    from coordinator.modules.live import Live
+    from nodes.node import Node
+
+Value = None | bool | int | float | str | list["Value"] | dict[str, "Value"]
+"""What a status may hold."""
+
+
+class Device(Protocol):
+    """What a module has on a node: the host's side of one of its objects."""
+
+    def configure(self, config: NodeConfig) -> None:
+        """Add it to what its node is configured as; raises NodeConfigError."""
+
+    def started(self, node: "Node") -> None:
+        """Its node is ready: at the start, and each time that it came back after it was lost."""
+
+
+class Modules(Protocol):
+    """The other modules of the machine."""
+
+    def find(self, name: str, kind: "type[M]") -> "M | None":
+        """Return the module of section NAME, or None when there is none of KIND."""
+
+    def names(self, kind: "type[Module]") -> list[str]:
+        """Return the section names of all modules of KIND, in the order of the file."""
+
+
+class Module:
+    """One section of the configuration."""
+
+    SPEC: ClassVar[SectionSpec]
+    """All its options; the reference page is made from it."""
+
+    def __init__(self, build: "Build") -> None:
+        """Read all options; no I/O. Raises ConfigError."""
+        self.name = build.name
+        """The section's name: ``heater_fan hotend``."""
+
+    def link(self, modules: Modules) -> None:
+        """Find other modules; raises ConfigError."""
+
+    async def connect(self, live: "Live") -> None:
+        """Begin to act; raises CanductorError when the hardware does not allow it."""
+
+    def ready(self) -> None:
+        """Take note that the machine is ready."""
+
+    def stopped(self, cause: str) -> None:
+        """Take note that the machine is stopped, and why."""
+
+    def close(self) -> None:
+        """Release what it holds."""
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell how it is: for macros and front ends; cheap, and not changed afterwards."""
+        return {}
+
+
+M = TypeVar("M", bound=Module)
+T = TypeVar("T")
+
+
+class Build:
+    """What a module is built from: its SECTION, read by SPEC; or a part of a section that others read too."""
+
+    def __init__(
+        self,
+        section: RawSection,
+        spec: SectionSpec,
+        pins: PinRegistry,
+        *,
+        whole: bool = True,
+        share: "Callable[[type[Module]], Module]",
+    ) -> None:
+        self.name = section.name
+        self.reader = SectionReader(section, spec, whole=whole)
+        self.devices: list[tuple[str, Device]] = []
+        """With the node of each."""
+        self.commands: list[GCodeCommand] = []
+        self._pins = pins
+        self._share = share
+
+    @property
+    def instance(self) -> str:
+        """What follows the section's first word: ``hotend``; for a plain section the word itself."""
+        return self.reader.section.instance or self.name
+
+    @property
+    def place(self) -> Place:
+        """Where the section stands."""
+        return self.reader.place
+
+    def get(self, option: Option[T]) -> T:
+        """Return an option's value or its default; raises ConfigError."""
+        return self.reader.get(option)
+
+    def find(self, option: Option[T]) -> T | None:
+        """Return an option's value, or None when it is absent; raises ConfigError."""
+        return self.reader.find(option)
+
+    def pin(self, option: PinOption) -> PinDescription:
+        """Take the pin that a required option names; raises ConfigError."""
+        return self._pins.claim(self.reader.get(option), option, self.reader.section)
+
+    def find_pin(self, option: PinOption) -> PinDescription | None:
+        """Take the pin that an option names, if it is given; raises ConfigError."""
+        return None if self.reader.find(option) is None else self.pin(option)
+
+    def add_device(self, node: str, device: Device) -> None:
+        """Have DEVICE on a node."""
+        self.devices.append((node, device))
+
+    def add_command(self, command: GCodeCommand) -> None:
+        """Have programs know COMMAND."""
+        self.commands.append(command)
+
+    def shared(self, kind: type[M]) -> M:
+        """Return the one module of KIND without a section, which is made when it is first asked for.
+
+        It is where modules of several sections meet: it has their commands in common.
+        """
+        found = self._share(kind)
+        assert isinstance(found, kind)
+        return found
+
+    def needed(self, option: Option[str], kind: type[M]) -> Callable[[Modules], M]:
+        """Return what finds, in ``link``, the module of KIND that OPTION names; raises ConfigError."""
+        name = self.reader.get(option)
+
+        def find(modules: Modules) -> M:
+            found = modules.find(name, kind)
+            if found is None:
+                others = modules.names(kind)
+                hint = nearest(name, others, pattern="[{}]") or f"; there is {', '.join(others) or 'none'}"
+                raise ConfigError(
+                    self.reader.place_of(option),
+                    f"'{option.name}' of [{self.name}] names {shown(name)}, which does not exist{hint}",
+                )
+            return found
+
+        return find

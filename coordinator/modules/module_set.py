@@ -1,0 +1,159 @@
+"""All modules of one machine, from its configuration to its end."""
+
+import contextlib
+import copy
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, TypeVar
+
+from coordinator.gcode.commands import Call, GCodeCommand, Reading, Vocabulary
+from coordinator.machine.config_file import RawSection
+from coordinator.machine.pins import PinRegistry
+from coordinator.machine.problem import ConfigError, Place
+from coordinator.modules.base import Build, Device, Module, Value
+from nodes.node_config import NodeConfig
+from nodes.records import record
+
+if TYPE_CHECKING:
+    from coordinator.modules.live import Live
+    from nodes.node import Node
+
+M = TypeVar("M", bound=Module)
+
+
+@record
+class ModuleSource:
+    """A section and the module that it is for."""
+
+    section: RawSection
+    kind: type[Module]
+    whole: bool
+    """Whether the whole section is the module's."""
+
+
+@record
+class ModuleSources:
+    """What the modules of a machine are made from, as often as it is started."""
+
+    sources: tuple[ModuleSource, ...]
+    pins: PinRegistry
+    """As the machine's own sections left it."""
+
+    def build(self) -> "ModuleSet":
+        """Make them, linked with each other; raises ConfigError."""
+        built = ModuleSet(copy.deepcopy(self.pins))
+        for source in self.sources:
+            built.build(source)
+        built.link()
+        return built
+
+
+class ModuleSet:
+    """The modules, by the names of their sections; also what they are to each other."""
+
+    def __init__(self, pins: PinRegistry) -> None:
+        self.pins = pins
+        self._modules: list[Module] = []
+        self._devices: dict[str, list[Device]] = {}
+        self._commands: dict[str, GCodeCommand] = {}
+        self._owners: dict[str, str] = {}
+        self._live: Live | None = None
+        self.home: Callable[[Call, str], Reading] | None = None
+        """Reads G28."""
+
+    def build(self, source: ModuleSource) -> Module:
+        """Make the module of SOURCE; raises ConfigError."""
+        build = Build(source.section, source.kind.SPEC, self.pins, whole=source.whole, share=self._share)
+        module = source.kind(build)
+        build.reader.finish()
+        self._add(module, build)
+        return module
+
+    def _share(self, kind: type[Module]) -> Module:
+        for module in self._modules:
+            if type(module) is kind:
+                return module
+        section = RawSection(kind.__name__.lower(), Place("", 0))
+        return self.build(ModuleSource(section, kind, whole=True))
+
+    def _add(self, module: Module, build: Build) -> None:
+        self._modules.append(module)
+        for node, device in build.devices:
+            self._devices.setdefault(node, []).append(device)
+        for command in build.commands:
+            owner = self._owners.setdefault(command.name, build.name)
+            if owner != build.name and command.name in self._commands:
+                raise ConfigError(
+                    build.place,
+                    f"[{build.name}] brings the command {command.name}, which [{owner}] has; rename one",
+                )
+            self._commands[command.name] = command
+
+    def link(self) -> None:
+        """Let them find each other; raises ConfigError."""
+        for module in self._modules:
+            module.link(self)
+
+    # ---------------------------------------------------------------------------------------- looking up
+
+    def find(self, name: str, kind: type[M]) -> M | None:
+        """Return the module of section NAME, or None when there is none of KIND."""
+        return next((m for m in self._modules if m.name == name and isinstance(m, kind)), None)
+
+    def names(self, kind: type[Module]) -> list[str]:
+        """Return the section names of all modules of KIND."""
+        return [module.name for module in self._modules if isinstance(module, kind)]
+
+    def of(self, kind: type[M]) -> Iterator[M]:
+        """Yield all modules of KIND."""
+        for module in self._modules:
+            if isinstance(module, kind):
+                yield module
+
+    @property
+    def vocabulary(self) -> Vocabulary:
+        """What programs know through them."""
+        return Vocabulary(self._commands, self.home)
+
+    @property
+    def nodes(self) -> Sequence[str]:
+        """Names of the nodes that carry anything of them."""
+        return tuple(self._devices)
+
+    def configure(self, config: NodeConfig) -> None:
+        """Add all that is on a node to its CONFIG; raises CanductorError."""
+        for device in self._devices.get(config.name, ()):
+            device.configure(config)
+
+    # ---------------------------------------------------------------------------------------------- life
+
+    def node_started(self, node: "Node") -> None:
+        """Take note that NODE is ready, for the first time or again."""
+        for device in self._devices.get(node.name, ()):
+            device.started(node)
+
+    async def connect(self, live: "Live") -> None:
+        """Let all begin to act, then tell them that the machine is ready; raises CanductorError."""
+        self._live = live
+        for module in self._modules:
+            await module.connect(live)
+        for module in self._modules:
+            module.ready()
+
+    def stopped(self, cause: str) -> None:
+        """Tell all that the machine is stopped."""
+        if self._live is not None:
+            for module in self._modules:
+                module.stopped(cause)
+
+    def close(self) -> None:
+        """End all."""
+        with contextlib.ExitStack() as stack:
+            if self._live is not None:
+                stack.callback(self._live.close)
+            for module in self._modules:
+                stack.callback(module.close)
+        self._live = None
+
+    def status(self) -> Mapping[str, Mapping[str, Value]]:
+        """Tell how each is, by the name of its section."""
+        return {module.name: status for module in self._modules if (status := module.status())}

@@ -1,0 +1,80 @@
+"""Which module a section is for. Third parties add theirs by the entry point group ``canductor.modules``."""
+
+import re
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Final
+
+from coordinator.machine.problem import ConfigError, Place
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from coordinator.modules.base import Module
+
+ENTRY_POINTS: Final = "canductor.modules"
+"""Name: the section's first word; value: ``package.module:Class``."""
+_OURS: Final[dict[str, str]] = {}
+"""By the section's first word: module and class."""
+_BESIDE: Final[dict[str, str]] = {}
+"""By a pattern of section names that the machine's own readers read too: whose further options they are."""
+
+
+def own_kinds() -> tuple[str, ...]:
+    """Return the first words of the sections that our modules are for."""
+    return tuple(_OURS)
+
+
+def known_kinds() -> tuple[str, ...]:
+    """Return the first words of the sections that some module is for."""
+    return (*_OURS, *_others())
+
+
+def module_for(kind: str, place: Place) -> "type[Module] | None":
+    """Return the module for sections ``[KIND ...]``, or None; raises ConfigError when it cannot be loaded."""
+    if kind in _OURS:
+        return _load(_OURS[kind])
+    other = _others().get(kind)
+    if other is None:
+        return None
+    from coordinator.modules.base import Module  # noqa: PLC0415 (start-up time)
+
+    try:
+        found = other.load()
+    # Whatever code that is not ours raises, its user learns which package it was.
+    except Exception as error:
+        raise ConfigError(
+            place,
+            f"the module for [{kind}], {other.value} of package {_package(other)}, cannot be loaded:"
+            f" {error or type(error).__name__}; update or remove that package",
+        ) from error
+    if not (isinstance(found, type) and issubclass(found, Module)):
+        raise ConfigError(
+            place,
+            f"{other.value} of package {_package(other)} is no module for [{kind}]: it must be a subclass of"
+            " coordinator.modules.base.Module; update or remove that package",
+        )
+    return found
+
+
+def modules_beside(section: str) -> "Iterator[type[Module]]":
+    """Yield the modules that read further options of a section that belongs to the machine itself."""
+    for pattern, path in _BESIDE.items():
+        if re.fullmatch(pattern, section, re.ASCII):
+            yield _load(path)
+
+
+def _load(path: str) -> "type[Module]":
+    name, _, attribute = path.partition(":")
+    found: type[Module] = getattr(import_module(name), attribute)
+    return found
+
+
+@cache
+def _others() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+
+
+def _package(point: EntryPoint) -> str:
+    return point.dist.name if point.dist is not None else "?"

@@ -1,0 +1,51 @@
+"""Performs what a program has to be done while the machine stands; the program waits for it."""
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable
+
+from coordinator.app import MachineStopped
+from coordinator.gcode.commands import Done
+from coordinator.gcode.events import Resting
+from nodes.errors import CanductorError
+
+
+class RestTask:
+    """EVENT being performed on the running loop; ``look`` until it is over."""
+
+    def __init__(self, event: Resting) -> None:
+        self._event = event
+        self._task = asyncio.ensure_future(_performed(event.perform()))
+
+    def look(self) -> bool:
+        """End it if nobody wants it any more; return whether it is over, with EVENT telling how.
+
+        Raises what performing it raised, but for a CanductorError, which the program gets. Whoever failed or
+        was ended on the way may have moved something.
+        """
+        if self._event.cancelled:
+            self._task.cancel()
+        if not self._task.done():
+            return False
+        event = self._event
+        event.done, event.over = None, True
+        if self._task.cancelled():
+            event.moved = True
+        elif (error := self._task.exception()) is not None:
+            if isinstance(error, MachineStopped) or not isinstance(error, CanductorError):
+                raise error
+            event.failure, event.moved = str(error), True
+        else:
+            event.done = self._task.result()
+            event.moved = event.done.moved
+        return True
+
+    async def close(self) -> None:
+        """End it, whatever becomes of it."""
+        self._task.cancel()
+        with contextlib.suppress(asyncio.CancelledError, CanductorError):
+            await self._task
+
+
+async def _performed(awaitable: Awaitable[Done | None]) -> Done:
+    return await awaitable or Done()
