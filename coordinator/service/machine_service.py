@@ -271,5 +271,6 @@ class MachineService:
     async def _refresh(self) -> None:
         while True:
             with contextlib.suppress(MachineStopped):
-                self._figures.show(self)
+                for _ in self._figures.parts(self):
+                    await asyncio.sleep(0)
             await asyncio.sleep(REFRESH_S)
