@@ -251,19 +251,41 @@ def _attack(place: Place, code: str, *, tcp: bool, packed: bool) -> tuple[str, s
         return str(said["code"]), str(said["message"])
 
 
+class _Progress:
+    """Watches a job: what is carried out is where its line begins in the file, and what is read is ahead."""
+
+    def __init__(self, file: Path) -> None:
+        self._lines = file.read_bytes().splitlines(keepends=True)
+        self._fields: dict[str, Any] = {}
+        self._before = 0
+
+    def look(self, changed: dict[str, Any]) -> bool:
+        """Return whether it goes on."""
+        self._fields |= changed
+        done, read = self._fields["job.done_bytes"], self._fields["job.read_bytes"]
+        assert self._before <= done <= read
+        self._before = done
+        if self._fields["job.state"] != "printing":
+            return False
+        begin = sum(map(len, self._lines[: max(0, self._fields["job.line"] - 1)]))
+        assert abs(done - begin) <= 3 * max(map(len, self._lines))
+        return True
+
+
 def test_what_is_wrong_ends_that_client_only_while_the_machine_prints(machine: Hardware) -> None:
     with serving(machine, "--no-tls-on-loopback") as place, BlockingClient(str(place.path)) as bystander:
         bystander.call("job.start", {"file": "zigzag.gcode"})
+        progress = _Progress(machine.folder / "jobs" / "zigzag.gcode")
         kinds = [(tcp, packed) for tcp in (False, True) for packed in (False, True)]
         attacks = [(code, *kind) for code in SENTENCES for kind in kinds if code != "bad_token" or kind[0]]
         with ThreadPoolExecutor(len(attacks)) as pool:
-            ends = list(pool.map(lambda a: _attack(place, a[0], tcp=a[1], packed=a[2]), attacks))
+            ends = pool.map(lambda a: _attack(place, a[0], tcp=a[1], packed=a[2]), attacks)
+            for update in bystander.watch(["job.*"], rate_hz=20):
+                if not progress.look(update.values):
+                    break
         for (code, *kind), (said, sentence) in zip(attacks, ends, strict=True):
             assert said == code, kind
             assert SENTENCES[code] in sentence
-        for update in bystander.watch(["job.state", "job.progress", "machine.state"]):
-            if update.values.get("job.state", "printing") != "printing":
-                break
         done = bystander.call("job.status")
         assert (done["state"], done["progress"]) == ("done", 1.0)
         assert done["done_bytes"] == done["read_bytes"] == done["size_bytes"]
