@@ -1,6 +1,6 @@
 """Fuzzes the sockets of a machine while it prints, and proves that the print is none the worse.
 
-Usage, from the project's root: python -m tests.fuzz.live [--minutes M] [--gcode FILE] [--seed N]
+Usage, from the project's root: python -m tests.fuzz.live [--minutes M] [--gcode FILE] [--seed N] [--riot]
 
 One service prints the same file again and again: now quietly, now under clients that do their worst. Every
 stepper must have moved by the same number of steps, and at the end the demo's proof looks at the position
@@ -11,14 +11,15 @@ import argparse
 import asyncio
 import json
 import shutil
+import signal
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -32,6 +33,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 QUIET_EVERY: Final = 4
 """Of so many prints one is quiet, and the last one is."""
 PATIENCE_S: Final = 120.0
+LONG_S: Final = 10.0
 
 
 @dataclass
@@ -114,15 +116,32 @@ class Bench:
         assert told["nodes_steps"] == {n: s["steps_sent"] for n, s in told["steppers"].items()}
         return dict(told["nodes_steps"])
 
-    def _fuzzer(self, seed: int) -> subprocess.Popen[str]:
+    def _fuzzer(self, seed: int, token: str = WATCH_TOKEN) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "tests.fuzz.live_visits", str(self.path), str(self.port)]
         return subprocess.Popen(
-            [*command, WATCH_TOKEN, str(seed)],
+            [*command, token, str(seed)],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
+
+    async def riot(self, seconds: float, seed: int) -> None:
+        """Let fuzzers in that may do everything; whatever they did, the machine can print afterwards."""
+        fuzzer = self._fuzzer(seed, ADMIN_TOKEN)
+        await asyncio.sleep(seconds)
+        told = json.loads((await asyncio.to_thread(fuzzer.communicate))[0])
+        self.findings.counts.update(told["counts"])
+        self.findings.problems += told["problems"]
+        await self._until("machine.state", "ready", "shutdown", "error")
+        await self.client.call("machine.emergency_stop")
+        await self.client.call("machine.restart")
+        await self._until("machine.state", "ready")
+
+    async def _until(self, path: str, *values: str) -> None:
+        async for update in self.client.watch([path], rate_hz=5):
+            if update.values.get(path) in values:
+                return
 
 
 def memory_kib(pid: int) -> int:
@@ -149,29 +168,30 @@ def _service(folder: Path, jobs: Path) -> Iterator[subprocess.Popen[str]]:
             process.wait()
 
 
-async def _drive(
-    process: subprocess.Popen[str], folder: Path, file: str, fuzz_s: float, seed: int
-) -> Findings:
+@asynccontextmanager
+async def _bench(process: subprocess.Popen[str], folder: Path) -> AsyncIterator[Bench]:
     assert process.stdout is not None
     port = int(await asyncio.to_thread(process.stdout.readline) or "0")
     assert port, (folder / "errors").read_text()
     async with Client.connect(f"tcp://127.0.0.1:{port}", token=ADMIN_TOKEN) as client:
-        bench = Bench(process, folder, port, client)
-        fuzzed_s, turn = 0.0, 0
-        while True:
+        yield Bench(process, folder, port, client)
+
+
+async def _prints(
+    process: subprocess.Popen[str], folder: Path, file: str, fuzz_s: float, seed: int
+) -> Findings:
+    async with _bench(process, folder) as bench:
+        fuzzed_s, turn, over = 0.0, 0, False
+        while not over:  # the last print is quiet; in a long run the first one, too
             over = fuzzed_s >= fuzz_s
-            quiet = over or turn % QUIET_EVERY == 0
+            quiet = over or (turn % QUIET_EVERY == 0 and fuzz_s > LONG_S)
             await bench.print(file, seed=None if quiet else seed + turn * 1_000_000)
             fuzzed_s += 0.0 if quiet else bench.findings.prints[-1].took_s
             turn += 1
             _show(bench.findings.prints[-1])
-            if over:  # the last one is quiet, as the first one is
-                break
     proof, _ = await asyncio.to_thread(process.communicate, None, PATIENCE_S)
     findings = bench.findings
-    errors = (folder / "errors").read_text()
-    if errors or process.returncode:
-        findings.problems.append(f"the service ended with {process.returncode} and said: {errors[-2000:]}")
+    if not _ended_well(process, folder, findings):
         return findings
     findings.proof = json.loads(proof.splitlines()[-1])
     for printed, lead_ms in zip(findings.prints, findings.proof["leads_ms"], strict=True):
@@ -179,15 +199,46 @@ async def _drive(
     return findings
 
 
+async def _riot(
+    process: subprocess.Popen[str], folder: Path, file: str, fuzz_s: float, seed: int
+) -> Findings:
+    async with _bench(process, folder) as bench:
+        await bench.riot(fuzz_s, seed)
+        await bench.print(file, seed=None)
+    process.terminate()
+    await asyncio.to_thread(process.communicate, None, PATIENCE_S)
+    _ended_well(process, folder, bench.findings)
+    return bench.findings
+
+
+def _ended_well(process: subprocess.Popen[str], folder: Path, findings: Findings) -> bool:
+    errors = (folder / "errors").read_text()
+    well = not errors and process.returncode in (0, -signal.SIGTERM)
+    if not well:
+        findings.problems.append(f"the service ended with {process.returncode} and said: {errors[-2000:]}")
+    return well
+
+
 def fuzz_a_print(gcode: Path, fuzz_s: float, seed: int) -> Findings:
-    """Print GCODE until fuzzers were at work for FUZZ_S."""
+    """Print GCODE until fuzzers that may watch were at work for FUZZ_S."""
+    return _on_a_service(_prints, gcode, fuzz_s, seed)
+
+
+def fuzz_the_machine(gcode: Path, fuzz_s: float, seed: int) -> Findings:
+    """Let fuzzers that may do everything be at work for FUZZ_S, then print GCODE."""
+    return _on_a_service(_riot, gcode, fuzz_s, seed)
+
+
+def _on_a_service(
+    drive: Callable[..., Coroutine[Any, Any, Findings]], gcode: Path, fuzz_s: float, seed: int
+) -> Findings:
     with tempfile.TemporaryDirectory(prefix="canductor-fuzz-") as name:
         folder = Path(name)
         jobs = folder / "jobs"
         jobs.mkdir()
         shutil.copy(gcode, jobs)
         with _service(folder, jobs) as process:
-            return asyncio.run(_drive(process, folder, gcode.name, fuzz_s, seed))
+            return asyncio.run(drive(process, folder, gcode.name, fuzz_s, seed))
 
 
 def _show(printed: Printed) -> None:
@@ -201,7 +252,12 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--gcode", type=Path, default=DEMO_GCODE)
     parser.add_argument("--seed", type=int, default=int(time.time()))
+    parser.add_argument("--riot", action="store_true", help="fuzzers may do everything; then one print")
     given = parser.parse_args()
+    if given.riot:
+        found = fuzz_the_machine(given.gcode, given.minutes * 60, given.seed)
+        sys.stdout.write(f"seed {given.seed}: {json.dumps(found.counts, indent=1)}\n")
+        sys.exit("".join(f"PROBLEM: {sentence}\n" for sentence in found.problems) or 0)
     found = fuzz_a_print(given.gcode, given.minutes * 60, given.seed)
     tell = sys.stdout.write
     for printed in found.prints:

@@ -1,6 +1,7 @@
-"""Visits of clients that are random, wrong, slow or rude to a service that runs; they may watch, no more.
+"""Visits of clients that are random, wrong, slow or rude to a service that runs.
 
-Usage: python -m tests.fuzz.live_visits SOCKET PORT TOKEN SEED; ends with its standard input.
+Usage: python -m tests.fuzz.live_visits SOCKET PORT TOKEN SEED; ends with its standard input. What they may do
+over TCP is what TOKEN gives, and over the socket what its owner's programs may.
 
 Every visit is made from a seed. What the server says must always be readable, whoever it cuts off is told
 why, and no method may fail by a mistake of the program; ``problems`` has the seeds of those where it was not.
@@ -207,7 +208,7 @@ class Visit:
         return line(message) if self._json else packed(message)
 
     def _hello(self) -> dict[str, Any]:
-        params: dict[str, Any] = {"version": 1, "client": "fuzzer", "scope": "watch"}
+        params: dict[str, Any] = {"version": 1, "client": "fuzzer"}
         if self._over_tcp:
             params["token"] = self._site.token
         return {"id": 1, "method": "api.hello", "params": params}
@@ -307,6 +308,8 @@ class Visit:
     def _look(self, message: dict[str, Any]) -> None:
         self._tally.counts["messages received"] += 1
         error = message.get("error")
+        if "id" in message:
+            self._tally.counts[f"answered: {'with a result' if error is None else error['code']}"] += 1
         if error is None:
             if not message.keys() & {"id", "event"}:
                 self._problem(f"a message means nothing: {str(message)[:100]}")
