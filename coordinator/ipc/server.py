@@ -20,6 +20,7 @@ from coordinator.ipc.session import Common, Session, SessionCounters
 from coordinator.ipc.session_methods import add_session_methods
 from coordinator.ipc.settings import IpcSettings, TcpSettings
 from coordinator.ipc.state import StateTree
+from coordinator.ipc.turns import Turns
 from coordinator.ipc.wire import Encoder, Encoding, Fault
 from nodes.errors import CanductorError
 
@@ -72,11 +73,12 @@ class IpcServer:
 
     async def start(self) -> None:
         """Open the sockets; raises CanductorError with all closed."""
+        turns = Turns()
         try:
             if self._settings.unix_path is not None:
-                await self._open_unix(self._settings.unix_path)
+                await self._open_unix(self._settings.unix_path, turns)
             if self._settings.tcp is not None:
-                await self._open_tcp(self._settings.tcp)
+                await self._open_tcp(self._settings.tcp, turns)
         except BaseException:
             await self.close()
             raise
@@ -129,26 +131,26 @@ class IpcServer:
 
     # ---------------------------------------------------------------------------------------- sockets
 
-    async def _open_unix(self, path: Path) -> None:
+    async def _open_unix(self, path: Path, turns: Turns) -> None:
         await asyncio.to_thread(_make_way, path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             os.fchmod(listener.fileno(), 0o600)  # before there is a name, so that nobody can be faster
             listener.bind(str(path))
             server = await asyncio.get_running_loop().create_unix_server(
-                lambda: Connection(self._admit_unix, self._drop), sock=listener, backlog=BACKLOG
+                lambda: Connection(self._admit_unix, self._drop, turns), sock=listener, backlog=BACKLOG
             )
         except OSError as error:
             listener.close()
             raise CanductorError(f"the socket {path} cannot be opened: {error.strerror or error}") from None
         self._servers.append(server)
 
-    async def _open_tcp(self, tcp: TcpSettings) -> None:
+    async def _open_tcp(self, tcp: TcpSettings, turns: Turns) -> None:
         context = await asyncio.to_thread(_tls_context, tcp)
         self._tokens = await asyncio.to_thread(Tokens.read, tcp.tokens)
         try:
             server = await asyncio.get_running_loop().create_server(
-                lambda: Connection(self._admit_tcp, self._drop),
+                lambda: Connection(self._admit_tcp, self._drop, turns),
                 tcp.host,
                 tcp.port,
                 ssl=context,

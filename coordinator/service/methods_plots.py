@@ -1,6 +1,7 @@
 """``motion.dump``: what was planned and sent within the last seconds, for plotting."""
 
 import asyncio
+import time
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Any, Final
@@ -16,16 +17,20 @@ COMMANDS_MAX: Final = 4000
 """Of each moving node."""
 _COLUMNS: Final = ("print_time", "accel_s", "cruise_s", "decel_s", "start_v", "cruise_v", "accel", "line")
 _HEADER: Final = 17
+REST: Final = 4.0
+"""A dump keeps an interpreter busy for some 50 ms; for so many times as long there is no other."""
 
 
 def plot_methods(service: MachineService) -> Iterator[Method]:
     """Return them."""
     dumping = asyncio.Lock()
+    rest_until_s = 0.0
 
     async def dump(_caller: Caller, params: dict[str, Any]) -> Value:
+        nonlocal rest_until_s
         motion, machine = service.ready_motion(), service.up_machine()
-        if dumping.locked():
-            raise ApiError("busy", "another dump is being made; ask again in a moment")
+        if dumping.locked() or time.monotonic() < rest_until_s:
+            raise ApiError("busy", "another dump is being made, or was just now; ask again in a moment")
         async with dumping:
             now_s = motion.now_s
             since_s = now_s - params["seconds"]
@@ -38,7 +43,10 @@ def plot_methods(service: MachineService) -> Iterator[Method]:
             }
             moves = motion.trace.moves(since_s)
             # Reading commands one by one takes Python a while: not on the control loop.
-            return await asyncio.to_thread(_dump, now_s, since_s, moves, senders, names)
+            begun_s = time.monotonic()
+            made = await asyncio.to_thread(_dump, now_s, since_s, moves, senders, names)
+            rest_until_s = begun_s + (1 + REST) * (time.monotonic() - begun_s)
+            return made
 
     yield Method(
         "motion.dump",
