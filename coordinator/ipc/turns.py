@@ -5,6 +5,7 @@ turn that reaches it; one client for TURN_S, then the others that wait come firs
 """
 
 import asyncio
+from collections.abc import Callable
 from typing import Final, Protocol
 
 ROUND_S: Final = 0.004
@@ -23,10 +24,11 @@ class Worker(Protocol):
 
 
 class Turns:
-    """Shares the rounds of the loop that makes it."""
+    """Shares the rounds of the loop that makes it; NOW_S is the loop's clock."""
 
-    def __init__(self) -> None:
+    def __init__(self, now_s: Callable[[], float] | None = None) -> None:
         self._loop = asyncio.get_running_loop()
+        self._now_s = self._loop.time if now_s is None else now_s
         self._waiting: dict[Worker, None] = {}  # in the order in which they came
         self._spent_s = 0.0  # in this round
         self._round_is_due = False
@@ -46,9 +48,9 @@ class Turns:
         self._waiting.pop(worker, None)
 
     def _let(self, worker: Worker) -> None:
-        begun_s = self._loop.time()
+        begun_s = self._now_s()
         more = worker.work(begun_s + TURN_S)
-        self._spent_s += self._loop.time() - begun_s
+        self._spent_s += self._now_s() - begun_s
         if more:
             self._wait(worker)
         self._expect_round()
