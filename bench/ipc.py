@@ -5,9 +5,9 @@ machine is behind it. With --at it is a machine that runs: canductor demo --serv
 
 With --print it is a machine that prints: `canductor demo --serve` and its virtual nodes are started anew for
 every line of the table, so that the smallest leads are those of that load, and print the same for as long.
-Loads take turns, round after round; each is compared with the quiet prints of its round. Leads: how far the
-motion worker's commands reach ahead of now, smallest after the first second; and how long before it was due
-a command reached its node, smallest of all nodes.
+Loads take turns, round after round; each is compared with the quiet print of its round. Leads: how far the
+commands still reached ahead of now when the motion worker's next ones were handed over, smallest after the
+first second; and how long before it was due a command reached its node, smallest of all nodes.
 
 Usage: python bench/ipc.py [--seconds S] [--stall-seconds S] [--at PATH]
        python bench/ipc.py --print [--rounds N] [--seconds S] [--stall-seconds S] [--gcode FILE]
@@ -141,11 +141,11 @@ def at_rate(peer: Peer, rate_hz: float, seconds: float) -> list[float]:
     return delays
 
 
-def flat_out(peer: Peer, seconds: float, window: int = 64) -> float:
+def flat_out(peer: Peer, seconds: float, method: str = "machine.state", window: int = 64) -> float:
     """Keep WINDOW requests under way; return answers a second."""
     began, answered, got, numbers = time.perf_counter(), 0, window, count(1)
     while time.perf_counter() - began < seconds:
-        more = ({"id": next(numbers), "method": "machine.state"} for _ in range(got))
+        more = ({"id": next(numbers), "method": method} for _ in range(got))
         peer.socket.sendall(b"".join(map(peer.write, more)))
         got = sum(1 for _ in peer.messages())
         answered += got
@@ -210,15 +210,9 @@ def start(target: Callable[[Path], None], name: str) -> tuple[Path, int]:
 # --------------------------------------------------------------------------------------------------- loads
 
 
-def p99_ms(delays: list[float]) -> float:
-    return sorted(delays)[int(len(delays) * 0.99)] * 1e3
-
-
 def told(delays: list[float]) -> str:
-    return (
-        f"p50 {statistics.median(delays) * 1e3:.2f} ms, p99 {p99_ms(delays):.2f} ms, "
-        f"longest {max(delays) * 1e3:.1f} ms"
-    )
+    p50_ms, p99_ms, longest_ms = (sorted(delays)[int(len(delays) * q) - 1] * 1e3 for q in (0.5, 0.99, 1.0))
+    return f"p50 {p50_ms:.2f} ms, p99 {p99_ms:.2f} ms, longest {longest_ms:.1f} ms"
 
 
 def load_requests(path: Path, kind: str, seconds: float) -> str:
@@ -239,6 +233,10 @@ def load_flat_out(path: Path, seconds: float) -> str:
     return f"{flat_out(Peer(path, 'msgpack'), seconds):,.0f} requests/s"
 
 
+def load_dumps(path: Path, seconds: float) -> str:
+    return f"{flat_out(Peer(path, 'msgpack'), seconds, 'motion.dump'):,.0f} requests/s, most refused: busy"
+
+
 QUIET, STALL = "no clients", "a client that does not read"
 LOADS: dict[str, Callable[[Path, float], str]] = {
     "2,000 requests/s, msgpack": lambda path, seconds: load_requests(path, "msgpack", seconds),
@@ -246,6 +244,7 @@ LOADS: dict[str, Callable[[Path, float], str]] = {
     "2,000 messages/s to a bare echo beside it": load_echo,
     "200 subscribers of all fields at 10 Hz": load_subscribers,
     "as many requests as it takes": load_flat_out,
+    "as many dumps of motion as it takes": load_dumps,
     STALL: stalled,
 }
 
