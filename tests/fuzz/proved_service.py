@@ -33,7 +33,7 @@ from coordinator.session import Outcome, outcome_of
 
 WATCH_TOKEN, ADMIN_TOKEN = "watch" * 8, "admin" * 8
 LOOK_S = 0.02
-NODES_NICE = -10
+NODES_PRIORITY = 10
 
 
 class Proved:
@@ -144,7 +144,7 @@ def main() -> None:
     with Stage(description, options, folder) as stage:
         for node in stage.processes.values():  # boards do not compete with clients for a processor
             with suppress(PermissionError):
-                os.setpriority(os.PRIO_PROCESS, node.pid, NODES_NICE)
+                os.sched_setscheduler(node.pid, os.SCHED_FIFO, os.sched_param(NODES_PRIORITY))
         proved = Proved(stage, folder, jobs)
         outcome = asyncio.run(_serve(proved))
         figures = stage.stop_nodes()
