@@ -30,7 +30,7 @@ from nodes.errors import CanductorError
 from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-QUIET_EVERY: Final = 6
+QUIET_EVERY: Final = 10
 """Of so many prints one is quiet, and the last one is."""
 PATIENCE_S: Final = 120.0
 LONG_S: Final = 10.0

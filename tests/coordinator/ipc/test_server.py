@@ -141,6 +141,14 @@ ATTACKS = {
     "abysmal msgpack": (framed(b"\x91" * 200_000 + b"\xc0"), "too_deep"),
     "deep JSON": (b'{"a":' + b"[" * 500 + b"]" * 500 + b"}\n", "too_deep"),
     "abysmal JSON": (b'{"a":' + b"[" * 100_000 + b"]" * 100_000 + b"}\n", "too_deep"),
+    "many small lists": (
+        framed(b"\x81\xa1a\xdc\x00\x40" + (b"\xdc\x0f\xa0" + b"\x90" * 4000) * 64),
+        "too_long",
+    ),
+    "many small lists in JSON": (
+        b'{"a":[' + b",".join([b"[" + b"[]," * 3000 + b"[]]"] * 3) + b"]}\n",
+        "too_long",
+    ),
     "half a message": (framed(b"\x81\xa1")[:-1], "timeout"),
     "half a length": (b"\0\0", "timeout"),
     "half a line": (b'{"id":1', "timeout"),
