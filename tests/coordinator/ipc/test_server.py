@@ -138,7 +138,7 @@ ATTACKS = {
     "a huge message": (struct.pack(">I", 2**24 - 1), "too_long"),
     "a huge line": (b'{"a":"' + b"x" * 300_000, "too_long"),
     "deep msgpack": (framed(b"\x81\xa1a" + b"\x91" * 500 + b"\xc0"), "too_deep"),
-    "abysmal msgpack": (framed(b"\x91" * 200_000 + b"\xc0"), "too_deep"),
+    "abysmal msgpack": (framed(b"\x91" * 200_000 + b"\xc0"), "too_long"),
     "deep JSON": (b'{"a":' + b"[" * 500 + b"]" * 500 + b"}\n", "too_deep"),
     "abysmal JSON": (b'{"a":' + b"[" * 100_000 + b"]" * 100_000 + b"}\n", "too_deep"),
     "many small lists": (
