@@ -116,7 +116,7 @@ class Connection(asyncio.Protocol):
     def work(self, until_s: float) -> bool:
         """Do the work there is, at most until UNTIL_S; return whether there is more."""
         session, now_s = self.session, self._loop.time()
-        for request in session.read(now_s):
+        for request in session.read(now_s) if session.should_read else ():
             self._call(request)
         for _ in range(REQUESTS_PER_TURN):
             waiting = session.next_request(now_s)

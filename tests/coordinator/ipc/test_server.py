@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from coordinator.ipc import turns as turns_module
 from coordinator.ipc.connection import REQUESTS_PER_TURN
 from coordinator.ipc.methods import Scope
 from coordinator.ipc.server import IpcServer
@@ -182,6 +183,23 @@ def test_what_is_wrong_ends_that_client_only_with_a_clear_error(tmp_path: Path, 
         writer.close()
 
     run(tmp_path, body, limits=Limits(message_timeout_s=0.2))
+
+
+def test_however_many_are_sent_at_once_what_is_answered_at_once_is_never_too_much(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(turns_module, "TURN_S", 0.0)  # time for one request, on the slowest of computers
+
+    async def body(served: Served) -> None:
+        script = await served.script()
+        count = 4 * served.settings.limits.pending_requests
+        for number in range(count):
+            script.send("machine.info", number)
+        for number in range(count):
+            answer = await script.receive()
+            assert (answer.get("id"), "result" in answer) == (number, True), answer
+
+    run(tmp_path, body)
 
 
 def test_an_emergency_stop_overtakes_what_waits(tmp_path: Path) -> None:
