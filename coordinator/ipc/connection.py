@@ -188,8 +188,19 @@ class Connection(asyncio.Protocol):
         if isinstance(result, Awaitable):
             task = self._loop.create_task(self._finish(request, result))
             self._tasks[request] = task
+            task.add_done_callback(lambda task: self._check_begun(task, request, result))
         else:
             self.session.answer(request, result)
+
+    def _check_begun(self, task: asyncio.Task[None], request: Request, result: Awaitable[Value]) -> None:
+        """End REQUEST when its TASK was cancelled before its first step, unheard by ``_finish``."""
+        if not task.cancelled():
+            return
+        if asyncio.iscoroutine(result):
+            result.close()
+        del self._tasks[request]
+        self.session.fail(request, ApiError("cancelled", f"{request.method.name} was cancelled"))
+        self._turn()
 
     async def _finish(self, request: Request, result: Awaitable[Value]) -> None:
         try:

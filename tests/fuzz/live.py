@@ -46,7 +46,7 @@ class Printed:
     """By stepper: what its node counted, from the begin of the print to its end."""
     memory_kib: int
     """Of the service, at the end."""
-    lead_ms: float = 0.0
+    lead_ms: float = float("nan")
 
 
 @dataclass

@@ -202,6 +202,24 @@ def test_however_many_are_sent_at_once_what_is_answered_at_once_is_never_too_muc
     run(tmp_path, body)
 
 
+@pytest.mark.filterwarnings("error")
+def test_what_is_cancelled_before_it_begins_is_answered_too(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        script = await served.script()
+        (connection,) = served.server._connections
+        session, now_s = connection.session, asyncio.get_running_loop().time()
+        session.receive(b'{"id":5,"method":"wait"}\n', now_s)
+        connection.work(now_s + 1)
+        session.receive(b'{"id":6,"method":"api.cancel","params":{"id":5}}\n', now_s)
+        connection.work(now_s + 1)  # within the same round of the loop
+        answers = {answer["id"]: answer for answer in [await script.receive() for _ in range(2)]}
+        assert answers[5]["error"]["code"] == "cancelled"
+        assert answers[6]["result"] == {"found": True}
+        assert not connection._tasks
+
+    run(tmp_path, body)
+
+
 def test_an_emergency_stop_overtakes_what_waits(tmp_path: Path) -> None:
     async def body(served: Served) -> None:
         script = await served.script()
