@@ -16,6 +16,8 @@ class Limits:
     """Lists and maps inside one another."""
     items: int = 4_096
     """Entries of one list or map."""
+    values: int = 8_192
+    """In all lists and maps of a message together: looking at them takes the control loop 2 ms."""
     message_timeout_s: float = 5.0
     """For a message to be complete after its first byte, and for the hello after connecting."""
     pending_requests: int = 256

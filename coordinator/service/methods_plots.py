@@ -1,6 +1,7 @@
 """``motion.dump``: what was planned and sent within the last seconds, for plotting."""
 
 import asyncio
+import time
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Any, Final
@@ -19,16 +20,22 @@ COMMANDS_MAX: Final = 4000
 """Of each moving node."""
 _COLUMNS: Final = ("print_time", "accel_s", "cruise_s", "decel_s", "start_v", "cruise_v", "accel", "line")
 _HEADER: Final = 17
+REST: Final = 4.0
+"""A dump keeps the interpreter busy for some 50 ms; for so many times as long there is no other."""
+ROWS_AT_A_TIME: Final = 50
+"""Takes half a millisecond."""
 
 
 def plot_methods(service: MachineService) -> Iterator[Method]:
     """Return them."""
     dumping = asyncio.Lock()
+    rest_until_s = 0.0
 
     async def dump(_caller: Caller, params: dict[str, Any]) -> Value:
+        nonlocal rest_until_s
         motion, machine = service.ready_motion(), service.up_machine()
-        if dumping.locked():
-            raise ApiError("busy", "another dump is being made; ask again in a moment")
+        if dumping.locked() or time.monotonic() < rest_until_s:
+            raise ApiError("busy", "another dump is being made, or was just now; ask again in a moment")
         async with dumping:
             now_s = motion.now_s
             since_s = now_s - params["seconds"]
@@ -40,8 +47,10 @@ def plot_methods(service: MachineService) -> Iterator[Method]:
                 (s.node, machine.devices.steppers[s.name].oid): s.name for s in machine.description.steppers
             }
             moves = motion.trace.moves(since_s)
-            # Reading commands one by one takes Python a while: not on the control loop.
-            return await asyncio.to_thread(_dump, now_s, since_s, moves, senders, names)
+            begun_s = time.monotonic()
+            made = await _dump(now_s, since_s, moves, senders, names)
+            rest_until_s = begun_s + (1 + REST) * (time.monotonic() - begun_s)
+            return made
 
     def path(_caller: Caller, params: dict[str, Any]) -> Value:
         motion = service.motion or service.ready_motion()  # also of a machine that has stopped
@@ -104,7 +113,7 @@ class _Sender:
         return self.piece.print_time + (ticks - self.piece.ticks) / self.piece.ticks_per_s
 
 
-def _dump(
+async def _dump(
     now_s: float,
     since_s: float,
     moves: Moves,
@@ -112,7 +121,7 @@ def _dump(
     names: dict[tuple[str, int | None], str],
 ) -> Value:
     kept = moves[-MOVES_MAX:]
-    queues = [_queue(sender, since_s, names) for sender in senders]
+    queues = [await _queue(sender, since_s, names) for sender in senders]
     columns: dict[str, Value] = {name: kept[name].tolist() for name in _COLUMNS}
     columns |= {name: kept[name].tolist() for name in ("start", "ratio")}
     truncated = len(kept) < len(moves) or any(full for _, full in queues)
@@ -124,11 +133,17 @@ def _dump(
     }
 
 
-def _queue(
+async def _queue(
     sender: _Sender, since_s: float, names: dict[tuple[str, int | None], str]
 ) -> tuple[dict[str, Value], bool]:
     """Return the newest queue_step commands of one node, and whether older ones were left out."""
-    found = list(islice(_newest_first(sender, since_s), COMMANDS_MAX + 1))
+    found = []
+    # Reading commands one by one takes Python a while. In a thread it would take the interpreter from the
+    # control loop at each of its calls to a socket, for 5 ms; so the loop does it, some at a time.
+    for row in islice(_newest_first(sender, since_s), COMMANDS_MAX + 1):
+        found.append(row)
+        if len(found) % ROWS_AT_A_TIME == 0:
+            await asyncio.sleep(0)
     full = len(found) > COMMANDS_MAX
     rows = found[:COMMANDS_MAX][::-1]
     per_tick_s = 1 / sender.piece.ticks_per_s

@@ -113,10 +113,17 @@ class _Hall:
         add_methods(service, registry)
         if settings.jobs is not None:
             registry.add(upload_method(settings.jobs))
-        self._server = IpcServer(registry, tree, _ipc_settings(self._options, self.path))
+        self._server = IpcServer(
+            registry,
+            tree,
+            _ipc_settings(self._options, self.path),
+            on_notice=lambda text: service.log.add("notice", text),
+        )
         await self._server.start()
         page = await _open_page(self._server, self._options)
         _say(f"serving at {self.path}")
+        if self._options.tcp is not None:
+            _say(f"serving at {_address(self._options, self._server.tcp_port)}")
         if page is not None:
             _say(f"the live page is at {page.url}")
         metrics = await self._open_metrics(tree)
@@ -224,6 +231,13 @@ async def _open_page(server: IpcServer, options: ServeOptions) -> "WebServer | N
         await server.close()
         raise
     return page
+
+
+def _address(options: ServeOptions, port: int | None) -> str:
+    assert options.tcp is not None
+    host = options.tcp[0]
+    scheme = "tls" if options.certificate is not None else "tcp"
+    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 def _say(line: str) -> None:
