@@ -37,8 +37,9 @@ if TYPE_CHECKING:
     from coordinator.timebase import ClockMap
 
 CYCLE_S: Final = 0.05
-PLAN_AHEAD_S: Final = 3.0
-"""Moves are planned so far ahead of now; beyond, the g-code waits."""
+PLAN_AHEAD_S: Final = 2.0
+"""Moves are planned so far ahead of now; beyond, the g-code waits. A pause takes so long; what it leaves
+beyond SEND_AHEAD_S is for sources that stall, and for lines that take longer to read than to carry out."""
 SEND_AHEAD_S: Final = 1.2
 """Step commands are made so far ahead of now; the clocks of the nodes are predicted over this long."""
 START_LEAD_S: Final = 0.25

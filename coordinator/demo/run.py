@@ -60,9 +60,9 @@ def run_demo(options: DemoOptions) -> DemoReport:
             )
         )
         figures = stage.stop_nodes()
-        prover = _Prover(description, stage.edge_log, outcome, record, both_edges=both_edges, claimed=claimed)
+        prover = Prover(description, stage.edge_log, outcome, record, both_edges=both_edges, claimed=claimed)
         notices = [*map(str, description.not_yet_acting), *description.notes, *told]
-        return _report(prover, stage, figures, outcome, notices)
+        return report_of(prover, stage, figures, outcome, notices)
 
 
 @contextmanager
@@ -79,7 +79,7 @@ def _text(told: Told) -> str:
     return told.text
 
 
-class _Prover:
+class Prover:
     """Compares what the nodes' pins did with the plan."""
 
     def __init__(
@@ -183,13 +183,14 @@ class _Prover:
             yield clock[proved], direction[proved] * sign
 
 
-def _report(
-    prover: _Prover,
+def report_of(
+    prover: Prover,
     stage: Stage,
     figures: Mapping[str, Mapping[str, Any]],
     outcome: Outcome,
     notices: Sequence[str],
 ) -> DemoReport:
+    """Return the report, with every stepper proved; the nodes have ended, with these FIGURES."""
     frames, frames_lost = stage.frames()
     return DemoReport(
         moves=outcome.moves,

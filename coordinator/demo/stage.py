@@ -1,7 +1,10 @@
-"""The stage of the demo: a machine's configuration played by virtual nodes on virtual or SocketCAN buses."""
+"""The stage of the demo: a machine's configuration played by virtual nodes on virtual or SocketCAN buses.
+
+Their pins are connected with a plant of that machine: endstops switch where they are, heaters heat.
+"""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +22,8 @@ from nodes.errors import CanductorError
 from nodes.transport.socketcan import SocketCanTransport
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.hub import VirtualBus
+from nodes.virtual.plant_log import PlantEvent, plant_log
+from nodes.virtual.plant_page import PlantPage
 from nodes.virtual.processes import Flavour, NodeProcess
 
 BITRATE = 1_000_000
@@ -48,7 +53,7 @@ class Stage:
         self._stack = ExitStack()
         self._described = description
         self._plants = machine_plants(
-            description, PlantSettings(seed=options.seed, start=start_point(description, START_MM))
+            description, PlantSettings(seed=options.seed + 1, start=start_point(description, START_MM))
         )
         self.description = dataclasses.replace(
             description, nodes=tuple(self._virtual(node) for node in description.nodes)
@@ -144,9 +149,18 @@ class Stage:
             % 2**47,
             jitter_us=JITTER_US,
             seed=self._options.seed + index,
-            plant=self._plants[node.name].write(self._folder),
             edge_log=None if self._options.serve is not None else self.edge_log_path(node.name),
+            plant=self._plants[node.name].write(self._folder),
+            plant_log=self._options.serve is None,
         )
+
+    def plant_page(self, node: str) -> PlantPage:
+        """Return the truth about NODE's plant while it runs, in which faults can be switched."""
+        return PlantPage.at(self._folder, node)
+
+    def plant_log(self, node: str) -> Iterator[PlantEvent]:
+        """Yield what NODE's heaters and fans did, and how warm its bodies were."""
+        return plant_log(self._folder, node)
 
     # ------------------------------------------------------------------------------------------ afterwards
 

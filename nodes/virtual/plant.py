@@ -1,6 +1,6 @@
 """Describes the plant of a virtual node: what its pins are connected with, as the node's process reads it.
 
-Parts are named; names are words without blanks of at most 31 characters. Lengths are in mm (of an angle:
+Parts are named; names are words without blanks of at most 63 characters. Lengths are in mm (of an angle:
 rad), temperatures in °C, powers in W, capacities in J/K, conductances in W/K, resistances in ohm, times in s.
 The text's format and what each part does: docs/plant.md.
 """
@@ -14,7 +14,7 @@ from typing import Any, Final
 from nodes.errors import CanductorError
 from nodes.records import record
 
-NAME_MAX: Final = 31
+NAME_MAX: Final = 63
 
 
 @record(kw_only=True)
@@ -169,6 +169,13 @@ class Linear:
 
 
 @record(kw_only=True)
+class Table:
+    """At most 64 points of °C (rising) and share of the converter's full scale; straight between them."""
+
+    points: tuple[tuple[float, float], ...]
+
+
+@record(kw_only=True)
 class Sensor:
     """A sensor in a body of any node; it follows with a lag, and has noise in steps of the converter."""
 
@@ -177,7 +184,7 @@ class Sensor:
     node: str
     """Of its body."""
     body: str
-    curve: Beta | Steinhart | Rtd | Linear
+    curve: Beta | Steinhart | Rtd | Linear | Table
     lag: float = 0.0
     noise: float = 0.0
     """Standard deviation."""
@@ -243,8 +250,10 @@ class NodePlant:
         yield from self._parts("cooling", self.coolings)
         yield from self._parts("heater", self.heaters)
         for sensor in self.sensors:
-            curve = {"curve": type(sensor.curve).__name__.lower()} | _fields(sensor.curve)
+            curve = {"curve": type(sensor.curve).__name__.lower()} | _fields(sensor.curve, ("points",))
             yield _line("sensor", self._own(_fields(sensor, without=("curve",))) | curve)
+            for celsius, ratio in sensor.curve.points if isinstance(sensor.curve, Table) else ():
+                yield _line("point", {"sensor": sensor.name, "celsius": celsius, "ratio": ratio})
 
     def _parts(self, kind: str, parts: Iterable[Any]) -> Iterator[str]:
         for part in parts:
