@@ -13,6 +13,9 @@ from nodes.errors import CanductorError
 
 REQUESTS_PER_TURN: Final = 64
 """Requests of one client that are called before others get their turn."""
+UNREAD_BYTES: Final = 65_536
+"""From so many on nothing more is read for a client that waits for its turn. (Below, two calls of the system to
+stop and to go on would cost as much as a request.)"""
 LINGER_S: Final = 2.0
 """For a client that is cut off to take the reason. What it still sends is read and dropped meanwhile: closing
 a socket with unread bytes in it would reset it, and the reason would be lost."""
@@ -109,8 +112,8 @@ class Connection(asyncio.Protocol):
             self._turns.ask(self)
 
     def hold(self) -> None:
-        """Take no more in until the next turn."""
-        if not self._half_closed:
+        """Wait for the next turn; take no more in meanwhile than what may be unread."""
+        if self.session.unread_bytes >= UNREAD_BYTES and not self._half_closed:
             self.transport.pause_reading()
 
     def work(self, until_s: float) -> bool:
@@ -130,9 +133,13 @@ class Connection(asyncio.Protocol):
                 self._tasks[request].cancel()
         self.flush()
         more = session.has_work
-        if not self.transport.is_closing() and not self._half_closed:
-            (self.transport.pause_reading if more else self.transport.resume_reading)()
-        return more and not self.transport.is_closing()
+        if self.transport.is_closing():
+            return False
+        if more:
+            self.hold()
+        elif not self._half_closed:
+            self.transport.resume_reading()
+        return more
 
     def flush(self) -> None:
         """Send what the session has to say, as far as the client reads."""

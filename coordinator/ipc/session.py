@@ -157,6 +157,11 @@ class Session:
         return not self.writable or self._out_bytes > self._limits.output_bytes
 
     @property
+    def unread_bytes(self) -> int:
+        """Bytes that wait for ``read``."""
+        return self._reader.waiting_bytes
+
+    @property
     def output_bytes(self) -> int:
         """Bytes that wait for ``take_output``."""
         return self._out_bytes

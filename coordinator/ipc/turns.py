@@ -30,14 +30,14 @@ class Turns:
         self._loop = asyncio.get_running_loop()
         self._now_s = self._loop.time if now_s is None else now_s
         self._waiting: dict[Worker, None] = {}  # in the order in which they came
-        self._spent_s = 0.0  # in this round
+        self._spent_s = 0.0  # in this round, and in those before it that nobody had to wait in
         self._round_is_due = False
 
     def ask(self, worker: Worker) -> None:
         """Let WORKER work: now, or when those before it did."""
         if worker in self._waiting:
-            return
-        if self._waiting or self._spent_s >= ROUND_S:
+            worker.hold()
+        elif self._waiting or self._spent_s >= ROUND_S:
             self._wait(worker)
             worker.hold()
         else:
@@ -53,7 +53,8 @@ class Turns:
         self._spent_s += self._now_s() - begun_s
         if more:
             self._wait(worker)
-        self._expect_round()
+        elif self._spent_s >= ROUND_S / 2:  # a round for each request would cost as much as the request
+            self._expect_round()
 
     def _wait(self, worker: Worker) -> None:
         self._waiting[worker] = None

@@ -265,13 +265,14 @@ class _Inspection:
         if self._values_left < 0:
             return _too_many(limits)
         if type(value) is dict:
-            if any(type(key) is not str for key in value):
-                return Fault("bad_message", "the keys of maps must be strings")
-            if not all(key.isascii() or _is_text(key) for key in value):
-                return Fault("bad_message", "a string is no Unicode")
+            for key in value:
+                if type(key) is not str:
+                    return Fault("bad_message", "the keys of maps must be strings")
+                if not (key.isascii() or _is_text(key)):
+                    return Fault("bad_message", "a string is no Unicode")
             value = value.values()
         for below in value:
-            if (found := self.flaw(below, depth - 1)) is not None:
+            if type(below) not in _PLAIN and (found := self.flaw(below, depth - 1)) is not None:
                 return found
         return None
 
