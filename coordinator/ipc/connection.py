@@ -14,8 +14,8 @@ from nodes.errors import CanductorError
 REQUESTS_PER_TURN: Final = 64
 """Requests of one client that are called before others get their turn."""
 UNREAD_BYTES: Final = 65_536
-"""From so many on nothing more is read for a client that waits for its turn. (Below, two calls of the system to
-stop and to go on would cost as much as a request.)"""
+"""From so many on no more is read for a client that waits for its turn. With less, the calls of the system
+to stop and to go on would cost as much as a request."""
 LINGER_S: Final = 2.0
 """For a client that is cut off to take the reason. What it still sends is read and dropped meanwhile: closing
 a socket with unread bytes in it would reset it, and the reason would be lost."""

@@ -58,7 +58,7 @@ def test_a_round_is_bounded_and_turns_are_fair() -> None:
         found = await rounds(worked)
         # The first one has more to do than a turn, so all others wait behind it.
         assert list(map("".join, found)) == ["a", "abcd", "efgh", "abcd", "efgh", "bcde", "fgh"]
-        # Whoever asks while it waits is told to take no more in than it may: the first one when it asks again.
+        # Whoever asks while it waits holds, the first one when it asks again.
         assert [client.held for client in clients] == [1] + [2] * 7
 
     asyncio.run(body())
