@@ -1,6 +1,7 @@
 """Nodes that may come and go, killed and started again in the middle of a print, as real processes."""
 
 import asyncio
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -109,14 +110,18 @@ def test_a_machine_starts_without_an_optional_node_and_knows_the_dictionaries_th
     machine: Hardware,
 ) -> None:
     gcode = write_gcode(machine.folder, "G28\nG1 X5 F3000\n")
-    sent: list[int] = []
+    dictionaries = Path(os.environ["XDG_CACHE_HOME"]) / "canductor" / "dictionaries"
+    kept: list[dict[Path, int]] = []
     light = section(machine, "light", LIGHT_UUID, "optional")
-    for config in (config_with(machine, light), machine.config):
+    for config, is_known in ((config_with(machine, light), False), (machine.config, True)):
         with Command("run", config, "--gcode", gcode, "--json") as command:
             ended = command.end()
         assert ended.status == 0, ended
-        assert (f"node {LIGHT_UUID} not found" in ended.stdout) == (not sent)
+        assert (f"node {LIGHT_UUID} not found" in ended.stdout) == (not is_known)
         assert set(ended.json["nodes"]) == {"mcu", "toolhead", "zboard"}
-        sent.append(sum(node["bytes_sent"] for node in ended.json["nodes"].values()))
-    # Three questions for a dictionary instead of some forty, for three nodes.
-    assert sent[1] < sent[0] - 1000
+        kept.append({path: path.stat().st_ino for path in dictionaries.iterdir()})
+        assert all(path.stat().st_mtime_ns > 0 for path in kept[-1])  # written, or known again
+        for path in kept[-1]:
+            os.utime(path, ns=(0, 0))
+    assert kept[1] == kept[0]  # a dictionary read again would be another file
+    assert len(kept[0]) == 3
