@@ -101,6 +101,7 @@ class _Hall:
             jobs=self._options.jobs,
             node_commands=self._options.node_commands,
             tables=table_folder(self._options.name),
+            own_process=True,
         )
         service = MachineService(
             self._load,

@@ -53,7 +53,7 @@ class Proved:
             lambda: stage.description,
             LinuxHost(),
             tree,
-            ServiceSettings(name="proved", jobs=jobs, node_commands=True),
+            ServiceSettings(name="proved", jobs=jobs, node_commands=True, own_process=True),
             record=self.record,
             on_line=self._tell,
         )

@@ -44,12 +44,19 @@ class Served:
         *,
         node_commands: bool = False,
         tables: Path | None = None,
+        own_process: bool = False,
     ) -> None:
         self.jobs = folder / "jobs"
         self.jobs.mkdir(exist_ok=True)
         self.tree = StateTree()
         self.lines: list[str] = []
-        settings = ServiceSettings(name="test", jobs=self.jobs, node_commands=node_commands, tables=tables)
+        settings = ServiceSettings(
+            name="test",
+            jobs=self.jobs,
+            node_commands=node_commands,
+            tables=tables,
+            own_process=own_process,
+        )
         self.service = MachineService(
             load, host, self.tree, settings, on_line=lambda entry: self.lines.append(str(entry["text"]))
         )
@@ -115,10 +122,13 @@ class Served:
 
 
 @asynccontextmanager
-async def served(hardware: Hardware, *, node_commands: bool = False) -> AsyncIterator[Served]:
+async def served(
+    hardware: Hardware, *, node_commands: bool = False, own_process: bool = False
+) -> AsyncIterator[Served]:
     """Run a service on HARDWARE; READY when the block begins."""
     load = partial(load_machine, str(hardware.config))
-    async with running(Served(hardware.folder, load, LinuxHost(), node_commands=node_commands)) as stage:
+    stage = Served(hardware.folder, load, LinuxHost(), node_commands=node_commands, own_process=own_process)
+    async with running(stage):
         yield stage
 
 

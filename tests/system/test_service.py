@@ -1,6 +1,8 @@
 """The machine as a service on virtual nodes: whatever clients do, every stepper is where the plan says."""
 
 import asyncio
+import gc
+import weakref
 
 import pytest
 
@@ -115,6 +117,25 @@ def test_emergency_stop_and_restart(machine: Hardware) -> None:
             assert stage.tree.get("machine.starts") == 2
 
     asyncio.run(go())
+
+
+def test_the_collector_passes_by_a_machine_while_it_is_there(machine: Hardware) -> None:
+    async def go() -> None:
+        async with served(machine, own_process=True) as stage:
+            await stage.until_state("ready")
+            assert gc.get_freeze_count() > 0
+            assert stage.service.machine is not None
+            first = weakref.ref(stage.service.machine)
+            await stage.call("machine.emergency_stop", who="the tester")
+            await stage.call("machine.restart")
+            await stage.until(lambda: stage.tree.get("machine.starts") == 2, "the second start")
+            await stage.until_state("ready")
+            assert first() is None
+
+    try:
+        asyncio.run(go())
+    finally:
+        gc.unfreeze()
 
 
 _ENOUGH = {"gcode.run": {"script": "M114"}, "job.start": {"file": "job.gcode"}}
