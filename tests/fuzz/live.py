@@ -34,6 +34,8 @@ QUIET_EVERY: Final = 10
 """Of so many prints one is quiet, and the last one is."""
 PATIENCE_S: Final = 120.0
 LONG_S: Final = 10.0
+LOOK_S: Final = 1.0
+"""Between looks at whether the service is still there."""
 
 
 @dataclass
@@ -102,14 +104,25 @@ class Bench:
         self.findings.prints.append(Printed(fuzzer is not None, took_s, steps, memory_kib(self.process.pid)))
 
     async def _until_done(self) -> None:
-        async for update in self.client.watch(["job.state"], rate_hz=5):
-            state = update.values.get("job.state")
-            if state not in (None, "printing"):
-                break
+        ending = asyncio.ensure_future(self._job_end())
+        while not (await asyncio.wait((ending,), timeout=LOOK_S))[0]:
+            if self.process.poll() is not None:  # the client would wait for another one
+                ending.cancel()
+                raise CanductorError(
+                    f"the service ended with {self.process.returncode} in the middle of a print"
+                )
+        state = await ending
         if state != "done":
             why = await self.client.call("machine.state")
             leads = await self.client.call("state.get", {"fields": ["*lead*"]})
             raise CanductorError(f"the print {state}: {why['cause']}; {leads['values']}")
+
+    async def _job_end(self) -> Any:
+        async for update in self.client.watch(["job.state"], rate_hz=5):
+            state = update.values.get("job.state")
+            if state not in (None, "printing"):
+                return state
+        raise CanductorError("the service closed the connection")
 
     async def _positions(self) -> dict[str, int]:
         told = await self.client.call("position.get", {"ask_nodes": True})
