@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from coordinator.ipc import turns as turns_module
-from coordinator.ipc.connection import REQUESTS_PER_TURN
+from coordinator.ipc.connection import REQUESTS_PER_TURN, UNREAD_BYTES
 from coordinator.ipc.methods import Scope
 from coordinator.ipc.server import IpcServer
 from coordinator.ipc.settings import IpcSettings, Limits, TcpSettings
@@ -198,6 +198,29 @@ def test_however_many_are_sent_at_once_what_is_answered_at_once_is_never_too_muc
         for number in range(count):
             answer = await script.receive()
             assert (answer.get("id"), "result" in answer) == (number, True), answer
+
+    run(tmp_path, body)
+
+
+def test_of_a_client_that_waits_for_its_turn_no_more_than_a_bounded_part_is_taken_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(turns_module, "TURN_S", 0.0)
+    read_at_once = 256 * 1024  # by asyncio
+    requests = [b'{"id":%d,"method":"machine.info"}%s\n' % (n, b" " * 8000) for n in range(200)]
+
+    async def body(served: Served) -> None:
+        script = await served.script()
+        (connection,) = served.server._connections
+        first = asyncio.ensure_future(script.receive())
+        script.writer.write(b"".join(requests))
+        most = 0
+        while not first.done() or connection.session.unread_bytes:
+            most = max(most, connection.session.unread_bytes)
+            await asyncio.sleep(0)
+        assert UNREAD_BYTES <= most <= UNREAD_BYTES + read_at_once
+        received = [first.result()] + [await script.receive() for _ in requests[1:]]
+        assert [answer["id"] for answer in received] == list(range(len(requests)))
 
     run(tmp_path, body)
 
