@@ -22,6 +22,15 @@ from coordinator.machine import (
 from coordinator.machine.options import Option, SectionSpec
 from coordinator.machine.printer_options import PRINTER_SPECS
 from coordinator.machine.well_known import LATER_SECTIONS
+from coordinator.modules import (
+    automatic_fans,
+    fans,
+    heater_sections,
+    sensor_module,
+    temperature_fan,
+    thermistor,
+    verify_heater,
+)
 
 SECTIONS: dict[str, SectionSpec] = {
     "[mcu], [mcu NAME]": read_nodes.MCU,
@@ -42,9 +51,23 @@ SECTIONS: dict[str, SectionSpec] = {
     "[extruder], [extruder1] …": read_extruder.EXTRUDER,
     "[extruder_stepper NAME]": read_extruder.EXTRUDER_STEPPER,
     "[input_shaper]": read_shaper.INPUT_SHAPER,
+    "[extruder], [extruder1] …: the heater": heater_sections.ExtruderHeater.SPEC,
+    "[heater_bed]": heater_sections.HeaterBed.SPEC,
+    "[heater_generic NAME]": heater_sections.HeaterGeneric.SPEC,
+    "[verify_heater NAME]": verify_heater.VerifyHeater.SPEC,
+    "[thermistor NAME]": thermistor.Thermistor.SPEC,
+    "[adc_temperature NAME]": thermistor.AdcTemperature.SPEC,
+    "[temperature_sensor NAME]": sensor_module.TemperatureSensor.SPEC,
+    "[fan]": fans.Fan.SPEC,
+    "[fan_generic NAME]": fans.FanGeneric.SPEC,
+    "[heater_fan NAME]": automatic_fans.HeaterFan.SPEC,
+    "[controller_fan NAME]": automatic_fans.ControllerFan.SPEC,
+    "[temperature_fan NAME]": temperature_fan.TemperatureFan.SPEC,
     "[board_pins], [board_pins NAME]": read_nodes.BOARD_PINS,
     "[duplicate_pin_override]": read_nodes.DUPLICATE_PIN_OVERRIDE,
 }
+MOST_NUMBERED = 3
+"""Options that differ in their number are shown so far; the help says how many there are."""
 
 
 def section_table(title: str) -> str:
@@ -58,7 +81,7 @@ def section_table(title: str) -> str:
         "| option | value | default | what it is |",
         "|---|---|---|---|",
     ]
-    lines += [_row(option) for option in spec.options]
+    lines += [_row(option) for option in spec.options if not _is_one_of_many(option)]
     if spec.later:
         names = ", ".join(f"`{name}`" for name in spec.later)
         lines += ["", f"Recognised, not yet acting: {names}."]
@@ -68,6 +91,12 @@ def section_table(title: str) -> str:
 def later_sections() -> str:
     """Return the first words of all sections that do not act yet."""
     return ", ".join(f"`{name}`" for name in sorted(LATER_SECTIONS)) + ".\n"
+
+
+def _is_one_of_many(option: Option[object]) -> bool:
+    """Whether OPTION is as those of lower numbers before it (``voltage17``)."""
+    number = option.name.lstrip("abcdefghijklmnopqrstuvwxyz_")
+    return number.isdecimal() and int(number) > MOST_NUMBERED
 
 
 def _row(option: Option[object]) -> str:

@@ -98,8 +98,8 @@ class AdcTemperature(CustomSensor):
     """A sensor by its voltages or its resistances at some temperatures."""
 
     SPEC: ClassVar = SectionSpec(
-        help="A sensor of your own, by its voltages or its resistances at two or more temperatures, with"
-        " straight lines between; sections with a sensor name it as their sensor_type",
+        help="A sensor of your own, by its voltages or its resistances at 2 to 40 temperatures, with straight"
+        " lines between; sections with a sensor name it as their sensor_type",
         options=tuple(option for point in ADC_POINTS for option in point),
     )
 
