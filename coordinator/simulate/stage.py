@@ -1,5 +1,6 @@
 """The stage of a scenario: a simulated world with wires and boards, and the host a machine is run on."""
 
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, Final
 
@@ -26,6 +27,8 @@ from nodes.clock import HostTime
 from nodes.link import LinkIO
 from nodes.seams import LinkIOLike, OnFrame, OnLost
 from nodes.virtual._sim import lib
+from nodes.virtual.plant import NodePlant
+from nodes.virtual.sim_plant import SimPlant, connect_plants
 from nodes.virtual.world import (
     CanController,
     CanPort,
@@ -186,6 +189,12 @@ class Stage:
             self._world.at(self._world.now_ns + LOAD_EVERY_NS, send)
 
         send()
+
+    def start_plants(self, plants: Iterable[NodePlant]) -> dict[str, SimPlant]:
+        """Connect the pins of boards with PLANTS from now on; return them by node. CanductorError."""
+        started = {plant.node: self._boards[plant.node].node.start_plant(plant) for plant in plants}
+        connect_plants(started)
+        return started
 
     # ------------------------------------------------------------------------------------------ performance
 

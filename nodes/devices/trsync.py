@@ -87,10 +87,13 @@ class Trsync:
 
     async def finish(self, node: "Node") -> TrsyncState:
         """End the round and return how it ended; triggers it when nothing did."""
-        answer = await node.query(
-            "trsync_trigger", "trsync_state", oid=self._oid, reason=int(TriggerReason.HOST)
-        )
-        return _state(answer)
+        while True:
+            answer = await node.query(
+                "trsync_trigger", "trsync_state", oid=self._oid, reason=int(TriggerReason.HOST)
+            )
+            # A report of before the end, held up by a repeated block, looks like the answer.
+            if not (state := _state(answer)).armed:
+                return state
 
     def listen(self, node: "Node", on_state: Callable[[TrsyncState], None]) -> Callable[[], None]:
         """Call ON_STATE for every report; returns what ends that."""

@@ -186,7 +186,8 @@ class NodeProcess(ChildProcess):
     interface) and ``uart`` (where to put the link to the node's pseudo-terminal) says how it is reached.
     ``rate_ppm``: by how much its clock is too fast; ``start_clock``: where its clock starts. ``jitter_us``,
     ``slice_us`` and ``seed``: see the firmware. ``legacy``: it plays a board with Klipper firmware, which
-    knows none of this project's extensions of the CAN protocol.
+    knows none of this project's extensions of the CAN protocol. ``plant``: the file that describes what its
+    pins are connected with (plant.py); beside it the process writes its page and its log.
     """
 
     def __init__(
@@ -204,6 +205,7 @@ class NodeProcess(ChildProcess):
         seed: int | None = None,
         edge_log: Path | None = None,
         legacy: bool = False,
+        plant: Path | None = None,
         name: str | None = None,
         bin_dir: Path = BIN_DIR,
     ) -> None:
@@ -226,6 +228,7 @@ class NodeProcess(ChildProcess):
             "--seed": seed,
             "--edge-log": edge_log,
             "--legacy": 1 if legacy else None,
+            "--plant": plant,
         }
         command: list[str | Path] = [executable]
         for option, value in options.items():

@@ -7,6 +7,8 @@ import numpy.typing as npt
 
 from nodes.errors import CanductorError
 from nodes.virtual._sim import ffi, lib
+from nodes.virtual.plant import NodePlant
+from nodes.virtual.sim_plant import SimPlant
 
 _CLOCK_LIMIT = 1 << 47
 _MOVE_COUNT_MAX = 0xFFFF
@@ -158,6 +160,10 @@ class SimNode:
         """Drop the changes recorded so far."""
         lib.sim_edges_forget(self._board)
         self._edges.clear()
+
+    def start_plant(self, plant: NodePlant) -> SimPlant:
+        """Connect the pins with PLANT from now on; raises CanductorError. Use it while the node lives."""
+        return SimPlant(self._board, plant)
 
     def counters(self) -> dict[str, int]:
         """Return the node's own counters of damaged, dropped and accepted input."""

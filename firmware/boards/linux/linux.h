@@ -10,6 +10,8 @@
 #include "boards/virtual/virtual.h"
 #include "net/can_stream.h"
 
+#include <stdio.h>
+
 enum link_kind { LINK_NONE, LINK_VIRTUAL_CAN, LINK_SOCKETCAN, LINK_UART };
 
 enum { EDGE_BUFFER = 8192, OUT_BUFFER = 65536, IN_BUFFER = 4096 };
@@ -18,6 +20,7 @@ struct options {
     enum link_kind link;
     const char *target; // socket path, interface, or the link to make to the pseudo-terminal
     const char *edge_log;
+    const char *plant;
     uint8_t uuid[NODE_UUID_SIZE];
     double rate_ppm;
     uint64_t start_clock, jitter_us, slice_us, seed, legacy;
@@ -46,6 +49,12 @@ struct linux_board {
     uint64_t bytes_in, bytes_out, frames_in, frames_out, resets;
     uint64_t late_sum, late_count, late_max; // ticks by which timers were dispatched late
 
+    struct plant plant; // virtual.plant points to it when there is one
+    FILE *plant_log;
+    uint64_t plant_update_ns;             // when it is due
+    uint64_t plant_given_up[PLANT_PEERS]; // the horizon at which we waited in vain
+    uint64_t plant_waits, plant_misses;
+
     uint64_t edge_buffer[EDGE_BUFFER];
     _Alignas(16) uint8_t arena[256 * 1024];
 };
@@ -64,6 +73,14 @@ void link_close(struct linux_board *board);
 // Reads what is there and gives it to the node, running its tasks as it goes.
 void link_read(struct linux_board *board);
 void link_flush(struct linux_board *board);
+
+// plant.c. linux_plant_open returns 0, or -1 after one sentence on stderr.
+int linux_plant_open(struct linux_board *board);
+void linux_plant_close(struct linux_board *board);
+// Keeps page and log up to date; returns when it wants to do so next.
+uint64_t linux_plant_update(struct linux_board *board, uint64_t now);
+// No step will be made before NS.
+void linux_plant_horizon(struct linux_board *board, uint64_t ns);
 
 // edge_log.c. edge_log_open returns 0, or -1 after one sentence on stderr.
 int edge_log_open(struct linux_board *board);

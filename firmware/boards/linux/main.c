@@ -94,7 +94,8 @@ static uint64_t random_below(struct linux_board *board, uint64_t limit) {
 static int wait(struct linux_board *board, int signal_fd, uint64_t held_until) {
     uint64_t now = monotonic_ns();
     uint64_t clock = clock_at(board, now);
-    uint64_t until = ns_of_clock(board, extend(clock, node_next_deadline(&board->virtual.node))) + 1;
+    uint64_t until = ns_of_clock(board, extend(clock, node_next_deadline(&board->virtual.node)));
+    linux_plant_horizon(board, until++);
     uint64_t slice_end = now + board->options.slice_us * NS_PER_US;
     if (until < slice_end)
         until = slice_end;
@@ -102,6 +103,9 @@ static int wait(struct linux_board *board, int signal_fd, uint64_t held_until) {
         until = held_until;
     if (board->out_size && board->retry_ns && board->retry_ns < until)
         until = board->retry_ns;
+    uint64_t update_ns = linux_plant_update(board, now);
+    if (update_ns < until)
+        until = update_ns;
     uint64_t wait_ns = until > now ? until - now : 0;
     struct timespec timeout = {.tv_sec = (time_t)(wait_ns / 1000000000u),
                                .tv_nsec = (long)(wait_ns % 1000000000u)};
@@ -144,13 +148,15 @@ static void print_statistics(const struct linux_board *board) {
     double mean = board->late_count ? (double)board->late_sum / (double)board->late_count : 0;
     printf("{\"edges\":%llu,\"bytes_in\":%llu,\"bytes_out\":%llu,\"frames_in\":%llu,\"frames_out\":%llu,"
            "\"timers\":%llu,\"late_us_max\":%.1f,\"late_us_mean\":%.1f,\"resets\":%llu,\"blocks\":%u,"
-           "\"lost\":%u,\"out_of_order\":%u,\"overflow_bytes\":%u,\"tx_dropped\":%u,\"is_shutdown\":%s}\n",
+           "\"lost\":%u,\"out_of_order\":%u,\"overflow_bytes\":%u,\"tx_dropped\":%u,\"plant_waits\":%llu,"
+           "\"plant_misses\":%llu,\"is_shutdown\":%s}\n",
            (unsigned long long)board->virtual.edges_total, (unsigned long long)board->bytes_in,
            (unsigned long long)board->bytes_out, (unsigned long long)board->frames_in,
            (unsigned long long)board->frames_out, (unsigned long long)board->late_count,
            (double)board->late_max * us_per_tick, mean * us_per_tick, (unsigned long long)board->resets,
            stats->rx_blocks, stats->rx_lost, stats->rx_out_of_order, stats->rx_overflow_bytes,
-           stats->tx_dropped, board->virtual.node.shutdown.active ? "true" : "false");
+           stats->tx_dropped, (unsigned long long)board->plant_waits, (unsigned long long)board->plant_misses,
+           board->virtual.node.shutdown.active ? "true" : "false");
     fflush(stdout);
 }
 
@@ -197,11 +203,12 @@ int main(int argc, char **argv) {
     board->random = board->options.seed;
     board->start_clock = board->options.start_clock;
     board->start_ns = monotonic_ns();
-    if (signal_fd < 0 || link_open(board) || edge_log_open(board))
+    if (signal_fd < 0 || link_open(board) || edge_log_open(board) || linux_plant_open(board))
         return FAILED;
     start_node(board);
     print_ready(board);
     run(board, signal_fd);
+    linux_plant_close(board);
     edge_log_close(board);
     link_close(board);
     print_statistics(board);

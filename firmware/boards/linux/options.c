@@ -13,7 +13,7 @@ enum { USAGE = 2 };
 static const char usage[] =
     "usage: %s (--can SOCKET | --socketcan INTERFACE | --uart LINK) [--uuid HEX12] [--rate-ppm X]\n"
     "       [--start-clock N] [--jitter-us J] [--seed S] [--slice-us N] [--edge-log FILE]\n"
-    "       [--legacy 0|1]\n"
+    "       [--legacy 0|1] [--plant FILE]\n"
     "A virtual node: canductor firmware as a process on a virtual CAN bus, SocketCAN or a pseudo-terminal.\n";
 
 static int complain(const char *program, const char *option, const char *value, const char *wanted) {
@@ -60,6 +60,10 @@ static const char *take(struct options *options, const char *name, const char *v
         }
     if (strcmp(name, "--edge-log") == 0) {
         options->edge_log = value;
+        return NULL;
+    }
+    if (strcmp(name, "--plant") == 0) {
+        options->plant = value;
         return NULL;
     }
     if (strcmp(name, "--uuid") == 0)

@@ -5,10 +5,11 @@
 #include "boards/virtual/virtual.h"
 #include "net/can_stream.h"
 
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
-enum { EDGES_AT_FIRST = 1024, ARENA = 64 * 1024 };
+enum { EDGES_AT_FIRST = 1024, ARENA = 64 * 1024, NS_PER_S = 1000000000 };
 
 struct sim_board {
     struct virtual_board virtual;
@@ -20,11 +21,66 @@ struct sim_board {
     struct sim_owner owner; // all null: none
     uint8_t out[SIM_OUT_ROOM];
     size_t out_size;
+    struct sim_plant *plant;
     _Alignas(16) uint8_t arena[ARENA];
 };
 
-// ------------------------------------------------------------------------------------------------ life and
-// time
+// ------------------------------------------------------------------------------------------------- plant
+
+struct sim_plant {
+    struct plant plant;
+    struct plant_page page;
+    struct sim_board *peers[PLANT_PEERS];
+};
+_Static_assert((int)SIM_ERROR == (int)PLANT_ERROR, "its sentences fit");
+
+int sim_plant_start(struct sim_board *board, const char *text, size_t size, char *error) {
+    struct sim_plant *plant = board->plant ? NULL : calloc(1, sizeof(*plant));
+    if (!plant) {
+        snprintf(error, SIM_ERROR, "%s", board->plant ? "it has a plant already" : "out of memory");
+        return -1;
+    }
+    if (plant_read(&plant->plant, text, size, VIRTUAL_ADC_MAX, VIRTUAL_PWM_MAX, error)) {
+        free(plant);
+        return -1;
+    }
+    plant_start(&plant->plant, &plant->page, virtual_true_ns(&board->virtual));
+    board->plant = plant;
+    board->virtual.plant = &plant->plant;
+    return 0;
+}
+
+// All boards of a world come to an instant together: their steps are in, only heat is worked out when asked.
+static void refresh_peer(void *context, unsigned number, uint64_t ns) {
+    const struct sim_plant *plant = context;
+    if (plant->peers[number])
+        plant_update(&plant->peers[number]->plant->plant, ns);
+}
+
+int sim_plant_peer(struct sim_board *board, const char *name, struct sim_board *peer) {
+    struct sim_plant *plant = board->plant;
+    for (int i = 0; plant && peer->plant && i < plant->plant.peer_count; i++) {
+        if (strcmp(plant->plant.peers[i].node, name) != 0)
+            continue;
+        plant->peers[i] = peer;
+        plant->plant.peers[i].page = &peer->plant->page;
+        plant->plant.host = (struct plant_host){.context = plant, .refresh = refresh_peer};
+        return 0;
+    }
+    return -1;
+}
+
+void sim_plant_update(struct sim_board *board) {
+    if (board->plant)
+        plant_update(&board->plant->plant, virtual_true_ns(&board->virtual));
+}
+
+void *sim_plant_page(struct sim_board *board, size_t *size) {
+    *size = sizeof(struct plant_page);
+    return board->plant ? &board->plant->page : NULL;
+}
+
+// ------------------------------------------------------------------------------------------- life and time
 
 static void start(struct sim_board *board) {
     board->config.clock_high = (uint32_t)(board->clock >> 32);
@@ -83,6 +139,7 @@ struct sim_board *sim_new(const uint8_t *uuid, uint64_t start_clock, int on_can)
 }
 
 void sim_free(struct sim_board *board) {
+    free(board->plant);
     free(board->virtual.edges);
     free(board);
 }
@@ -136,6 +193,14 @@ uint32_t board_clock(struct node *node) {
 
 uint64_t virtual_clock(struct virtual_board *virtual) {
     return ((struct sim_board *)virtual)->clock;
+}
+
+uint64_t virtual_true_ns(struct virtual_board *virtual) {
+    const struct sim_board *board = (const struct sim_board *)virtual;
+    if (board->owner.true_ns)
+        return board->owner.true_ns(board->owner.context, board->clock);
+    uint64_t second = board->config.clock_freq;
+    return board->clock / second * NS_PER_S + board->clock % second * NS_PER_S / second;
 }
 
 void board_reset(struct node *node) {

@@ -60,6 +60,17 @@ void sim_edges_forget(struct sim_board *board);
 // Edges that were lost because memory was out.
 uint64_t sim_edges_lost(const struct sim_board *board);
 
+// What stands around the board (boards/virtual/plant.h): TEXT describes it (docs/plant.md). It begins now,
+// and outlives resets. -1, with a sentence of at most SIM_ERROR bytes in ERROR: there is one already, TEXT is
+// wrong, or memory is out.
+enum { SIM_ERROR = 200 };
+int sim_plant_start(struct sim_board *board, const char *text, size_t size, char *error);
+// Node NAME, which the text speaks of, is PEER; they end together. -1: it speaks of no such node.
+int sim_plant_peer(struct sim_board *board, const char *name, struct sim_board *peer);
+// Brings the page up to date; the page (plant_page.h) and its size; null without plant.
+void sim_plant_update(struct sim_board *board);
+void *sim_plant_page(struct sim_board *board, size_t *size);
+
 struct sim_counters {
     uint32_t rx_overflow_bytes, rx_lost, rx_out_of_order, rx_blocks, tx_dropped, timers_run;
     uint32_t clock_freq, node_id;
@@ -80,6 +91,7 @@ struct sim_owner {
     size_t (*send_bytes)(void *context, const uint8_t *data, size_t size);           // bytes taken
     void (*edge)(void *context, uint64_t clock, uint32_t pin, int level);
     void (*can_status)(void *context, struct board_can_status *out);
+    uint64_t (*true_ns)(void *context, uint64_t clock); // when the clock became CLOCK
 };
 // OWNER is copied.
 void sim_own(struct sim_board *board, const struct sim_owner *owner);

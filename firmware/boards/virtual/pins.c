@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Pins in memory. An input reads what the board's owner (or an output on the same pin) last put there.
+// Pins in memory. An input reads what the plant says; where that has nothing, what the board's owner (or an
+// output on the same pin) last put there.
 #include "boards/virtual/virtual.h"
 
 DECL_ENUMERATION_RANGE("pin", "PA0", 0, 16);
@@ -26,6 +27,8 @@ static int check(uint32_t pin) {
 
 static void set_output(struct virtual_board *board, uint32_t pin, int level) {
     uint8_t value = level != 0;
+    if (board->plant && board->plant->cares[pin])
+        plant_output(board->plant, virtual_true_ns(board), pin, value);
     if (board->level[pin] == value)
         return;
     board->level[pin] = value;
@@ -37,12 +40,23 @@ static void set_output(struct virtual_board *board, uint32_t pin, int level) {
         board->on_edge(board, pin, value);
 }
 
+static void set_pwm(struct virtual_board *board, uint32_t pin, uint16_t value) {
+    board->pwm[pin] = value;
+    if (board->plant)
+        plant_pwm(board->plant, virtual_true_ns(board), pin, value);
+}
+
 void virtual_pins_reset(struct virtual_board *board) {
+    struct plant *plant = board->plant;
+    if (plant)
+        plant_reset(plant, virtual_true_ns(board));
+    board->plant = NULL; // for it the pins float, whatever the log says
     for (uint32_t pin = 0; pin < VIRTUAL_PINS; pin++) {
         set_output(board, pin, 0);
         board->adc[pin] = VIRTUAL_ADC_IDLE;
         board->pwm[pin] = 0;
     }
+    board->plant = plant;
 }
 
 int board_gpio_out(struct node *node, uint32_t pin, int level) {
@@ -63,7 +77,10 @@ int board_gpio_in(struct node *node, uint32_t pin, int pull) {
 }
 
 int board_gpio_read(struct node *node, uint32_t pin) {
-    return board_of(node)->level[pin];
+    struct virtual_board *board = board_of(node);
+    if (board->plant && board->plant->reads[pin])
+        return plant_input(board->plant, virtual_true_ns(board), pin, board->level[pin]);
+    return board->level[pin];
 }
 
 int board_adc_setup(struct node *node, uint32_t pin) {
@@ -72,7 +89,10 @@ int board_adc_setup(struct node *node, uint32_t pin) {
 }
 
 uint32_t board_adc_sample(struct node *node, uint32_t pin, uint16_t *value) {
-    *value = board_of(node)->adc[pin];
+    struct virtual_board *board = board_of(node);
+    *value = board->adc[pin];
+    if (board->plant && board->plant->reads[pin])
+        *value = plant_sample(board->plant, virtual_true_ns(board), pin, *value);
     return 0;
 }
 
@@ -80,12 +100,12 @@ int board_pwm_setup(struct node *node, uint32_t pin, uint32_t cycle_ticks, uint1
     (void)cycle_ticks;
     if (check(pin))
         return -1;
-    board_of(node)->pwm[pin] = value;
+    set_pwm(board_of(node), pin, value);
     return 0;
 }
 
 void board_pwm_write(struct node *node, uint32_t pin, uint16_t value) {
-    board_of(node)->pwm[pin] = value;
+    set_pwm(board_of(node), pin, value);
 }
 
 // Everything runs in one thread: nothing to mask.

@@ -1,11 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the boards without a chip (linux, sim) share: pins in memory, and a log of every change of an output.
+// What the boards without a chip (linux, sim) share: pins in memory, a log of every change of an output, and
+// perhaps a plant behind the pins.
 #ifndef BOARDS_VIRTUAL_H
 #define BOARDS_VIRTUAL_H
 
 #include "boards/board.h"
+#include "boards/virtual/plant.h"
 
-enum { VIRTUAL_PINS = 144, VIRTUAL_ADC_MAX = 4095, VIRTUAL_PWM_MAX = 32768, VIRTUAL_ADC_IDLE = 2048 };
+enum { VIRTUAL_PINS = PLANT_PINS, VIRTUAL_ADC_MAX = 4095, VIRTUAL_PWM_MAX = 32768, VIRTUAL_ADC_IDLE = 2048 };
 
 // First member of a board's own struct; its first member in turn is the node.
 struct virtual_board {
@@ -20,6 +22,7 @@ struct virtual_board {
     // changed and stands at the end of the edges.
     void (*on_edge)(struct virtual_board *board, uint32_t pin, int level);
     void (*can_status)(struct virtual_board *board, struct board_can_status *out);
+    struct plant *plant; // what its pins are connected with; null: nothing
 };
 
 // What one variant of the boards is built as (constants.c).
@@ -32,8 +35,10 @@ extern const struct virtual_variant virtual_variant;
 // All pins low, all converters in the middle of their range. Outputs that were high are logged as falling.
 void virtual_pins_reset(struct virtual_board *board);
 
-// From the board: its clock in 64 bits, and more room in (or a flush of) the full edge buffer.
+// From the board: its clock in 64 bits, the true time of that in ns, and more room in (or a flush of) the
+// full edge buffer.
 uint64_t virtual_clock(struct virtual_board *board);
+uint64_t virtual_true_ns(struct virtual_board *board);
 void virtual_edges_full(struct virtual_board *board);
 
 #endif

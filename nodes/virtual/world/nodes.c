@@ -16,6 +16,7 @@ enum {
     NODE_MAILBOXES = 3,
     DATA_IDS = 0x100,
     DATA_IDS_END = 0x300,
+    PS_PER_NS = 1000,
 };
 
 // -------------------------------------------------------------------------------------------- its own time
@@ -171,6 +172,11 @@ static void edge(void *context, uint64_t clock, uint32_t pin, int level) {
     axes_edge(node, clock, pin, level);
 }
 
+static uint64_t true_ns(void *context, uint64_t clock) {
+    const struct world_node *node = context;
+    return (uint64_t)(crystal_time_ps(&node->crystal, clock) / PS_PER_NS);
+}
+
 const struct world_edge *world_node_edges(const struct world_node *node, size_t *count) {
     *count = node->counters.edges;
     return node->edges;
@@ -256,7 +262,7 @@ static void start(struct world_node *node, const struct sim_options *options) {
     sim_counters(node->board, &counters);
     crystal_start(&node->crystal, counters.clock_freq, world->agenda.now_ns, options->start_clock,
                   node->settings.ppm);
-    const struct sim_owner owner = {node, send_frame, send_bytes, edge, can_status};
+    const struct sim_owner owner = {node, send_frame, send_bytes, edge, can_status, true_ns};
     sim_own(node->board, &owner);
     node->counters.powered = 1;
     node->timer = (struct event){.fire = timer_due, .owner = node};

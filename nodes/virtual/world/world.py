@@ -7,6 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from nodes.virtual._sim import ffi, lib
+from nodes.virtual.plant import NodePlant
+from nodes.virtual.sim_plant import SimPlant
 from nodes.virtual.world.parts import CanController, CanPort, CanWire, Uart, UartPort, counters
 from nodes.virtual.world.settings import (
     ControllerSettings,
@@ -283,6 +285,13 @@ class WorldNode:
         if number < 0:
             raise WorldError(f"node {self.uuid}: no such pin, or more than {lib.WORLD_AXES_MAX} axes")
         return int(number)
+
+    def start_plant(self, plant: NodePlant) -> SimPlant:
+        """Connect the pins with PLANT from now on; raises CanductorError.
+
+        It goes before inputs and axes of the same pins. `connect_plants` lets several see each other.
+        """
+        return SimPlant(lib.world_node_board(self.raw), plant)
 
     def axis_position(self, number: int) -> int:
         """Return where axis NUMBER is, in steps."""

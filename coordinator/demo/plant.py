@@ -1,0 +1,204 @@
+"""The plant of a configured machine: what stands around its virtual nodes so that homing and heating do work.
+
+Every stepper is counted where it is driven; every rail's endstop stands where the configuration says, and
+switches by the steppers of all nodes that move its axis. The heat is in ``plant_heat.py``.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from coordinator.demo.plant_heat import HeatSettings, machine_heat
+from coordinator.kinematics.base import Point
+from coordinator.machine.description import MachineDescription, RailDescription, StepperDescription
+from coordinator.motion.specs import StepKinematics
+from nodes.errors import CanductorError
+from nodes.records import record
+from nodes.virtual.plant import Axis, NodePlant, Stepper, Switch, Term
+
+AXES: Final = "xyz"
+START_MM: Final = 30.0
+"""How far from where it is after homing the head begins, along each axis, unless told otherwise."""
+BEYOND_MM: Final = 5.0
+"""How far behind the end of an axis its stop stands."""
+RAD_PER_MM: Final = 0.01
+"""Of a rail that turns, these lengths are as small angles as of an arm of 100 mm."""
+DIGITS: Final = 12
+_SMALL: Final = 1e-9
+
+
+@record(kw_only=True)
+class PlantSettings:
+    """How the machine is to be."""
+
+    seed: int = 1
+    start: Point | None = None
+    """Where the head stands at the begin, mm; None: some way from where it homes to."""
+    stops: bool = True
+    """Whether steps beyond the ends of an axis are lost."""
+    enable_pins: bool = True
+    """Whether a motor whose enable pin is off stands still."""
+    hysteresis_mm: float = 0.1
+    """Travel of an endstop from where it closes to where it opens."""
+    switch_noise_mm: float = 0.0
+    """How far beside its place each approach finds an endstop, at most."""
+    heat: HeatSettings = HeatSettings()
+
+
+def machine_plants(
+    description: MachineDescription, settings: PlantSettings | None = None
+) -> dict[str, NodePlant]:
+    """Return the plants of the machine's nodes, by node; raises CanductorError when it cannot have one."""
+    settings = settings or PlantSettings()
+    start = settings.start or start_point(description)
+    try:
+        rails = description.kinematics.inverse(start)
+    except ValueError:
+        raise CanductorError(f"the head of the plant cannot begin at {start}: no rail reaches it") from None
+    endstops = [
+        _endstop(description, rail, start, rails, settings)
+        for rail in _rails(description)
+        if rail.homing.endstop_pin is not None
+    ]
+    plants = [_mechanics(description, node.name, endstops, settings) for node in description.nodes]
+    heat = machine_heat(description, settings.heat)
+    return {
+        plant.node: replace(
+            plant, seed=settings.seed + number, ambient=settings.heat.ambient_c, **heat[plant.node].parts()
+        )
+        for number, plant in enumerate(plants)
+    }
+
+
+def start_point(description: MachineDescription) -> Point:
+    """Return a place START_MM from where the head is after homing, along each axis, towards the middle."""
+    home = np.array(description.home)
+    space = description.kinematics.work_space
+    middle = (np.array(space.low) + np.array(space.high)) / 2
+    x, y, z = home + np.clip(middle - home, -START_MM, START_MM)
+    return (float(x), float(y), float(z))
+
+
+def _rails(description: MachineDescription) -> Iterator[RailDescription]:
+    yield from description.rails
+    if description.dual_carriage is not None:
+        known = [rail.steppers for rail in description.rails]
+        yield from (rail for rail in description.dual_carriage.rails if rail.steppers not in known)
+
+
+def _mechanics(
+    description: MachineDescription,
+    node: str,
+    endstops: Sequence[tuple[str, Switch, Axis]],
+    settings: PlantSettings,
+) -> NodePlant:
+    own = [(switch, axis) for at, switch, axis in endstops if at == node]
+    # An axis with stops is also known where its steppers are.
+    moved = [axis for _, _, axis in endstops if any(term.node == node for term in axis.terms)]
+    axes = {axis.name: axis for axis in (moved if settings.stops else [])}
+    axes |= {axis.name: axis for _, axis in own}
+    return NodePlant(
+        node=node,
+        steppers=tuple(_stepper(s, settings) for s in description.steppers if s.node == node),
+        axes=tuple(axes.values()),
+        switches=tuple(switch for switch, _ in own),
+    )
+
+
+def _stepper(stepper: StepperDescription, settings: PlantSettings) -> Stepper:
+    enable = stepper.enable_pin if settings.enable_pins else None
+    if enable is not None and enable.node != stepper.node:
+        enable = None  # its driver hangs on another node's pin, which this plant does not see
+    return Stepper(
+        name=stepper.name,
+        step_pin=stepper.step_pin.name,
+        dir_pin=stepper.dir_pin.name,
+        enable_pin=None if enable is None else enable.name,
+        step_inverted=stepper.step_pin.invert,
+        dir_inverted=stepper.dir_pin.invert,
+        enable_inverted=enable is not None and enable.invert,
+        both_edges=stepper.step_pulse_s == 0,
+    )
+
+
+# ------------------------------------------------------------------------------------------------ endstops
+
+
+def _endstop(
+    description: MachineDescription,
+    rail: RailDescription,
+    start: Point,
+    rails: Sequence[float],
+    settings: PlantSettings,
+) -> tuple[str, Switch, Axis]:
+    """Return the node, the switch and the axis of RAIL's endstop."""
+    pin, name = rail.homing.endstop_pin, rail.steppers[0].name
+    assert pin is not None
+    is_axis = rail.axis in AXES and rail in description.rails
+    if is_axis and (terms := _axis_terms(description, rail)):
+        origin, at = start[AXES.index(rail.axis)], rail.homing.position_endstop
+        name = rail.axis
+    else:
+        terms = tuple(Term(s.node, s.name, s.step_distance / len(rail.steppers)) for s in rail.steppers)
+        origin, at = _own_places(description, rail, rails)
+    assert at is not None
+    direction = 1 if rail.homing.positive_dir else -1
+    unit = RAD_PER_MM if rail.steppers[0].function.turns else 1.0
+    low, high = _stops(rail, at, BEYOND_MM * unit) if settings.stops else (-np.inf, np.inf)
+    switch = Switch(
+        name=name,
+        pin=pin.name,
+        axis=name,
+        at=at,
+        direction=direction,
+        hysteresis=settings.hysteresis_mm * unit,
+        noise=settings.switch_noise_mm * unit,
+        inverted=pin.invert,
+    )
+    return pin.node, switch, Axis(name=name, terms=terms, origin=origin, min=low, max=high)
+
+
+def _own_places(
+    description: MachineDescription, rail: RailDescription, rails: Sequence[float]
+) -> tuple[float, float | None]:
+    """Return where a rail that is no axis, or one of two of an axis, is at the begin and at its endstop."""
+    at = rail.homing.position_endstop
+    if rail not in description.rails:  # the second carriage: parked at its endstop, nearly
+        assert at is not None
+        return (at - START_MM if rail.homing.positive_dir else at + START_MM), at
+    index = description.kinematics.rails.index(rail.axis)
+    return rails[index], description.kinematics.inverse(description.home)[index]
+
+
+def _stops(rail: RailDescription, at: float, beyond: float) -> tuple[float, float]:
+    """Return where an axis ends: behind its range; where there is none, only behind its endstop."""
+    upper = rail.homing.positive_dir
+    low = rail.position_min if rail.position_min is not None else -np.inf if upper else at
+    high = rail.position_max if rail.position_max is not None else at if upper else np.inf
+    return min(low, at) - beyond, max(high, at) + beyond
+
+
+def _axis_terms(description: MachineDescription, rail: RailDescription) -> tuple[Term, ...]:
+    """Return how the place of RAIL's axis follows from steppers that are sums of axes; empty: it does not."""
+    motors = _motors(description)
+    weights = np.array([motor.weights[:3] for motor in motors]).reshape(-1, 3)
+    axis = np.zeros(3)
+    axis[AXES.index(rail.axis)] = 1.0
+    solution = np.linalg.pinv(weights).T @ axis if len(motors) else axis[:0]
+    if not np.allclose(weights.T @ solution, axis, atol=_SMALL):
+        return ()
+    return tuple(
+        Term(motor.node, motor.name, round(float(share), DIGITS) * motor.step_distance)
+        for motor, share in zip(motors, solution, strict=True)
+        if abs(share) > _SMALL
+    )
+
+
+def _motors(description: MachineDescription) -> list[StepperDescription]:
+    """Return the motors that are sums of axes, but for those of a second carriage."""
+    dual = description.dual_carriage
+    others = [stepper.name for stepper in dual.rails[1].steppers] if dual is not None else []
+    linear = [m for m in description.motors if m.function.kinematics is StepKinematics.LINEAR]
+    return [motor for motor in linear if motor.name not in others]

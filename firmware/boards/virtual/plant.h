@@ -1,0 +1,223 @@
+// SPDX-License-Identifier: Apache-2.0
+// The plant: what stands around a virtual node and makes its pins behave as hardware does. Heaters heat,
+// sensors follow, endstops switch where they are, fans turn. This header is its manual.
+//
+// Nothing runs by itself. The board tells what its outputs do and asks for its inputs, each with the true
+// time NS, and the plant works out what has become of the world since: temperatures by the exact solution of
+// the linear equations between two changes of power, positions by counting steps. Times that go back count as
+// the latest ones. Each node has a plant of its own; what it needs of others it reads in their pages
+// (plant_page.h).
+//
+// Temperatures °C, powers W, capacities J/K, conductances W/K, lengths mm (of an angle: rad), resistances
+// ohm.
+#ifndef BOARDS_PLANT_H
+#define BOARDS_PLANT_H
+
+#include "boards/virtual/plant_page.h"
+
+#include <stddef.h>
+
+enum {
+    PLANT_PINS = 144,
+    PLANT_PEERS = 8,
+    PLANT_AXES = 16,
+    PLANT_TERMS = 8,
+    PLANT_SWITCHES = 16,
+    PLANT_BODIES = 12,
+    PLANT_HEATERS = 12,
+    PLANT_FANS = 12,
+    PLANT_SENSORS = 12,
+    PLANT_COUPLES = 16,
+    PLANT_COOLINGS = 16,
+    PLANT_ZONE_STATES = 12, // bodies and sensors that heat flows between
+    PLANT_ERROR = 200,
+};
+_Static_assert(PLANT_BODIES + PLANT_HEATERS + PLANT_FANS + PLANT_SENSORS + PLANT_SWITCHES <= PLANT_ITEMS,
+               "all items have a place in the page");
+
+// Something of this node (peer -1) or of another's page. FOUND: its number there, once it is known.
+struct plant_reference {
+    char node[PLANT_NAME], name[PLANT_NAME];
+    int peer, found;
+};
+
+struct plant_peer {
+    char node[PLANT_NAME];
+    struct plant_page *page; // the board's to set; NULL: nothing is known of it
+};
+
+// Step and direction pins as the driver sees them. Without enable pin (-1) the driver is always on.
+struct plant_stepper {
+    char name[PLANT_NAME];
+    int step_pin, dir_pin, enable_pin;
+    int step_inverted, dir_inverted, enable_inverted;
+    int both_edges; // each change of the step pin is a step
+};
+
+// A place along a line: origin + the sum of each term's mm per step times its stepper's count.
+struct plant_term {
+    struct plant_reference stepper;
+    double mm;
+};
+struct plant_axis {
+    char name[PLANT_NAME];
+    double origin, min, max; // steps beyond min and max are lost
+    struct plant_term terms[PLANT_TERMS];
+    int term_count;
+};
+
+// Pressed (high, or low when inverted) from AT on in DIRECTION (1 or -1). It is released HYSTERESIS before
+// that again, and each approach finds it up to NOISE beside AT.
+struct plant_switch {
+    char name[PLANT_NAME];
+    int pin, axis, direction, inverted;
+    double at, hysteresis, noise;
+    int pressed;
+    double shift; // of this approach
+    uint64_t switched;
+};
+
+struct plant_body {
+    char name[PLANT_NAME];
+    double capacity, loss, start;
+    int zone, state;
+};
+struct plant_couple {
+    int a, b;
+    double conductance;
+};
+struct plant_cooling {
+    int body;
+    struct plant_reference fan;
+    double conductance; // beside its loss, at full duty
+    double duty;        // what it was reckoned with last
+};
+struct plant_heater {
+    char name[PLANT_NAME];
+    int pin, inverted, body;
+    double power;
+    double wanted, duty, energy; // what the pin says, what it does
+    uint32_t fault;
+};
+// The tachometer gives PULSES a turn. LAG: s to follow its duty, in turns per minute at full duty.
+struct plant_fan {
+    char name[PLANT_NAME];
+    int pin, inverted, tach_pin;
+    double rpm, lag, pulses;
+    double wanted, duty, speed, turns; // speed: share of rpm
+    uint64_t at_ns;
+    uint32_t fault;
+};
+
+enum plant_curve { PLANT_BETA, PLANT_STEINHART, PLANT_RTD, PLANT_LINEAR };
+// Below a pull-up resistor to the converter's reference: a thermistor (r0 at t0 °C and beta; or c1, c2, c3 of
+// Steinhart and Hart), or a resistor r0·(1 + a·T + b·T²). Linear: zero + slope·T of full scale.
+struct plant_sensor {
+    char name[PLANT_NAME];
+    int pin, curve, bits;
+    struct plant_reference body;
+    double lag; // s; 0: none
+    double pullup, r0, t0, beta, c1, c2, c3, a, b, zero, slope;
+    double noise; // steps of the converter, standard deviation
+    int zone, state;
+    double remote; // °C of a body on another node
+    uint64_t samples;
+    uint32_t fault;
+};
+
+// Bodies and sensors between which heat flows: x' = m·x, the last of x is 1.
+struct plant_zone {
+    int count;
+    double x[PLANT_ZONE_STATES + 1];
+    double m[PLANT_ZONE_STATES + 1][PLANT_ZONE_STATES + 1];
+    uint64_t at_ns;
+    uint8_t stale;    // m is to be made anew
+    uint64_t step_ns; // of which `step` is the solution; 0: none
+    double step[PLANT_ZONE_STATES + 1][PLANT_ZONE_STATES + 1];
+};
+
+// What the plant asks of its board; each may be NULL.
+struct plant_host {
+    void *context;
+    // The page of a peer is about to be read at NS: see that all its steps before are in.
+    void (*settle)(void *context, unsigned peer, uint64_t ns);
+    // The same, where its items are to be of NS as well as can be.
+    void (*refresh)(void *context, unsigned peer, uint64_t ns);
+    // KIND of NAME has become VALUE: power (W), fan (duty), switch (pressed), lost (steps), fault (its
+    // number).
+    void (*note)(void *context, uint64_t ns, const char *kind, const char *name, double value);
+};
+
+struct plant {
+    struct plant_page *page; // the board's, at least as long-lived
+    struct plant_host host;  // the board's, set after plant_start()
+    char node[PLANT_NAME];
+    double seed, ambient;
+    double adc_max, pwm_max;
+    uint8_t refreshing;
+    uint8_t level[PLANT_PINS];
+    uint8_t floating[PLANT_PINS]; // not driven since the board (re)started
+    // Whether its level matters, whether more than that happens when it changes, whether the plant drives it.
+    uint8_t cares[PLANT_PINS], writes[PLANT_PINS], reads[PLANT_PINS];
+    int peer_count, stepper_count, axis_count, switch_count, body_count, couple_count, cooling_count;
+    int heater_count, fan_count, sensor_count, zone_count;
+    int first_heater, first_fan, first_sensor, first_switch; // their first items in the page
+    struct plant_peer peers[PLANT_PEERS];
+    struct plant_stepper steppers[PLANT_STEPPERS];
+    struct plant_axis axes[PLANT_AXES];
+    struct plant_switch switches[PLANT_SWITCHES];
+    struct plant_body bodies[PLANT_BODIES];
+    struct plant_couple couples[PLANT_COUPLES];
+    struct plant_cooling coolings[PLANT_COOLINGS];
+    struct plant_heater heaters[PLANT_HEATERS];
+    struct plant_fan fans[PLANT_FANS];
+    struct plant_sensor sensors[PLANT_SENSORS];
+    struct plant_zone zones[PLANT_BODIES + PLANT_SENSORS];
+};
+
+// Makes the plant that TEXT describes (docs/plant.md). Returns 0, or -1 with one sentence in ERROR
+// (PLANT_ERROR bytes). ADC_MAX and PWM_MAX: full scale of the board's converters and of its hardware PWM.
+int plant_read(struct plant *plant, const char *text, size_t size, uint32_t adc_max, uint32_t pwm_max,
+               char *error);
+// Begins at NS with everything at rest, and makes PAGE: one that is of the same steppers keeps their counts,
+// the machine stands where it stood. Then the board sets the peers' pages and the host.
+void plant_start(struct plant *plant, struct plant_page *page, uint64_t ns);
+
+// An output of the board has changed, its hardware PWM is set to VALUE.
+void plant_output(struct plant *plant, uint64_t ns, uint32_t pin, int level);
+void plant_pwm(struct plant *plant, uint64_t ns, uint32_t pin, uint32_t value);
+// The board restarts: its outputs float, nothing is driven until they are set again.
+void plant_reset(struct plant *plant, uint64_t ns);
+// What an input reads, or a converter gives; LEVEL and VALUE when the plant has nothing there.
+int plant_input(struct plant *plant, uint64_t ns, uint32_t pin, int level);
+uint16_t plant_sample(struct plant *plant, uint64_t ns, uint32_t pin, uint16_t value);
+// Takes new faults to heart and brings the page up to date. To be called now and then.
+void plant_update(struct plant *plant, uint64_t ns);
+
+// ---------------------------------------------------------------------------------------- between its files
+
+// plant_text.c: fills PLANT's lists.
+int plant_parse(struct plant *plant, const char *text, size_t size, char *error);
+// plant_motion.c
+void plant_motion_edge(struct plant *plant, uint64_t ns, uint32_t pin, int level);
+double plant_axis_position(struct plant *plant, struct plant_axis *axis, uint64_t ns);
+int plant_switch_level(struct plant *plant, struct plant_switch *it, uint64_t ns);
+// plant_heat.c
+int plant_heat_make(struct plant *plant, char *error);
+void plant_heat_advance(struct plant *plant, uint64_t ns);
+void plant_heat_changed(struct plant *plant, int body); // after its heaters' or fans' duty has changed
+double plant_sensor_temperature(const struct plant *plant, const struct plant_sensor *sensor);
+// plant_sensor.c
+double plant_sensor_ratio(const struct plant_sensor *sensor, double temperature);
+uint16_t plant_sensor_sample(struct plant *plant, struct plant_sensor *sensor);
+// plant_fan.c
+void plant_fan_advance(struct plant_fan *fan, uint64_t ns);
+int plant_fan_tach(struct plant_fan *fan, uint64_t ns);
+// Numbers that hang on the seed, WHO and the n-th time alone: evenly in -1..1, and normally distributed.
+double plant_even(const struct plant *plant, uint64_t who, uint64_t nth);
+double plant_normal(const struct plant *plant, uint64_t who, uint64_t nth);
+// Of another node's page: the number of what REFERENCE names, once it is there; else -1.
+int plant_find(struct plant *plant, struct plant_reference *reference, enum plant_kind kind);
+void plant_note(const struct plant *plant, uint64_t ns, const char *kind, const char *name, double value);
+
+#endif

@@ -1,0 +1,112 @@
+// SPDX-License-Identifier: Apache-2.0
+// Steps are counted where they are made; an axis adds up counts of any nodes, a switch looks at its axis.
+#include "boards/virtual/plant.h"
+
+#include <math.h>
+
+// Threshold and place are sums of products: steps that meet exactly on paper may miss by their rounding.
+static const double ROUNDING = 1e-9;
+
+static int64_t count_of(struct plant *plant, struct plant_term *term, uint64_t ns) {
+    struct plant_reference *stepper = &term->stepper;
+    if (stepper->peer < 0)
+        return atomic_load_explicit(&plant->page->steppers[stepper->found].count, memory_order_relaxed);
+    int found = plant_find(plant, stepper, PLANT_NOTHING);
+    if (found < 0)
+        return 0;
+    return plant_page_count_at(&plant->peers[stepper->peer].page->steppers[found], ns);
+}
+
+double plant_axis_position(struct plant *plant, struct plant_axis *axis, uint64_t ns) {
+    double position = axis->origin;
+    for (int i = 0; i < axis->term_count; i++)
+        position += axis->terms[i].mm * (double)count_of(plant, &axis->terms[i], ns);
+    return position;
+}
+
+static void settle(struct plant *plant, const struct plant_axis *axis, uint64_t ns) {
+    for (int i = 0; i < axis->term_count && plant->host.settle; i++)
+        if (axis->terms[i].stepper.peer >= 0)
+            plant->host.settle(plant->host.context, (unsigned)axis->terms[i].stepper.peer, ns);
+}
+
+// ------------------------------------------------------------------------------------------------- steppers
+
+// Whether a step of STEPPER would push an axis against its stop. Other nodes' steppers count as they stand.
+static int is_blocked(struct plant *plant, int stepper, int direction, uint64_t ns) {
+    for (int i = 0; i < plant->axis_count; i++) {
+        struct plant_axis *axis = &plant->axes[i];
+        if (isinf(axis->min) && isinf(axis->max))
+            continue;
+        for (int t = 0; t < axis->term_count; t++) {
+            const struct plant_term *term = &axis->terms[t];
+            if (term->stepper.peer >= 0 || term->stepper.found != stepper)
+                continue;
+            double way = term->mm * direction;
+            double after = plant_axis_position(plant, axis, ns) + way;
+            if ((way > 0 && after > axis->max + ROUNDING) || (way < 0 && after < axis->min - ROUNDING))
+                return 1;
+        }
+    }
+    return 0;
+}
+
+static int is_enabled(const struct plant *plant, const struct plant_stepper *stepper) {
+    return stepper->enable_pin < 0 || plant->level[stepper->enable_pin] != (stepper->enable_inverted != 0);
+}
+
+static void step(struct plant *plant, uint64_t ns, int number) {
+    const struct plant_stepper *stepper = &plant->steppers[number];
+    struct plant_page_stepper *shown = &plant->page->steppers[number];
+    int direction = plant->level[stepper->dir_pin] != (stepper->dir_inverted != 0) ? 1 : -1;
+    if (!is_enabled(plant, stepper) || is_blocked(plant, number, direction, ns)) {
+        uint64_t lost = atomic_load_explicit(&shown->lost, memory_order_relaxed) + 1;
+        atomic_store_explicit(&shown->lost, lost, memory_order_relaxed);
+        if (lost == 1) // the page goes on counting; a line for each would fill the disk
+            plant_note(plant, ns, "lost", stepper->name, 1);
+        return;
+    }
+    plant_page_step(shown, ns, atomic_load_explicit(&shown->count, memory_order_relaxed) + direction);
+}
+
+void plant_motion_edge(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
+    for (int i = 0; i < plant->stepper_count; i++) {
+        const struct plant_stepper *stepper = &plant->steppers[i];
+        if (stepper->step_pin != (int)pin)
+            continue;
+        if (stepper->both_edges || level != (stepper->step_inverted != 0))
+            step(plant, ns, i);
+    }
+}
+
+// ------------------------------------------------------------------------------------------------- switches
+
+static void set_pressed(struct plant *plant, struct plant_switch *it, int pressed, uint64_t ns) {
+    it->pressed = pressed;
+    it->switched++;
+    if (!pressed) // the next approach finds it a little elsewhere
+        it->shift = it->noise * plant_even(plant, (uint64_t)it->pin, it->switched);
+    struct plant_page_item *item = &plant->page->items[plant->first_switch + (int)(it - plant->switches)];
+    plant_page_store(&item->value, pressed);
+    plant_page_store(&item->extra, (double)it->switched);
+    plant_note(plant, ns, "switch", it->name, pressed);
+}
+
+static int is_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns) {
+    struct plant_page_item *item = &plant->page->items[plant->first_switch + (int)(it - plant->switches)];
+    uint32_t fault = atomic_load_explicit(&item->fault, memory_order_relaxed);
+    if (fault == PLANT_NEVER || fault == PLANT_ALWAYS)
+        return fault == PLANT_ALWAYS;
+    struct plant_axis *axis = &plant->axes[it->axis];
+    settle(plant, axis, ns);
+    double beyond = it->direction * (plant_axis_position(plant, axis, ns) - it->at) - it->shift;
+    double needed = it->pressed ? -it->hysteresis : 0.0;
+    return beyond >= needed - ROUNDING;
+}
+
+int plant_switch_level(struct plant *plant, struct plant_switch *it, uint64_t ns) {
+    int pressed = is_pressed(plant, it, ns);
+    if (pressed != it->pressed)
+        set_pressed(plant, it, pressed, ns);
+    return pressed != (it->inverted != 0);
+}

@@ -1,0 +1,279 @@
+"""Describes the plant of a virtual node: what its pins are connected with, as the node's process reads it.
+
+Parts are named; names are words without blanks of at most 31 characters. Lengths are in mm (of an angle:
+rad), temperatures in °C, powers in W, capacities in J/K, conductances in W/K, resistances in ohm, times in s.
+The text's format and what each part does: docs/plant.md.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from nodes.errors import CanductorError
+from nodes.records import record
+
+NAME_MAX: Final = 31
+
+
+@record(kw_only=True)
+class Stepper:
+    """A motor with its driver, on pins of the plant's own node."""
+
+    name: str
+    step_pin: str
+    dir_pin: str
+    enable_pin: str | None = None
+    """None: the driver is always on."""
+    step_inverted: bool = False
+    dir_inverted: bool = False
+    """Whether a low direction pin counts up."""
+    enable_inverted: bool = False
+    both_edges: bool = False
+
+
+@record
+class Term:
+    """What the stepper of that name on NODE adds to an axis with each step."""
+
+    node: str
+    stepper: str
+    mm_per_step: float
+
+
+@record(kw_only=True)
+class Axis:
+    """A place along a line that steppers of any nodes move: ORIGIN with all counts at 0.
+
+    A step that would bring it beyond a limit is lost, when the plant of that step's node knows the axis.
+    """
+
+    name: str
+    terms: tuple[Term, ...]
+    origin: float = 0.0
+    min: float = -math.inf
+    max: float = math.inf
+
+
+@record(kw_only=True)
+class Switch:
+    """An endstop: pressed while its axis is at AT or beyond, in DIRECTION (1 or -1).
+
+    It is released HYSTERESIS before AT; each approach finds it up to NOISE beside where it is.
+    """
+
+    name: str
+    pin: str
+    axis: str
+    at: float
+    direction: int
+    hysteresis: float = 0.0
+    noise: float = 0.0
+    inverted: bool = False
+    """Pressed is a low level."""
+
+
+@record(kw_only=True)
+class Body:
+    """Something that gets warm."""
+
+    name: str
+    capacity: float
+    loss: float
+    """To the surroundings."""
+    start: float | None = None
+    """None: as warm as the surroundings."""
+
+
+@record(kw_only=True)
+class Couple:
+    """Two bodies that heat flows between."""
+
+    a: str
+    b: str
+    conductance: float
+
+
+@record(kw_only=True)
+class Heater:
+    """Full power while its pin is on; with hardware PWM in proportion."""
+
+    name: str
+    pin: str
+    body: str
+    power: float
+    inverted: bool = False
+
+
+@record(kw_only=True)
+class Fan:
+    """A fan, at full duty with RPM turns per minute, which it follows with a lag; perhaps a tachometer."""
+
+    name: str
+    pin: str
+    inverted: bool = False
+    rpm: float = 6000.0
+    lag: float = 0.3
+    tach_pin: str | None = None
+    pulses: float = 2.0
+    """Per turn."""
+
+
+@record(kw_only=True)
+class Cooling:
+    """A fan (on any node) that blows at a body: loss at full duty, beside the body's own."""
+
+    body: str
+    node: str
+    fan: str
+    conductance: float
+
+
+@record(kw_only=True)
+class Beta:
+    """A thermistor by its resistance at one temperature and its Beta, below a pull-up resistor."""
+
+    beta: float
+    r0: float = 100_000.0
+    t0: float = 25.0
+    pullup: float = 4700.0
+
+
+@record(kw_only=True)
+class Steinhart:
+    """A thermistor by the coefficients of Steinhart and Hart, below a pull-up resistor."""
+
+    c1: float
+    c2: float
+    c3: float
+    pullup: float = 4700.0
+
+
+@record(kw_only=True)
+class Rtd:
+    """A resistor r0·(1 + a·T + b·T²) below a pull-up resistor; by default a PT1000."""
+
+    r0: float = 1000.0
+    a: float = 3.9083e-3
+    b: float = -5.775e-7
+    pullup: float = 4700.0
+
+
+@record(kw_only=True)
+class Linear:
+    """An amplifier: ZERO + SLOPE·T as a share of the converter's full scale."""
+
+    zero: float
+    slope: float
+
+
+@record(kw_only=True)
+class Sensor:
+    """A sensor in a body of any node; it follows with a lag, and has noise in steps of the converter."""
+
+    name: str
+    pin: str
+    node: str
+    """Of its body."""
+    body: str
+    curve: Beta | Steinhart | Rtd | Linear
+    lag: float = 0.0
+    noise: float = 0.0
+    """Standard deviation."""
+    bits: int = 12
+
+
+_FIELD_NAMES: Final = {
+    "step_pin": "step",
+    "dir_pin": "dir",
+    "enable_pin": "enable",
+    "tach_pin": "tach",
+}
+"""Where a field is named otherwise in the text."""
+
+
+@record(kw_only=True)
+class NodePlant:
+    """All that stands around one node; the text and its file are made from it."""
+
+    node: str
+    seed: int = 1
+    ambient: float = 25.0
+    steppers: tuple[Stepper, ...] = ()
+    axes: tuple[Axis, ...] = ()
+    switches: tuple[Switch, ...] = ()
+    bodies: tuple[Body, ...] = ()
+    couples: tuple[Couple, ...] = ()
+    heaters: tuple[Heater, ...] = ()
+    fans: tuple[Fan, ...] = ()
+    coolings: tuple[Cooling, ...] = ()
+    sensors: tuple[Sensor, ...] = ()
+
+    def text(self) -> str:
+        """Return the description as the firmware reads it; CanductorError for a name that cannot be."""
+        return "".join(f"{line}\n" for line in self._lines())
+
+    def write(self, folder: Path) -> Path:
+        """Write the description into FOLDER, which all plants of a machine share; return its path."""
+        path = folder / f"{self.node}.plant"
+        path.write_text(self.text())
+        return path
+
+    @property
+    def peers(self) -> tuple[str, ...]:
+        """The other nodes whose steppers, fans or bodies it needs."""
+        named = [term.node for axis in self.axes for term in axis.terms]
+        named += [cooling.node for cooling in self.coolings]
+        named += [sensor.node for sensor in self.sensors]
+        return tuple(dict.fromkeys(name for name in named if name != self.node))
+
+    def _lines(self) -> Iterator[str]:
+        yield _line("plant", {"node": self.node, "seed": self.seed, "ambient": self.ambient})
+        yield from self._parts("stepper", self.steppers)
+        for axis in self.axes:
+            yield _line("axis", _fields(axis, without=("terms",)))
+            for term in axis.terms:
+                fields = {"axis": axis.name, "node": self._short(term.node), "stepper": term.stepper}
+                yield _line("term", fields | {"mm": term.mm_per_step})
+        yield from self._parts("switch", self.switches)
+        yield from self._parts("body", self.bodies)
+        yield from self._parts("couple", self.couples)
+        yield from self._parts("fan", self.fans)
+        yield from self._parts("cooling", self.coolings)
+        yield from self._parts("heater", self.heaters)
+        for sensor in self.sensors:
+            curve = {"curve": type(sensor.curve).__name__.lower()} | _fields(sensor.curve)
+            yield _line("sensor", self._own(_fields(sensor, without=("curve",))) | curve)
+
+    def _parts(self, kind: str, parts: Iterable[Any]) -> Iterator[str]:
+        for part in parts:
+            yield _line(kind, self._own(_fields(part)))
+
+    def _own(self, fields: dict[str, Any]) -> dict[str, Any]:
+        return fields | {"node": self._short(fields["node"])} if "node" in fields else fields
+
+    def _short(self, node: str) -> str:
+        return "-" if node == self.node else node
+
+
+def _fields(part: Any, without: tuple[str, ...] = ()) -> dict[str, Any]:
+    names = [field.name for field in dataclasses.fields(part) if field.name not in without]
+    return {_FIELD_NAMES.get(name, name): getattr(part, name) for name in names}
+
+
+def _line(kind: str, fields: dict[str, Any]) -> str:
+    words = [f"{name}={_word(name, value)}" for name, value in fields.items() if value is not None]
+    return " ".join((kind, *words))
+
+
+def _word(name: str, value: Any) -> str:
+    if isinstance(value, float):
+        return repr(value)
+    word = str(int(value) if isinstance(value, bool) else value)
+    if not word or len(word) > NAME_MAX or len(word.split()) != 1 or not word.isascii():
+        raise CanductorError(
+            f"the plant of a virtual node cannot have {name} {word!r}; "
+            f"use 1 to {NAME_MAX} characters without blanks"
+        )
+    return word

@@ -1,0 +1,46 @@
+"""Reads the log of a process's plant: what its heaters and fans did and how warm its bodies were, and when.
+
+One line each: true time (CLOCK_MONOTONIC in ns), kind, name, value, with tabs between. Kinds: ``power`` (W,
+whenever a heater's changes), ``fan`` (duty), ``switch`` (1: pressed), ``lost`` (a stepper's first lost step),
+``fault`` (its number), ``body`` (°C, every 50 ms).
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from nodes.errors import CanductorError
+from nodes.records import record
+
+
+@record
+class PlantEvent:
+    """One line."""
+
+    at_ns: int
+    kind: str
+    name: str
+    value: float
+
+
+def plant_log(folder: Path, node: str) -> Iterator[PlantEvent]:
+    """Yield what the log of NODE holds now, oldest first; a line that is still being written is left out.
+
+    FOLDER: where the node's description lies. Raises CanductorError.
+    """
+    path = folder / f"{node}.plantlog"
+    try:
+        with path.open() as file:
+            for number, line in enumerate(file, 1):
+                if not line.endswith("\n"):
+                    return
+                yield _event(path, number, line)
+    except OSError as error:
+        raise CanductorError(f"{path}: the plant's log cannot be read: {error.strerror}") from None
+
+
+def _event(path: Path, number: int, line: str) -> PlantEvent:
+    try:
+        at_ns, kind, name, value = line.split("\t")
+        return PlantEvent(int(at_ns), kind, name, float(value))
+    except ValueError:
+        raise CanductorError(f"{path}:{number}: this is no line of a plant's log") from None

@@ -1,0 +1,178 @@
+"""Reads the page of a running plant, which is the truth about it, and switches faults in it.
+
+The layout is that of firmware/boards/virtual/plant_page.h.
+"""
+
+import mmap
+from collections.abc import Mapping
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+
+from nodes.errors import CanductorError
+from nodes.records import record
+
+_MAGIC: Final = 0x31544E4C50444E43
+_NAME: Final = 32
+_ITEMS: Final = 64
+_STEPPERS: Final = 16
+_HISTORY: Final = 4096
+_HEADER: Final = np.dtype(
+    [("magic", "u8"), ("steppers", "u4"), ("items", "u4"), ("horizon_ns", "u8"), ("updated_ns", "u8")]
+)
+_ITEM: Final = np.dtype(
+    [("name", f"S{_NAME}"), ("kind", "u4"), ("fault", "u4"), ("value", "f8"), ("extra", "f8")]
+)
+_STEP: Final = np.dtype([("ns", "u8"), ("count", "i8")])
+_STEPPER: Final = np.dtype(
+    [
+        *(("name", f"S{_NAME}"), ("head", "u8"), ("count", "i8"), ("lost", "u8"), ("reserved", "u8")),
+        ("history", _STEP, (_HISTORY,)),
+    ]
+)
+_PAGE: Final = np.dtype(
+    [("head", _HEADER), ("items", _ITEM, (_ITEMS,)), ("steppers", _STEPPER, (_STEPPERS,))]
+)
+
+
+class Kind(IntEnum):
+    """What an item of a plant is."""
+
+    BODY = 1
+    HEATER = 2
+    FAN = 3
+    SENSOR = 4
+    SWITCH = 5
+
+
+class Fault(IntEnum):
+    """What may be wrong with an item."""
+
+    SOUND = 0
+    OPEN = 1
+    """A sensor's wire is broken."""
+    SHORTED = 2
+    """A sensor's wires touch."""
+    FALLEN = 3
+    """A sensor fell out of its body: it gets as warm as the surroundings, as fast as its lag lets it."""
+    STUCK_ON = 4
+    """A heater that is on whatever its pin says."""
+    DEAD = 5
+    """A heater or a fan that does nothing."""
+    NEVER = 6
+    """A switch that never closes."""
+    ALWAYS = 7
+    """A switch that is always closed."""
+
+
+_FAULTS: Final[Mapping[Kind, tuple[Fault, ...]]] = {
+    Kind.BODY: (),
+    Kind.HEATER: (Fault.STUCK_ON, Fault.DEAD),
+    Kind.FAN: (Fault.DEAD,),
+    Kind.SENSOR: (Fault.OPEN, Fault.SHORTED, Fault.FALLEN),
+    Kind.SWITCH: (Fault.NEVER, Fault.ALWAYS),
+}
+
+
+@record
+class Motor:
+    """Where a stepper truly is."""
+
+    count: int
+    steps: int
+    """Made in all."""
+    lost: int
+    """Steps that moved nothing: the driver was off, or the axis stood against its stop."""
+
+
+@record
+class Item:
+    """A part of the plant as it was last worked out."""
+
+    kind: Kind
+    fault: Fault
+    value: float
+    """Of a body °C; of a heater or fan its duty, 0 to 1; of a sensor its own °C; of a switch 1: pressed."""
+    extra: float
+    """Of a heater J given in all; of a fan turns; of a sensor its last sample; of a switch its changes."""
+
+
+class PlantPage:
+    """The page in BUFFER (of a simulated board), or with `at` that of a process. NAME is for messages.
+
+    It is a view: each reading is of the moment. A process works its plant out every 50 ms, or when its
+    firmware looks; a simulated board's has to be updated.
+    """
+
+    def __init__(self, name: str, buffer: Any) -> None:
+        self._name = name
+        self._page = np.frombuffer(buffer, _PAGE, 1)
+        if int(self._head["magic"]) != _MAGIC:
+            raise CanductorError(
+                f"{name}: this is no page of a running plant; was its node started with one?"
+            )
+
+    @classmethod
+    def at(cls, folder: Path, node: str) -> Self:
+        """Open the page of NODE, whose description lies in FOLDER; raises CanductorError."""
+        path = folder / f"{node}.page"
+        try:
+            with path.open("r+b") as file:
+                return cls(str(path), mmap.mmap(file.fileno(), _PAGE.itemsize))
+        except (OSError, ValueError) as error:
+            raise CanductorError(f"{path}: the plant's page cannot be opened: {error}") from None
+
+    @property
+    def _head(self) -> Any:
+        return self._page["head"][0]
+
+    @property
+    def updated_ns(self) -> int:
+        """True time (of a process: CLOCK_MONOTONIC) at which the items were worked out."""
+        return int(self._head["updated_ns"])
+
+    @property
+    def motors(self) -> dict[str, Motor]:
+        """All steppers by name."""
+        rows = self._page["steppers"][0, : int(self._head["steppers"])]
+        return {
+            row["name"].decode(): Motor(int(row["count"]), int(row["head"]), int(row["lost"])) for row in rows
+        }
+
+    def item(self, kind: Kind, name: str) -> Item:
+        """Return the item of KIND called NAME; raises CanductorError."""
+        row = self._row(kind, name)
+        return Item(kind, Fault(int(row["fault"])), float(row["value"]), float(row["extra"]))
+
+    def temperature(self, body: str) -> float:
+        """Return how warm BODY truly is, °C."""
+        return self.item(Kind.BODY, body).value
+
+    def names(self, kind: Kind) -> tuple[str, ...]:
+        """Return the names of all items of KIND."""
+        return tuple(row["name"].decode() for row in self._rows() if row["kind"] == kind)
+
+    def set_fault(self, kind: Kind, name: str, fault: Fault) -> None:
+        """Let FAULT be so from now on; SOUND repairs. Raises CanductorError for what cannot be.
+
+        The plant takes it to heart when it is worked out next.
+        """
+        row = self._row(kind, name)
+        if fault is not Fault.SOUND and fault not in _FAULTS[kind]:
+            able = ", ".join(other.name.lower() for other in _FAULTS[kind]) or "nothing"
+            raise CanductorError(
+                f"{self._name}: a {kind.name.lower()} cannot be {fault.name.lower()}; it can be {able}"
+            )
+        row["fault"] = fault
+
+    def _rows(self) -> Any:
+        return self._page["items"][0, : int(self._head["items"])]
+
+    def _row(self, kind: Kind, name: str) -> Any:
+        for row in self._rows():
+            if row["kind"] == kind and row["name"] == name.encode():
+                return row
+        known = ", ".join(self.names(kind)) or "none"
+        raise CanductorError(f"{self._name}: there is no {kind.name.lower()} {name!r}; there is {known}")

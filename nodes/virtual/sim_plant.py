@@ -1,0 +1,42 @@
+"""The plant of a simulated board (firmware/boards/sim): started, connected with others, read."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from nodes.errors import CanductorError
+from nodes.virtual._sim import ffi, lib
+from nodes.virtual.plant import NodePlant
+from nodes.virtual.plant_page import PlantPage
+
+
+class SimPlant:
+    """PLANT around BOARD (``struct sim_board *``, which outlives this), from now on and over its resets."""
+
+    def __init__(self, board: Any, plant: NodePlant) -> None:
+        self.description = plant
+        self.board = board
+        text, error = plant.text().encode(), ffi.new("char[]", lib.SIM_ERROR)
+        if lib.sim_plant_start(board, text, len(text), error):
+            said = ffi.string(error)
+            assert isinstance(said, bytes)
+            raise CanductorError(f"the plant of node {plant.node}: {said.decode()}")
+        size = ffi.new("size_t *")
+        page = lib.sim_plant_page(board, size)
+        self._page = PlantPage(f"the plant of node {plant.node}", ffi.buffer(page, size[0]))
+
+    @property
+    def page(self) -> PlantPage:
+        """The truth about it, as of now."""
+        lib.sim_plant_update(self.board)
+        return self._page
+
+
+def connect_plants(plants: Mapping[str, SimPlant]) -> None:
+    """Let the plants of boards that live together see each other; CanductorError when one is missing."""
+    for plant in plants.values():
+        for name in plant.description.peers:
+            if name not in plants:
+                raise CanductorError(
+                    f"the plant of node {plant.description.node} speaks of node '{name}', which has no plant"
+                )
+            lib.sim_plant_peer(plant.board, name.encode(), plants[name].board)
