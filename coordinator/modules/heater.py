@@ -23,8 +23,9 @@ from coordinator.modules.heater_options import (
     MAX_DURATION,
 )
 from coordinator.modules.pinned import AHEAD_S, add_pinned
-from coordinator.modules.temperature_input import SILENT_S, SensorModule, TemperatureInput
+from coordinator.modules.temperature_input import SensorModule, TemperatureInput
 from coordinator.modules.verify_heater import VerifyHeater, usual
+from nodes.devices.analog_in import RANGE_CHECKS
 from nodes.devices.pwm_out import PwmOut
 from nodes.errors import CanductorError
 from nodes.node_states import NodeState
@@ -34,6 +35,11 @@ if TYPE_CHECKING:
 
 LOOK_S: Final = 1.0
 """How often it is looked whether there still are measurements."""
+SILENT_LOOKS: Final = 2
+"""So many looks in a row may find none; looks and not seconds, as the host itself may have stood still."""
+
+BAD_MEASUREMENTS: Final = RANGE_CHECKS + 2
+"""So many out of range, and the node should have stopped by itself."""
 
 
 class Tuning(Protocol):
@@ -79,6 +85,7 @@ class HeaterUnit:
         self._tuning_failure: CanductorError | None = None
         self._live: Live | None = None
         self._on = False
+        self._bad = 0
 
     # ---------------------------------------------------------------------------------------------- life
 
@@ -178,12 +185,26 @@ class HeaterUnit:
         live = self._live
         if live is None:
             return
+        if not self.input.min_c <= celsius <= self.input.max_c:
+            self._out_of_range(live, celsius)
+            return
+        self._bad = 0
         watched_c = self.target_c if self._tuning is None else self._tuning.watched_c
         fault = self._check.check(at_s, celsius, watched_c, self.power)
         if fault is not None:
             live.stop(f"heater {self.key} {fault}")
             return
         self._apply(self._wanted(at_s, celsius))
+
+    def _out_of_range(self, live: "Live", celsius: float) -> None:
+        """Heat no more while what is measured cannot be; its node stops by itself a moment later."""
+        self._bad += 1
+        self._apply(0.0)
+        if self._bad > BAD_MEASUREMENTS:
+            live.stop(
+                f"heater {self.key}: its sensor tells {celsius:.0f} °C, outside {self.input.min_c:g} to"
+                f" {self.input.max_c:g} °C; check the sensor and its wires"
+            )
 
     def _wanted(self, at_s: float, celsius: float) -> float:
         if self._tuning is not None:
@@ -227,9 +248,10 @@ class HeaterUnit:
             if live.node(name).state is not NodeState.READY:
                 self._let_go(f"node {name} is {live.node(name).state.value}")
                 return
-        if self.input.silent_s() > SILENT_S:
+        missed = self.input.missed()
+        if missed > SILENT_LOOKS:
             live.stop(
-                f"heater {self.key}: its sensor has not said anything for {self.input.silent_s():.1f} s;"
+                f"heater {self.key}: its sensor has not said anything for some {missed * LOOK_S:g} s;"
                 f" check node {self.input.node} and its wires"
             )
 

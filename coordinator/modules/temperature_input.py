@@ -72,7 +72,7 @@ class TemperatureInput:
         self._analog.on_value = self._came
         add_pinned(build, self._analog, self._pin)
         self._live: Live | None = None
-        self._measured_s: float | None = None
+        self._looks = 0
         self._waiting: list[asyncio.Future[None]] = []
         self._over: str | None = None
 
@@ -115,7 +115,6 @@ class TemperatureInput:
     def connect(self, live: "Live") -> None:
         """Begin to tell what is measured."""
         self._live = live
-        self._measured_s = live.now_s()
 
     def end(self, cause: str) -> None:
         """End all waiting for it, because of CAUSE."""
@@ -128,11 +127,10 @@ class TemperatureInput:
         """The node it is on."""
         return self._pin.node
 
-    def silent_s(self) -> float:
-        """Return for how long nothing was measured."""
-        if self._live is None or self._measured_s is None:
-            return 0.0
-        return self._live.now_s() - self._measured_s
+    def missed(self) -> int:
+        """Return how often this was called since the last measurement."""
+        self._looks += 1
+        return self._looks - 1
 
     async def next(self) -> None:
         """Wait for the next measurement; raises CanductorError when there will be none."""
@@ -158,8 +156,8 @@ class TemperatureInput:
     def _came(self, value: AnalogValue) -> None:
         assert self._sensor is not None
         self.celsius = self._sensor.celsius(value.ratio)
+        self._looks = 0
         if self._live is not None:
-            self._measured_s = self._live.now_s()
             self.on_measured(self._live.print_time_of(self._pin.node, value.clock32), self.celsius)
         self._wake()
 
