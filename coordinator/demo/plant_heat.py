@@ -18,6 +18,8 @@ from nodes.records import record
 from nodes.virtual.plant import Beta, Body, Cooling, Couple, Fan, Heater, Rtd, Sensor, Steinhart
 
 SHARED: Final = "plant"
+WORD_MAX: Final = 50
+"""Characters of a section's name; what is added to it has room as well."""
 ZERO_C: Final = 273.15
 PULLUP_OHM: Final = 4700.0
 
@@ -258,4 +260,4 @@ def _number(section: RawSection, option: str, otherwise: float) -> float:
 
 def _word(name: str) -> str:
     """Return a section's name as a word of a plant."""
-    return "".join(c if c.isascii() and c.isalnum() else "_" for c in name)[:24]
+    return "".join(c if c.isascii() and c.isalnum() else "_" for c in name)[:WORD_MAX]

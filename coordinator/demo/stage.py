@@ -1,13 +1,17 @@
-"""The stage of the demo: a machine's configuration played by virtual nodes on virtual or SocketCAN buses."""
+"""The stage of the demo: a machine's configuration played by virtual nodes on virtual or SocketCAN buses.
+
+Their pins are connected with a plant of that machine: endstops switch where they are, heaters heat.
+"""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from coordinator.commands import DemoOptions
+from coordinator.demo.plant import PlantSettings, machine_plants
 from coordinator.machine.description import (
     CanConnection,
     MachineDescription,
@@ -18,6 +22,8 @@ from nodes.errors import CanductorError
 from nodes.transport.socketcan import SocketCanTransport
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.hub import VirtualBus
+from nodes.virtual.plant_log import PlantEvent, plant_log
+from nodes.virtual.plant_page import PlantPage
 from nodes.virtual.processes import Flavour, NodeProcess
 
 BITRATE = 1_000_000
@@ -48,6 +54,7 @@ class Stage:
             description, nodes=tuple(self._virtual(node) for node in description.nodes)
         )
         """The machine with its connections replaced by virtual ones."""
+        self._plants = machine_plants(description, PlantSettings(seed=options.seed + 1))
 
     def _check_names(self, description: MachineDescription) -> None:
         names = [node.name for node in description.nodes]
@@ -139,7 +146,16 @@ class Stage:
             jitter_us=JITTER_US,
             seed=self._options.seed + index,
             edge_log=None if self._options.serve is not None else self.edge_log_path(node.name),
+            plant=self._plants[node.name].write(self._folder),
         )
+
+    def plant_page(self, node: str) -> PlantPage:
+        """Return the truth about NODE's plant while it runs, in which faults can be switched."""
+        return PlantPage.at(self._folder, node)
+
+    def plant_log(self, node: str) -> Iterator[PlantEvent]:
+        """Yield what NODE's heaters and fans did, and how warm its bodies were."""
+        return plant_log(self._folder, node)
 
     # ------------------------------------------------------------------------------------------ afterwards
 

@@ -1,6 +1,6 @@
 """Describes the plant of a virtual node: what its pins are connected with, as the node's process reads it.
 
-Parts are named; names are words without blanks of at most 31 characters. Lengths are in mm (of an angle:
+Parts are named; names are words without blanks of at most 63 characters. Lengths are in mm (of an angle:
 rad), temperatures in °C, powers in W, capacities in J/K, conductances in W/K, resistances in ohm, times in s.
 The text's format and what each part does: docs/plant.md.
 """
@@ -14,7 +14,7 @@ from typing import Any, Final
 from nodes.errors import CanductorError
 from nodes.records import record
 
-NAME_MAX: Final = 31
+NAME_MAX: Final = 63
 
 
 @record(kw_only=True)

@@ -15,7 +15,7 @@ from nodes.errors import CanductorError
 from nodes.records import record
 
 _MAGIC: Final = 0x31544E4C50444E43
-_NAME: Final = 32
+_NAME: Final = 64
 _ITEMS: Final = 64
 _STEPPERS: Final = 16
 _HISTORY: Final = 4096

@@ -1,6 +1,6 @@
 """The plant of a simulated board (firmware/boards/sim): started, connected with others, read."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from nodes.errors import CanductorError
@@ -10,13 +10,17 @@ from nodes.virtual.plant_page import PlantPage
 
 
 class SimPlant:
-    """PLANT around BOARD (``struct sim_board *``, which outlives this), from now on and over its resets."""
+    """PLANT around BOARD (``struct sim_board *``, which outlives this), from now on and over its resets.
 
-    def __init__(self, board: Any, plant: NodePlant) -> None:
+    NOW_NS: true time; without it, that of the board's last event.
+    """
+
+    def __init__(self, board: Any, plant: NodePlant, now_ns: Callable[[], int] = lambda: 0) -> None:
         self.description = plant
         self.board = board
+        self._now_ns = now_ns
         text, error = plant.text().encode(), ffi.new("char[]", lib.SIM_ERROR)
-        if lib.sim_plant_start(board, text, len(text), error):
+        if lib.sim_plant_start(board, now_ns(), text, len(text), error):
             said = ffi.string(error)
             assert isinstance(said, bytes)
             raise CanductorError(f"the plant of node {plant.node}: {said.decode()}")
@@ -27,7 +31,7 @@ class SimPlant:
     @property
     def page(self) -> PlantPage:
         """The truth about it, as of now."""
-        lib.sim_plant_update(self.board)
+        lib.sim_plant_update(self.board, self._now_ns())
         return self._page
 
 

@@ -20,7 +20,7 @@
 #include <unistd.h>
 
 enum {
-    UPDATE_NS = 50 * 1000 * 1000, // between two entries of temperatures
+    UPDATE_NS = 50 * 1000 * 1000,    // between two entries of temperatures
     PATIENCE_NS = 500 * 1000 * 1000, // a busy computer may let a process wait for long
     LOOK_NS = 20 * 1000,
     TEXT_MAX = 64 * 1024,

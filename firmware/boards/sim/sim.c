@@ -34,7 +34,7 @@ struct sim_plant {
 };
 _Static_assert((int)SIM_ERROR == (int)PLANT_ERROR, "its sentences fit");
 
-int sim_plant_start(struct sim_board *board, const char *text, size_t size, char *error) {
+int sim_plant_start(struct sim_board *board, uint64_t now_ns, const char *text, size_t size, char *error) {
     struct sim_plant *plant = board->plant ? NULL : calloc(1, sizeof(*plant));
     if (!plant) {
         snprintf(error, SIM_ERROR, "%s", board->plant ? "it has a plant already" : "out of memory");
@@ -44,7 +44,7 @@ int sim_plant_start(struct sim_board *board, const char *text, size_t size, char
         free(plant);
         return -1;
     }
-    plant_start(&plant->plant, &plant->page, virtual_true_ns(&board->virtual));
+    plant_start(&plant->plant, &plant->page, now_ns ? now_ns : virtual_true_ns(&board->virtual));
     board->plant = plant;
     board->virtual.plant = &plant->plant;
     return 0;
@@ -70,9 +70,9 @@ int sim_plant_peer(struct sim_board *board, const char *name, struct sim_board *
     return -1;
 }
 
-void sim_plant_update(struct sim_board *board) {
+void sim_plant_update(struct sim_board *board, uint64_t now_ns) {
     if (board->plant)
-        plant_update(&board->plant->plant, virtual_true_ns(&board->virtual));
+        plant_update(&board->plant->plant, now_ns ? now_ns : virtual_true_ns(&board->virtual));
 }
 
 void *sim_plant_page(struct sim_board *board, size_t *size) {

@@ -61,14 +61,14 @@ void sim_edges_forget(struct sim_board *board);
 uint64_t sim_edges_lost(const struct sim_board *board);
 
 // What stands around the board (boards/virtual/plant.h): TEXT describes it (docs/plant.md). It begins now,
-// and outlives resets. -1, with a sentence of at most SIM_ERROR bytes in ERROR: there is one already, TEXT is
-// wrong, or memory is out.
+// and outlives resets. NOW_NS: true time; 0: that of the board's last event. -1, with a sentence of at most
+// SIM_ERROR bytes in ERROR: there is one already, TEXT is wrong, or memory is out.
 enum { SIM_ERROR = 200 };
-int sim_plant_start(struct sim_board *board, const char *text, size_t size, char *error);
+int sim_plant_start(struct sim_board *board, uint64_t now_ns, const char *text, size_t size, char *error);
 // Node NAME, which the text speaks of, is PEER; they end together. -1: it speaks of no such node.
 int sim_plant_peer(struct sim_board *board, const char *name, struct sim_board *peer);
 // Brings the page up to date; the page (plant_page.h) and its size; null without plant.
-void sim_plant_update(struct sim_board *board);
+void sim_plant_update(struct sim_board *board, uint64_t now_ns);
 void *sim_plant_page(struct sim_board *board, size_t *size);
 
 struct sim_counters {

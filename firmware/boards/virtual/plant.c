@@ -198,9 +198,14 @@ void plant_update(struct plant *plant, uint64_t ns) {
 // ------------------------------------------------------------------------------------------ what is read
 
 int plant_input(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
+    int any_pressed = 0, inverted = -1;
     for (int i = 0; i < plant->switch_count; i++)
-        if (plant->switches[i].pin == (int)pin)
-            return plant_switch_level(plant, &plant->switches[i], ns);
+        if (plant->switches[i].pin == (int)pin) { // several may be wired to one pin: any of them does it
+            any_pressed |= plant_switch_pressed(plant, &plant->switches[i], ns);
+            inverted = plant->switches[i].inverted != 0;
+        }
+    if (inverted >= 0)
+        return any_pressed != inverted;
     for (int i = 0; i < plant->fan_count; i++)
         if (plant->fans[i].tach_pin == (int)pin)
             return plant_fan_tach(&plant->fans[i], ns);

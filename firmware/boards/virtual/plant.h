@@ -201,7 +201,7 @@ int plant_parse(struct plant *plant, const char *text, size_t size, char *error)
 // plant_motion.c
 void plant_motion_edge(struct plant *plant, uint64_t ns, uint32_t pin, int level);
 double plant_axis_position(struct plant *plant, struct plant_axis *axis, uint64_t ns);
-int plant_switch_level(struct plant *plant, struct plant_switch *it, uint64_t ns);
+int plant_switch_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns);
 // plant_heat.c
 int plant_heat_make(struct plant *plant, char *error);
 void plant_heat_advance(struct plant *plant, uint64_t ns);

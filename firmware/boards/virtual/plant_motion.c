@@ -104,9 +104,9 @@ static int is_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns)
     return beyond >= needed - ROUNDING;
 }
 
-int plant_switch_level(struct plant *plant, struct plant_switch *it, uint64_t ns) {
+int plant_switch_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns) {
     int pressed = is_pressed(plant, it, ns);
     if (pressed != it->pressed)
         set_pressed(plant, it, pressed, ns);
-    return pressed != (it->inverted != 0);
+    return pressed;
 }

@@ -13,7 +13,7 @@
 enum {
     PLANT_STEPPERS = 16,
     PLANT_ITEMS = 64,
-    PLANT_NAME = 32,      // with the zero at its end
+    PLANT_NAME = 64,      // with the zero at its end
     PLANT_HISTORY = 4096, // steps of each stepper that can be looked up; a power of two
 };
 
@@ -70,8 +70,9 @@ struct plant_page {
     struct plant_page_stepper steppers[PLANT_STEPPERS];
 };
 
-_Static_assert(sizeof(struct plant_page_item) == 56, "plant_page.py reads it");
-_Static_assert(sizeof(struct plant_page_stepper) == 64 + 16 * PLANT_HISTORY, "plant_page.py reads it");
+_Static_assert(sizeof(struct plant_page_item) == PLANT_NAME + 24, "plant_page.py reads it");
+_Static_assert(sizeof(struct plant_page_stepper) == PLANT_NAME + 32 + 16 * PLANT_HISTORY,
+               "plant_page.py reads it");
 
 // Puts a step to the others.
 void plant_page_step(struct plant_page_stepper *stepper, uint64_t ns, int64_t count);

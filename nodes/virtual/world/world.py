@@ -291,7 +291,7 @@ class WorldNode:
 
         It goes before inputs and axes of the same pins. `connect_plants` lets several see each other.
         """
-        return SimPlant(lib.world_node_board(self.raw), plant)
+        return SimPlant(lib.world_node_board(self.raw), plant, lambda: self._world.now_ns)
 
     def axis_position(self, number: int) -> int:
         """Return where axis NUMBER is, in steps."""

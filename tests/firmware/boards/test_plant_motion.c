@@ -126,6 +126,22 @@ static void test_a_switch_with_travel_and_stops(void) {
     free(rig);
 }
 
+static void test_two_switches_on_one_pin(void) {
+    struct rig *rig = new_rig("plant node=n\n"
+                              "stepper name=both step=PA5 dir=PA6 both_edges=1\n"
+                              "axis name=x\nterm axis=x node=- stepper=both mm=1\n"
+                              "switch name=low pin=PB0 axis=x at=-3 direction=-1 inverted=1\n"
+                              "switch name=high pin=PB0 axis=x at=3 direction=1 inverted=1\n");
+    CHECK(pressed(rig, SWITCH_PIN)); // free is high
+    steps_both(rig, 3);
+    CHECK(!pressed(rig, SWITCH_PIN));
+    steps_both(rig, -5);
+    CHECK(pressed(rig, SWITCH_PIN));
+    steps_both(rig, -1);
+    CHECK(!pressed(rig, SWITCH_PIN));
+    free(rig);
+}
+
 static void test_noise_moves_the_switch_between_approaches(void) {
     struct rig *rig = new_rig("plant node=n seed=3\n"
                               "stepper name=both step=PA5 dir=PA6 both_edges=1\n"
@@ -243,6 +259,7 @@ static void test_reading_while_it_is_written(void) {
 int main(void) {
     test_drivers();
     test_a_switch_with_travel_and_stops();
+    test_two_switches_on_one_pin();
     test_noise_moves_the_switch_between_approaches();
     test_an_axis_of_two_other_nodes();
     test_history_wraps();
