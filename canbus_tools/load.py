@@ -296,7 +296,7 @@ def what_is(key: int) -> str:
     known = frame_format(key, bytes(8))
     if known is not None and known.command is None:
         return known.name
-    return {0x3F0: "admin, host", 0x3F1: "admin, nodes"}.get(key, TrafficClass.OTHER.value)
+    return {0x3F0: "admin, host", 0x3F1: "admin, nodes", 0x3F2: "tables"}.get(key, TrafficClass.OTHER.value)
 
 
 def _bar(mean: float, peak: float, width: int = BAR) -> str:

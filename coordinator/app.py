@@ -242,6 +242,11 @@ class Machine:
             return bus.name, bus.nodeid(uuid), str(uuid)
         return bus.name, None, None
 
+    def can_bus(self, node: Node) -> CanBus | None:
+        """Return the CAN bus of NODE; None when it is on a serial line."""
+        bus = self._bus_of[node]
+        return bus if isinstance(bus, CanBus) else None
+
     def bus_stats(self) -> dict[str, IOStats]:
         """Return the counters of every bus that is open, by its name."""
         return {o.bus.name: o.bus.io.stats() for o in self._open if o.bus.closed_because is None}

@@ -20,6 +20,7 @@ from coordinator.commands import (
     SimulateOptions,
     find_machine,
 )
+from coordinator.network_words import declare_network, read_announce, read_metrics
 from nodes.option_values import UsageError, assignments, existing_file, share, whole
 
 Job = Callable[[], Report]
@@ -38,6 +39,8 @@ FRONT_END_COMMANDS = {
     "status": "Tell how a machine that runs is doing.",
     "send": "Send a file to a machine that runs, and print it.",
     "estop": "Stop a machine that runs, at once.",
+    "discover": "List the machines that run here or are announced on the network.",
+    "table": "Check compensation tables of axes, and give them to a machine that runs.",
     "completion": "Write what makes a shell complete the words of canductor.",
 }
 """Commands whose words are read by ``coordinator.front_end_words``."""
@@ -224,7 +227,7 @@ def _demo(given: argparse.Namespace) -> Job:
         rate_ppm=assignments("--rate-ppm", given.rate_ppm, _ppm),
         start_clock=assignments("--start-clock", given.start_clock, _ticks),
         keep=given.keep,
-        serve=_serving(given, machine) if given.serve else None,
+        serve=_serving(given, machine, announce=False) if given.serve else None,
         socketcan=_interfaces(given.socketcan),
     )
     if options.socketcan and options.loss:
@@ -254,7 +257,7 @@ def _declare_run(command: argparse.ArgumentParser) -> None:
 
 def _run(given: argparse.Namespace) -> Job:
     existing_file(given.config)
-    asked = given.ipc is not None or given.tcp is not None
+    asked = any(word is not None for word in (given.ipc, given.tcp, given.metrics))
     if asked and given.gcode is not None:
         raise UsageError("--gcode prints a file and ends; leave it out to serve front ends")
     serves = asked or (given.gcode is None and sys.stdin is not None and sys.stdin.isatty())
@@ -280,9 +283,10 @@ def _declare_serving(command: argparse.ArgumentParser) -> None:
     add("--tls-certificate", type=Path, metavar="FILE", help="certificate chain, PEM")
     add("--tls-key", type=Path, metavar="FILE", help="private key, PEM")
     add("--no-tls-on-loopback", action="store_true", help="TCP without TLS, on a loopback address only")
+    declare_network(add)
 
 
-def _serving(given: argparse.Namespace, config: Path) -> ServeOptions:
+def _serving(given: argparse.Namespace, config: Path, announce: bool | None = None) -> ServeOptions:
     name = given.name or (config.parent.name if config.stem == "machine" else config.stem)
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,48}", name):
         raise UsageError(f"--name is '{name}', must be 1 to 48 letters, digits, - and _")
@@ -300,6 +304,9 @@ def _serving(given: argparse.Namespace, config: Path) -> ServeOptions:
         certificate=existing_file(given.tls_certificate),
         private_key=existing_file(given.tls_key),
         plain_on_loopback=given.no_tls_on_loopback,
+        announce=read_announce(given, announce),
+        metrics=read_metrics(given),
+        metrics_open=given.metrics_open,
     )
 
 

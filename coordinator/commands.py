@@ -53,6 +53,12 @@ class ServeOptions:
     certificate: Path | None = None
     private_key: Path | None = None
     plain_on_loopback: bool = False
+    announce: bool | None = None
+    """Announce the machine on the network; None: if its TCP port can be reached from there."""
+    metrics: tuple[str, int] | None = None
+    """IP address and port of the figures for Prometheus."""
+    metrics_open: bool = False
+    """Whether others than this computer may read them."""
 
 
 @record(kw_only=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from coordinator.commands import Report
+from coordinator.table.words import declare_table
 from nodes.errors import CanductorError
 from nodes.option_values import UsageError, existing_file, number, whole
 from nodes.records import record
@@ -30,6 +31,9 @@ class Target:
 def declare(command: argparse.ArgumentParser, name: str) -> None:
     """Add the options of the command NAME."""
     add = command.add_argument
+    if name == "table":
+        declare_table(command, _add_target, _target)
+        return
     if name == "call":
         add("method", help="its name; api.methods lists all")
         add("params", nargs="*", metavar="NAME=VALUE", help="parameters; values as JSON, or as they are")
@@ -44,13 +48,20 @@ def declare(command: argparse.ArgumentParser, name: str) -> None:
         add("--no-start", action="store_true", help="only send it")
     elif name == "completion":
         add("shell", choices=SHELLS, help="for which shell")
-    if name != "completion":
-        add("--at", metavar="ADDRESS", help="socket, tcp://HOST:PORT or tls://HOST:PORT")
-        add("--token-file", type=Path, metavar="FILE", help="file that holds the token, for TCP")
-        add("--certificate", type=Path, metavar="PEM", help="certificate that the server must have")
-        add("--timeout", default="5", metavar="S", help="for the machine to answer; 5 if not given")
+    elif name == "discover":
+        add("--timeout", default="3", metavar="S", help="for machines to answer; 3 if not given")
+    if name not in ("completion", "discover"):
+        _add_target(command)
     add("--json", action="store_true", help="print one JSON object as the last line")
     command.set_defaults(make_job=_MAKERS[name])
+
+
+def _add_target(command: argparse.ArgumentParser) -> None:
+    add = command.add_argument
+    add("--at", metavar="ADDRESS", help="socket, tcp://HOST:PORT or tls://HOST:PORT")
+    add("--token-file", type=Path, metavar="FILE", help="file that holds the token, for TCP")
+    add("--certificate", type=Path, metavar="PEM", help="certificate that the server must have")
+    add("--timeout", default="5", metavar="S", help="for the machine to answer; 5 if not given")
 
 
 def _target(given: argparse.Namespace) -> Target:
@@ -120,6 +131,11 @@ def _estop(given: argparse.Namespace) -> Callable[[], Report]:
     return lambda: _run("estop", target)
 
 
+def _discover(given: argparse.Namespace) -> Callable[[], Report]:
+    timeout_s = number("--timeout", given.timeout, 0.1, 60, "s")
+    return lambda: _run("discover", timeout_s)
+
+
 def _completion(given: argparse.Namespace) -> Callable[[], Report]:
     return lambda: _run("completion", given.shell)
 
@@ -131,4 +147,5 @@ _MAKERS: Final = {
     "send": _send,
     "estop": _estop,
     "completion": _completion,
+    "discover": _discover,
 }

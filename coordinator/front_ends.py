@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from coordinator.commands import Terminated
+from coordinator.commands import Report, Terminated
 from coordinator.front_end_words import Target
 from coordinator.interrupts import run_to_end
 from coordinator.ipc.client import Client, Update
@@ -165,6 +165,13 @@ def _show_progress(sent: int, size: int, *, quiet: bool) -> None:
     if not quiet and sys.stderr.isatty():
         end = "\n" if sent >= size else ""
         sys.stderr.write(f"\rsent {sent:,} of {size:,} bytes{end}")
+
+
+def discover(timeout_s: float) -> Report:
+    """List the machines that answer within TIMEOUT_S."""
+    from coordinator.discover import find_machines  # noqa: PLC0415 (an emergency stop shall not pay for it)
+
+    return run_to_end(lambda: find_machines(timeout_s))
 
 
 def completion(shell: str) -> Answer:

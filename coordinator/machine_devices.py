@@ -11,6 +11,7 @@ from coordinator.machine.description import (
 )
 from coordinator.modules.module_set import ModuleSet
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
+from coordinator.table.axle_map import stepper_tables
 from nodes.devices.endstop import Endstop
 from nodes.devices.stepper import Stepper
 from nodes.devices.trsync import Trsync
@@ -37,6 +38,8 @@ class MachineDevices:
             node: Trsync(f"homing on node {node}") for node in self._homing_nodes()
         }
         """By node, of all that take part in homing."""
+        self.tables = stepper_tables(description, self.steppers)
+        """Compensation tables, of steppers whose axes may have such."""
 
     def build_config(self, node: str, dictionary: Dictionary) -> NodeConfig:
         """Return what NODE is to be configured as; raises CanductorError when it cannot be that."""
@@ -49,6 +52,9 @@ class MachineDevices:
                 stepper.dir_pin.number(numbers)
                 self.steppers[stepper.name].configure(config)
         self._add_homing(config, numbers)
+        for tables in self.tables:
+            if tables.node == node:
+                tables.configure(config)
         self.modules.configure(config)
         self._spread_shutdown(config)
         return config

@@ -124,8 +124,14 @@ class CanBus(BusBase):
         # Boards are built for one bit rate, and this one has just been heard at it.
         self.io.learn_bitrate(node.dictionary.int_constant("CANBUS_FREQUENCY", 0))
 
-    def _send_frame(self, can_id: int, data: bytes) -> None:
+    def send_frame(self, can_id: int, data: bytes) -> None:
+        """Send a frame that is no node's, before all data; raises CanductorError when it cannot be queued."""
         self.io.send_frame(can_id, data)
+
+    @property
+    def bitrate(self) -> int:
+        """Bit/s; 0 while it is not known."""
+        return self.io.stats().bitrate
 
     def nodeid(self, uuid: Uuid) -> int:
         """Return the id UUID has, or gets."""
@@ -151,7 +157,7 @@ class CanBus(BusBase):
         loop = asyncio.get_running_loop()
         keeper = PulseKeeper(
             lambda: [node for node in self.nodes if _knows_pulses(node)],
-            self._send_frame,
+            self.send_frame,
             lambda: HostTime(_ns(loop.time())),
         )
         # From the start, so that the clocks agree when the nodes are ready.

@@ -39,7 +39,9 @@ OnFrame = Callable[[FrameLike], None]
 class LinkLike(Protocol):
     """The reliable way to one node. Callbacks run on the control loop."""
 
-    def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0) -> None: ...  # noqa: D102
+    def send(  # noqa: D102
+        self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False
+    ) -> None: ...
     def send_batch(self, buffer: bytes, /) -> None: ...  # noqa: D102
     def send_urgent(self, content: bytes) -> None: ...  # noqa: D102
     def set_receive_window(self, size: int, /) -> None: ...  # noqa: D102

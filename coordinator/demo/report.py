@@ -29,7 +29,7 @@ class DemoReport:
     steppers: tuple[StepperProof, ...]
     clocks: tuple[ClockProof, ...]
     stray_edges: int
-    """Level changes of pins that are no stepper's."""
+    """Level changes of pins that are nobody's."""
     nodes: tuple[NodeReport, ...]
     frames: int
     frames_lost: int
@@ -108,7 +108,7 @@ class DemoReport:
         failed = [s.stepper for s in self.steppers if not s.holds]
         if failed:
             return f"{', '.join(failed)} did not do what was planned"
-        return f"{self.stray_edges} changes of pins that are no stepper's"
+        return f"{self.stray_edges} changes of pins that are nobody's"
 
 
 def _node_line(node: NodeReport) -> str:

@@ -112,7 +112,7 @@ class _Prover:
         ]
 
     def stray_edges(self) -> int:
-        """Count level changes of pins that no stepper of the node owns."""
+        """Count level changes of pins that neither a stepper nor a module of the node owns."""
         return sum(self._stray(node.name, log) for node, log in self._with_logs())
 
     def _with_logs(self) -> Iterator[tuple[Any, EdgeLog]]:
@@ -126,6 +126,8 @@ class _Prover:
             if stepper.node == node
             for pin in (stepper.step_pin, stepper.dir_pin)
         ]
+        modules = self._description.modules.build().pins.names(node)
+        owned += [self._pins[name] for name in modules if self._pins[name] not in owned]
         counted = sum(len(clock) for clock, _, _ in log.edges(*owned))
         return log.record_count - counted
 

@@ -48,6 +48,8 @@ class IpcServer:
         self._gone = SessionCounters()
         self.tcp_port: int | None = None
         """The port, once open; of use where the settings say 0, any port."""
+        self.tcp_addresses: list[str] = []
+        """The IP addresses that the port is open on; 0.0.0.0 and :: stand for all."""
 
     # ------------------------------------------------------------------------------------------- life
 
@@ -140,6 +142,7 @@ class IpcServer:
             ) from None
         self._servers.append(server)
         self.tcp_port = server.sockets[0].getsockname()[1]
+        self.tcp_addresses = [opened.getsockname()[0] for opened in server.sockets]
 
     # ---------------------------------------------------------------------------------------- clients
 

@@ -29,6 +29,7 @@ from coordinator.machine.read_nodes import check_policies, make_pin_registry, re
 from coordinator.machine.read_printer import open_printer, read_printer
 from coordinator.machine.read_shaper import read_shapers
 from coordinator.machine.read_steppers import is_extra_stepper
+from coordinator.machine.read_tables import read_axis_tables
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_SECTIONS
 from coordinator.modules.module_set import ModuleSource, ModuleSources
@@ -55,7 +56,10 @@ __all__ = [
     "load_machine",
 ]
 
-_SINGLE_SECTIONS = ("printer", "stepper_x", "stepper_y", "stepper_z", "extruder", "input_shaper")
+_SINGLE_SECTIONS = (
+    *("printer", "stepper_x", "stepper_y", "stepper_z", "extruder", "input_shaper"),
+    "axis_tables",
+)
 _NAMED_SECTIONS = ("mcu", "board_pins", "duplicate_pin_override")
 _MOTION_SECTIONS = re.compile(
     r"stepper_([a-z]|bed|arm|left|right)|extruder[1-9]?|extruder1[0-5]|dual_carriage"
@@ -86,6 +90,7 @@ def load_machine(path: str) -> MachineDescription:
     )
     followers = read_extruder_steppers(reading, extruders)
     shapers = read_shapers(reading)
+    axis_tables = read_axis_tables(reading)
     modules = _read_modules(reading)
     description = MachineDescription(
         path=config.path,
@@ -102,6 +107,7 @@ def load_machine(path: str) -> MachineDescription:
         modules=modules,
         not_yet_acting=(*later, *_later_sections(reading, kinematics)),
         notes=tuple(config.notes),
+        axis_tables=axis_tables,
     )
     _check_names(description)
     check_policies(description.nodes, description.steppers)

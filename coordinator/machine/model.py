@@ -186,6 +186,15 @@ class ShaperDescription:
 
 
 @record
+class AxisTablesDescription:
+    """That axes may have compensation tables, which nodes of this project's firmware keep too."""
+
+    points: int
+    """Room of each table."""
+    place: Place
+
+
+@record
 class NotYetActing:
     """What was recognised but belongs to a module that is not built yet."""
 
@@ -224,6 +233,8 @@ class MachineDescription:
     not_yet_acting: tuple[NotYetActing, ...]
     notes: tuple[str, ...]
     """Sentences about what has no effect."""
+    axis_tables: AxisTablesDescription | None = None
+    """None: axes have no tables."""
 
     @property
     def homed_position(self) -> dict[str, float]:

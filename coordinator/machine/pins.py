@@ -124,6 +124,10 @@ class PinRegistry:
             self._check_shared(claimed, option.share, user, share)
         return claimed
 
+    def names(self, node: str) -> list[str]:
+        """Return the pins of a node that somebody has."""
+        return [name for at, name in self._users if at == node]
+
     def check_unclaimed(self, options: Iterable[RawOption], section: str) -> None:
         """Raise ConfigError when a section that does not act yet names a pin that is not to be shared.
 

@@ -17,6 +17,7 @@ from coordinator.machine import (
     read_rails,
     read_rotary_delta,
     read_shaper,
+    read_tables,
     read_winch,
 )
 from coordinator.machine.options import Option, SectionSpec
@@ -63,6 +64,7 @@ SECTIONS: dict[str, SectionSpec] = {
     "[heater_fan NAME]": automatic_fans.HeaterFan.SPEC,
     "[controller_fan NAME]": automatic_fans.ControllerFan.SPEC,
     "[temperature_fan NAME]": temperature_fan.TemperatureFan.SPEC,
+    "[axis_tables]": read_tables.AXIS_TABLES,
     "[board_pins], [board_pins NAME]": read_nodes.BOARD_PINS,
     "[duplicate_pin_override]": read_nodes.DUPLICATE_PIN_OVERRIDE,
 }

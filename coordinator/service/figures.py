@@ -186,11 +186,14 @@ def _firmware(node: Node) -> dict[str, Value]:
 def _clock(node: Node) -> dict[str, Value]:
     error_s = node.clock_error_s
     if error_s is None:
-        return {"clock_error_us": None, "clock_drift_ppm": None, "clock_source": None}
-    drift = node.clock.estimate().freq_hz / node.clock_freq_hz - 1.0
+        return {"clock_error_us": None, "clock_drift_ppm": None, "clock_offset_s": None, "clock_source": None}
+    estimate = node.clock.estimate()
+    drift = estimate.freq_hz / node.clock_freq_hz - 1.0
+    offset_s = estimate.at_ticks / node.clock_freq_hz - estimate.at_ns * 1e-9
     return {
         "clock_error_us": round(error_s * 1e6, 2),
         "clock_drift_ppm": round(drift * 1e6, 3),
+        "clock_offset_s": round(offset_s, 7),
         "clock_source": node.clock_source,
     }
 

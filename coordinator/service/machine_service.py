@@ -5,8 +5,9 @@ One object owns it. All of it runs on the control loop; clients' methods only ch
 
 import asyncio
 import contextlib
+import secrets
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Final
@@ -23,7 +24,9 @@ from coordinator.service.job_folder import JobFolder
 from coordinator.service.jobs import JobPhase, JobRun
 from coordinator.service.log_ring import Entry, LogRing
 from coordinator.service.motion import Motion
+from coordinator.service.tables import TableService
 from coordinator.service.work import FileWork
+from coordinator.table.store import TableStore
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 
@@ -54,6 +57,10 @@ class ServiceSettings:
     """The folder of files that may be printed; None: there are no jobs."""
     node_commands: bool = False
     """Whether ``node.command`` may send raw commands."""
+    id: str = field(default_factory=lambda: secrets.token_hex(8))
+    """Of this life of the service: tells whether two addresses lead to the same one."""
+    tables: Path | None = None
+    """Where accepted axis tables are kept; None: only as long as the service lives."""
 
 
 class MachineService:
@@ -84,6 +91,11 @@ class MachineService:
         """The last one, also when it has ended."""
         self.confirmed_s: dict[str, float] = {}
         """By node: how long after the stop it confirmed it."""
+        self.tables = TableService(
+            None if settings.tables is None else TableStore(settings.tables),
+            state,
+            lambda text: self.log.add("notice", text),
+        )
         self.starts = 0
         self.cut_off = False
         """Whether ``run`` was ended while something moved."""
@@ -137,6 +149,7 @@ class MachineService:
         await self._move(machine)
 
     async def _move(self, machine: Machine) -> None:
+        care = asyncio.ensure_future(self.tables.care(machine, self.stands))
         try:
             self.motion = Motion(machine, on_told=self._told, on_cycle=self.look)
             self._enter(ServiceState.READY)
@@ -148,6 +161,11 @@ class MachineService:
         except Exception as bug:
             machine.stop(f"internal error: {type(bug).__name__}: {bug}; all nodes were stopped")
             raise
+        finally:
+            care.cancel()
+            (ended,) = await asyncio.gather(care, return_exceptions=True)
+            if isinstance(ended, Exception):
+                raise ended  # a bug of it, which expects all that may happen
 
     def _stopped(self, machine: Machine) -> None:
         """Take note that the machine is stopped; again, without effect."""
@@ -216,6 +234,11 @@ class MachineService:
     def active_job(self) -> JobRun | None:
         """The job that is on its way."""
         return self.job if self.job is not None and self.job.active else None
+
+    def stands(self) -> bool:
+        """Tell whether nothing moves, and nothing is about to."""
+        motion = self.motion
+        return motion is not None and motion.standing and not motion.feeder.busy and self.active_job is None
 
     def ready_motion(self) -> Motion:
         """Return what moves the machine; raises ApiError when that is not possible now."""

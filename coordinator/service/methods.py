@@ -9,6 +9,7 @@ from coordinator.service.methods_machine import machine_methods
 from coordinator.service.methods_motion import motion_methods
 from coordinator.service.methods_nodes import node_methods
 from coordinator.service.methods_plots import plot_methods
+from coordinator.service.methods_tables import table_methods
 
 
 def add_methods(service: MachineService, registry: Registry) -> None:
@@ -23,3 +24,4 @@ def _every(service: MachineService) -> Iterable[Method]:
     yield from job_methods(service)
     yield from node_methods(service)
     yield from plot_methods(service)
+    yield from table_methods(service)

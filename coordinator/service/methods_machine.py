@@ -30,6 +30,7 @@ def machine_methods(service: MachineService) -> Iterator[Method]:
         described = None if service.machine is None else service.machine.description
         return {
             "name": service.settings.name,
+            "id": service.settings.id,
             "version": told_version,
             "host": platform.node(),
             "started_s": round(started_s, 3),
@@ -66,6 +67,7 @@ def machine_methods(service: MachineService) -> Iterator[Method]:
         info,
         returns=(
             Param("name", Kind.STR),
+            Param("id", Kind.STR, "of this life of the service: are two addresses of the same one?"),
             Param("version", Kind.STR, "of canductor"),
             Param("host", Kind.STR, "the computer it runs on"),
             Param("started_s", Kind.FLOAT, "when the service started, since the epoch", "s"),

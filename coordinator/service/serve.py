@@ -1,15 +1,22 @@
 """Serves a machine to front ends until Ctrl-C or SIGTERM: ``canductor run``, ``canductor demo --serve``."""
 
+import platform
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from ipaddress import ip_address
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from coordinator.command_line import version
 from coordinator.commands import RunOptions, ServeOptions
 from coordinator.host import LinuxHost
 from coordinator.interrupts import run_to_end
-from coordinator.ipc.methods import Registry
+from coordinator.ipc.announcement import Announcement, bracketed, host_word
+from coordinator.ipc.announcer import Announcer
+from coordinator.ipc.methods import Registry, Value
 from coordinator.ipc.server import IpcServer
+from coordinator.ipc.session_methods import API_VERSION
 from coordinator.ipc.settings import IpcSettings, TcpSettings
 from coordinator.ipc.state import StateTree
 from coordinator.ipc.uploads import upload_method
@@ -18,8 +25,12 @@ from coordinator.service.log_ring import Entry
 from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
 from coordinator.service.typed import Typed
+from coordinator.table.store import table_folder
 from nodes.dictionary_cache import DictionaryCache
 from nodes.host_sockets import socket_folder
+
+if TYPE_CHECKING:
+    from coordinator.metrics.server import MetricsServer
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,12 +88,16 @@ class _Hall:
         self._load = load
         self._options = options
         self._cache = cache
+        self._announcer: Announcer | None = None
 
     async def serve(self) -> None:
         """Be there for front ends until cancelled."""
         registry, tree = Registry(), StateTree()
         settings = ServiceSettings(
-            name=self._options.name, jobs=self._options.jobs, node_commands=self._options.node_commands
+            name=self._options.name,
+            jobs=self._options.jobs,
+            node_commands=self._options.node_commands,
+            tables=table_folder(self._options.name),
         )
         service = MachineService(
             self._load,
@@ -90,7 +105,7 @@ class _Hall:
             tree,
             settings,
             cache=self._cache,
-            on_line=self._tell,
+            on_line=lambda entry: self._tell(service, entry),
         )
         add_methods(service, registry)
         if settings.jobs is not None:
@@ -98,6 +113,8 @@ class _Hall:
         self._server = IpcServer(registry, tree, _ipc_settings(self._options, self.path))
         await self._server.start()
         _say(f"serving at {self.path}")
+        metrics = await self._open_metrics(tree)
+        self._announcer = self._announce(service)
         typed = Typed(service, _say) if sys.stdin is not None and sys.stdin.isatty() else None
         try:
             await service.run()
@@ -106,11 +123,61 @@ class _Hall:
                 typed.close()
             self.state = str(service.state)
             self.cut_off = service.cut_off
+            if self._announcer is not None:
+                await self._announcer.close()
+            if metrics is not None:
+                await metrics.close()
             await self._server.close()
 
-    def _tell(self, entry: Entry) -> None:
+    async def _open_metrics(self, tree: StateTree) -> "MetricsServer | None":
+        """Open the endpoint for Prometheus if asked for; raises CanductorError with the server closed."""
+        if self._options.metrics is None:
+            return None
+        from coordinator.metrics.server import MetricsServer, MetricsSettings  # noqa: PLC0415 (if needed)
+
+        def fields() -> dict[str, Value]:
+            figures = {f"api.{name}": value for name, value in self._server.figures().items()}
+            return tree.snapshot().values | figures
+
+        host, port = self._options.metrics
+        about = {"name": self._options.name, "version": version(), "api": str(API_VERSION)}
+        metrics = MetricsServer(fields, about, MetricsSettings(host, port, open=self._options.metrics_open))
+        try:
+            await metrics.start()
+        except BaseException:
+            await self._server.close()
+            raise
+        _say(f"metrics are at http://{bracketed(host)}:{metrics.port}/metrics")
+        return metrics
+
+    def _announce(self, service: MachineService) -> Announcer | None:
+        """Have the network told of the machine, if it is to be."""
+        bound, port = self._server.tcp_addresses, self._server.tcp_port
+        wanted = self._options.announce
+        if wanted is None:
+            wanted = not all(ip_address(address.partition("%")[0]).is_loopback for address in bound)
+        if not wanted or port is None:
+            return None
+        machine = Announcement(
+            name=service.settings.name,
+            host=host_word(platform.node()),
+            version=version(),
+            state=str(service.state),
+            api=API_VERSION,
+            tls=self._options.certificate is not None and self._options.private_key is not None,
+            id=service.settings.id,
+            port=port,
+            addresses=(),
+        )
+        announcer = Announcer(machine, bound, lambda sentence: service.log.add("network", sentence))
+        announcer.start()
+        return announcer
+
+    def _tell(self, service: MachineService, entry: Entry) -> None:
         self._server.notify("log", dict(entry))
         _say(str(entry["text"]))
+        if self._announcer is not None and entry["kind"] == "state":
+            self._announcer.state(str(service.state))
 
 
 def _ipc_settings(options: ServeOptions, path: Path) -> IpcSettings:

@@ -23,6 +23,17 @@ EXTENSIONS: Final = frozenset(
     (
         *("CAN_SYNC_PULSE", "CAN_TRIGGER_GROUPS", "CAN_BUS_STOP", "CAN_WHO_IS_HERE"),
         *("get_sync_pulse", "sync_pulse", "trsync_set_group", "set_bus_stop"),
+        *(
+            "MT_AXLES",
+            "config_table",
+            "table_bytes",
+            "table_query",
+            "table_state",
+            "table_read",
+            "table_pair",
+        ),
+        *("table_activate", "table_query_active", "table_active"),
+        *("config_table_register", "table_register_poll", "table_register_write"),
     )
 )
 """What the dictionary of firmware without this project's extensions does not have."""

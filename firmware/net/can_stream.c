@@ -6,6 +6,7 @@
 #include "net/can_stream.h"
 
 #include "boards/board.h"
+#include "objects/table.h"
 
 #include <string.h>
 
@@ -69,6 +70,8 @@ void can_stream_receive(struct node *node, uint32_t id, const uint8_t *data, siz
         bus_signals_receive(node, id, data, size);
     } else if (id == CAN_ID_ADMIN_REQUEST) {
         receive_admin(node, data, size);
+    } else if (id == CAN_ID_TABLES) {
+        table_receive_frame(node, data, size);
     } else if (stream->node_id && id == receive_id(stream)) {
         stream->frames_in++;
         node_receive(node, data, size);

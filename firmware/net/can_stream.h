@@ -8,6 +8,7 @@
 #include "net/discovery.h"
 
 enum { CAN_ID_ADMIN_REQUEST = 0x3F0, CAN_ID_ADMIN_RESPONSE = 0x3F1, CAN_FRAME_MAX = 8 };
+enum { CAN_ID_TABLES = 0x3F2 }; // words of MT for all nodes, ids or not (objects/table.h)
 
 enum { SET_NODEID = 0x01, SYNC_PULSE = 0x40 }; // admin commands; those of questions are in discovery.h
 

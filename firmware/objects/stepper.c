@@ -3,6 +3,8 @@
 //
 // Step times are exact: each is computed from the previous one, never from when a timer really ran. Steps
 // come as pulses of pulse_ticks, or (both edges) as one change of level each, which halves the work.
+#include "objects/stepper.h"
+
 #include "boards/board.h"
 #include "objects/trsync.h"
 
@@ -52,6 +54,14 @@ static const struct oid_type stepper_type = {"stepper"};
 
 static struct stepper *find(struct node *node, uint32_t oid) {
     return oid_find(node, oid, &stepper_type);
+}
+
+const struct stepper *stepper_find(struct node *node, uint32_t oid) {
+    return find(node, oid);
+}
+
+int stepper_moves(const struct stepper *stepper) {
+    return stepper->moving;
 }
 
 // -------------------------------------------------------------------------------------------------- stepping

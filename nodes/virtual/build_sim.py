@@ -45,7 +45,7 @@ ffibuilder = builder(
     "nodes.virtual._sim",
     headers=[
         *CORE_HEADERS,
-        *("nodes/can_bits.h", "firmware/boards/sim/sim.h"),
+        *("nodes/can_bits.h", "firmware/objects/mt.h", "firmware/boards/sim/sim.h"),
         *("nodes/virtual/world/can_wire.h", "nodes/virtual/world/world.h"),
     ],
     # The wire codec is in both, and linked once.

@@ -205,8 +205,9 @@ class TwinLink:
         self.clocks: list[tuple[float, int, int]] = []
         self.sent: list[tuple[bytes, int, int]] = []
 
-    def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0) -> None:
+    def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False) -> None:
         assert not self.closed
+        assert not bulk, "no test sends bulk data to a twin"
         self.sent.append((content, min_clock, req_clock))
         self._to_node.append((content, self.io.now_ns()))
         asyncio.get_running_loop().call_later(DELAY_S, self._arrive)

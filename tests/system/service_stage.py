@@ -37,13 +37,19 @@ class Served:
     """A service that runs, and how to call it."""
 
     def __init__(
-        self, folder: Path, load: Callable[[], MachineDescription], host: Host, *, node_commands: bool = False
+        self,
+        folder: Path,
+        load: Callable[[], MachineDescription],
+        host: Host,
+        *,
+        node_commands: bool = False,
+        tables: Path | None = None,
     ) -> None:
         self.jobs = folder / "jobs"
         self.jobs.mkdir(exist_ok=True)
         self.tree = StateTree()
         self.lines: list[str] = []
-        settings = ServiceSettings(name="test", jobs=self.jobs, node_commands=node_commands)
+        settings = ServiceSettings(name="test", jobs=self.jobs, node_commands=node_commands, tables=tables)
         self.service = MachineService(
             load, host, self.tree, settings, on_line=lambda entry: self.lines.append(str(entry["text"]))
         )

@@ -2,17 +2,19 @@
 // sources: firmware/wire/*.c firmware/core/*.c firmware/objects/*.c firmware/net/*.c
 // sources: firmware/boards/virtual/*.c firmware/boards/sim/sim.c build/sim/tables.c
 // Whatever a wire brings, a node survives: random commands with random arguments in sound blocks, and the
-// same with damage, under the sanitizers; on CAN also signals, admin commands and other nodes' frames.
+// same with damage, under the sanitizers; on CAN also signals, admin commands, tables and other nodes'
+// frames.
 // Everything follows from the seed that a failure prints.
 #include "boards/sim/sim.h"
 #include "core/node.h"
 #include "net/can_stream.h"
+#include "objects/mt.h"
 #include "tests/check.h"
 
 #include <string.h>
 
-enum { ROUNDS = 40, BLOCKS = 600, OIDS = 8, NODE_ID = 4, TO_NODE = 0x108, FROM_NODE = 0x109 };
-enum { DAMAGED = 1, ON_CAN = 2 };
+enum { ROUNDS = 40, BLOCKS = 600, OIDS = 10, NODE_ID = 4, TO_NODE = 0x108, FROM_NODE = 0x109 };
+enum { DAMAGED = 1, ON_CAN = 2, TABLE_ROOM = 4 };
 
 static const uint8_t uuid[NODE_UUID_SIZE] = {1, 2, 3, 4, 5, 6};
 
@@ -26,6 +28,8 @@ DECL_COMMAND(command_config_digital_out, "", 0);
 DECL_COMMAND(command_config_pwm_out, "", 0);
 DECL_COMMAND(command_config_analog_in, "", 0);
 DECL_COMMAND(command_config_buttons, "", 0);
+DECL_COMMAND(command_config_table, "", 0);
+DECL_COMMAND(command_config_table_register, "", 0);
 
 DECL_COMMAND(command_queue_step, "", 0);
 DECL_COMMAND(command_set_next_step_dir, "", 0);
@@ -46,6 +50,11 @@ DECL_COMMAND(command_queue_pwm_out, "", 0);
 DECL_COMMAND(command_query_analog_in, "", 0);
 DECL_COMMAND(command_buttons_query, "", 0);
 DECL_COMMAND(command_buttons_ack, "", 0);
+DECL_COMMAND(command_table_activate, "", 0);
+DECL_COMMAND(command_table_query, "", 0);
+DECL_COMMAND(command_table_read, "", 0);
+DECL_COMMAND(command_table_register_poll, "", 0);
+DECL_COMMAND(command_table_register_write, "", 0);
 
 // What each object of configure() is used for; with `timed` the second argument is a clock.
 static const struct {
@@ -70,6 +79,11 @@ static const struct {
     {command_query_analog_in, 6, 1},
     {command_buttons_query, 7, 1},
     {command_buttons_ack, 7, 1},
+    {command_table_activate, 8, 1},
+    {command_table_query, 8, 0},
+    {command_table_read, 8, 0},
+    {command_table_register_poll, 9, 1},
+    {command_table_register_write, 9, 0},
     {command_queue_step, 1, 0},
     {command_queue_step, 0, 0},
     {command_queue_step, 1, 0},
@@ -110,6 +124,21 @@ static void assign(struct fuzz *fuzz) {
     memcpy(data + 1, uuid, sizeof(uuid));
     data[7] = NODE_ID;
     sim_receive_frame(fuzz->board, CAN_ID_ADMIN_REQUEST, data, sizeof(data));
+}
+
+// A frame with one or two words of tables, sometimes with a size that is none.
+static void send_table_frame(struct fuzz *fuzz) {
+    static const uint32_t words[] = {0x80000000u, 0x80000001u, 0x10000000u, 0x10000001u,
+                                     0x20000000u, 0x30000000u, 0x40000000u, 0};
+    uint8_t data[CAN_FRAME_MAX];
+    for (size_t at = 0; at < sizeof(data); at += MT_WORD_SIZE) {
+        uint32_t word = words[below(fuzz, sizeof(words) / sizeof(*words))];
+        word += word >> 31 ? 0 : below(fuzz, 2 * TABLE_ROOM);
+        for (size_t i = 0; i < MT_WORD_SIZE; i++)
+            data[at + i] = (uint8_t)(word >> (8 * i));
+    }
+    size_t size = below(fuzz, 8) ? MT_WORD_SIZE * (1 + below(fuzz, 2)) : below(fuzz, CAN_FRAME_MAX + 1);
+    sim_receive_frame(fuzz->board, CAN_ID_TABLES, data, size);
 }
 
 // A frame that is not data for this node: any signal, any admin command, sometimes a trigger of its group or
@@ -236,6 +265,8 @@ static void configure(struct fuzz *fuzz) {
         {command_config_pwm_out, {INT(5), INT(7), INT(9), INT(0), INT(0), INT(below(fuzz, 9000))}},
         {command_config_analog_in, {INT(6), INT(8)}},
         {command_config_buttons, {INT(7), INT(8)}},
+        {command_config_table, {INT(8), INT(1), INT(TABLE_ROOM), INT(below(fuzz, 2))}},
+        {command_config_table_register, {INT(9)}},
         {command_trsync_set_group, {INT(2), INT(below(fuzz, 3))}},
         {command_set_bus_stop, {INT(1)}},
         {command_finalize_config, {INT(1)}},
@@ -346,6 +377,8 @@ static unsigned one_round(uint64_t seed, int kind) {
         send_block(&fuzz, kind & DAMAGED);
         if (fuzz.on_can && below(&fuzz, 2))
             send_other_frame(&fuzz);
+        for (unsigned frames = fuzz.on_can ? below(&fuzz, 8) : 0; frames--;)
+            send_table_frame(&fuzz);
         uint32_t ticks = below(&fuzz, fuzz.on_can && !below(&fuzz, 16) ? 200000 : 3000);
         sim_run_until(fuzz.board, sim_clock(fuzz.board) + ticks);
         sim_set_input(fuzz.board, below(&fuzz, 144), (int)below(&fuzz, 2));

@@ -1,0 +1,140 @@
+"""A table on a node that MT brings (firmware/objects/table.h): its configuration, and what the node has."""
+
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final
+
+from nodes.node_config import NodeConfig, NodeConfigError
+from nodes.node_errors import NodeError
+from nodes.records import record
+from nodes.table.mt import AXLES, MtStatus, Pair, checksum, digest
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from nodes.devices.stepper import Stepper
+    from nodes.node import Node  # planning needs no node, which draws in asyncio
+
+COMMANDS: Final = ("config_table", "table_query", "table_bytes", "table_activate", "table_query_active")
+CONSTANT: Final = "MT_AXLES"
+"""Of the dictionary: the firmware keeps tables; its value is how many axles a mask can select."""
+CAPACITY_MAX: Final = 0xFFFF
+_NO_STEPPER: Final = 255
+
+
+@record
+class TableState:
+    """What a node says of the table it keeps."""
+
+    status: MtStatus
+    """Of the last transmission to it."""
+    generation: int
+    """How many tables it has kept since it was configured; 0: none, whatever the status."""
+    length: int
+    checksum: int
+    digest: int
+    words: int
+    """How many words of MT it has heard, modulo 2^32."""
+
+    def holds(self, pairs: "Sequence[Pair]") -> bool:
+        """Tell whether the table kept can only be PAIRS."""
+        found = (self.length, self.checksum, self.digest)
+        return self.generation > 0 and found == (len(pairs), checksum(pairs), digest(pairs))
+
+
+class Activation(IntEnum):
+    """What became of the last ``activate``."""
+
+    NEVER = 0
+    WAITING = 1
+    DONE = 2
+    LATE = 3
+    """The clock was in the past when the command came, or the node shut down before."""
+    MOVING = 4
+    """The table's stepper moved at that clock."""
+    REPLACED = 5
+    """Another table had been kept by then."""
+
+
+@record
+class ActiveTable:
+    """Which of the tables kept is in use."""
+
+    activation: Activation
+    generation: int
+    """0: none."""
+    length: int
+    clock32: int
+    """The node's clock at which it came into use."""
+
+
+class AxleTable:
+    """The table for AXLE (1..28) with room for CAPACITY pairs; in use or not, while STEPPER stands.
+
+    NAME is what messages call it, such as "axis x forward". NodeConfigError for an axle or capacity that
+    cannot be.
+    """
+
+    def __init__(self, name: str, axle: int, capacity: int, stepper: "Stepper | None" = None) -> None:
+        if axle not in AXLES or not 1 <= capacity <= CAPACITY_MAX:
+            raise NodeConfigError(
+                f"{name}: a table of axle {axle} with {capacity} points; give an axle of {AXLES[0]}.."
+                f"{AXLES[-1]} and 1..{CAPACITY_MAX} points"
+            )
+        self.name = name
+        self.axle = axle
+        self.capacity = capacity
+        self.oid: int | None = None
+        """Its object id; known when its node's configuration is built."""
+        self._stepper = stepper
+
+    def configure(self, config: NodeConfig) -> None:
+        """Add it to its node's CONFIG, after its stepper; NodeConfigError when firmware keeps no tables."""
+        config.require(self.name, COMMANDS)
+        stepper_oid = _NO_STEPPER if self._stepper is None else self._stepper.oid
+        assert stepper_oid is not None
+        self.oid = config.create_oid()
+        config.add_config(
+            self.name,
+            f"config_table oid={self.oid} axle={self.axle} capacity={self.capacity}"
+            f" stepper_oid={stepper_oid}",
+        )
+
+    async def state(self, node: "Node") -> TableState:
+        """Ask NODE for what it keeps; raises NodeError."""
+        answer = await node.query("table_query", "table_state", oid=self._oid())
+        status = answer.integer("table_status")
+        if status not in tuple(MtStatus):
+            raise NodeError(f"{self.name}: node {node.name} answered with an unknown status {status}")
+        return TableState(
+            MtStatus(status),
+            answer.integer("generation"),
+            answer.integer("length"),
+            answer.integer("checksum"),
+            answer.integer("digest"),
+            answer.integer("words"),
+        )
+
+    async def active(self, node: "Node") -> ActiveTable:
+        """Ask NODE which table is in use; raises NodeError."""
+        answer = await node.query("table_query_active", "table_active", oid=self._oid())
+        activation = answer.integer("table_activation")
+        if activation not in tuple(Activation):
+            raise NodeError(f"{self.name}: node {node.name} answered with an unknown activation {activation}")
+        return ActiveTable(
+            Activation(activation),
+            answer.integer("generation"),
+            answer.integer("length"),
+            answer.integer("clock"),
+        )
+
+    def activate(self, node: "Node", *, clock: int, generation: int) -> None:
+        """Have NODE use the table of GENERATION (0: none) from CLOCK (ticks) on; ``active`` tells whether.
+
+        Tables of several nodes come into use together when each gets its own clock of one moment.
+        """
+        node.send("table_activate", oid=self._oid(), clock=clock & 0xFFFFFFFF, generation=generation)
+
+    def _oid(self) -> int:
+        if self.oid is None:
+            raise NodeError(f"{self.name}: its node is not configured yet")
+        return self.oid

@@ -1,0 +1,257 @@
+"""Axis tables of a machine in virtual time: accepted, brought to the nodes, in use, kept over restarts."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.ipc.methods import ApiError
+from coordinator.machine.description import MachineDescription
+from coordinator.machine.model import AxisTablesDescription
+from coordinator.simulate.scenario import load
+from coordinator.simulate.stage import Stage
+from coordinator.table.axis_table import AxisTable
+from coordinator.table.store import TableStore
+from tests.system.service_stage import Served, running
+
+SCENARIOS = Path("coordinator/simulate/scenarios")
+POINTS = 32
+TABLE: dict[str, Any] = {
+    "axis": "x",
+    "positions": [0, 50, 100.5],
+    "forward": [0, 0.01, 0.02],
+    "reverse": [0.05, 0.06, 0.07],
+}
+SAME: dict[str, Any] = {**TABLE, "reverse": TABLE["forward"]}
+
+
+def with_tables(world: Stage) -> MachineDescription:
+    described = world.description
+    return replace(described, axis_tables=AxisTablesDescription(POINTS, described.nodes[0].place))
+
+
+class World:
+    """A simulated machine with tables, that coordinators come and go at."""
+
+    def __init__(self, folder: Path, scenario: str = "clean") -> None:
+        self.stage = Stage(load(SCENARIOS / f"{scenario}.toml"), 1)
+        self.folder = folder
+        self.tables = folder / "tables"
+
+    def live(self, *acts: Callable[[Served], Awaitable[None]]) -> None:
+        """Let a coordinator live for each of ACTS, one after the other."""
+
+        async def go() -> None:
+            for act in acts:
+                served = Served(
+                    self.folder, lambda: with_tables(self.stage), self.stage.host, tables=self.tables
+                )
+                async with running(served) as stage:
+                    await act(stage)
+
+        with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
+            runner.run(go())
+
+
+async def sides(served: Served, axis: str = "x") -> list[dict[str, Any]]:
+    (found,) = [one for one in (await served.call("table.status"))["axes"] if one["axis"] == axis]
+    nodes: list[dict[str, Any]] = found["nodes"]
+    return nodes
+
+
+async def in_use(served: Served, generation: int, points: int = 3) -> None:
+    """Wait until the nodes of x use the table of GENERATION."""
+
+    async def looks() -> bool:
+        found = await sides(served)
+        return bool(found) and all(
+            (side["status"], side.get("generation"), side.get("points"), side.get("active"))
+            == ("ok", generation, points, True)
+            for side in found
+        )
+
+    async with asyncio.timeout(30):
+        while not await looks():  # noqa: ASYNC110  virtual time
+            await asyncio.sleep(0.1)
+
+
+def test_a_table_is_kept_on_the_nodes_and_in_use(tmp_path: Path) -> None:
+    world = World(tmp_path)
+
+    async def act(served: Served) -> None:
+        told = await served.call("table.send", **TABLE)
+        (note,) = told["notes"]
+        assert note.startswith("axis x travels from 0 to 250 mm, the table covers 0 to 100.5; beyond it")
+        (axis,) = told["axes"]
+        assert axis["table"]["greatest_backlash"] == pytest.approx(0.05)
+        assert {(s["direction"], s["axle"], s["status"], s["active"]) for s in axis["nodes"]} == {
+            ("forward", 1, "ok", True),
+            ("reverse", 2, "ok", True),
+        }
+        await in_use(served, 1)
+        assert served.tree.get("tables.x.nodes_ok") == 2
+        assert served.tree.get("tables.x.problem") == ""
+
+    world.live(act)
+    assert list(TableStore(world.tables).load()[0]) == ["x"]
+
+
+def test_who_compensates_hears_of_every_change(tmp_path: Path) -> None:
+    heard: list[tuple[str, AxisTable | None]] = []
+
+    async def act(served: Served) -> None:
+        served.service.tables.on_change.append(lambda axis, table: heard.append((axis, table)))
+        await served.call("table.send", **SAME)
+        await served.call("table.remove", axis="x")
+
+    World(tmp_path).live(act)
+    table = AxisTable(
+        axis="x", positions=(0.0, 50.0, 100.5), forward=(0.0, 0.01, 0.02), reverse=(0.0, 0.01, 0.02)
+    )
+    assert heard == [("x", table), ("x", None)]
+
+
+def test_a_removed_table_is_gone_everywhere(tmp_path: Path) -> None:
+    world = World(tmp_path)
+
+    async def act(served: Served) -> None:
+        await served.call("table.send", **TABLE)
+        await served.call("table.remove", axis="x")
+        found = await sides(served)
+        assert [(side["points"], side["active"]) for side in found] == [(0, True)] * 2
+        with pytest.raises(ApiError, match="axis x has no table"):
+            await served.call("table.remove", axis="x")
+
+    world.live(act)
+    assert TableStore(world.tables).load() == ({}, [])
+
+
+def test_a_new_coordinator_finds_the_tables_where_they_are(tmp_path: Path) -> None:
+    async def first(served: Served) -> None:
+        await served.call("table.send", **TABLE)
+
+    async def second(served: Served) -> None:
+        await in_use(served, 1)  # nothing was sent again
+
+    World(tmp_path).live(first, second)
+
+
+def test_nodes_that_lost_them_get_them_again(tmp_path: Path) -> None:
+    world = World(tmp_path)
+
+    async def first(served: Served) -> None:
+        await served.call("table.send", **TABLE)
+        await served.call("table.send", **{**TABLE, "forward": [0.01, 0, 0], "reverse": [0.05, 0.07, 0.06]})
+        await in_use(served, 2)
+
+    async def second(served: Served) -> None:
+        await served.call("machine.emergency_stop")
+        await served.until_state("shutdown")
+        await served.call("machine.restart")  # a node that was shut down is configured anew
+        await served.until_state("ready")
+        await in_use(served, 1)
+
+    world.live(first, second)
+
+
+def test_what_a_client_breaks_off_arrives_all_the_same(tmp_path: Path) -> None:
+    """It was accepted: whether its sender is still there makes no difference."""
+
+    async def act(served: Served) -> None:
+        sending = asyncio.ensure_future(served.call("table.send", **TABLE))
+        await served.until(lambda: bool(served.service.tables.tables), "acceptance")
+        await asyncio.sleep(0.002)
+        sending.cancel()
+        await asyncio.gather(sending, return_exceptions=True)
+        assert sending.cancelled()
+        await in_use(served, 1)
+
+    World(tmp_path).live(act)
+
+
+def test_tables_change_only_while_the_machine_stands(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        await served.call("gcode.run", script="G28\nG1 X20 F6000")
+        busy = asyncio.ensure_future(served.call("move.by", x=100, speed_mm_s=50))
+        motion = served.service.motion
+        assert motion is not None
+        await served.until(lambda: not motion.standing, "motion")
+        for call in (served.call("table.send", **TABLE), served.call("table.remove", axis="x")):
+            with pytest.raises(ApiError, match="the machine moves; tables change only while it stands"):
+                await call
+        await busy
+        await served.until(lambda: motion.standing, "standstill")
+        await served.call("table.send", **TABLE)
+
+    World(tmp_path).live(act)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"axis": "w"}, "axis w cannot have a table; axes with tables are x, y, z"),
+        ({"positions": [0, 50]}, "has 2 positions, 3 forward"),
+        ({"positions": [0, True, 100]}, "positions must be numbers"),
+        ({"positions": [500, 550, 600]}, "covers 500 to 600 mm, but the axis travels from 0 to 250 mm"),
+        ({"forward": [0, float("nan"), 1]}, "not finite"),
+        ({"forward": [0, 2**2000, 1]}, "forward has a number that is too large"),
+        (
+            {name: [0.001 * i for i in range(POINTS + 1)] for name in ("positions",)}
+            | {name: [0] * (POINTS + 1) for name in ("forward", "reverse")},
+            "has 33 points, and there is room for 32",
+        ),
+    ],
+)
+def test_what_cannot_be_accepted(tmp_path: Path, changes: dict[str, Any], problem: str) -> None:
+    async def act(served: Served) -> None:
+        with pytest.raises(ApiError, match=problem):
+            await served.call("table.send", **{**TABLE, **changes})
+
+    world = World(tmp_path)
+    world.live(act)
+    assert not world.tables.exists()
+
+
+def test_a_machine_without_the_section_has_no_tables(tmp_path: Path) -> None:
+    stage = Stage(load(SCENARIOS / "clean.toml"), 1)
+
+    async def act() -> None:
+        async with running(Served(tmp_path, lambda: stage.description, stage.host)) as served:
+            assert (await served.call("table.status"))["axes"] == []
+            with pytest.raises(ApiError, match=r"axis x cannot have a table; add \[axis_tables\]"):
+                await served.call("table.send", **TABLE)
+
+    with asyncio.Runner(loop_factory=stage.make_loop) as runner:
+        runner.run(act())
+
+
+def test_damaged_and_oversized_tables_do_not_keep_the_machine_from_starting(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    many = tuple(float(i) for i in range(POINTS + 1))
+    store = TableStore(world.tables)
+    store.save(
+        AxisTable(axis="x", positions=many, forward=many[:1] * len(many), reverse=many[:1] * len(many))
+    )
+    (world.tables / "y.table.json").write_text("{")
+
+    async def act(served: Served) -> None:
+        await served.until(lambda: bool(served.tree.get("tables.x.problem")), "x")
+        assert any("y.table.json is no kept table" in line for line in served.lines)
+        assert any(
+            "a table did not arrive: stepper_x forward has room for 32" in line for line in served.lines
+        )
+        assert str(served.service.state) == "ready"
+
+    world.live(act)
+
+
+def test_a_lossy_machine(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        for axis in ("x", "y", "z"):
+            told = await served.call("table.send", **{**TABLE, "axis": axis})
+            assert all(side["status"] == "ok" and side["active"] for side in told["axes"][0]["nodes"])
+
+    World(tmp_path, "loss_1_percent").live(act)
