@@ -127,6 +127,8 @@ class Job:
                 raise self._over
             if self._over is not None:
                 return self._over
+            filament = self.machine.filament
+            self.planner.cold = self.vocabulary.too_cold(filament.active if filament is not None else "")
             try:
                 if self._resting is not None:
                     self._rested(self._resting)

@@ -129,6 +129,7 @@ class ExtruderHeater(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.unit: HeaterUnit | None = None
+        self._connected = False
         self.min_extrude_c = build.get(MIN_EXTRUDE_TEMP)
         if build.find(HEATER_PIN) is None:
             return
@@ -146,6 +147,7 @@ class ExtruderHeater(Module):
         """Begin to act."""
         if self.unit is not None:
             self.unit.connect(live)
+            self._connected = True
 
     def stopped(self, cause: str) -> None:
         """Act no more."""
@@ -155,6 +157,11 @@ class ExtruderHeater(Module):
     def close(self) -> None:
         """Act no more."""
         self.stopped("the machine was closed")
+
+    @property
+    def too_cold(self) -> bool:
+        """Whether it is connected and too cold; one that is only planned with is not."""
+        return self._connected and not self.can_extrude
 
     @property
     def can_extrude(self) -> bool:

@@ -112,7 +112,13 @@ class ModuleSet:
     @property
     def vocabulary(self) -> Vocabulary:
         """What programs know through them."""
-        return Vocabulary(self._commands, self.home)
+        return Vocabulary(self._commands, self.home, self._too_cold)
+
+    def _too_cold(self, extruder: str) -> bool:
+        from coordinator.modules.heater_sections import ExtruderHeater  # noqa: PLC0415 (start-up time)
+
+        found = self.find(extruder, ExtruderHeater)
+        return found is not None and found.too_cold
 
     @property
     def nodes(self) -> Sequence[str]:
