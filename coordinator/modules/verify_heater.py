@@ -4,7 +4,8 @@ from typing import ClassVar, Final
 
 from coordinator.heat.verify import VerifyOptions
 from coordinator.machine.options import FloatOption, SectionSpec
-from coordinator.modules.base import Build, Module
+from coordinator.machine.problem import ConfigError, nearest
+from coordinator.modules.base import Build, Module, Modules
 
 MAX_ERROR: Final = FloatOption(
     name="max_error",
@@ -66,3 +67,13 @@ class VerifyHeater(Module):
             hysteresis_k=build.get(HYSTERESIS),
             heating_gain_k=build.get(HEATING_GAIN),
         )
+
+    def link(self, modules: Modules) -> None:
+        """Make sure that there is such a heater."""
+        from coordinator.modules.heaters import Heaters  # noqa: PLC0415 (heaters know this section)
+
+        heaters = modules.find("heaters", Heaters)
+        known = () if heaters is None else tuple(heaters.units)
+        if self.heater not in known:
+            hint = nearest(self.heater, known) or f"; there is {', '.join(known) or 'none'}"
+            raise ConfigError(self.place, f"[{self.name}] is for no heater{hint}")
