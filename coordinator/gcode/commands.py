@@ -32,6 +32,8 @@ class Call:
     """Letters of the axes that are homed then."""
     callers: tuple[str, ...] = ()
     """Names of the replaced commands that it stands in, the outermost first."""
+    extruder: str = ""
+    """The active extruder; empty where there is none."""
 
 
 @record

@@ -92,8 +92,6 @@ class ExtruderHeaters(Module):
         super().__init__(build)
         self.by_extruder: dict[str, ExtruderHeater] = {}
         self.heaters = build.shared(Heaters)
-        self.active = "extruder"
-        """The extruder that commands without T are for."""
         build.add_command(GCodeCommand("M104", "set an extruder's target: S, T", self._set))
         build.add_command(
             GCodeCommand("M109", "set an extruder's target and wait for it: S or R, T", self._wait)
@@ -107,7 +105,7 @@ class ExtruderHeaters(Module):
 
     def _unit(self, call: Call) -> HeaterUnit:
         words = numbers(call.command, "SRT")
-        name = self.active
+        name = call.extruder or "extruder"
         if "T" in words:
             index = round(words["T"])
             name = "extruder" if index == 0 else f"extruder{index}"

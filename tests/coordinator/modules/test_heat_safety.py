@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from nodes.node_states import NodeState
 from nodes.virtual.plant_page import Fault, Kind
 from tests.coordinator.modules.heat_stage import BED, HeatMachine
 
@@ -209,5 +210,39 @@ def test_who_waits_for_a_temperature_learns_that_it_will_not_come(tmp_path: Path
         await stage.stopped()
         await asyncio.wait((waiting,), timeout=10)
         assert "did not get 2 K nearer" in str(waiting.exception())
+
+    stage.run(main)
+
+
+BOX = (
+    "\n[mcu box]\ncanbus_uuid: 0123456789ad\ncanbus_interface: can0\npolicy: optional\n"
+    "\n[heater_generic chamber]\nheater_pin: box:PA1\nsensor_type: Generic 3950\nsensor_pin: box:PA2\n"
+    "min_temp: 0\nmax_temp: 100\ncontrol: watermark\n"
+)
+
+
+def test_a_node_that_may_be_away_takes_its_heater_along(tmp_path: Path) -> None:
+    stage = heating(tmp_path, BOX, hurry=3)
+
+    async def main() -> None:
+        await stage.do("SET_HEATER_TEMPERATURE HEATER=chamber TARGET=60")
+        await asyncio.sleep(3)
+        board = stage.stage._boards["box"].node
+        assert board.controller is not None
+        cut_s = stage.now_s()
+        board.controller.cut(1)
+        await asyncio.sleep(8)
+        assert stage.machine.stopped is None
+        assert stage.status("heater_generic chamber")["target"] == 0
+        assert any("heater chamber is off, its target of 60 °C is forgotten" in n for n in stage.notices)
+        assert 0 < stage.heater_off_after(cut_s, "PA1", "box") <= LIMIT_S + 0.6
+        board.controller.cut(0)
+        async with asyncio.timeout(60):
+            while stage.machine.nodes["box"].state is not NodeState.READY:  # noqa: ASYNC110  virtual time
+                await asyncio.sleep(0.1)
+        assert stage.edges("PA1", "box")[-1][1] == 0
+        await stage.do("SET_HEATER_TEMPERATURE HEATER=chamber TARGET=60")
+        await asyncio.sleep(3)
+        assert stage.edges("PA1", "box")[-1][1] == 1
 
     stage.run(main)
