@@ -11,9 +11,11 @@ from nodes.devices.counter import Counter
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
 from nodes.errors import CanductorError
+from nodes.node_config import NodeConfig
 
 if TYPE_CHECKING:
     from coordinator.modules.live import Live
+    from nodes.node import Node
 
 PIN: Final = PinOption(name="pin", help="output that drives the fan")
 MAX_POWER: Final = FloatOption(
@@ -115,6 +117,7 @@ class FanUnit:
             shutdown=stopped * self._max_power if hardware else stopped,
         )
         add_pinned(build, self._output, pin)
+        build.add_device(pin.node, self)
         self._enable = self._enable_node = None
         enable = build.find_pin(ENABLE_PIN)
         if enable is not None:
@@ -138,6 +141,14 @@ class FanUnit:
 
         counter.on_frequency = counted
         add_pinned(build, counter, tachometer)
+
+    def configure(self, config: NodeConfig) -> None:
+        """Do nothing: its parts are devices too."""
+
+    def started(self, node: "Node") -> None:
+        """Take note that its node has started, and the fan stands still, perhaps in the midst of a job."""
+        del node
+        self.speed = 0.0
 
     def connect(self, live: "Live") -> None:
         """Begin to act; the fan stands still."""

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from nodes.node import Node
 
 
-AHEAD_S: Final = 0.25
+AHEAD_S: Final = 0.4
 """How far ahead values are sent: late ones would stop the node, and hosts are sometimes slow."""
 
 

@@ -26,7 +26,7 @@ class TemperatureSensor(SensorModule):
     """A sensor of no heater."""
 
     SPEC: ClassVar = SectionSpec(
-        help="A temperature that is watched; outside min_temp to max_temp its node stops everything",
+        help="A temperature that is watched; with min_temp or max_temp its node stops all outside them",
         options=(*SENSOR_OPTIONS, GCODE_ID),
         later=LATER_SENSOR_OPTIONS,
     )

@@ -38,8 +38,9 @@ if TYPE_CHECKING:
 
 PT100_BOARD: Final = "PT100 INA826"
 KNOWN_SENSORS: Final = (*THERMISTORS, "PT1000", PT100_BOARD, *AMPLIFIERS)
-SILENT_S: Final = 2.0
-"""Measurements come some three times a second; after so long without there is none."""
+SILENT_S: Final = 10.0
+"""Who waits for a measurement that should come three times a second gives up after so long; a host may stand
+still for a while."""
 MAX_WAITERS: Final = 64
 
 OnMeasured = Callable[[float, float], None]
@@ -54,11 +55,15 @@ class TemperatureInput:
     """The sensor of section BUILD; ``on_measured`` is called with every measurement once it is connected."""
 
     def __init__(self, build: Build, *, min_c: float | None = None, max_c: float | None = None) -> None:
-        """Read the options of the sensor; where the section need not limit it MIN_C and MAX_C are given."""
+        """Read the options of the sensor; where the section need not limit it MIN_C and MAX_C are given.
+
+        A sensor that is not limited does not stop its node when its wire breaks.
+        """
         self.name = build.name
         self._pin = build.pin(SENSOR_PIN)
         self.min_c = build.get(MIN_TEMP) if min_c is None else _or(build.find(MIN_TEMP), min_c)
         self.max_c = build.get(MAX_TEMP) if max_c is None else _or(build.find(MAX_TEMP), max_c)
+        self._guarded = min_c is None or build.reader.has(MIN_TEMP) or build.reader.has(MAX_TEMP)
         self.celsius: float | None = None
         """The last measurement; None before the first."""
         self.on_measured: OnMeasured = _ignore
@@ -79,6 +84,8 @@ class TemperatureInput:
     def link(self, modules: Modules) -> None:
         """Find out what the sensor is, and what its converter may read; raises ConfigError."""
         self._sensor = self._find(modules)
+        if not self._guarded:
+            return
         try:
             limits = ratio_range(self._sensor, self.min_c, self.max_c)
         except SensorError as error:
@@ -141,7 +148,7 @@ class TemperatureInput:
         waiter = asyncio.get_running_loop().create_future()
         self._waiting.append(waiter)
         try:
-            async with asyncio.timeout(SILENT_S + self._analog.report_s):
+            async with asyncio.timeout(SILENT_S):
                 await waiter
         except TimeoutError:
             raise CanductorError(

@@ -4,10 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.gcode.commands import Call, InTime
+from coordinator.gcode.words import parse
 from coordinator.heat.known_sensors import PT1000, THERMISTORS
 from coordinator.machine.description import ConfigError, load_machine
 from coordinator.modules.heater_sections import ExtruderHeater, HeaterBed
 from coordinator.modules.module_set import ModuleSet
+from coordinator.modules.sensor_module import TemperatureSensor
 from nodes.node_config import NodeConfig
 from nodes.virtual.firmware import firmware_dictionary
 from tests.coordinator.modules.heat_stage import BASE, BED, HOTEND_PID
@@ -44,6 +47,37 @@ def test_every_heater_has_the_nodes_own_net(tmp_path: Path) -> None:
     outs = [command for command in commands if command.startswith("config_digital_out")]
     assert [out.split()[-1] for out in outs] == [f"max_duration={n * 168_000_000 // 2}" for n in (6, 3)]
     assert all("value=0 default_value=0" in out for out in outs)
+
+
+def test_only_a_sensor_with_limits_stops_its_node(tmp_path: Path) -> None:
+    sensor = "\n[temperature_sensor air]\nsensor_type: PT1000\nsensor_pin: PC3\n"
+    for text, low, high in ((sensor, 0.0, 1.0), (sensor + "min_temp: 0\nmax_temp: 100\n", 0.1754, 0.2276)):
+        (air,) = build(tmp_path, HOTEND_PID + text).of(TemperatureSensor)
+        limits = air.input._analog._low, air.input._analog._high
+        assert limits == pytest.approx((low, high), abs=1e-4)
+
+
+def test_targets_are_for_the_extruder_that_is_meant(tmp_path: Path) -> None:
+    second = BASE[BASE.index("[extruder]") :].replace("[extruder]", "[extruder1]").replace("PB", "PD")
+    modules = build(tmp_path, HOTEND_PID + second + HOTEND_PID)
+    heaters = {module.name: module for module in modules.of(ExtruderHeater)}
+    for line, active, name in (
+        ("M104 S200", "", "extruder"),
+        ("M104 S201", "extruder", "extruder"),
+        ("M104 S202", "extruder1", "extruder1"),
+        ("M104 S203 T1", "extruder", "extruder1"),
+        ("M104 S204 T0", "extruder1", "extruder"),
+    ):
+        command = parse(line.encode())
+        assert command is not None
+        reading = modules.vocabulary.commands["M104"].read(
+            Call(command, 1, (0, 0, 0, 0), "", extruder=active)
+        )
+        assert isinstance(reading, InTime)
+        reading.act(0.0)
+        unit = heaters[name].unit
+        assert unit is not None
+        assert unit.target_c == float(line.split()[1][1:])
 
 
 @pytest.mark.parametrize("name", THERMISTORS)
