@@ -8,7 +8,6 @@ from coordinator.gcode.words import WordError
 from coordinator.machine.options import SectionSpec
 from coordinator.modules.base import Build, Module, Value
 from coordinator.modules.heater import HeaterUnit
-from coordinator.modules.heater_tuning import calibrate_mpc, calibrate_pid
 from coordinator.modules.temperature_input import TemperatureInput
 from coordinator.modules.words_of import numbers, one, parameters, value
 
@@ -135,6 +134,8 @@ class Heaters(Module):
     def _pid(self, call: Call) -> Reading:
         given = parameters(call.command, ("HEATER", "TARGET", "WRITE_FILE", "TOLERANCE"))
         unit, target = self._unit(call, given), value(call.command, given, "TARGET")
+        from coordinator.modules.heater_tuning import calibrate_pid  # noqa: PLC0415 (start-up time)
+
         return self._calibration(unit, target, lambda: calibrate_pid(unit, target))
 
     def _mpc(self, call: Call) -> Reading:
@@ -145,6 +146,8 @@ class Heaters(Module):
             raise WordError(f"FAN_BREAKPOINTS of MPC_CALIBRATE must be 2 to {FAN_STEPS_MAX}")
         if unit.settings.heater_w is None:
             raise WordError(f"MPC_CALIBRATE needs the option heater_power of [{unit.name}], in W")
+        from coordinator.modules.heater_tuning import calibrate_mpc  # noqa: PLC0415 (start-up time)
+
         return self._calibration(unit, target, lambda: calibrate_mpc(unit, target, steps))
 
     @staticmethod

@@ -1,6 +1,5 @@
 """A temperature on an analog input, for whatever module has one."""
 
-import asyncio
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
@@ -34,6 +33,8 @@ from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.errors import CanductorError
 
 if TYPE_CHECKING:
+    import asyncio  # planning waits for nothing
+
     from coordinator.modules.live import Live
 
 PT100_BOARD: Final = "PT100 INA826"
@@ -141,6 +142,8 @@ class TemperatureInput:
 
     async def next(self) -> None:
         """Wait for the next measurement; raises CanductorError when there will be none."""
+        import asyncio  # noqa: PLC0415
+
         if self._over is not None:
             raise CanductorError(self._over)
         if len(self._waiting) >= MAX_WAITERS:
