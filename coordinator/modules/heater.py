@@ -80,6 +80,8 @@ class HeaterUnit:
         self.fan: FanModule | None = None
         """What cools it, where the section says so."""
         self._ambient: SensorModule | None = None
+        self.calibrated: dict[str, str] = {}
+        """Options of the section and their values, as calibration found them; for who saves them."""
         self._check = HeaterCheck(usual(key))
         self._tuning: Tuning | None = None
         self._tuning_failure: CanductorError | None = None

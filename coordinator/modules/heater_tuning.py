@@ -54,5 +54,7 @@ async def calibrate_mpc(unit: HeaterUnit, target_c: float, fan_steps: int) -> Do
 
 
 def _told(unit: HeaterUnit, found: tuple[tuple[str, str | float], ...]) -> Done:
-    lines = (f"{name}: {value if isinstance(value, str) else f'{value:.6g}'}" for name, value in found)
+    texts = {name: value if isinstance(value, str) else f"{value:.6g}" for name, value in found}
+    unit.calibrated = texts
+    lines = (f"{name}: {text}" for name, text in texts.items())
     return Done((f"[{unit.name}] was calibrated, {REMARK}:", *lines))

@@ -60,7 +60,14 @@ class Heaters(Module):
 
     def status(self) -> Mapping[str, Value]:
         """Tell what there is."""
-        return {"available_heaters": list(self.units), "available_sensors": list(self.sensors)}
+        calibrated: dict[str, Value] = {
+            unit.name: dict(unit.calibrated) for unit in self.units.values() if unit.calibrated
+        }
+        return {
+            "available_heaters": list(self.units),
+            "available_sensors": list(self.sensors),
+            "calibrated": calibrated,
+        }
 
     # ------------------------------------------------------------------------------------------ commands
 

@@ -57,6 +57,8 @@ def test_pid_calibration_gives_constants_that_hold(tmp_path: Path) -> None:
         replies = await stage.do("PID_CALIBRATE HEATER=extruder TARGET=210")
         assert [line.partition(":")[0] for line in replies[1:]] == ["control", "pid_kp", "pid_ki", "pid_kd"]
         assert stage.status("extruder")["target"] == 0
+        kept = stage.status("heaters")["calibrated"]
+        assert kept == {"extruder": dict(line.split(": ") for line in replies[1:])}
         await stage.do("M109 S210")
         await asyncio.sleep(15)
         low, high = await stage.true_range(10)
