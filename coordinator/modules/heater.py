@@ -102,10 +102,10 @@ class HeaterUnit:
         if self._find_ambient is not None:
             self._ambient = self._find_ambient(modules)
 
-    def connect(self, live: "Live") -> None:
+    async def connect(self, live: "Live") -> None:
         """Begin to act."""
         self._live = live
-        self.input.connect(live)
+        await self.input.connect(live)
         live.every(LOOK_S, self._look)
 
     def end(self, cause: str) -> None:

@@ -38,7 +38,7 @@ class HeaterModule(Module):
 
     async def connect(self, live: "Live") -> None:
         """Begin to act."""
-        self.unit.connect(live)
+        await self.unit.connect(live)
 
     def stopped(self, cause: str) -> None:
         """Act no more."""
@@ -144,7 +144,7 @@ class ExtruderHeater(Module):
     async def connect(self, live: "Live") -> None:
         """Begin to act."""
         if self.unit is not None:
-            self.unit.connect(live)
+            await self.unit.connect(live)
             self._connected = True
 
     def stopped(self, cause: str) -> None:

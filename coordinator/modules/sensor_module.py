@@ -44,7 +44,7 @@ class TemperatureSensor(SensorModule):
 
     async def connect(self, live: "Live") -> None:
         """Begin to measure."""
-        self.input.connect(live)
+        await self.input.connect(live)
 
     def stopped(self, cause: str) -> None:
         """Measure no more."""

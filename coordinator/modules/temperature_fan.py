@@ -123,7 +123,7 @@ class TemperatureFan(FanModule):
     async def connect(self, live: "Live") -> None:
         """Begin to act."""
         await super().connect(live)
-        self.input.connect(live)
+        await self.input.connect(live)
 
     def stopped(self, cause: str) -> None:
         """Act no more."""

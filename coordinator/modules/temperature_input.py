@@ -31,6 +31,7 @@ from coordinator.modules.sensor_options import (
 from coordinator.modules.thermistor import KINDS, Circuit, CustomSensor
 from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.errors import CanductorError
+from nodes.node_states import NodeState
 
 if TYPE_CHECKING:
     import asyncio  # planning waits for nothing
@@ -120,9 +121,11 @@ class TemperatureInput:
 
     # ---------------------------------------------------------------------------------------------- live
 
-    def connect(self, live: "Live") -> None:
-        """Begin to tell what is measured."""
+    async def connect(self, live: "Live") -> None:
+        """Begin to tell what is measured; waits for the first time, unless its node is away."""
         self._live = live
+        if self.celsius is None and live.node(self._pin.node).state is NodeState.READY:
+            await self.next()
 
     def end(self, cause: str) -> None:
         """End all waiting for it, because of CAUSE."""
