@@ -34,6 +34,8 @@ check: setup
 	# A board needs its build's constants: firmware/Makefile compiles those, with the same warnings as errors.
 	@for c in $(filter-out firmware/boards/%,$(filter %.c,$(filter firmware/% nodes/% coordinator/%,$(C_SOURCES)))); do \
 	  gcc $(C_WARNINGS) -fsyntax-only $$c || exit 1; done
+	@! command -v node >/dev/null || for f in coordinator/web/page/*.js; do \
+	  node --check --input-type=module <$$f || exit 1; done
 	$(BIN)/pytest tests/test_import_floors.py
 
 ctest: setup

@@ -70,7 +70,7 @@ class Machine:
         self.description = description
         self.host = host
         self.policies = {node.name: node.policy for node in description.nodes}
-        self.modules = description.modules.build()
+        self.modules = description.modules.build(description)
         self.devices = MachineDevices(description, self.modules)
         self.nodes: dict[str, Node] = {}
         self.stopped: MachineStopped | None = None

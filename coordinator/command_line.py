@@ -5,7 +5,6 @@ argparse, because the start counts: a library that is nicer to write with cost m
 
 import argparse
 import importlib
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,11 +15,10 @@ from coordinator.commands import (
     PlanOptions,
     Report,
     RunOptions,
-    ServeOptions,
     SimulateOptions,
     find_machine,
 )
-from coordinator.network_words import declare_network, read_announce, read_metrics
+from coordinator.serving_words import declare_serving, is_asked_to_serve, read_serving
 from nodes.option_values import UsageError, assignments, existing_file, share, whole
 
 Job = Callable[[], Report]
@@ -44,6 +42,12 @@ FRONT_END_COMMANDS = {
     "completion": "Write what makes a shell complete the words of canductor.",
 }
 """Commands whose words are read by ``coordinator.front_end_words``."""
+OTHER_COMMANDS = {
+    "config": "Check a configuration, or print what one may contain.",
+    "dnc": "Exchange programs and tables with machine-shop peripherals over a serial line.",
+}
+"""Commands whose words are read by a module of their own."""
+_WORDS_OF = {"config": "coordinator.config_words", "dnc": "coordinator.dnc.command_line"}
 
 
 class Answered(Exception):  # noqa: N818 (no failure: the words asked for help or the version, and got it)
@@ -72,6 +76,8 @@ def read_words(words: Sequence[str]) -> Job:
         return _tool(words)
     if words[0] in FRONT_END_COMMANDS:
         return _front_end(words)
+    if words[0] in OTHER_COMMANDS:
+        return _other(words)
     arguments = _parser().parse_args(list(words))
     if arguments.version:
         sys.stdout.write(f"canductor {version()}\n")
@@ -114,6 +120,8 @@ def whole_parser() -> argparse.ArgumentParser:
     (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))  # noqa: SLF001
     for name, summary in FRONT_END_COMMANDS.items():
         _declare_front_end(commands, name, summary)
+    for name in OTHER_COMMANDS:
+        _declare_other(commands, name)
     can = commands.add_parser("can", allow_abbrev=False, help=_in_list(TOOL_COMMANDS["can"]))
     add_tools(can, all_tools=True)
     declare_tool(commands, "console")
@@ -139,6 +147,23 @@ def _declare_front_end(commands: Any, name: str, summary: str) -> None:
     declare(commands.add_parser(name, help=_in_list(summary), description=summary, allow_abbrev=False), name)
 
 
+def _other(words: Sequence[str]) -> Job:
+    """Read the words of a command that has a module of its own."""
+    parser = _Parser(prog="canductor", allow_abbrev=False)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    _declare_other(commands, words[0])
+    arguments = parser.parse_args(list(words))
+    if "make_job" not in arguments:
+        raise UsageError(f"what '{words[0]}' shall do is missing")
+    return cast("Job", arguments.make_job(arguments))
+
+
+def _declare_other(commands: Any, name: str) -> None:
+    summary = OTHER_COMMANDS[name]
+    command = commands.add_parser(name, help=_in_list(summary), description=summary, allow_abbrev=False)
+    importlib.import_module(_WORDS_OF[name]).declare(command)
+
+
 def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
     """Return the parser; WHOLE: without the commands that others declare."""
     parser = _Parser(
@@ -149,7 +174,7 @@ def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version")
     parser.set_defaults(make_job=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for name, summary in () if whole else (TOOL_COMMANDS | FRONT_END_COMMANDS).items():
+    for name, summary in () if whole else (TOOL_COMMANDS | FRONT_END_COMMANDS | OTHER_COMMANDS).items():
         commands.add_parser(name, help=_in_list(summary))
     for name, summary, declare, make_job in (
         ("demo", "print on virtual nodes and compare every stepper with the plan", _declare_demo, _demo),
@@ -197,7 +222,11 @@ def _declare_demo(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add("--machine", default="demo", help="configuration file or example; its nodes become virtual ones")
     add("--gcode", type=Path, metavar="FILE", help="g-code file to print")
-    add("--no-web", action="store_true", help="for scripts: there is no live page yet")
+    add(
+        "--no-web",
+        action="store_true",
+        help="for scripts: no live page, which is there only with --serve --web",
+    )
     add("--loss", default="0", metavar="SHARE", help="share of frames the bus loses: 0.01 or 1%%")
     add("--seed", default="1", metavar="N", help="decides which frames are lost")
     add("--rate-ppm", action="append", metavar="NAME=X", help="a node's clock error in ppm")
@@ -210,13 +239,15 @@ def _declare_demo(command: argparse.ArgumentParser) -> None:
         metavar="[BUS=]INTERFACE",
         help="put the machine's CAN buses, or the one called BUS, on this interface (such as vcan0)",
     )
-    _declare_serving(command)
+    declare_serving(command)
 
 
 def _demo(given: argparse.Namespace) -> Job:
     machine = find_machine(given.machine)
     if given.serve and given.gcode is not None:
         raise UsageError("--serve prints nothing by itself; leave --gcode out, or --serve")
+    if given.web is not None and (given.no_web or not given.serve):
+        raise UsageError("--web shows the machine that --serve keeps up; give --serve, and no --no-web")
     options = DemoOptions(
         machine=machine,
         gcode=existing_file(given.gcode),
@@ -227,7 +258,7 @@ def _demo(given: argparse.Namespace) -> Job:
         rate_ppm=assignments("--rate-ppm", given.rate_ppm, _ppm),
         start_clock=assignments("--start-clock", given.start_clock, _ticks),
         keep=given.keep,
-        serve=_serving(given, machine, announce=False) if given.serve else None,
+        serve=read_serving(given, machine, announce=False) if given.serve else None,
         socketcan=_interfaces(given.socketcan),
     )
     if options.socketcan and options.loss:
@@ -252,12 +283,12 @@ def _interfaces(words: list[str] | None) -> Mapping[str, str]:
 def _declare_run(command: argparse.ArgumentParser) -> None:
     command.add_argument("config", type=Path, help="configuration file")
     command.add_argument("--gcode", type=Path, metavar="FILE", help="g-code file to print")
-    _declare_serving(command)
+    declare_serving(command)
 
 
 def _run(given: argparse.Namespace) -> Job:
     existing_file(given.config)
-    asked = any(word is not None for word in (given.ipc, given.tcp, given.metrics))
+    asked = is_asked_to_serve(given)
     if asked and given.gcode is not None:
         raise UsageError("--gcode prints a file and ends; leave it out to serve front ends")
     serves = asked or (given.gcode is None and sys.stdin is not None and sys.stdin.isatty())
@@ -265,49 +296,11 @@ def _run(given: argparse.Namespace) -> Job:
         config=given.config,
         gcode=existing_file(given.gcode),
         json=given.json,
-        serve=_serving(given, given.config) if serves else None,
+        serve=read_serving(given, given.config) if serves else None,
     )
     if options.serve is not None:
         return lambda: _runner("coordinator.service.serve", "serve_machine")(options)
     return lambda: _runner("coordinator.run", "run_machine")(options)
-
-
-def _declare_serving(command: argparse.ArgumentParser) -> None:
-    add = command.add_argument_group("serving front ends").add_argument
-    add("--ipc", type=Path, metavar="PATH", help="serve at this Unix socket; see docs/run.md")
-    add("--name", metavar="NAME", help="of the machine; the configuration file's name if not given")
-    add("--jobs", type=Path, metavar="DIR", help="folder of the files that front ends may print")
-    add("--node-commands", action="store_true", help="let administrators send raw commands to nodes")
-    add("--tcp", metavar="HOST:PORT", help="serve there, too; needs --tokens, and TLS but on loopback")
-    add("--tokens", type=Path, metavar="FILE", help="tokens of TCP clients; see docs/security.md")
-    add("--tls-certificate", type=Path, metavar="FILE", help="certificate chain, PEM")
-    add("--tls-key", type=Path, metavar="FILE", help="private key, PEM")
-    add("--no-tls-on-loopback", action="store_true", help="TCP without TLS, on a loopback address only")
-    declare_network(add)
-
-
-def _serving(given: argparse.Namespace, config: Path, announce: bool | None = None) -> ServeOptions:
-    name = given.name or (config.parent.name if config.stem == "machine" else config.stem)
-    if not re.fullmatch(r"[A-Za-z0-9_-]{1,48}", name):
-        raise UsageError(f"--name is '{name}', must be 1 to 48 letters, digits, - and _")
-    if given.jobs is not None and not given.jobs.is_dir():
-        raise UsageError(f"--jobs is '{given.jobs}', must be a folder; make it")
-    if given.tcp is not None and given.tokens is None:
-        raise UsageError("--tcp needs --tokens FILE: who comes over the network has to show one")
-    return ServeOptions(
-        name=name,
-        path=given.ipc,
-        jobs=given.jobs,
-        node_commands=given.node_commands,
-        tcp=None if given.tcp is None else _host_port(given.tcp),
-        tokens=given.tokens,
-        certificate=existing_file(given.tls_certificate),
-        private_key=existing_file(given.tls_key),
-        plain_on_loopback=given.no_tls_on_loopback,
-        announce=read_announce(given, announce),
-        metrics=read_metrics(given),
-        metrics_open=given.metrics_open,
-    )
 
 
 def _declare_plan(command: argparse.ArgumentParser) -> None:
@@ -381,13 +374,6 @@ def _seeds(text: str) -> range:
             f"--seeds is '{text}', must be A:B with B above A, at most {SEEDS_AT_ONCE_MAX:,} seeds"
         )
     return seeds
-
-
-def _host_port(text: str) -> tuple[str, int]:
-    host, colon, port = text.rpartition(":")
-    if not (colon and host and port.isascii() and port.isdecimal() and 0 < int(port[:6]) < 65536):
-        raise UsageError(f"--tcp is '{text}', must be HOST:PORT such as 127.0.0.1:7125")
-    return host.strip("[]"), int(port)
 
 
 def _ppm(text: str) -> float:

@@ -53,6 +53,10 @@ class ServeOptions:
     certificate: Path | None = None
     private_key: Path | None = None
     plain_on_loopback: bool = False
+    web: tuple[str, int] | None = None
+    """Address and port of the live page."""
+    web_without_tls: bool = False
+    """Serve the page without TLS beyond loopback, too."""
     announce: bool | None = None
     """Announce the machine on the network; None: if its TCP port can be reached from there."""
     metrics: tuple[str, int] | None = None

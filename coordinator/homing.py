@@ -21,6 +21,7 @@ from coordinator.app import Machine
 from coordinator.machine.description import CanConnection, RailDescription, StepperDescription
 from coordinator.single_move import Ramp, SingleMove, ratio_of
 from nodes.clock import Ticks, extend32
+from nodes.devices.endstop import Endstop
 from nodes.devices.trsync import NO_GROUP, TriggerReason, Trsync, TrsyncState
 from nodes.errors import CanductorError
 from nodes.node import Node
@@ -37,8 +38,6 @@ LATE_S: Final = 0.25
 """After the end of the move, before the endstop counts as not found."""
 LOOK_S: Final = 50e-6
 """Between two looks at the endstop: at 50 mm/s less than 3 µm."""
-GROUP: Final = 0
-"""The trigger group of homing: there is one homing move at a time."""
 
 
 class HomingError(CanductorError):
@@ -82,102 +81,144 @@ class HomingResult:
         return self.way_mm - self.way_to_trigger_mm
 
 
-class HomingMove:
-    """One move of RAIL's axis in DIRECTION (1 or -1), at most WAY_MM far, until its endstop switches.
+@dataclass(eq=False, slots=True)
+class _Leg:
+    """One rail of a homing move: its endstop and what that stops."""
 
-    SPEED in mm/s, ACCEL in mm/s². The machine stands still and its rail has an endstop on a pin.
+    rail: RailDescription
+    slot: int
+    endstop: Endstop
+    endstop_node: Node
+    steppers: Sequence[StepperDescription]
+    syncs: Sequence[tuple[Node, Trsync]]
+    """One for each node that takes part."""
+    by_group: bool
+    """Whether the nodes can stop each other: all on one bus, all with trigger groups."""
+    triggered: asyncio.Event
+
+    @property
+    def name(self) -> str:
+        return self.rail.axis
+
+    @property
+    def timeout_s(self) -> float:
+        return TIMEOUT_S if len(self.syncs) > 1 else TIMEOUT_ALONE_S
+
+    @property
+    def rest_ticks(self) -> int:
+        return round(LOOK_S * self.endstop_node.clock_freq_hz)
+
+
+class HomingMove:
+    """One move of the head along AXIS (x, y, z) in DIRECTION (1 or -1), at most WAY_MM far.
+
+    Of one of RAILS it stops all that moves when its endstop switches; of several (towers) each stops its own
+    steppers, and the move goes on until all have. SPEED in mm/s, ACCEL in mm/s². The machine stands still and
+    each of RAILS has an endstop on a pin.
     """
 
     def __init__(
         self,
         machine: Machine,
-        rail: RailDescription,
+        rails: Sequence[RailDescription],
         *,
+        axis: str,
         direction: int,
         way_mm: float,
         speed: float,
         accel: float,
     ) -> None:
         self._machine = machine
-        self._rail = rail
-        self._direction = direction
+        self._rails = rails
+        self._ratio = ratio_of(axis, direction)
         self._ramp = Ramp(way_mm, speed, accel)
-        self._endstop = machine.devices.endstops[rail.axis]
-        self._endstop_node = machine.nodes[machine.devices.endstop_node(rail)]
-        self._triggered = asyncio.Event()
-        self._heard_s: dict[str, float] = {}
+        self._heard_s: dict[tuple[int, str], float] = {}
+        self._changed = asyncio.Event()
 
-    async def run(self) -> HomingResult:
-        """Move until the endstop switches; raises HomingError with everything stopped."""
-        if (await self._endstop.state(self._endstop_node)).pressed:
-            raise HomingError(
-                f"the endstop of axis {self._rail.axis} is pressed before the move towards it; move the axis "
-                "away by hand, or check the endstop's wiring and whether its pin has to be inverted"
-            )
+    async def run(self) -> tuple[HomingResult, ...]:
+        """Move until every endstop switched; raises HomingError with everything stopped."""
+        devices = self._machine.devices
+        for rail in self._rails:
+            node = self._machine.nodes[devices.endstop_node(rail)]
+            if (await devices.endstops[rail.axis].state(node)).pressed:
+                raise HomingError(
+                    f"the endstop of axis {rail.axis} is pressed before the move towards it; move the axis "
+                    "away by hand, or check the endstop's wiring and whether its pin has to be inverted"
+                )
         began_at = await self._machine.stepper_positions()
-        move = SingleMove(self._machine, self._ramp, ratio_of(self._rail.axis, self._direction))
-        syncs = self._syncs(move)
+        move = SingleMove(self._machine, self._ramp, self._ratio)
+        legs = [self._leg(slot, rail, move) for slot, rail in enumerate(self._rails)]
         ends: list[Callable[[], None]] = []
         try:
-            ends = [sync.listen(node, self._hear(node, sync, syncs, move)) for node, sync in syncs]
-            await self._arm(move, syncs)
-            await self._until_trigger(move, syncs)
+            ends = [
+                sync.listen(node, self._hear(leg, node, sync, move))
+                for leg in legs
+                for node, sync in leg.syncs
+            ]
+            await self._arm(move, legs)
+            await self._until_triggered(move, legs)
         finally:
             for end in ends:
                 end()
-            states = await self._end(syncs)
-        self._check(states, syncs)
-        return await self._result(move, began_at)
+            states = [await self._end(leg) for leg in legs]
+        for leg, found in zip(legs, states, strict=True):
+            self._check(leg, found)
+        ended_at = await self._machine.stepper_positions()
+        moved = {s.name: ended_at[s.name] - began_at[s.name] for s in move.steppers}
+        return tuple([await self._result(leg, move, moved) for leg in legs])
 
     # ------------------------------------------------------------------------------------------ set up
 
-    def _syncs(self, move: SingleMove) -> list[tuple[Node, Trsync]]:
-        names = dict.fromkeys([self._endstop_node.name, *(stepper.node for stepper in move.steppers)])
-        return [(self._machine.nodes[name], self._machine.devices.trsyncs[name]) for name in names]
-
-    def _use_group(self, syncs: Sequence[tuple[Node, Trsync]]) -> bool:
-        """Whether the nodes can stop each other: all on one bus, all with trigger groups."""
+    def _leg(self, slot: int, rail: RailDescription, move: SingleMove) -> _Leg:
+        machine = self._machine
+        node = machine.nodes[machine.devices.endstop_node(rail)]
+        steppers = move.steppers if len(self._rails) == 1 else rail.steppers
+        names = dict.fromkeys([node.name, *(stepper.node for stepper in steppers)])
+        syncs = [(machine.nodes[name], machine.devices.trsyncs[slot, name]) for name in names]
         wires = {
-            node.connection.interface if isinstance(node.connection, CanConnection) else node.name
-            for node in self._machine.description.nodes
-            if node.name in {other.name for other, _ in syncs}
+            described.connection.interface
+            if isinstance(described.connection, CanConnection)
+            else described.name
+            for described in machine.description.nodes
+            if described.name in names
         }
-        return len(wires) == 1 and all(sync.groups > GROUP for _, sync in syncs)
+        by_group = len(syncs) > 1 and len(wires) == 1 and all(sync.groups > slot for _, sync in syncs)
+        endstop = machine.devices.endstops[rail.axis]
+        return _Leg(rail, slot, endstop, node, steppers, syncs, by_group, asyncio.Event())
 
-    def _timeout_s(self, syncs: Sequence[tuple[Node, Trsync]]) -> float:
-        return TIMEOUT_S if len(syncs) > 1 else TIMEOUT_ALONE_S
-
-    async def _arm(self, move: SingleMove, syncs: Sequence[tuple[Node, Trsync]]) -> None:
-        timeout_s = self._timeout_s(syncs)
-        now = move.print_time_now()
-        group = GROUP if len(syncs) > 1 and self._use_group(syncs) else NO_GROUP
-        for node, sync in syncs:
-            self._heard_s[node.name] = now
-            if sync.groups:
-                sync.join(node, group)
-            sync.start(
-                node,
-                report_clock=move.ticks_at(node.name, move.begin_s),
-                report_ticks=round(timeout_s / REPORTS * node.clock_freq_hz),
-                timeout_clock=move.ticks_at(node.name, move.begin_s + timeout_s),
-            )
-            for stepper in move.steppers:
-                if stepper.node == node.name:
-                    sync.stop_on_trigger(node, self._stepper_oid(stepper))
-            if node is self._endstop_node:
-                assert sync.oid is not None
-                self._endstop.home(
-                    node,
-                    clock=move.ticks_at(node.name, move.begin_s),
-                    rest_ticks=self._rest_ticks,
-                    trsync_oid=sync.oid,
-                )
-        for node, _ in syncs:
+    async def _arm(self, move: SingleMove, legs: Sequence[_Leg]) -> None:
+        for leg in legs:
+            for node, sync in leg.syncs:
+                self._arm_node(move, leg, node, sync)
+        move.stream()  # the steps are on their way, too, before anything is waited for
+        for node in {node for leg in legs for node, _ in leg.syncs}:
             await node.link.drained()
         if move.print_time_now() > move.begin_s:
             raise HomingError(
-                f"axis {self._rail.axis} was not homed: arming its nodes took too long; check the bus for "
+                f"axis {_names(legs)} was not homed: arming its nodes took too long; check the bus for "
                 "errors and load"
+            )
+
+    def _arm_node(self, move: SingleMove, leg: _Leg, node: Node, sync: Trsync) -> None:
+        self._heard_s[leg.slot, node.name] = move.print_time_now()
+        if sync.groups:
+            sync.join(node, leg.slot if leg.by_group else NO_GROUP)
+        sync.start(
+            node,
+            report_clock=move.ticks_at(node.name, move.begin_s),
+            report_ticks=round(leg.timeout_s / REPORTS * node.clock_freq_hz),
+            timeout_clock=move.ticks_at(node.name, move.begin_s + leg.timeout_s),
+        )
+        for stepper in leg.steppers:
+            if stepper.node == node.name:
+                sync.stop_on_trigger(node, self._stepper_oid(stepper))
+        if node is leg.endstop_node:
+            assert sync.oid is not None
+            leg.endstop.home(
+                node,
+                clock=move.ticks_at(node.name, move.begin_s),
+                rest_ticks=leg.rest_ticks,
+                trsync_oid=sync.oid,
             )
 
     def _stepper_oid(self, stepper: StepperDescription) -> int:
@@ -185,112 +226,104 @@ class HomingMove:
         assert oid is not None
         return oid
 
-    @property
-    def _rest_ticks(self) -> int:
-        return round(LOOK_S * self._endstop_node.clock_freq_hz)
-
     # ------------------------------------------------------------------------------------------ under way
 
-    def _hear(
-        self, node: Node, sync: Trsync, syncs: Sequence[tuple[Node, Trsync]], move: SingleMove
-    ) -> Callable[[TrsyncState], None]:
+    def _hear(self, leg: _Leg, node: Node, sync: Trsync, move: SingleMove) -> Callable[[TrsyncState], None]:
         """Return what takes the reports of one node's stop group."""
 
         def heard(state: TrsyncState) -> None:
-            self._heard_s[node.name] = move.print_time_now()
-            if state.armed or self._triggered.is_set():
+            self._heard_s[leg.slot, node.name] = move.print_time_now()
+            if state.armed or leg.triggered.is_set():
                 return
-            self._triggered.set()
-            for other, other_sync in syncs:
+            leg.triggered.set()
+            self._changed.set()
+            for other, other_sync in leg.syncs:
                 if other_sync is not sync and other.talks:
                     other_sync.trigger_now(other)
 
         return heard
 
-    async def _until_trigger(self, move: SingleMove, syncs: Sequence[tuple[Node, Trsync]]) -> None:
-        timeout_s = self._timeout_s(syncs)
-        while not self._triggered.is_set() and move.print_time_now() < move.end_s + LATE_S:
+    async def _until_triggered(self, move: SingleMove, legs: Sequence[_Leg]) -> None:
+        while not all(leg.triggered.is_set() for leg in legs) and move.print_time_now() < move.end_s + LATE_S:
             move.stream()
-            # Nobody is to go on longer than the host has heard from all.
-            until_s = min(self._heard_s.values()) + timeout_s
-            if until_s > move.begin_s + timeout_s:
-                for node, sync in syncs:
-                    sync.renew(node, move.ticks_at(node.name, until_s))
+            for leg in legs:
+                self._renew(move, leg)
+            self._changed.clear()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(CYCLE_S):
-                    await self._triggered.wait()
+                    await self._changed.wait()
             if self._machine.stopped is not None:
                 raise self._machine.stopped
 
-    async def _end(self, syncs: Sequence[tuple[Node, Trsync]]) -> dict[str, TrsyncState]:
+    def _renew(self, move: SingleMove, leg: _Leg) -> None:
+        """Nobody is to go on longer than the host has heard from all."""
+        heard_s = min(self._heard_s[leg.slot, node.name] for node, _ in leg.syncs)
+        if leg.triggered.is_set() or heard_s <= move.begin_s:
+            return
+        for node, sync in leg.syncs:
+            sync.renew(node, move.ticks_at(node.name, heard_s + leg.timeout_s))
+
+    @staticmethod
+    async def _end(leg: _Leg) -> dict[str, TrsyncState]:
         """Stop what is not stopped yet, drop what is queued; return how every node's round ended."""
         states = {}
-        for node, sync in syncs:
+        for node, sync in leg.syncs:
             if node.talks:
                 sync.trigger_now(node)
-        for node, sync in syncs:
+        for node, sync in leg.syncs:
             with contextlib.suppress(CanductorError):  # whoever is missing afterwards was lost
                 states[node.name] = await sync.finish(node)
-        if self._endstop_node.talks:
-            self._endstop.end(self._endstop_node)
+        if leg.endstop_node.talks:
+            leg.endstop.end(leg.endstop_node)
         return states
 
-    def _check(self, states: dict[str, TrsyncState], syncs: Sequence[tuple[Node, Trsync]]) -> None:
-        for node, _ in syncs:
+    def _check(self, leg: _Leg, states: dict[str, TrsyncState]) -> None:
+        for node, _ in leg.syncs:
             if node.name not in states:
                 raise node.failure or HomingError(f"node {node.name} did not answer while an axis homed")
             if states[node.name].reason is TriggerReason.TIMEOUT:
                 raise HomingError(
-                    f"axis {self._rail.axis} was not homed: node {node.name} did not hear from the host for "
-                    f"{self._timeout_s(syncs):g} s and stopped by itself; check the bus for errors and load"
+                    f"axis {leg.name} was not homed: node {node.name} did not hear from the host for "
+                    f"{leg.timeout_s:g} s and stopped by itself; check the bus for errors and load"
                 )
-        if states[self._endstop_node.name].reason is not TriggerReason.ENDSTOP:
+        if states[leg.endstop_node.name].reason is not TriggerReason.ENDSTOP:
             raise HomingError(
-                f"axis {self._rail.axis} moved {self._ramp.way_mm:g} mm and its endstop did not switch; "
+                f"axis {leg.name} moved {self._ramp.way_mm:g} mm and its endstop did not switch; "
                 "check the endstop's wiring, the direction of the axis, and homing_positive_dir"
             )
 
     # ------------------------------------------------------------------------------------------ afterwards
 
-    async def _result(self, move: SingleMove, began_at: dict[str, int]) -> HomingResult:
-        ended_at = await self._machine.stepper_positions()
-        moved = {s.name: ended_at[s.name] - began_at[s.name] for s in move.steppers}
-        triggered_at_s = await self._trigger_time(move)
+    async def _result(self, leg: _Leg, move: SingleMove, moved: dict[str, int]) -> HomingResult:
+        triggered_at_s = await self._trigger_time(leg, move)
         to_trigger = self._ramp.way_at(triggered_at_s - move.begin_s)
-        overshoots = tuple(self._overshoot(move, s, moved[s.name], to_trigger) for s in move.steppers)
-        syncs = self._syncs(move)
+        own = {stepper.name: moved[stepper.name] for stepper in leg.steppers}
         return HomingResult(
-            rail=self._rail.axis,
+            rail=leg.name,
             way_to_trigger_mm=to_trigger,
-            way_mm=self._way(move, moved),
+            way_mm=float(np.mean([own[s.name] * s.step_distance / move.along(s) for s in leg.steppers])),
             triggered_at_s=triggered_at_s,
-            through_group=len(syncs) > 1 and self._use_group(syncs),
-            moved=moved,
-            overshoots=overshoots,
+            through_group=leg.by_group,
+            moved=own,
+            overshoots=tuple(_overshoot(move, s, own[s.name], to_trigger) for s in leg.steppers),
         )
 
-    async def _trigger_time(self, move: SingleMove) -> float:
+    @staticmethod
+    async def _trigger_time(leg: _Leg, move: SingleMove) -> float:
         """Return the print time of the first of the looks that found the endstop pressed."""
-        state = await self._endstop.state(self._endstop_node)
-        name = self._endstop_node.name
+        state = await leg.endstop.state(leg.endstop_node)
+        name = leg.endstop_node.name
         near = Ticks(move.ticks_at(name, move.print_time_now()))
-        return move.print_time_of(name, extend32(state.next_clock32, near) - self._rest_ticks)
-
-    @staticmethod
-    def _overshoot(move: SingleMove, stepper: StepperDescription, moved: int, to_trigger: float) -> Overshoot:
-        planned = move.planned_steps(stepper, to_trigger)
-        forward = 1 if planned >= 0 else -1
-        steps = forward * (moved - int(np.floor(planned + 0.5)))
-        distance = forward * (moved - planned) * stepper.step_distance
-        return Overshoot(stepper.name, stepper.node, steps, distance / _along(move, stepper))
-
-    @staticmethod
-    def _way(move: SingleMove, moved: dict[str, int]) -> float:
-        """Return how far along the move the axis is by the steps made: the mean of its steppers'."""
-        ways = [moved[s.name] * s.step_distance / float(np.dot(s.weights, move.ratio)) for s in move.steppers]
-        return float(np.mean(ways))
+        return move.print_time_of(name, extend32(state.next_clock32, near) - leg.rest_ticks)
 
 
-def _along(move: SingleMove, stepper: StepperDescription) -> float:
-    """Return how many mm a stepper moves per mm of the axis."""
-    return abs(float(np.dot(stepper.weights, move.ratio)))
+def _overshoot(move: SingleMove, stepper: StepperDescription, moved: int, to_trigger: float) -> Overshoot:
+    planned = move.planned_steps(stepper, to_trigger)
+    forward = 1 if planned >= 0 else -1
+    steps = forward * (moved - int(np.floor(planned + 0.5)))
+    distance = forward * (moved - planned) * stepper.step_distance
+    return Overshoot(stepper.name, stepper.node, steps, distance / abs(move.along(stepper)))
+
+
+def _names(legs: Sequence[_Leg]) -> str:
+    return ", ".join(leg.name for leg in legs)

@@ -1,6 +1,6 @@
 """The configured machine's devices: what each node is configured as, and what motion has to know of it."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 
 from coordinator.machine.description import (
     CanConnection,
@@ -34,10 +34,10 @@ class MachineDevices:
             rail.axis: _endstop(rail) for rail in description.rails if rail.homing.endstop_pin is not None
         }
         """By axis, of the rails whose endstop is on a pin."""
-        self.trsyncs: dict[str, Trsync] = {
-            node: Trsync(f"homing on node {node}") for node in self._homing_nodes()
+        self.trsyncs: dict[tuple[int, str], Trsync] = {
+            (slot, node): Trsync(f"homing on node {node}") for slot, node in self._homing_nodes()
         }
-        """By node, of all that take part in homing."""
+        """By slot and node, of all that take part in homing: of rails homed together each has a slot."""
         self.tables = stepper_tables(description, self.steppers)
         """Compensation tables, of steppers whose axes may have such."""
 
@@ -59,12 +59,14 @@ class MachineDevices:
         self._spread_shutdown(config)
         return config
 
-    def _homing_nodes(self) -> Iterator[str]:
-        if self.endstops:
-            yield from self.moving_nodes
-        for rail in self.description.rails:
-            if rail.homing.endstop_pin is not None:
-                yield rail.homing.endstop_pin.node
+    def _homing_nodes(self) -> dict[tuple[int, str], None]:
+        """Return slots and nodes, each once, in order."""
+        if not self.endstops:
+            return {}
+        together = max(len(group) for group in self.description.kinematics.homing_order)
+        pins = (rail.homing.endstop_pin for rail in self.description.rails)
+        nodes = [*self.moving_nodes, *(pin.node for pin in pins if pin is not None)]
+        return dict.fromkeys((slot, node) for node in nodes for slot in range(together))
 
     def _add_homing(self, config: NodeConfig, pins: Mapping[str, int]) -> None:
         for rail in self.description.rails:
@@ -72,8 +74,9 @@ class MachineDevices:
             if pin is not None and pin.node == config.name:
                 pin.number(pins)
                 self.endstops[rail.axis].configure(config)
-        if config.name in self.trsyncs:
-            self.trsyncs[config.name].configure(config)
+        for (_, node), trsync in self.trsyncs.items():
+            if node == config.name:
+                trsync.configure(config)
 
     def endstop_node(self, rail: RailDescription) -> str:
         """Return the node of a rail's endstop, which is on a pin."""

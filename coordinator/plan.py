@@ -41,7 +41,7 @@ ASSUMED_MOVE_COUNT = 1024
 def plan_file(options: PlanOptions) -> PlanReport:
     """Plan OPTIONS.gcode for OPTIONS.config; raises CanductorError."""
     description = load_machine(str(options.config))
-    modules = description.modules.build()
+    modules = description.modules.build(description)
     devices = MachineDevices(description, modules)
     dictionaries = _dictionaries(description, options)
     for node in description.nodes:

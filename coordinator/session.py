@@ -132,10 +132,11 @@ async def _print(
     streamer = Streamer(machine, job, record=record, on_told=on_told, on_state=show)
     streamer.began_at = await machine.stepper_positions()
     await streamer.run()
-    return await _outcome(machine, streamer)
+    return await outcome_of(machine, streamer)
 
 
-async def _outcome(machine: Machine, streamer: Streamer) -> Outcome:
+async def outcome_of(machine: Machine, streamer: Streamer) -> Outcome:
+    """Return what became of STREAMER's job, which has ended."""
     ended_at = await machine.stepper_positions()
     stats = streamer.steps.stats()
     return Outcome(

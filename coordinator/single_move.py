@@ -4,6 +4,7 @@ It has step generation of its own, which begins with a reset of the steppers' cl
 anything, and whatever is left of it when the steppers are stopped on their nodes is simply dropped.
 """
 
+import asyncio
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -11,18 +12,24 @@ import numpy as np
 
 from coordinator.app import Machine, link_of
 from coordinator.machine.description import StepperDescription
+from coordinator.motion.specs import StepKinematics
 from coordinator.motion.steps import StepGenerator
 from coordinator.motion.trapezoid_array import TRAPEZOID
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-START_LEAD_S: Final = 0.25
+START_LEAD_S: Final = 0.4
 """From now to the first step: time to arm what has to stop it, and for the steps to reach the nodes."""
-SEND_AHEAD_S: Final = 0.25
-"""Steps are made so far ahead of now: late enough that little has to be dropped."""
+SEND_AHEAD_S: Final = 0.6
+"""Steps are made so far ahead of now: a busy host may pause that long, and what is left over is dropped."""
+CYCLE_S: Final = 0.05
+SETTLE_S: Final = 0.05
+"""After the last step is due, before it is believed to be done."""
 BATCH_ROOM: Final = 1 << 16
 AXES: Final = ("x", "y", "z")
+_UPRIGHT: Final = (StepKinematics.DELTA, StepKinematics.DELTESIAN)
+"""Steppers of towers: they go up and down with the head."""
 
 Ratio = tuple[float, float, float, float]
 """What each of X Y Z E moves per mm of way."""
@@ -91,9 +98,10 @@ class SingleMove:
         self.ramp = ramp
         self.ratio = ratio
         self.steppers: Sequence[StepperDescription] = [
-            s for s in machine.description.steppers if np.dot(s.weights, ratio) != 0
+            s for s in machine.description.steppers if self.along(s) != 0
         ]
         """Those it moves."""
+        machine.modules.before_motion()
         now = self.print_time_now()
         self.begin_s = now + START_LEAD_S
         self.end_s = self.begin_s + ramp.duration_s
@@ -121,6 +129,14 @@ class SingleMove:
         node = self._machine.nodes[node_name]
         return node.best_clock.ticks_at(self._time_base.host_ns_at(print_time))
 
+    async def run(self) -> None:
+        """Make the whole move and return when its last step is done; raises CanductorError."""
+        while self.print_time_now() < self.end_s + SETTLE_S:
+            self.stream()
+            await asyncio.sleep(CYCLE_S)
+            if self._machine.stopped is not None:
+                raise self._machine.stopped
+
     def stream(self) -> None:
         """Make and send what is due by now; CanductorError when a node cannot take it."""
         until = min(self.print_time_now() + SEND_AHEAD_S, self.end_s)
@@ -137,6 +153,12 @@ class SingleMove:
                     link_of(node).send_batch(batch)
         self._machine.check_load()
 
+    def along(self, stepper: StepperDescription) -> float:
+        """Return how many mm a stepper moves per mm of way; 0 where that is not the same all the way."""
+        if stepper.function.kinematics in _UPRIGHT and not any(self.ratio[:2]):
+            return self.ratio[2]
+        return float(np.dot(stepper.weights, self.ratio))
+
     def planned_steps(self, stepper: StepperDescription, way_mm: float) -> float:
         """Return where a stepper is after WAY_MM, in steps from the begin; a step is due at every half."""
-        return float(np.dot(stepper.weights, self.ratio)) * way_mm / stepper.step_distance
+        return self.along(stepper) * way_mm / stepper.step_distance

@@ -37,8 +37,9 @@ if TYPE_CHECKING:
     from coordinator.timebase import ClockMap
 
 CYCLE_S: Final = 0.05
-PLAN_AHEAD_S: Final = 3.0
-"""Moves are planned so far ahead of now; beyond, the g-code waits."""
+PLAN_AHEAD_S: Final = 2.0
+"""Moves are planned so far ahead of now; beyond, the g-code waits. A pause takes so long; what it leaves
+beyond SEND_AHEAD_S is for sources that stall, and for lines that take longer to read than to carry out."""
 SEND_AHEAD_S: Final = 1.2
 """Step commands are made so far ahead of now; the clocks of the nodes are predicted over this long."""
 START_LEAD_S: Final = 0.25
@@ -234,6 +235,8 @@ class Streamer:
         self._begin()
 
     def _hand_over(self, cycle: _Cycle) -> None:
+        if cycle.batches:
+            self._machine.modules.before_motion()
         for node, batch in cycle.batches:
             link_of(self._nodes[node]).send_batch(batch)
             if self._witness is not None:
@@ -321,7 +324,7 @@ class Streamer:
             speed_factor=planner.speed_factor,
             extrude_factor=planner.extrude_factor,
             stands_from_s=self.pipeline.moved_until + self.steps.lag_s if stands else None,
-            steps_sent=tuple(stepper.issued for stepper in self.steps.stats().steppers),
+            steps_sent=tuple(s.issued + self.began_at.get(s.name, 0) for s in self.steps.stats().steppers),
         )
 
     def _still_waiting(self, event: Event | None, now: float) -> bool:

@@ -72,12 +72,12 @@ def machine_plants(
     }
 
 
-def start_point(description: MachineDescription) -> Point:
-    """Return a place START_MM from where the head is after homing, along each axis, towards the middle."""
+def start_point(description: MachineDescription, away_mm: float = START_MM) -> Point:
+    """Return a place AWAY_MM from where the head is after homing, along each axis, towards the middle."""
     home = np.array(description.home)
     space = description.kinematics.work_space
     middle = (np.array(space.low) + np.array(space.high)) / 2
-    x, y, z = home + np.clip(middle - home, -START_MM, START_MM)
+    x, y, z = home + np.clip(middle - home, -away_mm, away_mm)
     return (float(x), float(y), float(z))
 
 

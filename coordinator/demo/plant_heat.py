@@ -5,7 +5,7 @@ machine reads is compared with something that shares no code with it.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
@@ -15,15 +15,28 @@ from coordinator.machine.options import BadValue
 from coordinator.machine.pins import PinDescription, PinOption, PinRegistry
 from coordinator.machine.read_nodes import make_pin_registry
 from nodes.records import record
-from nodes.virtual.plant import Beta, Body, Cooling, Couple, Fan, Heater, Rtd, Sensor, Steinhart
+from nodes.virtual.plant import (
+    Beta,
+    Body,
+    Cooling,
+    Couple,
+    Fan,
+    Heater,
+    Linear,
+    Rtd,
+    Sensor,
+    Steinhart,
+    Table,
+)
 
 SHARED: Final = "plant"
+TABLE_POINTS: Final = 64
 WORD_MAX: Final = 50
 """Characters of a section's name; what is added to it has room as well."""
 ZERO_C: Final = 273.15
 PULLUP_OHM: Final = 4700.0
 
-Curve = Beta | Steinhart | Rtd
+Curve = Beta | Steinhart | Rtd | Linear | Table
 
 
 @record(kw_only=True)
@@ -34,6 +47,8 @@ class HeatSettings:
     adc_noise: float = 0.5
     """Standard deviation of a sample, in steps of the converter."""
     bits: int = 12
+    curves: Mapping[str, Curve] = field(default_factory=dict)
+    """Of sensors by their `sensor_type`, before those known here; see `table_of`."""
     hurry: float = 1.0
     """Capacities are divided by this: 10 warms up in a tenth of the time, to where it would anyway."""
 
@@ -93,6 +108,13 @@ class NodeHeat:
     def parts(self) -> dict[str, Any]:
         """Return all as the fields of a NodePlant."""
         return {part.name: tuple(getattr(self, part.name)) for part in fields(self)}
+
+
+def table_of(ratio: Callable[[float], float], low_c: float, high_c: float) -> Table:
+    """Return the curve of a sensor by the share of full scale it gives at a temperature, LOW_C to HIGH_C."""
+    step_c = (high_c - low_c) / (TABLE_POINTS - 1)
+    celsius = [low_c + n * step_c for n in range(TABLE_POINTS)]
+    return Table(points=tuple((c, float(ratio(c))) for c in celsius))
 
 
 def machine_heat(description: MachineDescription, settings: HeatSettings) -> dict[str, NodeHeat]:
@@ -211,6 +233,8 @@ class _Maker:
     def _curve(self, section: RawSection) -> Curve:
         kind = _text(section, "sensor_type")
         pullup = _number(section, "pullup_resistor", PULLUP_OHM)
+        if kind in self._settings.curves:
+            return self._settings.curves[kind]
         own = self._config.sections.get(f"thermistor {kind}")
         if own is not None:
             return _own_curve(own, pullup)

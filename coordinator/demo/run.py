@@ -27,6 +27,9 @@ from coordinator.session import Outcome, run_job
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import firmware_dictionary
 
+BEFORE_S = 1e-3
+"""What moves a stepper so long before the plan begins does not belong to it: that was homing."""
+
 
 def run_demo(options: DemoOptions) -> DemoReport:
     """Run the demo; raises CanductorError when it cannot be brought to its end."""
@@ -35,7 +38,10 @@ def run_demo(options: DemoOptions) -> DemoReport:
     told: list[str] = []
     both_edges: dict[str, bool] = {}
 
+    claimed: dict[str, list[str]] = {}
+
     def ready(machine: Machine) -> None:
+        claimed.update({name: machine.modules.pins.claimed(name) for name in machine.nodes})
         both_edges.update({name: s.steps_on_both_edges for name, s in machine.devices.steppers.items()})
 
     with ExitStack() as stack:
@@ -54,9 +60,9 @@ def run_demo(options: DemoOptions) -> DemoReport:
             )
         )
         figures = stage.stop_nodes()
-        prover = _Prover(description, stage.edge_log, outcome, record, both_edges)
+        prover = Prover(description, stage.edge_log, outcome, record, both_edges=both_edges, claimed=claimed)
         notices = [*map(str, description.not_yet_acting), *description.notes, *told]
-        return _report(prover, stage, figures, outcome, notices)
+        return report_of(prover, stage, figures, outcome, notices)
 
 
 @contextmanager
@@ -73,7 +79,7 @@ def _text(told: Told) -> str:
     return told.text
 
 
-class _Prover:
+class Prover:
     """Compares what the nodes' pins did with the plan."""
 
     def __init__(
@@ -82,12 +88,15 @@ class _Prover:
         edge_log: Callable[[str], EdgeLog],
         outcome: Outcome,
         record: PlanRecord,
+        *,
         both_edges: Mapping[str, bool],
+        claimed: Mapping[str, Sequence[str]],
     ) -> None:
         self._description = description
         self._outcome = outcome
         self._record = record
         self._both_edges = both_edges
+        self._claimed = claimed
         self._logs = {node.name: edge_log(node.name) for node in description.nodes}
         self._pins = firmware_dictionary("canductor-node-mainboard").enumerations["pin"].values
         primary = self._logs[description.nodes[0].name]
@@ -112,7 +121,7 @@ class _Prover:
         ]
 
     def stray_edges(self) -> int:
-        """Count level changes of pins that neither a stepper nor a module of the node owns."""
+        """Count level changes of pins that nothing of the configuration is on."""
         return sum(self._stray(node.name, log) for node, log in self._with_logs())
 
     def _with_logs(self) -> Iterator[tuple[Any, EdgeLog]]:
@@ -120,14 +129,7 @@ class _Prover:
             yield node, self._logs[node.name]
 
     def _stray(self, node: str, log: EdgeLog) -> int:
-        owned = [
-            self._pins[pin.name]
-            for stepper in self._description.steppers
-            if stepper.node == node
-            for pin in (stepper.step_pin, stepper.dir_pin)
-        ]
-        modules = self._description.modules.build().pins.names(node)
-        owned += [self._pins[name] for name in modules if self._pins[name] not in owned]
+        owned = [self._pins[name] for name in self._claimed[node]]
         counted = sum(len(clock) for clock, _, _ in log.edges(*owned))
         return log.record_count - counted
 
@@ -170,22 +172,25 @@ class _Prover:
 
     def _executed(self, stepper: StepperDescription, log: EdgeLog) -> Iterator[tuple[Any, Any]]:
         sign = np.int8(-1 if stepper.dir_pin.invert else 1)
+        begin = self._outcome.maps[stepper.node].ticks(np.array([self._outcome.span[0] - BEFORE_S]))[0]
         for clock, direction in log.steps(
             self._pins[stepper.step_pin.name],
             self._pins[stepper.dir_pin.name],
             self._both_edges[stepper.name],
             step_idle_level=int(stepper.step_pin.invert),
         ):
-            yield clock, direction * sign
+            proved = clock >= begin
+            yield clock[proved], direction[proved] * sign
 
 
-def _report(
-    prover: _Prover,
+def report_of(
+    prover: Prover,
     stage: Stage,
     figures: Mapping[str, Mapping[str, Any]],
     outcome: Outcome,
     notices: Sequence[str],
 ) -> DemoReport:
+    """Return the report, with every stepper proved; the nodes have ended, with these FIGURES."""
     frames, frames_lost = stage.frames()
     return DemoReport(
         moves=outcome.moves,

@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from coordinator.commands import DemoOptions
-from coordinator.demo.plant import PlantSettings, machine_plants
+from coordinator.demo.plant import PlantSettings, machine_plants, start_point
 from coordinator.machine.description import (
     CanConnection,
     MachineDescription,
@@ -32,13 +32,15 @@ RATES_PPM = (-20.0, 60.0, -110.0, 35.0)
 ROLLOVER_AFTER_S = (1000.0, 20.0, 10.0, 35.0)
 """When the nodes' 32-bit clocks roll over: offsets that make some do it during the demo."""
 JITTER_US = 40
+START_MM = 8.0
+"""How far from where homing leaves it the head begins."""
 
 
 class Stage:
     """Virtual hardware for DESCRIPTION; a context manager that leaves no process behind.
 
     Every bus of the configuration becomes a virtual one in FOLDER, or the SocketCAN interface that the
-    options name for it; every UART becomes a pseudo-terminal.
+    options name for it; every UART becomes a pseudo-terminal. The nodes' pins are connected with a plant.
     """
 
     def __init__(self, description: MachineDescription, options: DemoOptions, folder: Path) -> None:
@@ -50,11 +52,13 @@ class Stage:
         self.processes: dict[str, NodeProcess] = {}
         self._stack = ExitStack()
         self._described = description
+        self._plants = machine_plants(
+            description, PlantSettings(seed=options.seed + 1, start=start_point(description, START_MM))
+        )
         self.description = dataclasses.replace(
             description, nodes=tuple(self._virtual(node) for node in description.nodes)
         )
         """The machine with its connections replaced by virtual ones."""
-        self._plants = machine_plants(description, PlantSettings(seed=options.seed + 1))
 
     def _check_names(self, description: MachineDescription) -> None:
         names = [node.name for node in description.nodes]
@@ -147,6 +151,7 @@ class Stage:
             seed=self._options.seed + index,
             edge_log=None if self._options.serve is not None else self.edge_log_path(node.name),
             plant=self._plants[node.name].write(self._folder),
+            plant_log=self._options.serve is None,
         )
 
     def plant_page(self, node: str) -> PlantPage:

@@ -13,7 +13,7 @@ Lines        is replaced by other lines: a macro
 
 from collections.abc import Awaitable, Callable, Mapping
 
-from coordinator.gcode.words import Command
+from coordinator.gcode.words import Command, WordError, quoted
 from nodes.records import record
 
 Position = tuple[float, float, float, float]
@@ -34,6 +34,14 @@ class Call:
     """Names of the replaced commands that it stands in, the outermost first."""
     extruder: str = ""
     """The active extruder; empty where there is none."""
+
+    def parameters(self, *known: str) -> dict[str, str]:
+        """Read NAME=VALUE parameters, of which KNOWN are the names; raises WordError."""
+        values = self.command.parameters()
+        for key in values.keys() - set(known):
+            takes = f"it takes {' '.join(known)}" if known else "it takes none"
+            raise WordError(f"{self.command.name} has no parameter {quoted(key)}; {takes}")
+        return values
 
 
 @record

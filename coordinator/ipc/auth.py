@@ -32,7 +32,9 @@ class Grant:
 class Tokens:
     """Tokens with their scopes; ``#`` begins a comment, every other line is ``SCOPE NAME TOKEN``."""
 
-    def __init__(self, grants: dict[str, Grant]) -> None:
+    def __init__(self, grants: dict[str, Grant], stamp: tuple[int, ...] = ()) -> None:
+        self.stamp = stamp
+        """Of the file, as it was read; another one: it has changed since."""
         self._grants = {token.encode(): grant for token, grant in grants.items()}
 
     @classmethod
@@ -63,7 +65,7 @@ class Tokens:
             if words[2] in grants:
                 raise CanductorError(f"{path}, line {number}: the token is there twice; make another one")
             grants[words[2]] = Grant(words[1], _SCOPES[words[0]])
-        return cls(grants)
+        return cls(grants, _stamp(status))
 
     def check(self, token: str) -> Grant | None:
         """Return what TOKEN gives, None if nothing; takes as long whichever token it resembles."""
@@ -73,6 +75,18 @@ class Tokens:
             if hmac.compare_digest(known, given):
                 found = grant
         return found
+
+
+def stamp_of(path: Path) -> tuple[int, ...]:
+    """Return what changes when the file PATH does; nothing when there is none."""
+    try:
+        return _stamp(path.stat())
+    except OSError:
+        return ()
+
+
+def _stamp(status: os.stat_result) -> tuple[int, ...]:
+    return (status.st_ino, status.st_mtime_ns, status.st_ctime_ns, status.st_size)
 
 
 class FailureBrake:

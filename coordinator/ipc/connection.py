@@ -8,6 +8,7 @@ from typing import Final
 
 from coordinator.ipc.methods import ApiError, Value
 from coordinator.ipc.session import Request, Session
+from coordinator.ipc.turns import Turns
 from nodes.errors import CanductorError
 
 REQUESTS_PER_TURN: Final = 64
@@ -26,14 +27,15 @@ class Connection(asyncio.Protocol):
         self,
         admit: Callable[[asyncio.Transport, "Connection"], Session],
         on_gone: Callable[["Connection"], None],
+        turns: Turns,
     ) -> None:
         self._admit = admit
         self._on_gone = on_gone
+        self._turns = turns
         self._loop = asyncio.get_running_loop()
         self._tasks: dict[Request, asyncio.Task[None]] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._linger: asyncio.TimerHandle | None = None
-        self._turn_is_due = False
         self._half_closed = False
         self._ended = False
         self.session: Session
@@ -97,20 +99,32 @@ class Connection(asyncio.Protocol):
         self._timer = self._linger = None
         for task in self._tasks.values():
             task.cancel()
+        self._turns.leave(self)
         self._on_gone(self)
 
     # ------------------------------------------------------------------------------------------- work
 
     def _turn(self) -> None:
-        """Do a bounded part of the work there is; the rest when others had their turn."""
+        if not self.transport.is_closing():
+            self._turns.ask(self)
+
+    def hold(self) -> None:
+        """Take no more in until the next turn."""
+        if not self._half_closed:
+            self.transport.pause_reading()
+
+    def work(self, until_s: float) -> bool:
+        """Do the work there is, at most until UNTIL_S; return whether there is more."""
         session, now_s = self.session, self._loop.time()
-        for request in session.read(now_s):
+        for request in session.read(now_s) if session.should_read else ():
             self._call(request)
         for _ in range(REQUESTS_PER_TURN):
             waiting = session.next_request(now_s)
             if waiting is None:
                 break
             self._call(waiting)
+            if self._loop.time() >= until_s:
+                break
         for request in session.take_cancelled():
             if request in self._tasks:
                 self._tasks[request].cancel()
@@ -118,14 +132,7 @@ class Connection(asyncio.Protocol):
         more = session.has_work
         if not self.transport.is_closing() and not self._half_closed:
             (self.transport.pause_reading if more else self.transport.resume_reading)()
-        if more and not self._turn_is_due:
-            self._turn_is_due = True
-            self._loop.call_soon(self._next_turn)
-
-    def _next_turn(self) -> None:
-        self._turn_is_due = False
-        if not self.transport.is_closing():
-            self._turn()
+        return more and not self.transport.is_closing()
 
     def flush(self) -> None:
         """Send what the session has to say, as far as the client reads."""
@@ -181,8 +188,19 @@ class Connection(asyncio.Protocol):
         if isinstance(result, Awaitable):
             task = self._loop.create_task(self._finish(request, result))
             self._tasks[request] = task
+            task.add_done_callback(lambda task: self._check_begun(task, request, result))
         else:
             self.session.answer(request, result)
+
+    def _check_begun(self, task: asyncio.Task[None], request: Request, result: Awaitable[Value]) -> None:
+        """End REQUEST when its TASK was cancelled before its first step, unheard by ``_finish``."""
+        if not task.cancelled():
+            return
+        if asyncio.iscoroutine(result):
+            result.close()
+        del self._tasks[request]
+        self.session.fail(request, ApiError("cancelled", f"{request.method.name} was cancelled"))
+        self._turn()
 
     async def _finish(self, request: Request, result: Awaitable[Value]) -> None:
         try:

@@ -6,34 +6,51 @@ import os
 import socket
 import ssl
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
 
-from coordinator.ipc.auth import FailureBrake, Grant, Tokens
+from coordinator.ipc.auth import FailureBrake, Grant, Tokens, stamp_of
 from coordinator.ipc.connection import Connection
-from coordinator.ipc.methods import Registry, Value
+from coordinator.ipc.methods import Registry, Scope, Value
 from coordinator.ipc.publisher import Publisher
 from coordinator.ipc.session import Common, Session, SessionCounters
 from coordinator.ipc.session_methods import add_session_methods
-from coordinator.ipc.settings import IpcSettings, TcpSettings
+from coordinator.ipc.settings import IpcSettings, Limits, TcpSettings
 from coordinator.ipc.state import StateTree
+from coordinator.ipc.turns import Turns
 from coordinator.ipc.wire import Encoder, Encoding, Fault
 from nodes.errors import CanductorError
 
 _PEER: Final = struct.Struct("3i")
 """Of SO_PEERCRED: pid, uid, gid."""
 BACKLOG: Final = 128
+TOKENS_LOOK_S: Final = 1.0
+"""Between looks at whether the tokens' file has changed."""
 REFUSALS_MAX: Final = 32
 """Connections beyond the most that are still told so; further ones are just closed."""
 
 
-class IpcServer:
-    """Serves the methods of REGISTRY, and STATE, to front ends; lives on the loop that starts it."""
+def _ignore(_: str) -> None:
+    pass
 
-    def __init__(self, registry: Registry, state: StateTree, settings: IpcSettings) -> None:
+
+class IpcServer:
+    """Serves the methods of REGISTRY, and STATE, to front ends; lives on the loop that starts it.
+
+    ON_NOTICE gets sentences for the machine's owner.
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        state: StateTree,
+        settings: IpcSettings,
+        *,
+        on_notice: Callable[[str], None] = _ignore,
+    ) -> None:
         add_session_methods(registry)
         self._settings = settings
         self._encoder = Encoder()
@@ -41,7 +58,11 @@ class IpcServer:
         self._servers: list[asyncio.AbstractServer] = []
         self._connections: set[Connection] = set()
         self._brake = FailureBrake()
+        self._on_notice = on_notice
         self._tokens: Tokens | None = None
+        self._shown: dict[Connection, str] = {}  # the token that each client over TCP came in with
+        self._watch: asyncio.Task[None] | None = None
+        self._turns: Turns | None = None
         self._sessions = 0
         self._refused = 0
         self._unsendable = 0  # notifications that no message can carry
@@ -55,17 +76,25 @@ class IpcServer:
 
     async def start(self) -> None:
         """Open the sockets; raises CanductorError with all closed."""
+        turns = self._turns = Turns()
         try:
+            if self._settings.tokens is not None:
+                self._tokens = await asyncio.to_thread(Tokens.read, self._settings.tokens)
             if self._settings.unix_path is not None:
-                await self._open_unix(self._settings.unix_path)
+                await self._open_unix(self._settings.unix_path, turns)
             if self._settings.tcp is not None:
-                await self._open_tcp(self._settings.tcp)
+                await self._open_tcp(self._settings.tcp, turns)
+            path = self._settings.tokens if self._settings.tcp is None else self._settings.tcp.tokens
+            if path is not None and self._tokens is not None:
+                self._watch = asyncio.ensure_future(self._watch_tokens(path, self._tokens))
         except BaseException:
             await self.close()
             raise
 
     async def close(self) -> None:
         """Let go of every client and close the sockets."""
+        if self._watch is not None:
+            self._watch.cancel()
         for server in self._servers:
             server.close()
         for connection in list(self._connections):
@@ -110,26 +139,26 @@ class IpcServer:
 
     # ---------------------------------------------------------------------------------------- sockets
 
-    async def _open_unix(self, path: Path) -> None:
+    async def _open_unix(self, path: Path, turns: Turns) -> None:
         await asyncio.to_thread(_make_way, path)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             os.fchmod(listener.fileno(), 0o600)  # before there is a name, so that nobody can be faster
             listener.bind(str(path))
             server = await asyncio.get_running_loop().create_unix_server(
-                lambda: Connection(self._admit_unix, self._drop), sock=listener, backlog=BACKLOG
+                lambda: Connection(self._admit_unix, self._drop, turns), sock=listener, backlog=BACKLOG
             )
         except OSError as error:
             listener.close()
             raise CanductorError(f"the socket {path} cannot be opened: {error.strerror or error}") from None
         self._servers.append(server)
 
-    async def _open_tcp(self, tcp: TcpSettings) -> None:
-        context = await asyncio.to_thread(_tls_context, tcp)
+    async def _open_tcp(self, tcp: TcpSettings, turns: Turns) -> None:
+        context = await asyncio.to_thread(_tls_of_tcp, tcp)
         self._tokens = await asyncio.to_thread(Tokens.read, tcp.tokens)
         try:
             server = await asyncio.get_running_loop().create_server(
-                lambda: Connection(self._admit_tcp, self._drop),
+                lambda: Connection(self._admit_tcp, self._drop, turns),
                 tcp.host,
                 tcp.port,
                 ssl=context,
@@ -144,7 +173,58 @@ class IpcServer:
         self.tcp_port = server.sockets[0].getsockname()[1]
         self.tcp_addresses = [opened.getsockname()[0] for opened in server.sockets]
 
+    # ----------------------------------------------------------------------------------------- tokens
+
+    async def _watch_tokens(self, path: Path, tokens: Tokens) -> None:
+        """Read PATH again when it changes. While it cannot be read no token lets anybody in."""
+        known, told = tokens.stamp, ""
+        while True:
+            await asyncio.sleep(TOKENS_LOOK_S)
+            if await asyncio.to_thread(stamp_of, path) == known and not told:
+                continue
+            try:
+                tokens = await asyncio.to_thread(Tokens.read, path)
+            except CanductorError as error:
+                if str(error) != told:
+                    self._on_notice(f"{error}; until then no token lets anybody in")
+                self._tokens, told = None, str(error)
+                continue
+            self._tokens, known, told = tokens, tokens.stamp, ""
+            self._on_notice(f"the tokens of {path.name} were read again")
+            self._part_from(tokens)
+
+    def _part_from(self, tokens: Tokens) -> None:
+        """End the clients whose token is not in TOKENS any more, or has a lower scope."""
+        for connection, token in list(self._shown.items()):
+            grant, caller = tokens.check(token), connection.session.caller
+            if caller is not None and (grant is None or grant.scope < caller.scope):
+                connection.session.end(Fault("bad_token", "the token was taken away"))
+                connection.flush()
+
     # ---------------------------------------------------------------------------------------- clients
+
+    @property
+    def limits(self) -> Limits:
+        """What one client may cost."""
+        return self._common.limits
+
+    def adopt(self, transport: asyncio.Transport, address: str, granted: Scope | None) -> Connection:
+        """Take a client that came by another door, such as the live page's; TRANSPORT carries JSON lines.
+
+        Without a token it may do what is GRANTED; with nothing granted it is let in as one over TCP.
+        """
+
+        def admit(transport: asyncio.Transport, connection: Connection) -> Session:
+            if granted is None:
+                return self._admit_tcp(transport, connection, address)
+            session = self._session(connection, address, address)
+            session.granted = granted
+            return session
+
+        assert self._turns is not None, "the server is not started"
+        connection = Connection(admit, self._drop, self._turns)
+        connection.connection_made(transport)
+        return connection
 
     def _admit_unix(self, transport: asyncio.Transport, connection: Connection) -> Session:
         opened = transport.get_extra_info("socket")
@@ -155,8 +235,11 @@ class IpcServer:
             self._refuse(session, Fault("not_allowed", f"this socket is not for the user with uid {uid}"))
         return session
 
-    def _admit_tcp(self, transport: asyncio.Transport, connection: Connection) -> Session:
-        address = str((transport.get_extra_info("peername") or ("unknown",))[0])
+    def _admit_tcp(
+        self, transport: asyncio.Transport, connection: Connection, address: str | None = None
+    ) -> Session:
+        if address is None:
+            address = str((transport.get_extra_info("peername") or ("unknown",))[0])
         session = self._session(connection, address, address)
         wait_s = self._brake.shut_out_s(address, asyncio.get_running_loop().time())
         others = self._connections - {connection}
@@ -174,7 +257,9 @@ class IpcServer:
 
         def check(token: str) -> Grant | None:
             grant = None if self._tokens is None else self._tokens.check(token)
-            if grant is None and address:
+            if grant is not None:
+                self._shown[connection] = token
+            elif address and self._tokens is not None:
                 self._brake.failed(address, loop.time())
             return grant
 
@@ -194,6 +279,7 @@ class IpcServer:
 
     def _drop(self, connection: Connection) -> None:
         self._connections.discard(connection)
+        self._shown.pop(connection, None)
         for field in fields(SessionCounters):
             total = getattr(self._gone, field.name) + getattr(connection.session.counters, field.name)
             setattr(self._gone, field.name, total)
@@ -222,18 +308,10 @@ def _make_way(path: Path) -> None:
     raise CanductorError(f"another coordinator serves at {path}; stop it, or choose another path")
 
 
-def _tls_context(tcp: TcpSettings) -> ssl.SSLContext | None:
+def _tls_of_tcp(tcp: TcpSettings) -> ssl.SSLContext | None:
     """Return how TCP is kept secret, None for plain loopback; raises CanductorError."""
     if tcp.certificate is not None and tcp.private_key is not None:
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.minimum_version = ssl.TLSVersion.TLSv1_2
-        try:
-            context.load_cert_chain(tcp.certificate, tcp.private_key)
-        except (OSError, ssl.SSLError) as error:
-            raise CanductorError(
-                f"the certificate {tcp.certificate} or its key cannot be used: {error}"
-            ) from None
-        return context
+        return tls_context(tcp.certificate, tcp.private_key)
     if not tcp.plain_on_loopback:
         raise CanductorError("TCP needs a certificate and its private key, or plain_on_loopback")
     if not _is_loopback(tcp.host):
@@ -241,6 +319,17 @@ def _tls_context(tcp: TcpSettings) -> ssl.SSLContext | None:
             f"TCP without TLS is for loopback only, and {tcp.host} is not: 127.0.0.1 or ::1 is"
         )
     return None
+
+
+def tls_context(certificate: Path, private_key: Path) -> ssl.SSLContext:
+    """Return TLS 1.2 or later with the chain and key of two PEM files; raises CanductorError."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(certificate, private_key)
+    except (OSError, ssl.SSLError) as error:
+        raise CanductorError(f"the certificate {certificate} or its key cannot be used: {error}") from None
+    return context
 
 
 def _is_loopback(host: str) -> bool:

@@ -225,6 +225,11 @@ class Session:
         return unread or (bool(self._waiting) and self._may_start)
 
     @property
+    def should_read(self) -> bool:
+        """Whether it is time for ``read``: not while half of all that may wait does, and can be started."""
+        return not self._may_start or 2 * len(self._waiting) < self._limits.pending_requests
+
+    @property
     def is_idle(self) -> bool:
         """Whether nothing the client has asked for is without answer."""
         return not self._waiting and not self._running and not self.has_work

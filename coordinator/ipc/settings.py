@@ -16,6 +16,8 @@ class Limits:
     """Lists and maps inside one another."""
     items: int = 4_096
     """Entries of one list or map."""
+    values: int = 8_192
+    """In all lists and maps of a message together: looking at them takes the control loop 2 ms."""
     message_timeout_s: float = 5.0
     """For a message to be complete after its first byte, and for the hello after connecting."""
     pending_requests: int = 256
@@ -56,6 +58,8 @@ class IpcSettings:
     unix_scope: Scope = Scope.ADMIN
     """What the owner's programs may do on the Unix socket, without a token."""
     tcp: TcpSettings | None = None
+    tokens: Path | None = None
+    """As of TCP, for clients that come by other doors (the live page) when there is no TCP."""
     connections_max: int = 512
     tcp_connections_max: int = 256
     """Of those; a flood from the network leaves room for the owner's programs."""

@@ -16,6 +16,7 @@ from typing import Any, Final
 import msgpack
 
 from coordinator.ipc.methods import Value
+from coordinator.ipc.packed_values import has_more_values
 from coordinator.ipc.settings import Limits
 
 LENGTH: Final = struct.Struct(">I")
@@ -131,7 +132,7 @@ class WireReader:
             return self._die(message)
         if not isinstance(message, dict):
             return self._die(Fault("bad_message", "a message must be a map"))
-        flaw = _flaw(message, self._limits.nesting, self._limits) if self._checked else None
+        flaw = _Inspection(self._limits).flaw(message, self._limits.nesting) if self._checked else None
         return message if flaw is None else self._die(flaw)
 
     def next_deadline(self) -> float | None:
@@ -204,7 +205,9 @@ class WireReader:
         try:
             if self.encoding is Encoding.JSON:
                 return json.loads(body.decode(), parse_constant=_refuse_constant)
-            items = self._limits.items
+            items, values = self._limits.items, self._limits.values
+            if self._checked and has_more_values(body, 2 * values + 1):  # keys count here, too
+                return _too_many(self._limits)
             return msgpack.unpackb(body, max_array_len=items, max_map_len=items, max_ext_len=0)
         except (RecursionError, msgpack.StackError):
             return _too_deep(self._limits)
@@ -214,6 +217,10 @@ class WireReader:
                 "bad_message",
                 f"a message is no {word}, or has lists of more than {self._limits.items:,} items",
             )
+
+
+def _too_many(limits: Limits) -> Fault:
+    return Fault("too_long", f"the lists and maps of a message have more than {limits.values:,} items")
 
 
 def _too_deep(limits: Limits) -> Fault:
@@ -227,37 +234,46 @@ def _refuse_constant(word: str) -> None:
 _PLAIN: Final = (int, bool, type(None))
 
 
-def _flaw(value: Any, depth: int, limits: Limits) -> Fault | None:
-    """Return what a message must not hold, at most DEPTH lists and maps down; None if all is well."""
-    kind = type(value)
-    if kind is dict or kind is list:
-        return _flaw_within(value, depth, limits)
-    if kind is str:
-        sound = value.isascii() or _is_text(value)
-        return None if sound else Fault("bad_message", "a string is no Unicode")
-    if kind is float:
-        return None if math.isfinite(value) else Fault("bad_message", "a number is not finite")
-    if kind in _PLAIN:
-        return None
-    return Fault("bad_message", "a message holds what JSON has no type for; text is a string, not bytes")
+class _Inspection:
+    """Looks for what a message must not hold."""
 
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._values_left = limits.values
 
-def _flaw_within(value: Any, depth: int, limits: Limits) -> Fault | None:
-    if depth == 0:
-        return _too_deep(limits)
-    if len(value) > limits.items:
-        return Fault("too_long", f"a list or map has more than {limits.items:,} items")
-    if type(value) is dict:
-        for key in value:
-            if type(key) is not str:
+    def flaw(self, value: Any, depth: int) -> Fault | None:
+        """Return what VALUE must not hold, at most DEPTH lists and maps down; None if all is well."""
+        kind = type(value)
+        if kind is dict or kind is list:
+            return self._flaw_within(value, depth)
+        if kind is str:
+            sound = value.isascii() or _is_text(value)
+            return None if sound else Fault("bad_message", "a string is no Unicode")
+        if kind is float:
+            return None if math.isfinite(value) else Fault("bad_message", "a number is not finite")
+        if kind in _PLAIN:
+            return None
+        return Fault("bad_message", "a message holds what JSON has no type for; text is a string, not bytes")
+
+    def _flaw_within(self, value: Any, depth: int) -> Fault | None:  # noqa: PLR0911 (one for each flaw)
+        limits = self._limits
+        if depth == 0:
+            return _too_deep(limits)
+        if len(value) > limits.items:
+            return Fault("too_long", f"a list or map has more than {limits.items:,} items")
+        self._values_left -= len(value)
+        if self._values_left < 0:
+            return _too_many(limits)
+        if type(value) is dict:
+            if any(type(key) is not str for key in value):
                 return Fault("bad_message", "the keys of maps must be strings")
-            if (flaw := _flaw(key, depth, limits)) is not None:
-                return flaw
-        value = value.values()
-    for below in value:
-        if (flaw := _flaw(below, depth - 1, limits)) is not None:
-            return flaw
-    return None
+            if not all(key.isascii() or _is_text(key) for key in value):
+                return Fault("bad_message", "a string is no Unicode")
+            value = value.values()
+        for below in value:
+            if (found := self.flaw(below, depth - 1)) is not None:
+                return found
+        return None
 
 
 def _is_text(value: str) -> bool:

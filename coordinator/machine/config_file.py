@@ -44,6 +44,20 @@ class RawSection:
     place: Place
     """Where it is named first."""
     options: dict[str, RawOption] = field(default_factory=dict)
+    problems: list[ConfigError] | None = None
+    """Where mistakes are collected; None: the first one ends the reading."""
+    set_aside: set[str] = field(default_factory=set)
+    """Options that are known to be wrong and were taken out: nobody is to miss them."""
+    is_set_aside: bool = False
+    """Whether all of them were."""
+    stands_in: bool = False
+    """Whether anything of it was read as a value that nobody gave."""
+
+    def report(self, error: ConfigError) -> None:
+        """Raise ERROR, or collect it."""
+        if self.problems is None:
+            raise error
+        self.problems.append(error)
 
     @property
     def kind(self) -> str:
@@ -69,11 +83,16 @@ class ConfigFile:
     """The main file's text before the block, untouched, for writing it back."""
     notes: list[str] = field(default_factory=list)
     """Sentences about what was read but has no effect."""
+    problems: list[ConfigError] | None = None
+    """Where mistakes are collected; None: the first one ends the reading."""
 
 
-def parse_config(path: str) -> ConfigFile:
-    """Read a configuration file and all it includes; raises ConfigError."""
-    config = ConfigFile(path)
+def parse_config(path: str, problems: list[ConfigError] | None = None) -> ConfigFile:
+    """Read a configuration file and all it includes; raises ConfigError.
+
+    With PROBLEMS that is only raised for files that cannot be read: other mistakes are collected there.
+    """
+    config = ConfigFile(path, problems=problems)
     budget = ReadBudget()
     place = Place(path, 0)
     config_text.enter_file(path, place, budget)
@@ -84,7 +103,9 @@ def parse_config(path: str) -> ConfigFile:
     saved_lines = _saved_lines(path, lines, header)
     _Parser(config, config.saved, None).parse(path, saved_lines)
     for saved in config.saved.values():
-        section = config.sections.setdefault(saved.name, RawSection(saved.name, saved.place))
+        section = config.sections.setdefault(
+            saved.name, RawSection(saved.name, saved.place, problems=config.problems)
+        )
         section.options.update(saved.options)
     return config
 
@@ -138,8 +159,16 @@ class _Parser:
                 self._value.append(text.strip())
             else:
                 self._end_option()
-                self._begin(text.strip(), indent, Place(path, number))
+                self._begin_or_report(text.strip(), indent, Place(path, number))
         self._end_option()
+
+    def _begin_or_report(self, text: str, indent: int, place: Place) -> None:
+        try:
+            self._begin(text, indent, place)
+        except ConfigError as error:
+            if self._config.problems is None:
+                raise
+            self._config.problems.append(error)
 
     def _begin(self, text: str, indent: int, place: Place) -> None:
         """Take a line that is not a value's continuation."""
@@ -155,7 +184,8 @@ class _Parser:
             self._section = None
             self._include(pattern, place)
         else:
-            self._section = self._sections.setdefault(name, RawSection(name, place))
+            new = RawSection(name, place, problems=self._config.problems)
+            self._section = self._sections.setdefault(name, new)
 
     def _end_option(self) -> None:
         if self._option is not None:

@@ -74,7 +74,14 @@ def load_machine(path: str) -> MachineDescription:
 
     Raises ConfigError, one sentence that begins with file and line, for the first mistake found.
     """
-    config = parse_config(str(path))
+    return describe(parse_config(str(path)))
+
+
+def describe(config: ConfigFile) -> MachineDescription:
+    """Return the machine that CONFIG speaks of; raises ConfigError for the first mistake found.
+
+    Where the file collects mistakes it is raised only for those that leave nothing to go on with.
+    """
     later: list[NotYetActing] = []
     _check_section_names(config)
     nodes = read_nodes(config, later)
@@ -91,7 +98,6 @@ def load_machine(path: str) -> MachineDescription:
     followers = read_extruder_steppers(reading, extruders)
     shapers = read_shapers(reading)
     axis_tables = read_axis_tables(reading)
-    modules = _read_modules(reading)
     description = MachineDescription(
         path=config.path,
         nodes=nodes,
@@ -104,27 +110,26 @@ def load_machine(path: str) -> MachineDescription:
         extruders=extruders,
         extruder_steppers=followers,
         shapers=shapers,
-        modules=modules,
-        not_yet_acting=(*later, *_later_sections(reading, kinematics)),
+        modules=_module_sources(reading),
+        not_yet_acting=(),
         notes=tuple(config.notes),
         axis_tables=axis_tables,
     )
     _check_names(description)
     check_policies(description.nodes, description.steppers)
-    return description
+    reading.pins = description.modules.build(description).pins  # made once to find mistakes
+    return replace(description, not_yet_acting=(*later, *_later_sections(reading, kinematics)))
 
 
-def _read_modules(reading: Reading) -> ModuleSources:
-    """Return what the modules are made from, made once to find mistakes; raises ConfigError."""
+def _module_sources(reading: Reading) -> ModuleSources:
+    """Return what the modules are made from; raises ConfigError."""
     sources: list[ModuleSource] = []
     for section in reading.config.sections.values():
         sources += [ModuleSource(section, kind, whole=False) for kind in modules_beside(section.name)]
         if not _is_acting(section) and (kind := module_for(section.kind, section.place)) is not None:
             sources.append(ModuleSource(section, kind, whole=True))
             reading.used.add(section.name)
-    modules = ModuleSources(tuple(sources), reading.pins)
-    reading.pins = modules.build().pins
-    return modules
+    return ModuleSources(tuple(sources), reading.pins)
 
 
 def _named(limits: MotionLimits, frame: Frame) -> MotionLimits:
@@ -166,12 +171,12 @@ def _check_section_names(config: ConfigFile) -> None:
         if section.kind in known_kinds():  # asked for last: it looks through all packages
             continue
         if section.kind in _SINGLE_SECTIONS:
-            raise ConfigError(
-                section.place, f"[{section.name}] must be [{section.kind}]: there is only one of it"
-            )
+            error = f"[{section.name}] must be [{section.kind}]: there is only one of it"
+            section.report(ConfigError(section.place, error))
+            continue
         valid = (*_SINGLE_SECTIONS, *_NAMED_SECTIONS, *known_kinds(), *sorted(LATER_SECTIONS))
         hint = nearest(section.kind, valid, pattern="[{}]") or "; remove it or correct its name"
-        raise ConfigError(section.place, f"there is no section [{section.name}]{hint}")
+        section.report(ConfigError(section.place, f"there is no section [{section.name}]{hint}"))
 
 
 def _later_sections(reading: Reading, kinematics: str) -> list[NotYetActing]:
@@ -189,11 +194,11 @@ def _later_sections(reading: Reading, kinematics: str) -> list[NotYetActing]:
             reading.pins.check_unclaimed(section.options.values(), section.name)
             continue
         if section.name not in reading.used and section.kind not in ("printer", *_NAMED_SECTIONS):
-            raise ConfigError(
-                section.place,
+            useless = (
                 f"[{section.name}] has no place in a machine of kinematics {kinematics}; remove it, or"
-                " correct its name or 'kinematics' of [printer]",
+                " correct its name or 'kinematics' of [printer]"
             )
+            section.report(ConfigError(section.place, useless))
         options = [option for name, option in section.options.items() if (section.name, name) in waiting]
         reading.pins.check_unclaimed(options, section.name)
     return result

@@ -45,6 +45,10 @@ class Option(Generic[T]):
         """Return the values allowed, to follow "must be"."""
         raise NotImplementedError
 
+    def stand_in(self) -> T:
+        """Return any value that is allowed, to go on with after a mistake."""
+        raise NotImplementedError
+
 
 @record(kw_only=True)
 class _Bounded(Option[T]):
@@ -79,6 +83,17 @@ class _Bounded(Option[T]):
         if not inside:
             raise BadValue
 
+    def _any(self) -> float:
+        bounds = [b for b in (self.minimum, self.maximum, self.above, self.below) if b is not None]
+        near = [*bounds, *(b + 1 for b in bounds), *(b - 1 for b in bounds), sum(bounds) / (len(bounds) or 1)]
+        for value in (1.0, 0.0, *near):
+            try:
+                self._check(value)
+            except BadValue:
+                continue
+            return value
+        raise AssertionError(self.name)
+
 
 @record(kw_only=True)
 class FloatOption(_Bounded[float]):
@@ -94,6 +109,10 @@ class FloatOption(_Bounded[float]):
     def rule(self) -> str:
         """Return the values allowed."""
         return self._rule("a number")
+
+    def stand_in(self) -> float:
+        """Return any number that is allowed."""
+        return self._any()
 
 
 @record(kw_only=True)
@@ -116,6 +135,10 @@ class IntOption(_Bounded[int]):
         """Return the values allowed."""
         return self._rule("a whole number" if self.multiple_of == 1 else f"a multiple of {self.multiple_of}")
 
+    def stand_in(self) -> int:
+        """Return any number that is allowed, but for ``multiple_of``."""
+        return int(self._any())
+
 
 @record(kw_only=True)
 class BoolOption(Option[bool]):
@@ -130,6 +153,10 @@ class BoolOption(Option[bool]):
     def rule(self) -> str:
         """Return the values allowed."""
         return "True or False"
+
+    def stand_in(self) -> bool:
+        """Return one of both."""
+        return False
 
 
 @record(kw_only=True)
@@ -152,6 +179,10 @@ class ChoiceOption(Option[str]):
         """Return the values allowed."""
         return one_of(self.choices)
 
+    def stand_in(self) -> str:
+        """Return the first."""
+        return self.choices[0]
+
 
 @record(kw_only=True)
 class TextOption(Option[str]):
@@ -170,6 +201,10 @@ class TextOption(Option[str]):
         """Return the values allowed."""
         return self.pattern_rule
 
+    def stand_in(self) -> str:
+        """Return no text."""
+        return ""
+
 
 @record(kw_only=True)
 class ListOption(Option[tuple[str, ...]]):
@@ -185,6 +220,10 @@ class ListOption(Option[tuple[str, ...]]):
     def rule(self) -> str:
         """Return the values allowed."""
         return "a list of words separated by commas"
+
+    def stand_in(self) -> tuple[str, ...]:
+        """Return none."""
+        return ()
 
 
 @record(kw_only=True)
@@ -209,6 +248,10 @@ class GearRatioOption(Option[float]):
     def rule(self) -> str:
         """Return the values allowed."""
         return "pairs of teeth as in 50:10 or 50:17, 3:1 (motor first)"
+
+    def stand_in(self) -> float:
+        """Return no gear."""
+        return 1.0
 
 
 def one_of(words: Sequence[str]) -> str:
@@ -249,7 +292,9 @@ class SectionReader:
         for raw in self.section.options.values():
             if raw.name not in valid:
                 hint = nearest(raw.name, valid, pattern="'{}'") or "; remove it or correct its name"
-                raise ConfigError(raw.place, f"[{self.name}] has no option {shown(raw.name)}{hint}")
+                error = ConfigError(raw.place, f"[{self.name}] has no option {shown(raw.name)}{hint}")
+                self.section.report(error)
+                self._read.add(raw.name)
 
     @property
     def name(self) -> str:
@@ -279,18 +324,23 @@ class SectionReader:
         try:
             return option.parse(raw.value)
         except BadValue as error:
-            raise self.bad(option, str(error) if error.args else f"must be {option.rule()}") from None
+            problem = self.bad(option, str(error) if error.args else f"must be {option.rule()}")
+        self.section.report(problem)
+        self.section.stands_in = True
+        return option.default if option.default is not None else option.stand_in()
 
     def get(self, option: Option[T]) -> T:
         """Return the value or the default; raises ConfigError when a required option is absent."""
         value = self.find(option)
         if value is None:
             value = option.default
-        if value is None:
-            raise ConfigError(
-                self.place, f"[{self.name}] lacks option '{option.name}', {option.rule()}: {option.help}"
-            )
-        return value
+        if value is not None:
+            return value
+        if not (self.section.is_set_aside or option.name in self.section.set_aside):
+            lack = f"[{self.name}] lacks option '{option.name}', {option.rule()}: {option.help}"
+            self.section.report(ConfigError(self.place, lack))
+        self.section.stands_in = True
+        return option.stand_in()
 
     def bad(self, option: Option[T], sentence: str) -> ConfigError:
         """Return the error for a value; the sentence goes on after "option 'x' of [y] is 'z', "."""
@@ -310,8 +360,10 @@ class SectionReader:
         ]
         for option in unread:
             if option.name not in self.spec.later:
-                raise ConfigError(
-                    option.place,
-                    f"option '{option.name}' of [{self.name}] has no effect beside the others; remove it",
+                self.section.report(
+                    ConfigError(
+                        option.place,
+                        f"option '{option.name}' of [{self.name}] has no effect beside the others; remove it",
+                    )
                 )
         return tuple(unread)

@@ -6,7 +6,7 @@ A pin is ``[!][^|~][node:]name``, or with the marks after the node as in ``toolh
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from coordinator.machine.config_file import RawOption, RawSection
 from coordinator.machine.options import BadValue, Option
@@ -55,6 +55,10 @@ class PinDescription:
         return number
 
 
+NO_PIN = PinName(PRIMARY_NODE, "")
+"""Stands in for a pin after a mistake."""
+
+
 @record(kw_only=True)
 class PinOption(Option[PinName]):
     """A pin."""
@@ -85,6 +89,10 @@ class PinOption(Option[PinName]):
         marks = ("!" if self.invertible else "") + ("^~" if self.pullable else "")
         return "a pin as in PA3 or toolhead:PA3" + (f", may begin with {' or '.join(marks)}" if marks else "")
 
+    def stand_in(self) -> PinName:
+        """Return a pin that there is not."""
+        return NO_PIN
+
 
 _ANY_PIN = PinOption(name="pin", help="any pin", pullable=True)
 
@@ -112,21 +120,31 @@ class PinRegistry:
 
     def claim(self, pin: PinName, option: PinOption, section: RawSection) -> PinDescription:
         """Take a pin for an option; raises ConfigError for an unknown node or a pin in use."""
-        place = section.options[option.name].place
+        place = section.options[option.name].place if option.name in section.options else section.place
         purpose = f"'{option.name}' of [{section.name}]"
-        if pin.node not in self.nodes:
-            hint = nearest(pin.node, self.nodes, pattern="'{}'") or f"; add a section [mcu {pin.node}]"
-            raise ConfigError(place, f"{purpose}: there is no node {shown(pin.node)}{hint}")
-        name = self._resolve(pin, purpose, place)
-        claimed = PinDescription(pin.node, name, pin.invert, pin.pull, purpose, place)
-        user, share = self._users.setdefault((pin.node, name), (claimed, option.share))
-        if user is not claimed:
-            self._check_shared(claimed, option.share, user, share)
+        claimed = PinDescription(pin.node, pin.name, pin.invert, pin.pull, purpose, place)
+        if pin is NO_PIN:
+            return claimed
+        try:
+            return self._claim(pin, claimed, option.share)
+        except ConfigError as error:
+            section.report(error)
+            section.stands_in = True
         return claimed
 
-    def names(self, node: str) -> list[str]:
-        """Return the pins of a node that somebody has."""
-        return [name for at, name in self._users if at == node]
+    def _claim(self, pin: PinName, wanted: PinDescription, share: str) -> PinDescription:
+        if pin.node not in self.nodes:
+            hint = nearest(pin.node, self.nodes, pattern="'{}'") or f"; add a section [mcu {pin.node}]"
+            raise ConfigError(wanted.place, f"{wanted.purpose}: there is no node {shown(pin.node)}{hint}")
+        claimed = replace(wanted, name=self._resolve(pin, wanted.purpose, wanted.place))
+        user, other_share = self._users.setdefault((pin.node, claimed.name), (claimed, share))
+        if user is not claimed:
+            self._check_shared(claimed, share, user, other_share)
+        return claimed
+
+    def claimed(self, node: str) -> list[str]:
+        """Return the names of NODE's pins that are in use."""
+        return [name for other, name in self._users if other == node]
 
     def check_unclaimed(self, options: Iterable[RawOption], section: str) -> None:
         """Raise ConfigError when a section that does not act yet names a pin that is not to be shared.

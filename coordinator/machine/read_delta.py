@@ -8,7 +8,7 @@ from coordinator.machine.model import RailDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
 from coordinator.machine.printer_options import DELTA_RADIUS, MINIMUM_Z, PRINT_RADIUS, ROUND_RANGE_OPTIONS
 from coordinator.machine.read_homing import HOMING, POSITION_ENDSTOP, read_tower_homing
-from coordinator.machine.read_rails import WAITING, read_extra_steppers
+from coordinator.machine.read_rails import read_extra_steppers
 from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, read_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.tower_checks import check_directions, check_height
@@ -58,7 +58,7 @@ def read_delta(reading: Reading, printer: SectionReader) -> Frame:
             read_stepper(reader, function, reading.pins),
             *read_extra_steppers(reading, reader.name, function),
         )
-        reading.finish(reader, waiting=WAITING)
+        reading.finish(reader)
         rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
     home = tidy(delta.forward(delta.endstop_positions))
     return Frame(delta, tuple(rails), home, range_options=ROUND_RANGE_OPTIONS)

@@ -9,7 +9,7 @@ from coordinator.machine.model import RailDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
 from coordinator.machine.printer_options import MIN_ANGLE, MINIMUM_Z, PRINT_WIDTH
 from coordinator.machine.read_homing import HOMING, POSITION_ENDSTOP, read_tower_homing
-from coordinator.machine.read_rails import WAITING, read_extra_steppers, read_rail
+from coordinator.machine.read_rails import read_extra_steppers, read_rail
 from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, read_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.tower_checks import check_height
@@ -61,7 +61,7 @@ def read_deltesian(reading: Reading, printer: SectionReader) -> Frame:
         homing = read_tower_homing(reader, arm.endstop_height, reading.pins)
         first = read_stepper(reader, function, reading.pins)
         steppers = (first, *read_extra_steppers(reading, reader.name, function))
-        reading.finish(reader, waiting=WAITING)
+        reading.finish(reader)
         name = reader.name.removeprefix("stepper_")
         rails.append(RailDescription(name, steppers, None, None, homing, reader.place))
     home = deltesian.forward((*deltesian.endstop_positions, home_of(y)))

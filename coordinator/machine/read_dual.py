@@ -8,7 +8,8 @@ from coordinator.machine.frame import Frame, axis_range, home_of
 from coordinator.machine.model import DualCarriageDescription, RailDescription, StepperDescription
 from coordinator.machine.options import ChoiceOption, FloatOption, SectionReader, SectionSpec, one_of
 from coordinator.machine.problem import ConfigError
-from coordinator.machine.read_rails import RAIL, WAITING, read_axis
+from coordinator.machine.read_homing import WAITING
+from coordinator.machine.read_rails import RAIL, read_axis
 from coordinator.machine.read_steppers import MAX_POSITION
 from coordinator.machine.reading import Reading
 

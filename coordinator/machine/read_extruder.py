@@ -8,7 +8,7 @@ from coordinator.machine.model import ExtruderDescription, ExtruderStepperDescri
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec, TextOption
 from coordinator.machine.problem import ConfigError, nearest
 from coordinator.machine.read_printer import MAX_ACCEL, MAX_SPEED, PrinterSection
-from coordinator.machine.read_steppers import MOTOR, WAITING, read_stepper
+from coordinator.machine.read_steppers import MOTOR, read_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_EXTRUDER_OPTIONS
 from coordinator.modules.heater_options import EXTRUDER_HEATER_OPTIONS, LATER_HEATER_OPTIONS
@@ -153,7 +153,7 @@ def _read_extruder(
         corner_velocity=reader.get(CORNER_VELOCITY),
     )
     advance, smooth = reader.get(PRESSURE_ADVANCE), reader.get(SMOOTH_TIME)
-    reading.finish(reader, waiting=WAITING)
+    reading.finish(reader)
     return ExtruderDescription(section.name, stepper, nozzle, filament, advance, smooth, limits)
 
 
@@ -178,7 +178,7 @@ def _read_follower(
     active = followed is not None and followed is extruders[0]
     function = MOVES if active else STANDS
     stepper = read_stepper(reader, function, reading.pins, name=section.instance)
-    reading.finish(reader, waiting=WAITING)
+    reading.finish(reader)
     return ExtruderStepperDescription(section.instance, stepper, name)
 
 

@@ -12,11 +12,9 @@ from coordinator.machine.model import RailDescription, StepperDescription
 from coordinator.machine.options import BadValue, ChoiceOption, Option, SectionReader, SectionSpec, TextOption
 from coordinator.machine.problem import ConfigError, Place, nearest, shown
 from coordinator.machine.read_dual import SAFE_DISTANCE, describe_dual, park
-from coordinator.machine.read_homing import ENDSTOP_PIN, HOMING, read_endstop, read_homing
-from coordinator.machine.read_homing import WAITING as HOMING_WAITING
+from coordinator.machine.read_homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
 from coordinator.machine.read_rails import RANGE, read_range
 from coordinator.machine.read_steppers import MOTOR, read_stepper
-from coordinator.machine.read_steppers import WAITING as MOTOR_WAITING
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
 from nodes.records import record
@@ -141,7 +139,7 @@ def _read_carriage(reading: Reading, section: RawSection) -> RailDescription:
     axis = reader.find(AXIS) or (section.instance if section.instance in "xyz" else reader.get(AXIS))
     low, high = read_range(reader)
     rail = RailDescription(axis, (), low, high, read_homing(reader, low, high, reading.pins), section.place)
-    reading.finish(reader, waiting=HOMING_WAITING)
+    reading.finish(reader)
     return rail
 
 
@@ -159,7 +157,7 @@ def _read_further_carriages(reading: Reading, carriages: _Carriages) -> None:
         reader = SectionReader(section, EXTRA_CARRIAGE)
         _primary(reader, carriages)
         read_endstop(reader, reading.pins)
-        reading.finish(reader, waiting=HOMING_WAITING)
+        reading.finish(reader, waiting=WAITING)
 
 
 def _primary(reader: SectionReader, carriages: _Carriages) -> RailDescription:
@@ -178,7 +176,7 @@ def _read_motor(reading: Reading, section: RawSection, carriages: _Carriages) ->
         second = name if name in carriages.second else second
     function = StepFunction(weights=(weights[0], weights[1], weights[2], weights[3]))
     stepper = read_stepper(reader, function, reading.pins, name=section.instance)
-    reading.finish(reader, waiting=MOTOR_WAITING)
+    reading.finish(reader)
     return _Motor(stepper, second)
 
 
@@ -211,7 +209,7 @@ def _frame(
                 rail.place, f"no [stepper NAME] moves carriage '{name}'; name it in 'carriages' of one"
             )
         dual = describe_dual(reader, axis, (frame.rails[axis], frame.rails[axis].steppers), (rail, theirs))
-        reading.finish(reader, waiting=HOMING_WAITING)
+        reading.finish(reader, waiting=WAITING)
         frame = park(frame, dual, theirs, reader.name)
     return frame
 

@@ -51,7 +51,7 @@ POSITIVE_DIR = BoolOption(
 APPROACH = (HOMING_SPEED, SECOND_HOMING_SPEED, RETRACT_DISTANCE, RETRACT_SPEED, POSITIVE_DIR)
 HOMING = (ENDSTOP_PIN, POSITION_ENDSTOP, *APPROACH)
 WAITING = tuple(option.name for option in (ENDSTOP_PIN, *APPROACH))
-"""Read and checked, but the module homing is not built yet."""
+"""Read and checked, but of rails that homing does not know yet, and of an axis' second endstop."""
 
 
 def read_endstop(reader: SectionReader, pins: PinRegistry) -> tuple[PinDescription | None, str]:

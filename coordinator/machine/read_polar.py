@@ -4,7 +4,8 @@ from coordinator.kinematics.polar import Polar
 from coordinator.machine.frame import Frame, axis_range, home_of
 from coordinator.machine.model import NO_ENDSTOP, RailDescription
 from coordinator.machine.options import SectionReader, SectionSpec
-from coordinator.machine.read_rails import POSITION_MAX, WAITING, read_extra_steppers, read_rail
+from coordinator.machine.read_homing import WAITING
+from coordinator.machine.read_rails import POSITION_MAX, read_extra_steppers, read_rail
 from coordinator.machine.read_steppers import TURNING_MOTOR, read_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS

@@ -3,10 +3,8 @@
 from coordinator.kinematics.base import StepFunction
 from coordinator.machine.model import RailDescription, StepperDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
-from coordinator.machine.read_homing import ENDSTOP_PIN, HOMING, read_endstop, read_homing
-from coordinator.machine.read_homing import WAITING as HOMING_WAITING
+from coordinator.machine.read_homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
 from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, TURNING_MOTOR, extra_sections, read_stepper
-from coordinator.machine.read_steppers import WAITING as MOTOR_WAITING
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
 
@@ -26,7 +24,6 @@ POSITION_MAX = FloatOption(
     maximum=MAX_POSITION,
 )
 RANGE = (POSITION_MIN, POSITION_MAX)
-WAITING = (*MOTOR_WAITING, *HOMING_WAITING)
 RAIL = SectionSpec(
     help="The first stepper of an axis, with the axis' range and its homing",
     options=(*MOTOR, *RANGE, *HOMING),
@@ -45,7 +42,7 @@ def read_rail(reading: Reading, axis: str, function: StepFunction) -> RailDescri
     """Return the rail of [stepper_AXIS] with all its steppers; raises ConfigError."""
     reader = SectionReader(reading.get(f"stepper_{axis}", EVERY_AXIS), RAIL)
     rail = read_axis(reading, reader, axis, function)
-    reading.finish(reader, waiting=WAITING)
+    reading.finish(reader, waiting=WAITING if rail.homing.virtual_endstop else ())
     return rail
 
 

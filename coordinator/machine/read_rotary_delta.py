@@ -13,8 +13,8 @@ from coordinator.machine.printer_options import (
     SHOULDER_HEIGHT,
     SHOULDER_RADIUS,
 )
-from coordinator.machine.read_homing import HOMING, POSITION_ENDSTOP, read_tower_homing
-from coordinator.machine.read_rails import WAITING, read_extra_steppers
+from coordinator.machine.read_homing import HOMING, POSITION_ENDSTOP, WAITING, read_tower_homing
+from coordinator.machine.read_rails import read_extra_steppers
 from coordinator.machine.read_steppers import MAX_POSITION, TURNING_MOTOR, read_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.tower_checks import check_directions, check_height

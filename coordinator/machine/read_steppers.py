@@ -49,8 +49,6 @@ TURNING_GEAR_RATIO = GearRatioOption(
 )
 TURNING_MOTOR = (STEP_PIN, DIR_PIN, ENABLE_PIN, MICROSTEPS, FULL_STEPS, TURNING_GEAR_RATIO, STEP_PULSE)
 """Of a motor that turns the bed or an arm instead of moving a rail."""
-WAITING = (ENABLE_PIN.name,)
-"""Read and checked, but the module that enables motors is not built yet."""
 
 _EXTRA_STEPPER = re.compile(r"stepper_[a-z]+[1-9][0-9]?|dual_carriage[1-9][0-9]?", re.ASCII)
 

@@ -9,7 +9,8 @@ from coordinator.kinematics.winch import MIN_WINCHES, Winch
 from coordinator.machine.frame import Frame
 from coordinator.machine.model import NO_ENDSTOP, RailDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
-from coordinator.machine.read_rails import WAITING, read_extra_steppers
+from coordinator.machine.read_homing import WAITING
+from coordinator.machine.read_rails import read_extra_steppers
 from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, read_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS

@@ -23,15 +23,7 @@ from coordinator.machine import (
 from coordinator.machine.options import Option, SectionSpec
 from coordinator.machine.printer_options import PRINTER_SPECS
 from coordinator.machine.well_known import LATER_SECTIONS
-from coordinator.modules import (
-    automatic_fans,
-    fans,
-    heater_sections,
-    sensor_module,
-    temperature_fan,
-    thermistor,
-    verify_heater,
-)
+from coordinator.modules.registry import own_beside, own_modules
 
 SECTIONS: dict[str, SectionSpec] = {
     "[mcu], [mcu NAME]": read_nodes.MCU,
@@ -52,18 +44,6 @@ SECTIONS: dict[str, SectionSpec] = {
     "[extruder], [extruder1] …": read_extruder.EXTRUDER,
     "[extruder_stepper NAME]": read_extruder.EXTRUDER_STEPPER,
     "[input_shaper]": read_shaper.INPUT_SHAPER,
-    "[extruder], [extruder1] …: the heater": heater_sections.ExtruderHeater.SPEC,
-    "[heater_bed]": heater_sections.HeaterBed.SPEC,
-    "[heater_generic NAME]": heater_sections.HeaterGeneric.SPEC,
-    "[verify_heater NAME]": verify_heater.VerifyHeater.SPEC,
-    "[thermistor NAME]": thermistor.Thermistor.SPEC,
-    "[adc_temperature NAME]": thermistor.AdcTemperature.SPEC,
-    "[temperature_sensor NAME]": sensor_module.TemperatureSensor.SPEC,
-    "[fan]": fans.Fan.SPEC,
-    "[fan_generic NAME]": fans.FanGeneric.SPEC,
-    "[heater_fan NAME]": automatic_fans.HeaterFan.SPEC,
-    "[controller_fan NAME]": automatic_fans.ControllerFan.SPEC,
-    "[temperature_fan NAME]": temperature_fan.TemperatureFan.SPEC,
     "[axis_tables]": read_tables.AXIS_TABLES,
     "[board_pins], [board_pins NAME]": read_nodes.BOARD_PINS,
     "[duplicate_pin_override]": read_nodes.DUPLICATE_PIN_OVERRIDE,
@@ -72,9 +52,41 @@ MOST_NUMBERED = 3
 """Options that differ in their number are shown so far; the help says how many there are."""
 
 
+def sections() -> list[str]:
+    """Return the titles of all sections: the machine's own, then those of our modules."""
+    return [*SECTIONS, *_module_sections()]
+
+
+def _module_sections() -> dict[str, SectionSpec]:
+    beside = {f"{title}, further options": module.SPEC for title, module in own_beside()}
+    return beside | {title: module.SPEC for title, module in own_modules()}
+
+
+def _spec(title: str) -> SectionSpec:
+    return SECTIONS.get(title) or _module_sections()[title]
+
+
+def section_json(title: str) -> dict[str, object]:
+    """Return one section's purpose and options."""
+    spec = _spec(title)
+    return {
+        "help": spec.help,
+        "options": [
+            {
+                "name": option.name,
+                "value": option.rule(),
+                "unit": option.unit,
+                "default": option.default,
+                "help": option.help,
+            }
+            for option in spec.options
+        ],
+    }
+
+
 def section_table(title: str) -> str:
     """Return one section's heading, purpose and options in Markdown."""
-    spec = SECTIONS[title]
+    spec = _spec(title)
     lines = [
         f"### `{title}`",
         "",
@@ -111,7 +123,7 @@ def _row(option: Option[object]) -> str:
 
 def main() -> None:
     """Print all tables."""
-    sys.stdout.write("\n".join(section_table(title) for title in SECTIONS) + "\n" + later_sections())
+    sys.stdout.write("\n".join(section_table(title) for title in sections()) + "\n" + later_sections())
 
 
 if __name__ == "__main__":

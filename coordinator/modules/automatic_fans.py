@@ -72,6 +72,7 @@ class _HeaterNames:
 class HeaterFan(FanModule):
     """A fan that runs while a heater is hot."""
 
+    NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that runs while a heater is hot or is to be, as that of a hot end",
         options=(*fan_options(FULL), HEATER, HEATER_TEMP, FAN_SPEED),
@@ -106,6 +107,7 @@ class HeaterFan(FanModule):
 class ControllerFan(FanModule):
     """A fan that cools a board while it is at work."""
 
+    NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that runs while a job moves the machine or a heater has a target, and some time after",
         options=(

@@ -25,6 +25,7 @@ from coordinator.machine.problem import ConfigError, Place, nearest, shown
 from nodes.node_config import NodeConfig
 
 if TYPE_CHECKING:  # planning needs neither, and they draw in asyncio
+    from coordinator.machine.model import MachineDescription
     from coordinator.modules.live import Live
     from nodes.node import Node
 
@@ -57,6 +58,10 @@ class Module:
 
     SPEC: ClassVar[SectionSpec]
     """All its options; the reference page is made from it."""
+    NAMED: ClassVar[bool] = False
+    """Whether there may be several, ``[kind NAME]``; else there is one, ``[kind]``."""
+    TITLE: ClassVar[str] = ""
+    """Which sections it reads a part of: ``[extruder], [extruder1] …``; else it has its own."""
 
     def __init__(self, build: "Build") -> None:
         """Read all options; no I/O. Raises ConfigError."""
@@ -95,11 +100,14 @@ class Build:
         section: RawSection,
         spec: SectionSpec,
         pins: PinRegistry,
+        machine: "MachineDescription",
         *,
         whole: bool = True,
         share: "Callable[[type[Module]], Module]",
     ) -> None:
         self.name = section.name
+        self.machine = machine
+        """Nodes, steppers, rails, limits: what does not come from modules."""
         self.reader = SectionReader(section, spec, whole=whole)
         self.devices: list[tuple[str, Device]] = []
         """With the node of each."""

@@ -64,6 +64,7 @@ class GenericFans(Module):
 class FanGeneric(FanModule):
     """A fan that programs set by its name."""
 
+    NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that programs set: SET_FAN_SPEED FAN=NAME SPEED=", options=fan_options(OFF)
     )

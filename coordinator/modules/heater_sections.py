@@ -73,6 +73,7 @@ class HeaterBed(HeaterModule):
 class HeaterGeneric(HeaterModule):
     """A heater of any kind."""
 
+    NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A heater for anything else; programs call it by NAME",
         options=(*HEATER_OPTIONS, GCODE_ID),
@@ -118,6 +119,7 @@ class ExtruderHeaters(Module):
 class ExtruderHeater(Module):
     """The heater of an extruder; an extruder without heater_pin has none."""
 
+    TITLE: ClassVar = "[extruder], [extruder1] …"
     SPEC: ClassVar = SectionSpec(
         help="The heater of an extruder",
         options=EXTRUDER_HEATER_OPTIONS,

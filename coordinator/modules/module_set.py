@@ -2,18 +2,21 @@
 
 import contextlib
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
-from coordinator.gcode.commands import Call, GCodeCommand, Reading, Vocabulary
+from coordinator.gcode.commands import GCodeCommand, Vocabulary
 from coordinator.machine.config_file import RawSection
 from coordinator.machine.pins import PinRegistry
 from coordinator.machine.problem import ConfigError, Place
 from coordinator.modules.base import Build, Device, Module, Value
+from coordinator.modules.homing import Homing
+from coordinator.modules.motor_power import MotorPower
 from nodes.node_config import NodeConfig
 from nodes.records import record
 
 if TYPE_CHECKING:
+    from coordinator.machine.model import MachineDescription
     from coordinator.modules.live import Live
     from nodes.node import Node
 
@@ -38,9 +41,9 @@ class ModuleSources:
     pins: PinRegistry
     """As the machine's own sections left it."""
 
-    def build(self) -> "ModuleSet":
-        """Make them, linked with each other; raises ConfigError."""
-        built = ModuleSet(copy.deepcopy(self.pins))
+    def build(self, machine: "MachineDescription") -> "ModuleSet":
+        """Make those of MACHINE, linked with each other; raises ConfigError."""
+        built = ModuleSet(machine, copy.deepcopy(self.pins))
         for source in self.sources:
             built.build(source)
         built.link()
@@ -50,23 +53,32 @@ class ModuleSources:
 class ModuleSet:
     """The modules, by the names of their sections; also what they are to each other."""
 
-    def __init__(self, pins: PinRegistry) -> None:
+    def __init__(self, machine: "MachineDescription", pins: PinRegistry) -> None:
         self.pins = pins
+        self._machine = machine
         self._modules: list[Module] = []
         self._devices: dict[str, list[Device]] = {}
         self._commands: dict[str, GCodeCommand] = {}
         self._owners: dict[str, str] = {}
         self._live: Live | None = None
-        self.home: Callable[[Call, str], Reading] | None = None
-        """Reads G28."""
+        self._homing = self.shared(Homing)
+        self._motors = self.shared(MotorPower)
 
     def build(self, source: ModuleSource) -> Module:
         """Make the module of SOURCE; raises ConfigError."""
-        build = Build(source.section, source.kind.SPEC, self.pins, whole=source.whole, share=self._share)
+        build = Build(
+            source.section, source.kind.SPEC, self.pins, self._machine, whole=source.whole, share=self._share
+        )
         module = source.kind(build)
         build.reader.finish()
         self._add(module, build)
         return module
+
+    def shared(self, kind: type[M]) -> M:
+        """Return the one module of KIND that has no section."""
+        found = self._share(kind)
+        assert isinstance(found, kind)
+        return found
 
     def _share(self, kind: type[Module]) -> Module:
         for module in self._modules:
@@ -112,7 +124,8 @@ class ModuleSet:
     @property
     def vocabulary(self) -> Vocabulary:
         """What programs know through them."""
-        return Vocabulary(self._commands, self.home, self._too_cold)
+        home = self._homing.read if self._homing.acts else None
+        return Vocabulary(self._commands, home, self._too_cold)
 
     def _too_cold(self, extruder: str) -> bool:
         from coordinator.modules.heater_sections import ExtruderHeater  # noqa: PLC0415 (start-up time)
@@ -144,6 +157,10 @@ class ModuleSet:
             await module.connect(live)
         for module in self._modules:
             module.ready()
+
+    def before_motion(self) -> None:
+        """Get ready for steps, which follow no sooner than a start from standstill takes."""
+        self._motors.on()
 
     def stopped(self, cause: str) -> None:
         """Tell all that the machine is stopped."""

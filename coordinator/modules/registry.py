@@ -40,6 +40,20 @@ def own_kinds() -> tuple[str, ...]:
     return tuple(_OURS)
 
 
+def own_modules() -> "Iterator[tuple[str, type[Module]]]":
+    """Yield our modules with how their sections are written: ``[fan]``, ``[fan_generic NAME]``."""
+    for kind, path in _OURS.items():
+        module = _load(path)
+        yield (f"[{kind} NAME]" if module.NAMED else f"[{kind}]"), module
+
+
+def own_beside() -> "Iterator[tuple[str, type[Module]]]":
+    """Yield our modules that read further options of sections that the machine itself reads."""
+    for path in _BESIDE.values():
+        module = _load(path)
+        yield module.TITLE, module
+
+
 def known_kinds() -> tuple[str, ...]:
     """Return the first words of the sections that some module is for."""
     return (*_OURS, *_others())

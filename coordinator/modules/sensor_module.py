@@ -25,6 +25,7 @@ HIGHEST_C: Final = 1500.0
 class TemperatureSensor(SensorModule):
     """A sensor of no heater."""
 
+    NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A temperature that is watched; with min_temp or max_temp its node stops all outside them",
         options=(*SENSOR_OPTIONS, GCODE_ID),

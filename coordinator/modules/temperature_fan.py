@@ -84,6 +84,7 @@ class TemperatureFans(Module):
 class TemperatureFan(FanModule):
     """A fan that holds a temperature down."""
 
+    NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that holds a temperature down, as that of a board or a chamber",
         options=(

@@ -51,6 +51,7 @@ def usual(heater: str) -> VerifyOptions:
 class VerifyHeater(Module):
     """How the heater of the section's instance is watched."""
 
+    NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="The watch over a heater (extruder, heater_bed or the name of a heater_generic); every heater"
         " has it, the section only changes its values",

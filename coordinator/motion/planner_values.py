@@ -65,6 +65,8 @@ class Fault:
 
     def __str__(self) -> str:
         """Say what is wrong and what to do, without the place."""
+        if self.kind in (FaultKind.EXTRUDE_LONG, FaultKind.EXTRUDE_RATIO) and not self.high:
+            return "the move pushes filament, but this machine has no extruder; leave E out"
         return _FAULTS[self.kind](self)
 
 
@@ -159,6 +161,7 @@ def check_number(
 def check_limits(limits: MotionLimits) -> None:
     """Refuse limits the arithmetic cannot stand: they would come out as NaN."""
     may_be_zero = {"square_corner_velocity", "instantaneous_corner_velocity", "max_radius", "radius_min"}
+    may_be_zero |= {"max_extrude_only_distance", "max_extrude_ratio"}  # a machine without an extruder
     may_be_zero |= {f"max_{axis}_{what}" for axis in "xy" for what in ("velocity", "accel")}
     for field in fields(limits):
         if field.name == "range_options":

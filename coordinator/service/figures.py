@@ -5,6 +5,7 @@ docs/run.md lists the fields; names end in their unit.
 
 import re
 from collections import deque
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
 from coordinator.app import link_of
@@ -43,30 +44,47 @@ class Figures:
 
     def show(self, service: "MachineService") -> None:
         """Bring the tree up to date."""
+        for _ in self.parts(service):
+            pass
+
+    def parts(self, service: "MachineService") -> Iterator[None]:
+        """Do the same in parts of some 0.2 ms, so that others get their turn between two of them."""
         self._tree.update("job", job_figures(service.job, service.now_s))
         if service.motion is not None and service.machine is not None and service.machine.stopped is None:
             self._tree.update("position", position_figures(service.motion))
             waiting: Value = service.motion.streamer.held
             self._tree.set("machine.waits_for", waiting)
+            self._tree.update("machine", lead_figures(service.motion))
         else:
             self._tree.update("position", {"moving": False, "velocity_mm_s": 0.0, "homed": ""})
+            self._tree.set("machine.lead_ms", None)
         if service.confirmed_s:
             confirmed: Value = {name: round(s * 1e3, 1) for name, s in service.confirmed_s.items()}
             self._tree.set("machine.stop_confirmed_ms", confirmed)
+        yield
         if service.machine is not None:
-            self._show_machine(service.machine)
+            machine = service.machine
+            for _ in self._machine_parts(machine):
+                yield
+                if service.machine is not machine:
+                    return  # it is closed
 
-    def _show_machine(self, machine: "Machine") -> None:
+    def _machine_parts(self, machine: "Machine") -> Iterator[None]:
         shown: set[str] = set()
-        for name, node in machine.nodes.items():
+        for name, node in list(machine.nodes.items()):  # they are added meanwhile, at a start
             prefix = f"nodes.{field_name(name)}"
             shown.add(prefix)
             recent = self._leads.setdefault(name, _RecentLead())
             self._tree.update(prefix, node_figures(machine, node, recent))
+            yield
         for name, stats in machine.bus_stats().items():
             prefix = f"buses.{field_name(name)}"
             shown.add(prefix)
             self._tree.update(prefix, bus_figures(name, stats))
+        for name, status in machine.modules.status().items():
+            prefix = f"modules.{field_name(name)}"
+            shown.add(prefix)
+            self._tree.update(prefix, status)
         for prefix in self._shown - shown:
             self._tree.remove(prefix)
         self._shown = shown
@@ -84,6 +102,7 @@ def job_figures(job: "JobRun | None", now_s: float) -> dict[str, Value]:
         "file": job.file,
         "size_bytes": job.size_bytes,
         "done_bytes": job.done_bytes,
+        "read_bytes": job.read_bytes,
         "progress": round(job.progress, 4),
         "line": job.line,
         "lines_read": job.lines_read,
@@ -108,6 +127,16 @@ def position_figures(motion: "Motion") -> dict[str, Value]:
         "extrude_factor": planned.extrude_factor,
         "print_time_s": round(motion.now_s, 3),
     }
+
+
+def lead_figures(motion: "Motion") -> dict[str, Value]:
+    """Return how far ahead commands are made, in ms."""
+    lead = motion.lead
+    return {"lead_ms": _ms(lead.now_s), "lead_min_ms": _ms(lead.least_s)}
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else round(seconds * 1e3, 1)
 
 
 def axes(position: Position) -> Value:
@@ -199,7 +228,6 @@ def _clock(node: Node) -> dict[str, Value]:
 
 
 def _link(stats: LinkStats, recent: _RecentLead) -> dict[str, Value]:
-    least = stats.min_lead_s
     histogram: Value = list(stats.lead_histogram)
     return {
         "round_trip_ms": round(stats.srtt_s * 1e3, 3),
@@ -212,7 +240,7 @@ def _link(stats: LinkStats, recent: _RecentLead) -> dict[str, Value]:
         "retransmitted_bytes": stats.bytes_repeated,
         "invalid_bytes": stats.bytes_invalid,
         "lead_ms": recent.look(stats.lead_histogram),
-        "lead_min_ms": None if least is None else round(least * 1e3, 1),
+        "lead_min_ms": _ms(stats.min_lead_s),
         "lead_histogram": histogram,
     }
 

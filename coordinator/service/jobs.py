@@ -1,6 +1,8 @@
 """The job of a machine: one file at a time, from its start to whatever became of it."""
 
+from collections import deque
 from enum import StrEnum
+from typing import Final
 
 from coordinator.service.feeder import Feeder, Ticket
 from coordinator.service.motion import Motion
@@ -24,6 +26,8 @@ class JobPhase(StrEnum):
     """The machine stopped."""
 
 
+TRAIL_MAX: Final = 512
+"""Places of the file between what is carried out and what is read; there are some 20 a second."""
 ACTIVE = frozenset((JobPhase.PRINTING, JobPhase.PAUSING, JobPhase.PAUSED, JobPhase.CANCELLING))
 
 
@@ -42,6 +46,7 @@ class JobRun:
         """For which it has moved, pauses left out."""
         self.line = 0
         """Being carried out."""
+        self._trail = Trail()
         self._looked_s = now_s
         self._motion = motion
         self._ticket: Ticket = motion.feeder.submit(work, is_job=True)
@@ -57,15 +62,18 @@ class JobRun:
         return self._ticket.progress.line
 
     @property
-    def done_bytes(self) -> int:
+    def read_bytes(self) -> int:
         """Bytes read."""
-        if self.phase is JobPhase.DONE:
-            return self.size_bytes
-        return self._ticket.progress.done_bytes
+        return self.size_bytes if self.phase is JobPhase.DONE else self._ticket.progress.done_bytes
+
+    @property
+    def done_bytes(self) -> int:
+        """Bytes carried out."""
+        return self.size_bytes if self.phase is JobPhase.DONE else self._trail.done_bytes
 
     @property
     def progress(self) -> float:
-        """The part that is read, 0..1."""
+        """The part that is carried out, 0..1."""
         return min(1.0, self.done_bytes / self.size_bytes) if self.size_bytes else 0.0
 
     def pause(self) -> None:
@@ -103,6 +111,7 @@ class JobRun:
         if moment.moving and moment.line and began_s is not None and self._motion.now_s >= began_s:
             self.line = moment.line
         ticket = self._ticket
+        self._trail.look(ticket.progress.line, ticket.progress.done_bytes, self.line)
         if ticket.done:
             self._ended(ticket, now_s)
         elif self.phase is JobPhase.PAUSING and self._motion.paused:
@@ -123,3 +132,26 @@ class JobRun:
     @property
     def _feeder(self) -> Feeder:
         return self._motion.feeder
+
+
+class Trail:
+    """Where in the file the line is that is carried out, from where each look found the reader."""
+
+    def __init__(self) -> None:
+        self.done_bytes = 0
+        """Where the line carried out begins, as near as the looks were; never goes back."""
+        self._places: deque[tuple[int, int]] = deque([(0, 0)])  # lines and bytes read, oldest first
+
+    def look(self, lines_read: int, read_bytes: int, line: int) -> None:
+        """Take note that so much is read, while LINE is being carried out."""
+        places = self._places
+        if lines_read > places[-1][0]:
+            if len(places) == TRAIL_MAX:
+                places.pop()  # coarser, never wrong
+            places.append((lines_read, read_bytes))
+        before = max(0, line - 1)
+        while len(places) > 1 and places[1][0] <= before:
+            places.popleft()
+        (lines, begin), (more, end) = places[0], places[min(1, len(places) - 1)]
+        part = (before - lines) / (more - lines) if more > lines else 0.0
+        self.done_bytes = max(self.done_bytes, begin + int(max(0.0, part) * (end - begin)))

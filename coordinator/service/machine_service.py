@@ -19,6 +19,7 @@ from coordinator.ipc.methods import ApiError
 from coordinator.ipc.state import StateTree
 from coordinator.machine.description import MachineDescription
 from coordinator.move_source import Told
+from coordinator.pipeline import PlanRecord
 from coordinator.service.figures import Figures
 from coordinator.service.job_folder import JobFolder
 from coordinator.service.jobs import JobPhase, JobRun
@@ -66,7 +67,8 @@ class ServiceSettings:
 class MachineService:
     """Runs the machine that LOAD describes (called again at every restart; CanductorError).
 
-    ``run`` until it is cancelled. ON_LINE hears every line of the log.
+    ``run`` until it is cancelled. ON_LINE hears every line of the log. RECORD keeps all that is planned, for
+    a proof; memory grows with it.
     """
 
     def __init__(
@@ -77,6 +79,7 @@ class MachineService:
         settings: ServiceSettings,
         *,
         cache: DictionaryCache | None = None,
+        record: PlanRecord | None = None,
         on_line: Callable[[Entry], None],
     ) -> None:
         self.settings = settings
@@ -103,6 +106,7 @@ class MachineService:
         self._load = load
         self.tree = state
         self._cache = cache
+        self._record = record
         self._figures = Figures(state)
         self._restart = asyncio.Event()
         self._asked_to_stop: str | None = None
@@ -151,7 +155,7 @@ class MachineService:
     async def _move(self, machine: Machine) -> None:
         care = asyncio.ensure_future(self.tables.care(machine, self.stands))
         try:
-            self.motion = Motion(machine, on_told=self._told, on_cycle=self.look)
+            self.motion = Motion(machine, on_told=self._told, on_cycle=self.look, record=self._record)
             self._enter(ServiceState.READY)
             await self.motion.run()
         except CanductorError as error:
@@ -218,6 +222,7 @@ class MachineService:
             raise ApiError(
                 "busy", "the machine is busy; wait for its moves, or cancel them, then start the job"
             )
+        motion.toolpath.clear()
         self.job = JobRun(motion, work, self.now_s)
         self.log.add("job", f"{self.job.file}: started")
         self.look()
@@ -290,5 +295,6 @@ class MachineService:
     async def _refresh(self) -> None:
         while True:
             with contextlib.suppress(MachineStopped):
-                self._figures.show(self)
+                for _ in self._figures.parts(self):
+                    await asyncio.sleep(0)
             await asyncio.sleep(REFRESH_S)

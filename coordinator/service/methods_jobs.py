@@ -15,7 +15,7 @@ _LISTED_MAX: Final = 1000
 _JOB: Final = (
     Param("state", Kind.STR, ", ".join(JobPhase)),
     Param("file", Kind.STR, "null before the first job"),
-    Param("progress", Kind.FLOAT, "the part that is read, 0 to 1"),
+    Param("progress", Kind.FLOAT, "the part that is carried out, 0 to 1"),
     Param("line", Kind.INT, "being carried out"),
     Param("print_time_s", Kind.FLOAT, "pauses left out", "s"),
     Param("elapsed_s", Kind.FLOAT, "with pauses", "s"),
@@ -123,7 +123,7 @@ def job_methods(service: MachineService) -> Iterator[Method]:
         (
             "job.pause",
             jobs.pause,
-            "Come to a standstill between two moves; what is planned (some 4 s) is carried out.",
+            "Come to a standstill between two moves; what is planned (some 2 s) is carried out.",
         ),
         ("job.resume", jobs.resume, "Go on exactly where the job stands."),
         (

@@ -1,9 +1,12 @@
 """``motion.dump``: what was planned and sent within the last seconds, for plotting."""
 
 import asyncio
+import time
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Any, Final
+
+import numpy as np
 
 from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
 from coordinator.service.machine_service import MachineService
@@ -11,21 +14,28 @@ from coordinator.service.motion import Motion
 from coordinator.service.trace import KEEP_S, Moves
 from nodes.dictionary import Dictionary
 
+POINTS_AT_ONCE: Final = 4000
 MOVES_MAX: Final = 4000
 COMMANDS_MAX: Final = 4000
 """Of each moving node."""
 _COLUMNS: Final = ("print_time", "accel_s", "cruise_s", "decel_s", "start_v", "cruise_v", "accel", "line")
 _HEADER: Final = 17
+REST: Final = 4.0
+"""A dump keeps the interpreter busy for some 50 ms; for so many times as long there is no other."""
+ROWS_AT_A_TIME: Final = 50
+"""Takes half a millisecond."""
 
 
 def plot_methods(service: MachineService) -> Iterator[Method]:
     """Return them."""
     dumping = asyncio.Lock()
+    rest_until_s = 0.0
 
     async def dump(_caller: Caller, params: dict[str, Any]) -> Value:
+        nonlocal rest_until_s
         motion, machine = service.ready_motion(), service.up_machine()
-        if dumping.locked():
-            raise ApiError("busy", "another dump is being made; ask again in a moment")
+        if dumping.locked() or time.monotonic() < rest_until_s:
+            raise ApiError("busy", "another dump is being made, or was just now; ask again in a moment")
         async with dumping:
             now_s = motion.now_s
             since_s = now_s - params["seconds"]
@@ -37,9 +47,43 @@ def plot_methods(service: MachineService) -> Iterator[Method]:
                 (s.node, machine.devices.steppers[s.name].oid): s.name for s in machine.description.steppers
             }
             moves = motion.trace.moves(since_s)
-            # Reading commands one by one takes Python a while: not on the control loop.
-            return await asyncio.to_thread(_dump, now_s, since_s, moves, senders, names)
+            begun_s = time.monotonic()
+            made = await _dump(now_s, since_s, moves, senders, names)
+            rest_until_s = begun_s + (1 + REST) * (time.monotonic() - begun_s)
+            return made
 
+    def path(_caller: Caller, params: dict[str, Any]) -> Value:
+        motion = service.motion or service.ready_motion()  # also of a machine that has stopped
+        toolpath = motion.toolpath
+        first = params["first"] if params["generation"] == toolpath.generation else 0
+        at, time_s, extrudes = toolpath.after(first, POINTS_AT_ONCE)
+        return {
+            "generation": toolpath.generation,
+            "first": first,
+            "count": len(toolpath),
+            **{axis: np.round(at[:, i], 3).tolist() for i, axis in enumerate("xyz")},
+            "print_time_s": np.round(time_s, 3).tolist(),
+            "extrudes": extrudes.tolist(),
+        }
+
+    yield Method(
+        "motion.path",
+        Scope.WATCH,
+        f"Return corners of the tool's path since the job began, planned ones too; at most {POINTS_AT_ONCE}.",
+        path,
+        params=(
+            Param("generation", Kind.INT, "of the points known", required=False, default=0, low=0),
+            Param("first", Kind.INT, "number of the first one wanted", required=False, default=0, low=0),
+        ),
+        returns=(
+            Param("generation", Kind.INT, "another one than known: what was known is void"),
+            Param("first", Kind.INT, "number of the first point returned"),
+            Param("count", Kind.INT, "of all points"),
+            *(Param(axis, Kind.LIST, "of each point, in the machine's frame", "mm") for axis in "xyz"),
+            Param("print_time_s", Kind.LIST, "when the tool is there", "s"),
+            Param("extrudes", Kind.LIST, "whether it extrudes on the way there"),
+        ),
+    )
     yield Method(
         "motion.dump",
         Scope.WATCH,
@@ -69,7 +113,7 @@ class _Sender:
         return self.piece.print_time + (ticks - self.piece.ticks) / self.piece.ticks_per_s
 
 
-def _dump(
+async def _dump(
     now_s: float,
     since_s: float,
     moves: Moves,
@@ -77,7 +121,7 @@ def _dump(
     names: dict[tuple[str, int | None], str],
 ) -> Value:
     kept = moves[-MOVES_MAX:]
-    queues = [_queue(sender, since_s, names) for sender in senders]
+    queues = [await _queue(sender, since_s, names) for sender in senders]
     columns: dict[str, Value] = {name: kept[name].tolist() for name in _COLUMNS}
     columns |= {name: kept[name].tolist() for name in ("start", "ratio")}
     truncated = len(kept) < len(moves) or any(full for _, full in queues)
@@ -89,11 +133,17 @@ def _dump(
     }
 
 
-def _queue(
+async def _queue(
     sender: _Sender, since_s: float, names: dict[tuple[str, int | None], str]
 ) -> tuple[dict[str, Value], bool]:
     """Return the newest queue_step commands of one node, and whether older ones were left out."""
-    found = list(islice(_newest_first(sender, since_s), COMMANDS_MAX + 1))
+    found = []
+    # Reading commands one by one takes Python a while. In a thread it would take the interpreter from the
+    # control loop at each of its calls to a socket, for 5 ms; so the loop does it, some at a time.
+    for row in islice(_newest_first(sender, since_s), COMMANDS_MAX + 1):
+        found.append(row)
+        if len(found) % ROWS_AT_A_TIME == 0:
+            await asyncio.sleep(0)
     full = len(found) > COMMANDS_MAX
     rows = found[:COMMANDS_MAX][::-1]
     per_tick_s = 1 / sender.piece.ticks_per_s

@@ -8,8 +8,11 @@ from coordinator.app import Machine
 from coordinator.gcode.events import Notice
 from coordinator.motion.planner import Planner
 from coordinator.move_source import JobState, Planned, Told
+from coordinator.pipeline import PlanRecord
 from coordinator.program_machine import machine_state
 from coordinator.service.feeder import Feeder, Ticket
+from coordinator.service.motion_lead import MotionLead
+from coordinator.service.toolpath import Toolpath
 from coordinator.service.trace import KEEP_S, Moment, MotionTrace
 from coordinator.service.work import LinesWork, Work
 from coordinator.streamer import Streamer
@@ -20,11 +23,17 @@ UNMOVED = Planned((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, "", 1.0, 1.0, 0.0)
 class Motion:
     """What moves MACHINE, whose nodes are READY.
 
-    ON_TOLD gets replies and notices, ON_CYCLE is called at the end of every cycle.
+    ON_TOLD gets replies and notices, ON_CYCLE is called at the end of every cycle. RECORD keeps all that is
+    planned, for a proof.
     """
 
     def __init__(
-        self, machine: Machine, *, on_told: Callable[[Told], None], on_cycle: Callable[[], None]
+        self,
+        machine: Machine,
+        *,
+        on_told: Callable[[Told], None],
+        on_cycle: Callable[[], None],
+        record: PlanRecord | None = None,
     ) -> None:
         described = machine.description
         self.feeder = Feeder(
@@ -34,9 +43,16 @@ class Motion:
             machine.modules.vocabulary,
         )
         self.trace = MotionTrace(len(machine.moving))
+        self.toolpath = Toolpath()
         self.planned = UNMOVED
+        self.lead = MotionLead()
         self.streamer = Streamer(
-            machine, self.feeder, witness=self.trace, on_told=on_told, on_state=self._cycle_ended
+            machine,
+            self.feeder,
+            record=record,
+            witness=self.trace,
+            on_told=on_told,
+            on_state=self._cycle_ended,
         )
         self._on_cycle = on_cycle
         self._ending: list[Ticket] = []
@@ -109,7 +125,10 @@ class Motion:
     def _cycle_ended(self, state: JobState) -> None:
         self.planned = state.planned
         now_s = self.now_s
+        comes_to_rest = state.planned.stands_from_s is not None
+        self.lead.look(now_s, self.streamer.steps.generated_until, comes_to_rest=comes_to_rest)
         self.trace.forget_before_s = now_s - KEEP_S
+        self.toolpath.add(self.trace.take_fresh())
         with contextlib.suppress(IndexError):
             while True:
                 self._ending.append(self.feeder.finished.popleft())

@@ -3,7 +3,7 @@
 import platform
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,11 +26,14 @@ from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
 from coordinator.service.typed import Typed
 from coordinator.table.store import table_folder
+from coordinator.web.settings import WebSettings
 from nodes.dictionary_cache import DictionaryCache
+from nodes.errors import CanductorError
 from nodes.host_sockets import socket_folder
 
 if TYPE_CHECKING:
     from coordinator.metrics.server import MetricsServer
+    from coordinator.web.server import WebServer
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +113,19 @@ class _Hall:
         add_methods(service, registry)
         if settings.jobs is not None:
             registry.add(upload_method(settings.jobs))
-        self._server = IpcServer(registry, tree, _ipc_settings(self._options, self.path))
+        self._server = IpcServer(
+            registry,
+            tree,
+            _ipc_settings(self._options, self.path),
+            on_notice=lambda text: service.log.add("notice", text),
+        )
         await self._server.start()
+        page = await _open_page(self._server, self._options)
         _say(f"serving at {self.path}")
+        if self._options.tcp is not None:
+            _say(f"serving at {_address(self._options, self._server.tcp_port)}")
+        if page is not None:
+            _say(f"the live page is at {page.url}")
         metrics = await self._open_metrics(tree)
         self._announcer = self._announce(service)
         typed = Typed(service, _say) if sys.stdin is not None and sys.stdin.isatty() else None
@@ -128,6 +141,8 @@ class _Hall:
             if metrics is not None:
                 await metrics.close()
             await self._server.close()
+            if page is not None:
+                await page.close()
 
     async def _open_metrics(self, tree: StateTree) -> "MetricsServer | None":
         """Open the endpoint for Prometheus if asked for; raises CanductorError with the server closed."""
@@ -192,7 +207,37 @@ def _ipc_settings(options: ServeOptions, path: Path) -> IpcSettings:
             private_key=options.private_key,
             plain_on_loopback=options.plain_on_loopback,
         )
-    return IpcSettings(unix_path=path, tcp=tcp)
+    return IpcSettings(unix_path=path, tcp=tcp, tokens=options.tokens)
+
+
+async def _open_page(server: IpcServer, options: ServeOptions) -> "WebServer | None":
+    """Open the live page if asked for; raises CanductorError with the server closed."""
+    if options.web is None:
+        return None
+    host, port = options.web
+    try:
+        try:
+            from coordinator.web.server import WebServer  # noqa: PLC0415 (the extra web)
+        except ModuleNotFoundError as error:
+            raise CanductorError(
+                f"the live page needs {error.name}, which is not installed; run: pip install 'canductor[web]'"
+            ) from None
+        settings = WebSettings(host=host, port=port)
+        if not settings.on_loopback and not options.web_without_tls:
+            settings = replace(settings, certificate=options.certificate, private_key=options.private_key)
+        page = WebServer(server, settings)
+        await page.start()
+    except BaseException:
+        await server.close()
+        raise
+    return page
+
+
+def _address(options: ServeOptions, port: int | None) -> str:
+    assert options.tcp is not None
+    host = options.tcp[0]
+    scheme = "tls" if options.certificate is not None else "tcp"
+    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
 def _say(line: str) -> None:

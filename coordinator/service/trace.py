@@ -3,6 +3,7 @@
 The motion worker adds moves, the control loop reads; both see one immutable tuple at a time: neither waits.
 """
 
+import contextlib
 from collections import deque
 from typing import Any, Final
 
@@ -16,6 +17,8 @@ from nodes.records import record
 KEEP_S: Final = 10.0
 MOVES_MAX: Final = 20_000
 PIECE_MOVES: Final = 256
+FRESH_MAX: Final = 256
+"""Batches of moves that wait for ``take_fresh``."""
 BATCH_BYTES_MAX: Final = 1 << 20
 """Per node."""
 
@@ -44,12 +47,14 @@ class MotionTrace:
         self._batch_bytes = [0] * nodes
         self.forget_before_s = 0.0
         """Print time; set by the control loop."""
+        self._fresh: deque[Moves] = deque(maxlen=FRESH_MAX)
 
     # ------------------------------------------------------------------------------------ as a witness
 
     def see_moves(self, trapezoids: Any, count: int) -> None:
         """Copy moves; in the worker's thread."""
         new = np.frombuffer(ffi_memory(trapezoids, count), TRAPEZOID).copy()
+        self._fresh.append(new)
         kept = list(self._pieces)
         while len(kept) > 1 and _end_s(kept[0][-1]) < self.forget_before_s:
             del kept[0]  # the last one stays: it is where the machine stands
@@ -86,6 +91,14 @@ class MotionTrace:
         ends = every["print_time"] + every["accel_s"] + every["cruise_s"] + every["decel_s"]
         kept: Moves = every[ends > since_s]
         return kept
+
+    def take_fresh(self) -> Moves:
+        """Return the moves that came since this was called last; of too many the newest."""
+        new: list[Moves] = []
+        with contextlib.suppress(IndexError):
+            while True:
+                new.append(self._fresh.popleft())
+        return np.concatenate(new) if new else np.empty(0, TRAPEZOID)
 
     def batches(self, node: int) -> tuple[bytes, ...]:
         """Return what was sent to a moving node, oldest first."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from coordinator.app import Machine
 from coordinator.demo.plant import AXES, PlantSettings, machine_plants
-from coordinator.homing import CYCLE_S, HomingMove, HomingResult
+from coordinator.homing import CYCLE_S, HomingMove
 from coordinator.machine.description import RailDescription
 from coordinator.simulate.scenario import BusSetting, Scenario
 from coordinator.simulate.stage import Stage
@@ -90,13 +90,14 @@ class _Performance:
         begun_mm = self._place(rail)
         move = HomingMove(
             machine,
-            rail,
+            [rail],
+            axis=rail.axis,
             direction=direction,
             way_mm=40.0,
             speed=rail.homing.speed * self._dice.uniform(*SPEED),
             accel=ACCEL,
         )
-        result: HomingResult = await move.run()
+        (result,) = await move.run()
         assert rail.homing.position_endstop is not None
         found_mm = begun_mm + direction * result.way_to_trigger_mm
         await self._go_back(machine, rail, -direction)

@@ -169,6 +169,13 @@ class Linear:
 
 
 @record(kw_only=True)
+class Table:
+    """At most 64 points of °C (rising) and share of the converter's full scale; straight between them."""
+
+    points: tuple[tuple[float, float], ...]
+
+
+@record(kw_only=True)
 class Sensor:
     """A sensor in a body of any node; it follows with a lag, and has noise in steps of the converter."""
 
@@ -177,7 +184,7 @@ class Sensor:
     node: str
     """Of its body."""
     body: str
-    curve: Beta | Steinhart | Rtd | Linear
+    curve: Beta | Steinhart | Rtd | Linear | Table
     lag: float = 0.0
     noise: float = 0.0
     """Standard deviation."""
@@ -243,8 +250,10 @@ class NodePlant:
         yield from self._parts("cooling", self.coolings)
         yield from self._parts("heater", self.heaters)
         for sensor in self.sensors:
-            curve = {"curve": type(sensor.curve).__name__.lower()} | _fields(sensor.curve)
+            curve = {"curve": type(sensor.curve).__name__.lower()} | _fields(sensor.curve, ("points",))
             yield _line("sensor", self._own(_fields(sensor, without=("curve",))) | curve)
+            for celsius, ratio in sensor.curve.points if isinstance(sensor.curve, Table) else ():
+                yield _line("point", {"sensor": sensor.name, "celsius": celsius, "ratio": ratio})
 
     def _parts(self, kind: str, parts: Iterable[Any]) -> Iterator[str]:
         for part in parts:

@@ -187,7 +187,8 @@ class NodeProcess(ChildProcess):
     ``rate_ppm``: by how much its clock is too fast; ``start_clock``: where its clock starts. ``jitter_us``,
     ``slice_us`` and ``seed``: see the firmware. ``legacy``: it plays a board with Klipper firmware, which
     knows none of this project's extensions of the CAN protocol. ``plant``: the file that describes what its
-    pins are connected with (plant.py); beside it the process writes its page and its log.
+    pins are connected with (plant.py); beside it the process writes its page and, if
+    ``plant_log``, its log, which grows as long as it runs.
     """
 
     def __init__(
@@ -206,6 +207,7 @@ class NodeProcess(ChildProcess):
         edge_log: Path | None = None,
         legacy: bool = False,
         plant: Path | None = None,
+        plant_log: bool = True,
         name: str | None = None,
         bin_dir: Path = BIN_DIR,
     ) -> None:
@@ -229,6 +231,7 @@ class NodeProcess(ChildProcess):
             "--edge-log": edge_log,
             "--legacy": 1 if legacy else None,
             "--plant": plant,
+            "--plant-log": None if plant_log else 0,
         }
         command: list[str | Path] = [executable]
         for option, value in options.items():

@@ -214,6 +214,17 @@ def test_a_refusal_names_the_options_that_this_machine_has(
     assert all(f"\n[{section}]" in config.read_text() for section in sections)
 
 
+@pytest.mark.parametrize("line", ["G1 E1", "G1 X10 E1"])
+def test_a_machine_without_an_extruder(tmp_path: Path, line: str) -> None:
+    """A mill: it moves, and refuses filament."""
+    config = tmp_path / "mill.cfg"
+    sections = (DEMO_MACHINE.parents[1] / "cartesian.cfg").read_text().split("\n[")
+    config.write_text("\n[".join(part for part in sections if not part.startswith("extruder")))
+    assert plan(tmp_path, "G28\nG1 X10 F6000\n", config=config).moves == 1
+    with pytest.raises(CanductorError, match=r"square\.gcode:2: the move pushes filament, .* no extruder"):
+        plan(tmp_path, f"G28\n{line} F600\n", config=config)
+
+
 def test_steps_faster_than_the_pulse_end_the_plan_near_their_line(tmp_path: Path) -> None:
     machine = tmp_path / "machine.cfg"
     machine.write_text(

@@ -107,10 +107,13 @@ class Home:
         await machine.start()
         try:
             rail = self.stage.description.rails[0]
-            move = HomingMove(machine, rail, direction=-1, way_mm=self.way_mm, speed=self.speed, accel=3000.0)
+            move = HomingMove(
+                machine, [rail], axis="x", direction=-1, way_mm=self.way_mm, speed=self.speed, accel=3000.0
+            )
             if self.during is not None:
                 asyncio.get_running_loop().call_later(0.5, self.during, self.stage)
-            return await move.run()
+            (result,) = await move.run()
+            return result
         finally:
             await machine.close()
 

@@ -23,7 +23,7 @@ struct options {
     const char *plant;
     uint8_t uuid[NODE_UUID_SIZE];
     double rate_ppm;
-    uint64_t start_clock, jitter_us, slice_us, seed, legacy;
+    uint64_t start_clock, jitter_us, slice_us, seed, legacy, plant_log;
 };
 
 struct linux_board {
@@ -49,8 +49,8 @@ struct linux_board {
     uint64_t bytes_in, bytes_out, frames_in, frames_out, resets;
     uint64_t late_sum, late_count, late_max; // ticks by which timers were dispatched late
 
-    struct plant plant; // virtual.plant points to it when there is one
-    FILE *plant_log;
+    struct plant plant;                   // virtual.plant points to it when there is one
+    FILE *plant_log;                      // null: none is wanted
     uint64_t plant_update_ns;             // when it is due
     uint64_t plant_given_up[PLANT_PEERS]; // the horizon at which we waited in vain
     uint64_t plant_waits, plant_misses;

@@ -13,7 +13,7 @@ enum { USAGE = 2 };
 static const char usage[] =
     "usage: %s (--can SOCKET | --socketcan INTERFACE | --uart LINK) [--uuid HEX12] [--rate-ppm X]\n"
     "       [--start-clock N] [--jitter-us J] [--seed S] [--slice-us N] [--edge-log FILE]\n"
-    "       [--legacy 0|1] [--plant FILE]\n"
+    "       [--legacy 0|1] [--plant FILE] [--plant-log 0|1]\n"
     "A virtual node: canductor firmware as a process on a virtual CAN bus, SocketCAN or a pseudo-terminal.\n";
 
 static int complain(const char *program, const char *option, const char *value, const char *wanted) {
@@ -78,13 +78,15 @@ static const char *take(struct options *options, const char *name, const char *v
         return parse_count(value, 1000000, &options->slice_us) ? "0 to 1000000 microseconds" : NULL;
     if (strcmp(name, "--legacy") == 0)
         return parse_count(value, 1, &options->legacy) ? "1 for firmware without CAN extensions, or 0" : NULL;
+    if (strcmp(name, "--plant-log") == 0)
+        return parse_count(value, 1, &options->plant_log) ? "1 for a log of the plant, or 0" : NULL;
     if (strcmp(name, "--seed") == 0)
         return parse_count(value, UINT64_MAX, &options->seed) ? "a number" : NULL;
     return "";
 }
 
 int options_parse(struct options *options, int argc, char **argv) {
-    *options = (struct options){.slice_us = 500};
+    *options = (struct options){.slice_us = 500, .plant_log = 1};
     for (int i = 1; i < argc; i += 2) {
         if (strcmp(argv[i], "--help") == 0) {
             printf(usage, argv[0]);

@@ -135,7 +135,8 @@ static void note_temperatures(struct linux_board *board, uint64_t ns) {
     const struct plant *plant = &board->plant;
     for (int i = 0; i < plant->body_count; i++)
         note(board, ns, "body", plant->bodies[i].name, plant_page_load(&plant->page->items[i].value));
-    fflush(board->plant_log);
+    if (board->plant_log)
+        fflush(board->plant_log);
 }
 
 uint64_t linux_plant_update(struct linux_board *board, uint64_t now) {
@@ -165,6 +166,8 @@ static int open_pages(struct linux_board *board) {
 
 static int open_log(struct linux_board *board) {
     char path[PATH_SIZE];
+    if (!board->options.plant_log)
+        return 0;
     path_of(board, board->plant.node, ".plantlog", path);
     board->plant_log = fopen(path, "we");
     return board->plant_log ? 0 : complain("write the plant's log", path, strerror(errno));
@@ -195,6 +198,7 @@ void linux_plant_close(struct linux_board *board) {
     board->plant_update_ns = 0;
     linux_plant_update(board, now);
     linux_plant_horizon(board, UINT64_MAX); // nobody is to wait for what comes no more
-    fclose(board->plant_log);
+    if (board->plant_log)
+        fclose(board->plant_log);
     board->virtual.plant = NULL;
 }

@@ -29,6 +29,7 @@ enum {
     PLANT_SENSORS = 12,
     PLANT_COUPLES = 16,
     PLANT_COOLINGS = 16,
+    PLANT_POINTS = 64,      // of a sensor's table
     PLANT_ZONE_STATES = 12, // bodies and sensors that heat flows between
     PLANT_ERROR = 200,
 };
@@ -109,15 +110,18 @@ struct plant_fan {
     uint32_t fault;
 };
 
-enum plant_curve { PLANT_BETA, PLANT_STEINHART, PLANT_RTD, PLANT_LINEAR };
+enum plant_curve { PLANT_BETA, PLANT_STEINHART, PLANT_RTD, PLANT_LINEAR, PLANT_TABLE };
 // Below a pull-up resistor to the converter's reference: a thermistor (r0 at t0 °C and beta; or c1, c2, c3 of
 // Steinhart and Hart), or a resistor r0·(1 + a·T + b·T²). Linear: zero + slope·T of full scale.
+// Table: straight between points of °C and share of full scale, level beyond them.
 struct plant_sensor {
     char name[PLANT_NAME];
     int pin, curve, bits;
     struct plant_reference body;
     double lag; // s; 0: none
     double pullup, r0, t0, beta, c1, c2, c3, a, b, zero, slope;
+    int point_count;
+    double celsius[PLANT_POINTS], ratio[PLANT_POINTS];
     double noise; // steps of the converter, standard deviation
     int zone, state;
     double remote; // °C of a body on another node

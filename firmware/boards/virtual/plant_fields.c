@@ -89,7 +89,7 @@ int plant_text_fan(const struct plant *plant, const char *name) {
 
 static int read_value(const struct plant *plant, const struct plant_field *field, void *target,
                       const char *text) {
-    static const char *const curves[] = {"beta", "steinhart", "rtd", "linear"};
+    static const char *const curves[] = {"beta", "steinhart", "rtd", "linear", "table"};
     char *out = (char *)target + field->offset;
     switch (field->type) {
     case NAME:
@@ -105,7 +105,7 @@ static int read_value(const struct plant *plant, const struct plant_field *field
     case NUMBER:
         return read_number((double *)out, text, field->min, field->max);
     case CURVE:
-        return read_word((int *)out, text, curves, 4);
+        return read_word((int *)out, text, curves, 5);
     case AXIS:
         return (*(int *)out = find_axis(plant, text)) < 0 ? -1 : 0;
     case BODY:
@@ -119,7 +119,7 @@ static void describe(const struct plant_field *field, char *out) {
                                         [PIN] = "a pin, PA0 to PI15",
                                         [FLAG] = "0 or 1",
                                         [SIGN] = "1 or -1",
-                                        [CURVE] = "beta, steinhart, rtd or linear",
+                                        [CURVE] = "beta, steinhart, rtd, linear or table",
                                         [AXIS] = "an axis described above",
                                         [BODY] = "a body described above"};
     if (field->type == NUMBER || field->type == WHOLE)

@@ -123,7 +123,7 @@ static void make_zone(const struct plant *plant, struct plant_zone *zone) {
 }
 
 static void advance(const struct plant *plant, struct plant_zone *zone, uint64_t ns) {
-    if (ns <= zone->at_ns)
+    if (ns <= zone->at_ns || !zone->count)
         return;
     if (zone->stale)
         make_zone(plant, zone);

@@ -30,6 +30,17 @@ static double resistance(const struct plant_sensor *sensor, double temperature) 
     return sensor->r0 * exp(sensor->beta * (1 / kelvin - 1 / (sensor->t0 + ZERO_C)));
 }
 
+static double from_table(const struct plant_sensor *sensor, double temperature) {
+    int at = 0;
+    while (at < sensor->point_count && sensor->celsius[at] < temperature)
+        at++;
+    if (at == 0 || at == sensor->point_count)
+        return sensor->point_count ? sensor->ratio[at ? at - 1 : 0] : 0;
+    double width = sensor->celsius[at] - sensor->celsius[at - 1];
+    double share = (temperature - sensor->celsius[at - 1]) / width;
+    return sensor->ratio[at - 1] + share * (sensor->ratio[at] - sensor->ratio[at - 1]);
+}
+
 // The voltage as a share of the converter's reference.
 double plant_sensor_ratio(const struct plant_sensor *sensor, double temperature) {
     if (sensor->fault == PLANT_OPEN)
@@ -38,6 +49,8 @@ double plant_sensor_ratio(const struct plant_sensor *sensor, double temperature)
         return 0;
     if (sensor->curve == PLANT_LINEAR)
         return sensor->zero + sensor->slope * temperature;
+    if (sensor->curve == PLANT_TABLE)
+        return from_table(sensor, temperature);
     double ohm = resistance(sensor, temperature);
     return isinf(ohm) ? 1 : ohm / (ohm + sensor->pullup);
 }

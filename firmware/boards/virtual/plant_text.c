@@ -206,7 +206,7 @@ static int read_heater(const struct plant_reader *reader, char *rest) {
 
 // What a curve needs, else a division by zero would follow.
 static int check_curve(const struct plant_reader *reader, const struct plant_sensor *sensor) {
-    int good = sensor->curve == PLANT_LINEAR || sensor->pullup > 0;
+    int good = sensor->curve >= PLANT_LINEAR || sensor->pullup > 0;
     if (sensor->curve == PLANT_BETA)
         good &= sensor->r0 > 0 && sensor->beta > 0;
     else if (sensor->curve == PLANT_STEINHART)
@@ -250,6 +250,40 @@ static int read_sensor(const struct plant_reader *reader, char *rest) {
            resolve(reader, &sensor->body, plant_text_body) || check_curve(reader, sensor);
 }
 
+static int find_sensor(const struct plant *plant, const char *name) {
+    for (int i = 0; i < plant->sensor_count; i++)
+        if (strcmp(plant->sensors[i].name, name) == 0)
+            return i;
+    return -1;
+}
+
+static int read_point(const struct plant_reader *reader, char *rest) {
+    struct line {
+        char sensor[PLANT_NAME];
+        double celsius, ratio;
+    } line;
+    static const struct plant_field fields[] = {
+        {"sensor", NAME, AT(line, sensor), 0, 0, 0},
+        {"celsius", NUMBER, AT(line, celsius), -300, 10000, 0},
+        {"ratio", NUMBER, AT(line, ratio), -1, 2, 0},
+    };
+    if (plant_text_fields(reader, FIELDS(fields), rest, &line))
+        return -1;
+    int found = find_sensor(reader->plant, line.sensor);
+    if (found < 0)
+        return plant_text_fail(reader, line.sensor, "is not described above");
+    struct plant_sensor *sensor = &reader->plant->sensors[found];
+    int at = sensor->point_count;
+    if (at == PLANT_POINTS)
+        return plant_text_fail(reader, line.sensor, "a table of too many points");
+    if (at && line.celsius <= sensor->celsius[at - 1])
+        return plant_text_fail(reader, line.sensor, "a table whose temperatures do not rise");
+    sensor->celsius[at] = line.celsius;
+    sensor->ratio[at] = line.ratio;
+    sensor->point_count++;
+    return 0;
+}
+
 static int read_line(const struct plant_reader *reader, char *line) {
     static const struct {
         const char *kind;
@@ -258,7 +292,7 @@ static int read_line(const struct plant_reader *reader, char *line) {
         {"plant", read_plant},   {"stepper", read_stepper}, {"axis", read_axis},
         {"term", read_term},     {"switch", read_switch},   {"body", read_body},
         {"fan", read_fan},       {"couple", read_couple},   {"cooling", read_cooling},
-        {"heater", read_heater}, {"sensor", read_sensor},
+        {"heater", read_heater}, {"sensor", read_sensor},   {"point", read_point},
     };
     line += strspn(line, " \t\r");
     if (!*line || *line == '#')

@@ -8,7 +8,7 @@ import pytest
 
 from coordinator.commands import EXAMPLES, DemoOptions
 from coordinator.demo.plant import START_MM, PlantSettings, machine_plants, start_point
-from coordinator.demo.plant_heat import HeatSettings, steinhart
+from coordinator.demo.plant_heat import HeatSettings, steinhart, table_of
 from coordinator.demo.stage import Stage
 from coordinator.kinematics.base import Point
 from coordinator.machine.description import MachineDescription, load_machine
@@ -231,6 +231,19 @@ def test_a_thermistor_goes_through_the_points_of_its_data_sheet(
             kelvin = 1 / (1 / (curve.t0 + 273.15) + math.log(ohm / curve.r0) / curve.beta)
         exact = isinstance(curve, Steinhart) or celsius != 150
         assert kelvin - 273.15 == pytest.approx(celsius, abs=1e-6 if exact else 2.0)
+
+
+def test_a_sensor_may_be_given_by_what_it_reads(tmp_path: Path) -> None:
+    (tmp_path / "machine.cfg").write_text(CONFIG)
+    curve = table_of(lambda celsius: 0.1 + celsius * 0.002, -50.0, 400.0)
+    heat = HeatSettings(curves={"Generic 3950": curve}, ambient_c=30.0, adc_noise=0.0)
+    plants = machine_plants(load_machine(str(tmp_path / "machine.cfg")), PlantSettings(heat=heat))
+    node = SimNode()
+    node.start_plant(plants["mcu"])  # the firmware takes the table
+    (chamber,) = [s for s in plants["mcu"].sensors if s.pin == "PB3"]
+    assert chamber.curve is curve
+    assert curve.points[0] == (-50.0, 0.0)
+    assert curve.points[-1] == pytest.approx((400.0, 0.9))
 
 
 def test_three_points_of_no_thermistor_give_the_one_by_beta_of_the_outer_two() -> None:

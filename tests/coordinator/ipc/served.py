@@ -25,7 +25,7 @@ class Served:
     stops: list[str] = field(default_factory=list)
     order: list[str] = field(default_factory=list)
     cancelled: asyncio.Event = field(default_factory=asyncio.Event)
-
+    notices: asyncio.Queue[str] = field(default_factory=asyncio.Queue)
     writers: list[asyncio.StreamWriter] = field(default_factory=list)
 
     @property
@@ -99,7 +99,9 @@ async def serving(folder: Path, **settings: Any) -> AsyncIterator[Served]:
     """Serve at FOLDER/m.sock with SETTINGS."""
     path = folder / "m.sock"
     served = Served(None, StateTree(), path, IpcSettings(unix_path=path, **settings))  # type: ignore[arg-type]
-    served.server = IpcServer(registry_of(served), served.state, served.settings)
+    served.server = IpcServer(
+        registry_of(served), served.state, served.settings, on_notice=served.notices.put_nowait
+    )
     await served.server.start()
     try:
         yield served

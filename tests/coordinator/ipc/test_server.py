@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from coordinator.ipc import turns as turns_module
 from coordinator.ipc.connection import REQUESTS_PER_TURN
 from coordinator.ipc.methods import Scope
 from coordinator.ipc.server import IpcServer
@@ -138,9 +139,17 @@ ATTACKS = {
     "a huge message": (struct.pack(">I", 2**24 - 1), "too_long"),
     "a huge line": (b'{"a":"' + b"x" * 300_000, "too_long"),
     "deep msgpack": (framed(b"\x81\xa1a" + b"\x91" * 500 + b"\xc0"), "too_deep"),
-    "abysmal msgpack": (framed(b"\x91" * 200_000 + b"\xc0"), "too_deep"),
+    "abysmal msgpack": (framed(b"\x91" * 200_000 + b"\xc0"), "too_long"),
     "deep JSON": (b'{"a":' + b"[" * 500 + b"]" * 500 + b"}\n", "too_deep"),
     "abysmal JSON": (b'{"a":' + b"[" * 100_000 + b"]" * 100_000 + b"}\n", "too_deep"),
+    "many small lists": (
+        framed(b"\x81\xa1a\xdc\x00\x40" + (b"\xdc\x0f\xa0" + b"\x90" * 4000) * 64),
+        "too_long",
+    ),
+    "many small lists in JSON": (
+        b'{"a":[' + b",".join([b"[" + b"[]," * 3000 + b"[]]"] * 3) + b"]}\n",
+        "too_long",
+    ),
     "half a message": (framed(b"\x81\xa1")[:-1], "timeout"),
     "half a length": (b"\0\0", "timeout"),
     "half a line": (b'{"id":1', "timeout"),
@@ -174,6 +183,41 @@ def test_what_is_wrong_ends_that_client_only_with_a_clear_error(tmp_path: Path, 
         writer.close()
 
     run(tmp_path, body, limits=Limits(message_timeout_s=0.2))
+
+
+def test_however_many_are_sent_at_once_what_is_answered_at_once_is_never_too_much(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(turns_module, "TURN_S", 0.0)  # time for one request, on the slowest of computers
+
+    async def body(served: Served) -> None:
+        script = await served.script()
+        count = 4 * served.settings.limits.pending_requests
+        for number in range(count):
+            script.send("machine.info", number)
+        for number in range(count):
+            answer = await script.receive()
+            assert (answer.get("id"), "result" in answer) == (number, True), answer
+
+    run(tmp_path, body)
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_is_cancelled_before_it_begins_is_answered_too(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        script = await served.script()
+        (connection,) = served.server._connections
+        session, now_s = connection.session, asyncio.get_running_loop().time()
+        session.receive(b'{"id":5,"method":"wait"}\n', now_s)
+        connection.work(now_s + 1)
+        session.receive(b'{"id":6,"method":"api.cancel","params":{"id":5}}\n', now_s)
+        connection.work(now_s + 1)  # within the same round of the loop
+        answers = {answer["id"]: answer for answer in [await script.receive() for _ in range(2)]}
+        assert answers[5]["error"]["code"] == "cancelled"
+        assert answers[6]["result"] == {"found": True}
+        assert not connection._tasks
+
+    run(tmp_path, body)
 
 
 def test_an_emergency_stop_overtakes_what_waits(tmp_path: Path) -> None:

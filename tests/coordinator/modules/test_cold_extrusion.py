@@ -65,7 +65,8 @@ def test_a_hot_one_takes_it_in_the_same_program(tmp_path: Path) -> None:
 
 def test_a_plan_is_never_cold(tmp_path: Path) -> None:
     stage = HeatMachine(tmp_path, HEATER)
-    vocabulary = stage.stage.description.modules.build().vocabulary
+    described = stage.stage.description
+    vocabulary = described.modules.build(described).vocabulary
     work = job(stage, vocabulary, "G28", "M109 S200", "G1 X10 E0.5 F3000")
     events(work)
     assert work.planner.moves == 1

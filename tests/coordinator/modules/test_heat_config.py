@@ -25,7 +25,8 @@ BLOWER = (
 def build(tmp_path: Path, text: str) -> ModuleSet:
     path = tmp_path / "printer.cfg"
     path.write_text(BASE + text)
-    return load_machine(str(path)).modules.build()
+    machine = load_machine(str(path))
+    return machine.modules.build(machine)
 
 
 def configured(modules: ModuleSet, node: str) -> list[str]:
@@ -114,7 +115,8 @@ def test_sensors_of_the_users_own(tmp_path: Path) -> None:
 def test_an_extruder_without_heater_is_never_cold(tmp_path: Path) -> None:
     path = tmp_path / "printer.cfg"
     path.write_text(BASE[: BASE.index("heater_pin")])
-    modules = load_machine(str(path)).modules.build()
+    machine = load_machine(str(path))
+    modules = machine.modules.build(machine)
     (heater,) = modules.of(ExtruderHeater)
     assert heater.can_extrude
     assert not modules.vocabulary.too_cold("extruder")

@@ -54,7 +54,7 @@ class Planned:
 def plan_program(config: Path, gcode: Path) -> Planned:
     """Plan GCODE for CONFIG; nothing but the streams and the trapezoids is kept."""
     description = load_machine(str(config))
-    devices = MachineDevices(description, description.modules.build())
+    devices = MachineDevices(description, description.modules.build(description))
     first = description.nodes[0].name
     dictionaries = {
         node.name: firmware_dictionary(MAINBOARD if node.name == first else TOOLHEAD)

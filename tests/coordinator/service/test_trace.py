@@ -81,3 +81,11 @@ def test_only_the_stretch_that_is_asked_for() -> None:
     assert len(trace.moves(0.0)) == 5
     assert len(trace.moves(planner.print_time_end_s + 1e-6)) == 0
     assert trace.moves(planner.print_time_end_s - 1e-3)["line"].tolist() == [5]
+
+
+def test_fresh_moves_are_taken_once() -> None:
+    planner, trace = planned(LINES)
+    fresh = trace.take_fresh()
+    assert len(fresh) == len(trace.moves(0.0)) > 0
+    assert len(trace.take_fresh()) == 0
+    assert planner.homed == "XYZ"

@@ -193,6 +193,23 @@ static void test_curves(void) {
     free(rig);
 }
 
+static void test_a_table(void) {
+    static const double expected[][2] = {{-50, 0.8}, {10, 0.8},   {20, 0.7},
+                                         {50, 0.4},  {100, 0.25}, {500, 0.1}};
+    for (size_t i = 0; i < sizeof(expected) / sizeof(*expected); i++) {
+        char text[400];
+        snprintf(text, sizeof(text),
+                 "plant node=n\nbody name=b capacity=1 loss=1 start=%g\n"
+                 "sensor name=s pin=PB0 node=- body=b curve=table bits=16\n"
+                 "point sensor=s celsius=10 ratio=0.8\npoint sensor=s celsius=50 ratio=0.4\n"
+                 "point sensor=s celsius=150 ratio=0.1\n",
+                 expected[i][0]);
+        struct rig *rig = new_rig(text);
+        check_near(plant_sample(&rig->plant, BEGIN, 16, 0), 4095 * expected[i][1], 0.6);
+        free(rig);
+    }
+}
+
 static void test_coarse_converters_and_noise(void) {
     static const char text[] =
         "plant node=n seed=%d\nbody name=b capacity=10 loss=0.1\n"
@@ -338,8 +355,12 @@ static void test_what_is_no_plant(void) {
         {"plant node=n\nbody name=b capacity=1 loss=1\nsensor name=s pin=PB0 node=- body=b curve=beta "
          "beta=4000\n",
          "its curve needs"},
+        {"plant node=n\npoint sensor=s celsius=1 ratio=0\n", "line 2: s: is not described above"},
+        {"plant node=n\nbody name=b capacity=1 loss=1\nsensor name=s pin=PB0 node=- body=b curve=table\n"
+         "point sensor=s celsius=2 ratio=0\npoint sensor=s celsius=2 ratio=1\n",
+         "line 5: s: a table whose temperatures do not rise"},
         {"plant node=n\nbody name=b capacity=1 loss=1\nsensor name=s pin=PB0 node=- body=b curve=round\n",
-         "expected beta, steinhart, rtd or linear"},
+         "expected beta, steinhart, rtd, linear or table"},
     };
     struct rig *rig = calloc(1, sizeof(*rig));
     CHECK(rig);
@@ -367,6 +388,7 @@ int main(void) {
     test_long_waits_end_in_balance();
     test_a_restart_lets_go();
     test_curves();
+    test_a_table();
     test_coarse_converters_and_noise();
     test_faults();
     test_tachometer();

@@ -260,6 +260,15 @@ def test_a_file_that_describes_no_plant(tmp_path: Path, text: bytes, said: str) 
         process.wait_ready()
 
 
+def test_a_process_without_end_keeps_no_log(start: Start, tmp_path: Path) -> None:
+    node = start(HOT, "toolhead", "--plant-log", "0")
+    page = PlantPage.at(tmp_path, "hot")
+    begun_ns = page.updated_ns
+    wait_until(lambda: page.updated_ns > begun_ns)
+    node.end()
+    assert not (tmp_path / "hot.plantlog").exists()
+
+
 def test_no_file_no_page_no_log(tmp_path: Path) -> None:
     process = NodeProcess("uart", uuid="000000000001", uart=tmp_path / "tty", plant=tmp_path / "n.plant")
     with pytest.raises(CanductorError, match=r"cannot read the plant .*n\.plant: No such file"):

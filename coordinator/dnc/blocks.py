@@ -1,0 +1,127 @@
+"""What goes over the line: characters, block check, headers and blocks of text."""
+
+from typing import Final
+
+from nodes.errors import CanductorError
+from nodes.records import record
+
+SOH: Final = 0x01
+STX: Final = 0x02
+ETX: Final = 0x03
+EOT: Final = 0x04
+ACK: Final = 0x06
+LF: Final = 0x0A
+CR: Final = 0x0D
+DC1: Final = 0x11
+DC3: Final = 0x13
+NAK: Final = 0x15
+ETB: Final = 0x17
+ESC: Final = 0x1B
+SPACE: Final = 0x20
+
+CRLF: Final = b"\r\n"
+DIRECTORY_REQUEST: Final = bytes((DC3, ESC, DC1)) + b"0 D" + CRLF
+"""What a control sends to see the directory: the FE 401's command for it."""
+NAME_MAX: Final = 64
+"""Characters of a file's name in a header."""
+INPUT: Final = "E"
+"""Mode of a header: the control wants the file."""
+OUTPUT: Final = "A"
+"""Mode of a header: the control sends the file."""
+CODES: Final = {
+    "H": "dialog program",
+    "D": "ISO program",
+    "L": "pallet table",
+    "S": "axis-correction table",
+    "M": "machine parameters",
+    "P": "PLC program",
+    "T": "tool table",
+}
+"""File codes known by name; any other letter is carried as well."""
+
+
+class BadText(CanductorError):  # noqa: N818 (the sentence is about a text)
+    """A text that no block can carry."""
+
+
+def block_check(data: bytes | bytearray) -> int:
+    """Return the XOR of all characters, parity not included.
+
+    >>> hex(block_check(bytes.fromhex("014831354517")))
+    '0x1f'
+    """
+    value = 0
+    for character in data:
+        value ^= character
+    return value
+
+
+def write_block(start: int, content: bytes, *, avoid_control: bool = False, dc1: bool = False) -> bytes:
+    """Return START content ETB BCC [DC1].
+
+    AVOID_CONTROL: no check character below 20 hex, by a space before ETB.
+    """
+    body = bytes((start,)) + content + bytes((ETB,))
+    check = block_check(body)
+    if avoid_control and check < SPACE:
+        body = body[:-1] + bytes((SPACE, ETB))
+        check ^= SPACE
+    return body + bytes((check, DC1) if dc1 else (check,))
+
+
+def strip_text(content: bytes, check: int, *, avoid_control: bool) -> bytes:
+    """Return the line in a block's content: without one stuffed space, then without CR LF.
+
+    After CR LF a space can only be stuffed. Without CR LF it is one where the option is on and the check
+    character, which CHECK is, would have been a control character without it.
+    """
+    if content.endswith(CRLF + b" ") or (
+        avoid_control and content.endswith(b" ") and check ^ SPACE < SPACE and not content.endswith(CRLF)
+    ):
+        content = content[:-1]
+    return content.removesuffix(CRLF)
+
+
+def is_text(content: bytes, data_bits: int = 8) -> bool:
+    """Tell whether a block may carry CONTENT: no control character but CR LF as a pair."""
+    bare = content.replace(CRLF, b"")
+    return not any(c < SPACE or c == 0x7F or (data_bits == 7 and c > 0x7F) for c in bare)
+
+
+@record
+class Header:
+    """Which file, and in which direction. NAME may be empty: the next file, then."""
+
+    code: str
+    """One letter: what kind of file."""
+    name: str
+    mode: str
+    """INPUT or OUTPUT, as seen by the control."""
+
+    def __post_init__(self) -> None:
+        """Check; raises BadText."""
+        if len(self.code) != 1 or not (self.code.isascii() and (self.code.isalpha() or self.code == "%")):
+            raise BadText(f"the file code is {self.code!r}, must be one letter such as H, D or S")
+        if len(self.name) > NAME_MAX or not (self.name.isascii() and self.name.isprintable()):
+            raise BadText(
+                f"{self.name[:NAME_MAX]!a} is no name for the other side: it takes at most"
+                f" {NAME_MAX} ASCII characters"
+            )
+        if self.name != self.name.strip():
+            raise BadText(f"{self.name!a} begins or ends with a space; a name must not")
+        if self.mode not in (INPUT, OUTPUT):
+            raise BadText(f"a header's mode is {self.mode!r}, must be {INPUT} or {OUTPUT}")
+
+    def to_content(self) -> bytes:
+        """Return what stands between SOH and ETB."""
+        return f"{self.code}{self.name}{self.mode}".encode("ascii")
+
+
+def read_header(content: bytes) -> Header | None:
+    """Return the header in CONTENT, or None: one stuffed space goes first, then CR LF, then the mode."""
+    bare = content.removesuffix(b" ").removesuffix(CRLF)
+    try:
+        text = bare.decode("ascii")
+        return Header(text[:1], text[1:-1], text[-1:]) if len(text) >= 2 else None
+    except (UnicodeDecodeError, BadText):
+        return None

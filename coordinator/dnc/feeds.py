@@ -1,0 +1,87 @@
+"""Jobs that have no end yet: lines from a pipe that come when they come, lines to a machine that runs."""
+
+import contextlib
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from typing import IO, Any, Final
+
+from coordinator.dnc.desk import NOT_YET, Pause
+from coordinator.dnc.files import FileRefused, read_lines
+from nodes.errors import CanductorError
+
+QUEUED_LINES_MAX: Final = 64
+"""Lines read ahead: what feeds them waits, then, as the control does with its answers."""
+
+
+class SlowSource:
+    """The lines of a pipe, read by a thread, so that the line is looked after while none comes."""
+
+    def __init__(self, content: IO[bytes], line_max: int) -> None:
+        self._content = content
+        self._line_max = line_max
+        self._lines: queue.Queue[bytes | CanductorError | None] = queue.Queue(QUEUED_LINES_MAX)
+        self._closing = threading.Event()
+        threading.Thread(target=self._read, name="dnc drip", daemon=True).start()
+
+    def next_line(self) -> bytes | Pause | None:
+        """See Source."""
+        try:
+            line = self._lines.get_nowait()
+        except queue.Empty:
+            return NOT_YET
+        if isinstance(line, CanductorError):
+            raise line
+        return line
+
+    def close(self) -> None:
+        """See Source: the thread ends with the next line that comes."""
+        self._closing.set()
+
+    def _read(self) -> None:
+        try:
+            for line in read_lines(self._content, self._line_max):
+                if not self._put(line):
+                    return
+        except CanductorError as error:
+            self._put(error)
+        except (OSError, ValueError) as error:  # ValueError: closed
+            self._put(CanductorError(f"the program cannot be read on: {error}"))
+        else:
+            self._put(None)
+
+    def _put(self, line: bytes | CanductorError | None) -> bool:
+        while not self._closing.is_set():
+            with contextlib.suppress(queue.Full):
+                self._lines.put(line, timeout=0.1)
+                return True
+        return False
+
+
+class MachineSink:
+    """A machine that runs carries out each line as it comes; its answer is what lets the next one come.
+
+    The machine plans a few seconds ahead and answers when it has read a line, so that a peripheral feeds it
+    exactly as fast as it moves. CALL is a client's.
+    """
+
+    def __init__(self, call: Callable[[str, Mapping[str, Any]], Any], name: str) -> None:
+        self.name = name
+        self.size_bytes = 0
+        self._call = call
+
+    def write(self, line: bytes) -> None:
+        """See Sink: raises what the machine answers."""
+        self.size_bytes += len(line) + 1
+        try:
+            text = line.decode("ascii").strip()
+        except UnicodeDecodeError:
+            raise FileRefused(f"{self.name} has a line that is not ASCII", "BAD CHARACTER") from None
+        if text and not text.startswith("%"):
+            self._call("gcode.run", {"script": text, "wait": False})
+
+    def keep(self) -> None:
+        """See Sink."""
+
+    def drop(self) -> None:
+        """See Sink: what was carried out cannot be taken back."""

@@ -1,0 +1,55 @@
+"""The directory as a peripheral tells it: lines of text, without a block check.
+
+Four lines that mean nothing; then on each line six characters that mean nothing, a name, blanks, the sectors
+it takes and whatever follows; at last ``FREE:`` and a number of sectors.
+"""
+
+from collections.abc import Iterable
+from typing import Final
+
+from coordinator.dnc.files import Entry
+from nodes.errors import CanductorError
+from nodes.records import record
+
+SECTOR_BYTES: Final = 512
+_IGNORED_LINES: Final = 4
+_IGNORED_CHARACTERS: Final = 6
+
+
+@record
+class Listing:
+    """What a directory tells."""
+
+    sectors: dict[str, int]
+    """By name."""
+    free_sectors: int | None
+
+
+def write_listing(entries: Iterable[Entry], free_bytes: int) -> bytes:
+    """Return the directory of ENTRIES; names with blanks are left out, nobody could read them back."""
+    lines = ["", "      CANDUCTOR", "", ""]
+    for entry in entries:
+        if " " not in entry.name:
+            sectors = -(-entry.size_bytes // SECTOR_BYTES)
+            lines.append(f"      {entry.name:<24} {sectors:>7} {entry.code}")
+    lines.append(f"      FREE: {min(free_bytes // SECTOR_BYTES, 9_999_999)}")
+    return "".join(line + "\r\n" for line in lines).encode("ascii")
+
+
+def read_listing(text: bytes) -> Listing:
+    """Read a directory; raises CanductorError for what cannot be one."""
+    if any(c > 0x7E or (c < 0x20 and c not in b"\r\n\t") for c in text):
+        raise CanductorError("the directory came damaged; check baud rate and parity, and ask again")
+    sectors: dict[str, int] = {}
+    free = None
+    for line in text.decode("ascii").split("\n")[_IGNORED_LINES:]:
+        before, found, after = line.partition("FREE:")
+        words = (after if found else line[_IGNORED_CHARACTERS:]).split()
+        if found:
+            free = int(words[0]) if words and words[0].isdecimal() else None
+        elif words:
+            sectors[words[0]] = (
+                int(words[1]) if words[1:] and words[1].isdecimal() and len(words[1]) < 10 else 0
+            )
+        del before
+    return Listing(sectors, free)

@@ -1,0 +1,100 @@
+"""What both sides of a line have to agree on, and how patient this side is."""
+
+from typing import Final
+
+from nodes.errors import CanductorError
+from nodes.records import record
+
+BAUD_RATES: Final = (110, 150, 300, 600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400)
+TRANSMISSIONS_MAX: Final = 15
+BLOCK_MAX: Final = 1024
+PARITIES: Final = {"N": "none", "E": "even", "O": "odd"}
+
+
+@record
+class Frame:
+    """One character on the line, as in 7E1."""
+
+    data_bits: int = 7
+    parity: str = "E"
+    stop_bits: int = 1
+
+    @property
+    def bits(self) -> int:
+        """Bits of one character with its start bit."""
+        return 1 + self.data_bits + (self.parity != "N") + self.stop_bits
+
+    def __str__(self) -> str:
+        return f"{self.data_bits}{self.parity}{self.stop_bits}"
+
+
+def read_frame(text: str) -> Frame:
+    """Read 7E1, 8N1 and the like; raises CanductorError."""
+    word = text.strip().upper()
+    if len(word) != 3 or word[0] not in "78" or word[1] not in PARITIES or word[2] not in "12":
+        raise CanductorError(
+            f"the character frame is '{text}', must be like 7E1 or 8N1: bits, parity, stop bits"
+        )
+    return Frame(int(word[0]), word[1], int(word[2]))
+
+
+@record(kw_only=True)
+class DncOptions:
+    """All of the protocol that can be chosen; times in seconds."""
+
+    frame: Frame = Frame()
+    baud: int = 9600
+    dc1: bool = True
+    """Send DC1 after each check character; received, it may be there or not."""
+    avoid_control: bool = False
+    """Send no check character below 20 hex;
+    a received space for that, after CR LF, is taken off in any case."""
+    transmissions: int = TRANSMISSIONS_MAX
+    """Of one block, the first included; old controls send 3 times."""
+    block_max: int = BLOCK_MAX
+    """Characters of one block's text, CR LF included."""
+    answer_s: float = 8.0
+    """For the other side to answer a block, and for its next block; then EOT, and the transfer has failed."""
+    decide_s: float = 30.0
+    """For the other side to answer a header: a floppy may have to start."""
+    character_s: float = 0.25
+    """Silence that ends whatever is on the line."""
+    nak_quiet_s: float = 0.3
+    """After NAK: repeat only if no other answer comes within this time."""
+    paced: bool = False
+    """The line is known to take characters no faster than BAUD: an answer that comes before the block can
+    have left is none, then. Not for sockets and pseudo-terminals."""
+
+    def __post_init__(self) -> None:
+        """Check; raises CanductorError."""
+        for name, value, low, high in (
+            ("baud", self.baud, 50, 4_000_000),
+            ("transmissions", self.transmissions, 1, 100),
+            ("block_max", self.block_max, 16, 65_536),
+            ("answer_s", self.answer_s, 0.01, 86_400.0),
+            ("decide_s", self.decide_s, 0.01, 86_400.0),
+            ("character_s", self.character_s, 0.001, 60.0),
+            ("nak_quiet_s", self.nak_quiet_s, 0.0, 60.0),
+        ):
+            if not low <= value <= high:
+                raise CanductorError(f"{name} is {value}, must be from {low} to {high}")
+        if self.answer_s <= self.character_s or self.answer_s <= self.nak_quiet_s:
+            raise CanductorError(
+                f"an answer may take {self.answer_s:g} s, must be longer than the silence that ends a block"
+                f" ({self.character_s:g} s) and the wait after NAK ({self.nak_quiet_s:g} s)"
+            )
+
+    @property
+    def character_time_s(self) -> float:
+        """Of one character on the line."""
+        return self.frame.bits / self.baud
+
+    @property
+    def settle_s(self) -> float:
+        """Silence after which a block or answer is complete: the next character would be there."""
+        return 1.5 * self.character_time_s
+
+    @property
+    def pair_s(self) -> float:
+        """Between ETX and EOT at most: they are sent in one go, but adapters hand on in pieces."""
+        return min(self.character_s, 0.02 + 4 * self.character_time_s)

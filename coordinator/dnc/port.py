@@ -1,0 +1,171 @@
+"""The serial line itself: a device, a pseudo-terminal, or a pyserial URL such as socket://HOST:PORT."""
+
+import contextlib
+import os
+import queue
+import select
+import stat
+import termios
+import threading
+from typing import Any, Final
+
+import serial
+
+from coordinator.dnc.options import DncOptions
+from nodes.errors import CanductorError
+
+READ_SIZE: Final = 4096
+_QUEUED_MAX: Final = 256
+"""Pieces of READ_SIZE that wait, from a port without a file descriptor."""
+_PSEUDO_MAJORS: Final = range(136, 144)
+
+
+class PortError(CanductorError):
+    """The port cannot be opened, or is gone."""
+
+
+class Port:
+    """An open line. NAME is a device or a pyserial URL; raises PortError."""
+
+    def __init__(self, name: str, options: DncOptions, *, rtscts: bool = False) -> None:
+        self.name = name
+        try:
+            self._port: Any = serial.serial_for_url(
+                name,
+                baudrate=options.baud,
+                bytesize=options.frame.data_bits,
+                parity=options.frame.parity,
+                stopbits=options.frame.stop_bits,
+                xonxoff=False,  # it would eat DC1, and a check character of 11 or 13 hex
+                rtscts=rtscts,
+                timeout=0.05,
+                write_timeout=None,
+                **({"exclusive": True} if "://" not in name else {}),
+            )
+        except (OSError, ValueError, OverflowError, termios.error) as error:
+            raise PortError(_cannot_open(name, options, error)) from None
+        self._fd = _descriptor(self._port)
+        self._is_tty = self._fd is not None and os.isatty(self._fd)
+        if self._fd is not None and self._is_tty:
+            _mark_parity_errors(self._fd, on=options.frame.parity != "N")
+            with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
+                self._port.set_low_latency_mode(low_latency_settings=True)
+        if self._fd is not None:
+            os.set_blocking(self._fd, False)
+        self._closing = threading.Event()
+        self._read: queue.Queue[bytes | OSError] = queue.Queue(_QUEUED_MAX)
+        if self._fd is None:
+            self._thread = threading.Thread(target=self._read_on, name="dnc port", daemon=True)
+            self._thread.start()
+
+    @property
+    def is_paced(self) -> bool:
+        """Whether characters leave at the baud rate: not those of sockets, pseudo-terminals, USB modems."""
+        if self._fd is None or not self._is_tty:
+            return False
+        device = os.fstat(self._fd)
+        usb_modem = os.path.basename(os.path.realpath(self.name)).startswith("ttyACM")  # noqa: PTH119
+        return (
+            stat.S_ISCHR(device.st_mode) and os.major(device.st_rdev) not in _PSEUDO_MAJORS and not usb_modem
+        )
+
+    def close(self) -> None:
+        """Let the line go."""
+        self._closing.set()
+        if self._fd is None:
+            self._thread.join(timeout=1.0)
+        with contextlib.suppress(OSError):
+            self._port.close()
+
+    def read(self, timeout_s: float) -> bytes:
+        """Return what came, after TIMEOUT_S at most; raises PortError."""
+        if self._fd is None:
+            return self._read_queue(timeout_s)
+        try:
+            ready, _, _ = select.select([self._fd], [], [], max(timeout_s, 0.0))
+            if not ready:
+                return b""
+            data = os.read(self._fd, READ_SIZE)
+        except BlockingIOError:
+            return b""
+        except (OSError, ValueError) as error:
+            raise PortError(f"{self.name} is gone: {error}; check its plug and start again") from None
+        if not data:
+            if self._is_tty:
+                return b""
+            raise PortError(f"{self.name} was closed by the other side; start again when it is back")
+        return data
+
+    def write(self, data: bytes, timeout_s: float) -> None:
+        """Send DATA; raises PortError when the line has not taken it within TIMEOUT_S."""
+        try:
+            if self._fd is None:
+                self._port.write(data)
+                return
+            while data:
+                _, ready, _ = select.select([], [self._fd], [], timeout_s)
+                if not ready:
+                    raise PortError(f"{self.name} takes no bytes for {timeout_s:g} s; check its handshake")
+                with contextlib.suppress(BlockingIOError):
+                    data = data[os.write(self._fd, data) :]
+        except (OSError, ValueError) as error:
+            raise PortError(f"{self.name} is gone: {error}; check its plug and start again") from None
+
+    def _read_queue(self, timeout_s: float) -> bytes:
+        try:
+            data = self._read.get(timeout=max(timeout_s, 0.0005))
+        except queue.Empty:
+            return b""
+        if isinstance(data, OSError):
+            raise PortError(f"{self.name} is gone: {data}; start again when it is back")
+        return data
+
+    def _read_on(self) -> None:
+        """Read a port that select does not know."""
+        while not self._closing.is_set():
+            try:
+                data = self._port.read(1)
+                data += self._port.read(min(self._port.in_waiting, READ_SIZE)) if data else b""
+            except OSError as error:
+                self._put(error)
+                return
+            if data:
+                self._put(data)
+
+    def _put(self, data: bytes | OSError) -> None:
+        while not self._closing.is_set():
+            with contextlib.suppress(queue.Full):
+                self._read.put(data, timeout=0.1)
+                return
+
+
+def _descriptor(port: Any) -> int | None:
+    """Return the file descriptor to wait at, if the port has one."""
+    try:
+        return int(port.fileno())
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+def _mark_parity_errors(fd: int, *, on: bool) -> None:
+    """Have a character of wrong parity come as NUL, which no block holds; pyserial lets it pass as right."""
+    settings = termios.tcgetattr(fd)
+    mask = termios.INPCK if on else 0
+    settings[0] = (settings[0] & ~(termios.INPCK | termios.PARMRK | termios.IGNPAR)) | mask
+    # A read with nothing there fails, then; else it would look like the end.
+    settings[6][termios.VMIN] = 1
+    settings[6][termios.VTIME] = 0
+    termios.tcsetattr(fd, termios.TCSANOW, settings)
+
+
+def _cannot_open(name: str, options: DncOptions, error: Exception) -> str:
+    why = getattr(error, "strerror", None) or str(error)
+    code = getattr(error, "errno", None)
+    if isinstance(error, PermissionError) or code == 13:
+        return f"{name} may not be opened; add yourself to the group 'dialout' and log in again"
+    if isinstance(error, FileNotFoundError) or code == 2:
+        return f"there is no serial port {name}; check its plug ('ls /dev/serial/by-id')"
+    if code in (11, 16):
+        return f"{name} is in use by another program; close that first"
+    settings = f"{options.baud} baud {options.frame}"
+    return f"{name} cannot be opened at {settings}: {why.lower()}; check name and settings"

@@ -1,0 +1,77 @@
+"""Whose turn it is: however many clients ask for however much, the loop gets to its other work in time.
+
+The control loop also hands motion over. In each of its rounds all clients together work for ROUND_S and the
+turn that reaches it; one client for TURN_S, then the others that wait come first.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import Final, Protocol
+
+ROUND_S: Final = 0.004
+TURN_S: Final = 0.001
+
+
+class Worker(Protocol):
+    """A client's connection."""
+
+    def work(self, until_s: float) -> bool:
+        """Do what there is to do, until UNTIL_S by the loop's clock; return whether there is more."""
+        ...
+
+    def hold(self) -> None:
+        """Take no more in until the next turn."""
+
+
+class Turns:
+    """Shares the rounds of the loop that makes it; NOW_S is the loop's clock."""
+
+    def __init__(self, now_s: Callable[[], float] | None = None) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._now_s = self._loop.time if now_s is None else now_s
+        self._waiting: dict[Worker, None] = {}  # in the order in which they came
+        self._spent_s = 0.0  # in this round
+        self._round_is_due = False
+
+    def ask(self, worker: Worker) -> None:
+        """Let WORKER work: now, or when those before it did."""
+        if worker in self._waiting:
+            return
+        if self._waiting or self._spent_s >= ROUND_S:
+            self._wait(worker)
+            worker.hold()
+        else:
+            self._let(worker)
+
+    def leave(self, worker: Worker) -> None:
+        """Forget WORKER."""
+        self._waiting.pop(worker, None)
+
+    def _let(self, worker: Worker) -> None:
+        begun_s = self._now_s()
+        more = worker.work(begun_s + TURN_S)
+        self._spent_s += self._now_s() - begun_s
+        if more:
+            self._wait(worker)
+        self._expect_round()
+
+    def _wait(self, worker: Worker) -> None:
+        self._waiting[worker] = None
+        self._expect_round()
+
+    def _expect_round(self) -> None:
+        if not self._round_is_due:
+            self._round_is_due = True
+            self._loop.call_soon(self._round)  # what the loop has ready by now comes before it
+
+    def _round(self) -> None:
+        self._round_is_due = False
+        self._spent_s = 0.0
+        for worker in list(self._waiting):
+            if self._spent_s >= ROUND_S:
+                break
+            if worker in self._waiting:
+                del self._waiting[worker]
+                self._let(worker)
+        if self._waiting:
+            self._expect_round()

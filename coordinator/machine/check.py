@@ -1,0 +1,64 @@
+"""Finds everything that is wrong with a configuration, not only the first mistake.
+
+Single options are read on with a value that stands in. A mistake that ends the reading of a section is taken
+out, and all is read again; so nothing is told twice, and nothing that only follows from another mistake.
+"""
+
+from typing import Final
+
+from coordinator.machine.config_file import ConfigFile, RawSection, parse_config
+from coordinator.machine.description import describe
+from coordinator.machine.problem import ConfigError
+from nodes.errors import CanductorError
+
+PROBLEMS_MAX: Final = 100
+"""A file that is no configuration has more; nobody wants to see them."""
+
+
+def check_config(path: str) -> list[CanductorError]:
+    """Return all mistakes in the configuration file PATH and what it includes, by file and line."""
+    collected: list[ConfigError] = []
+    raised: list[CanductorError] = []
+    try:
+        config = parse_config(path, collected)
+        while len(raised) < PROBLEMS_MAX:
+            try:
+                describe(config)
+                break
+            except ConfigError as error:
+                section = _section_of(config, error)
+                # What is raised after a value stood in may well come from that value.
+                if section is None or not section.stands_in:
+                    raised.append(error)
+                if section is None or not _take_out(config, section, error):
+                    break
+    except CanductorError as error:
+        raised.append(error)
+    every = {str(error): error for error in (*collected, *raised)}
+    return sorted(every.values(), key=_order)[:PROBLEMS_MAX]
+
+
+def _order(error: CanductorError) -> tuple[str, int]:
+    return (error.place.path, error.place.line) if isinstance(error, ConfigError) else ("", 0)
+
+
+def _section_of(config: ConfigFile, error: ConfigError) -> RawSection | None:
+    for section in config.sections.values():
+        if error.place in (section.place, *(option.place for option in section.options.values())):
+            return section
+    return None
+
+
+def _take_out(config: ConfigFile, section: RawSection, error: ConfigError) -> bool:
+    """Take out of SECTION what ERROR is about; return whether anything is left to be read."""
+    for name, option in section.options.items():
+        if option.place == error.place:
+            del section.options[name]
+            section.set_aside.add(name)
+            return True
+    if section.is_set_aside:
+        del config.sections[section.name]
+        return section.kind not in ("mcu", "printer")
+    section.options.clear()
+    section.is_set_aside = section.stands_in = True
+    return True

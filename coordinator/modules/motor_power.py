@@ -1,0 +1,132 @@
+"""Enable pins: the drivers are switched on before anything moves, and off by M84.
+
+All are switched together: a motor that is off while others move could be pushed about by them.
+SET_STEPPER_ENABLE is for trying out.
+"""
+
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.words import WordError, quoted
+from coordinator.machine.options import SectionSpec
+from coordinator.modules.base import Build, Module, Value
+from nodes.devices.digital_out import DigitalOut
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from coordinator.machine.pins import PinDescription
+    from coordinator.modules.live import Live
+    from nodes.node import Node
+
+WAKE_S: Final = 0.1
+"""Drivers need a moment after they were switched on or off, before what comes next."""
+
+
+class EnableLine(DigitalOut):
+    """One enable pin, for all motors that share it."""
+
+    def __init__(self, pin: "PinDescription") -> None:
+        super().__init__(f"the drivers on {pin.node}:{pin.name}", pin=pin.name, invert=pin.invert)
+        self.node = pin.node
+        self.steppers: list[str] = []
+        self.on = False
+
+    def started(self, node: "Node") -> None:
+        """Take note that all is as configured: off."""
+        super().started(node)
+        self.on = False
+
+
+class MotorPower(Module):
+    """The enable pins of a machine's steppers."""
+
+    SPEC = SectionSpec(help="Enable pins", options=())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        lines: dict[tuple[str, str], EnableLine] = {}
+        for stepper in build.machine.steppers:
+            pin = stepper.enable_pin
+            if pin is not None:
+                line = lines.setdefault((pin.node, pin.name), EnableLine(pin))
+                line.steppers.append(stepper.name)
+        self._lines = tuple(lines.values())
+        self._live: Live | None = None
+        for line in self._lines:
+            build.add_device(line.node, line)
+        for name in ("M84", "M18"):
+            build.add_command(
+                GCodeCommand(name, "Switch all motors off; nothing is homed any more", self._read_off)
+            )
+        build.add_command(GCodeCommand("M17", "Switch all motors on", self._read_on))
+        build.add_command(
+            GCodeCommand(
+                "SET_STEPPER_ENABLE", "Switch the motor STEPPER on or off (ENABLE=1, 0)", self._read_one
+            )
+        )
+
+    async def connect(self, live: "Live") -> None:
+        """Take over the machine."""
+        self._live = live
+
+    def stopped(self, cause: str) -> None:
+        """Take note that the nodes have switched all off."""
+        del cause
+        for line in self._lines:
+            line.on = False
+
+    def status(self) -> dict[str, Value]:
+        """Tell which motors are on."""
+        return {"steppers": {name: line.on for line in self._lines for name in line.steppers}}
+
+    def on(self) -> None:
+        """Switch all on that are not, as soon as possible; steps may follow WAKE_S later."""
+        for line in self._lines:
+            if not line.on:
+                self._switch(line, on=True)
+
+    def _switch(self, line: EnableLine, *, on: bool) -> None:
+        live = self._live
+        if live is None or not live.node(line.node).talks:
+            return
+        line.set(live.node(line.node), live.ticks_at(line.node, live.soon()), on)
+        line.on = on
+
+    # --------------------------------------------------------------------------------------------- commands
+
+    def _read_off(self, call: Call) -> Reading:
+        call.command.words()  # slicers name axes, which means nothing: the motors go off together
+        if not self._lines:
+            return AtOnce()
+        return AtRest(lambda: self._all(on=False), Done(unhomed="XYZ"))
+
+    def _read_on(self, call: Call) -> Reading:
+        call.command.words()
+        return AtRest(lambda: self._all(on=True))
+
+    def _read_one(self, call: Call) -> Reading:
+        values = call.parameters("STEPPER", "ENABLE")
+        name, enable = values.get("STEPPER", ""), values.get("ENABLE", "1")
+        names = [stepper for line in self._lines for stepper in line.steppers]
+        if name not in names:
+            raise WordError(
+                f"SET_STEPPER_ENABLE names {quoted(name)}; motors with enable pins: {' '.join(names)}"
+            )
+        if enable not in ("0", "1"):
+            raise WordError(f"ENABLE of SET_STEPPER_ENABLE is {quoted(enable)}; it must be 0 or 1")
+        lines = [line for line in self._lines if name in line.steppers]
+        return AtRest(
+            lambda: self._some(lines, on=enable == "1"), Done() if enable == "1" else Done(unhomed="XYZ")
+        )
+
+    async def _all(self, *, on: bool) -> Done:
+        return await self._some(self._lines, on=on)
+
+    async def _some(self, lines: "Iterable[EnableLine]", *, on: bool) -> Done:
+        import asyncio  # noqa: PLC0415 (planning needs none)
+
+        for line in lines:
+            self._switch(line, on=on)
+        await asyncio.sleep(2 * WAKE_S)
+        return Done() if on else Done(unhomed="XYZ")

@@ -1,0 +1,116 @@
+// The job: how far it is, and start, pause, resume, cancel of files of the job folder.
+
+import { $, count, duration, make, mark, percent, put, show } from "./dom.js";
+
+const ACTIVE = new Set(["printing", "pausing", "paused", "cancelling"]);
+const SURE_MS = 4000;
+const FILES_MAX = 1000;
+
+export class Job {
+  #link;
+  #may = false;
+  #state = "none";
+  #sure = 0; // timer
+
+  constructor(link) {
+    this.#link = link;
+    $("job-pause").addEventListener("click", () => this.#call("job.pause"));
+    $("job-resume").addEventListener("click", () => this.#call("job.resume"));
+    $("job-cancel").addEventListener("click", () => this.#cancel());
+    $("job-start").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.#call("job.start", { file: $("job-files").value });
+    });
+    $("job-files").addEventListener("pointerdown", () => this.list());
+    $("job-files").addEventListener("focus", () => this.list());
+  }
+
+  set may(may) {
+    this.#may = may;
+  }
+
+  /** Ask which files there are. */
+  async list() {
+    let files = [];
+    try {
+      files = (await this.#link.call("job.list")).files.slice(0, FILES_MAX);
+    } catch (error) {
+      if (error.code !== "no_such_file") return;
+    }
+    const select = $("job-files");
+    const names = files.map((file) => file.name);
+    if (names.join("\n") === [...select.options].map((option) => option.value).join("\n")) return;
+    const chosen = select.value;
+    select.replaceChildren(
+      ...files.map((file) => make("option", { value: file.name }, `${file.name} (${size(file.size_bytes)})`)),
+    );
+    if (!files.length) select.append(make("option", { value: "" }, "no files in the job folder"));
+    if (names.includes(chosen)) select.value = chosen;
+  }
+
+  show(fields, machine_state) {
+    const get = (name) => fields.get(`job.${name}`);
+    const state = get("state") ?? "none";
+    const progress = get("progress") ?? 0;
+    const active = ACTIVE.has(state);
+    this.#state = state;
+    put($("job-file"), get("file") ?? "no job yet");
+    show($("job-state"), state !== "none");
+    put($("job-state"), state);
+    mark($("job-state"), "state", state);
+    const message = get("message") ?? "";
+    show($("job-message"), message !== "");
+    put($("job-message"), message);
+    $("job-progress").value = progress;
+    put($("job-percent"), percent(progress));
+    put($("job-time"), get("print_time_s") === null ? "–" : duration(get("print_time_s")));
+    put($("job-left"), active && progress > 0.01 ? duration((get("print_time_s") * (1 - progress)) / progress) : "–");
+    put($("job-row"), count(get("line")));
+    $("top-bar").style.transform = `scaleX(${active ? progress : 0})`;
+    put($("top-file"), active ? get("file") : "");
+    put($("top-percent"), active ? percent(progress) : "");
+    this.#enable(state, machine_state);
+  }
+
+  #enable(state, machine_state) {
+    const may = this.#may && this.#link.up;
+    $("job-pause").disabled = !(may && state === "printing");
+    $("job-resume").disabled = !(may && (state === "paused" || state === "pausing"));
+    $("job-cancel").disabled = !(may && ACTIVE.has(state) && state !== "cancelling");
+    $("job-files").disabled = !may;
+    $("job-print").disabled = !(may && machine_state === "ready" && !ACTIVE.has(state) && $("job-files").value);
+  }
+
+  /** Cancel when asked twice: a print is hours. */
+  #cancel() {
+    const button = $("job-cancel");
+    const settle = () => {
+      clearTimeout(this.#sure);
+      mark(button, "sure", "false");
+      put(button, "Cancel");
+    };
+    if (button.dataset.sure === "true") {
+      settle();
+      this.#call("job.cancel");
+      return;
+    }
+    mark(button, "sure", "true");
+    put(button, "Really cancel?");
+    this.#sure = setTimeout(settle, SURE_MS);
+  }
+
+  async #call(method, params) {
+    const told = $("job-told");
+    try {
+      await this.#link.call(method, params);
+      show(told, false);
+    } catch (error) {
+      put(told, error.message);
+      show(told, true);
+    }
+  }
+}
+
+function size(bytes) {
+  return bytes < 1e6 ? `${Math.max(1, Math.round(bytes / 1e3))} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
+}

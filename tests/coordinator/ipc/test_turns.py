@@ -1,0 +1,80 @@
+"""Clients share the rounds of the loop; the clock is the test's."""
+
+import asyncio
+
+from coordinator.ipc.turns import ROUND_S, TURN_S, Turns
+
+TURNS_IN_A_ROUND = round(ROUND_S / TURN_S)
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+class Client:
+    """Has TURNS turns' worth of work, and notes in WORKED when it gets one."""
+
+    def __init__(self, name: str, turns: int, clock: Clock, worked: list[str]) -> None:
+        self.name = name
+        self.turns = turns
+        self.held = 0
+        self._clock = clock
+        self._worked = worked
+
+    def work(self, until_s: float) -> bool:
+        assert until_s == self._clock.now_s + TURN_S
+        self._clock.now_s = until_s
+        self._worked.append(self.name)
+        self.turns -= 1
+        return self.turns > 0
+
+    def hold(self) -> None:
+        self.held += 1
+
+
+async def rounds(worked: list[str]) -> list[list[str]]:
+    """Return who worked in each round of the loop, until nobody does."""
+    found, seen = [worked.copy()], len(worked)
+    while True:
+        await asyncio.sleep(0)
+        if len(worked) == seen:
+            return found
+        found.append(worked[seen:])
+        seen = len(worked)
+
+
+def test_a_round_is_bounded_and_turns_are_fair() -> None:
+    async def body() -> None:
+        clock, worked = Clock(), list[str]()
+        turns = Turns(clock)
+        clients = [Client(name, 3, clock, worked) for name in "abcdefgh"]
+        for client in clients:
+            turns.ask(client)
+            turns.ask(client)  # twice is once
+        found = await rounds(worked)
+        # The first one has more to do than a turn, so all others wait behind it.
+        assert list(map("".join, found)) == ["a", "abcd", "efgh", "abcd", "efgh", "bcde", "fgh"]
+        assert [client.held for client in clients] == [0] + [1] * 7
+
+    asyncio.run(body())
+
+
+def test_who_asks_little_is_served_at_once_until_the_round_is_spent() -> None:
+    async def body() -> None:
+        clock, worked = Clock(), list[str]()
+        turns = Turns(clock)
+        clients = [Client(str(number), 1, clock, worked) for number in range(2 * TURNS_IN_A_ROUND)]
+        for client in clients:
+            turns.ask(client)
+        assert len(worked) == TURNS_IN_A_ROUND
+        turns.leave(clients[-1])
+        found = await rounds(worked)
+        assert found[1:] == [[client.name for client in clients[TURNS_IN_A_ROUND:-1]]]
+        turns.ask(clients[0])  # a new round: at once again
+        assert worked[-1] == "0"
+
+    asyncio.run(body())

@@ -1,0 +1,59 @@
+"""The words about serving: the page beyond this computer only with what protects it."""
+
+import builtins
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from coordinator import cli
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    assert cli.main(["demo", "--serve", *words]) != 0
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    return err
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0:8080", "192.168.1.5:8080", "[::]:8080"])
+def test_beyond_loopback_there_are_tokens_and_tls(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, address: str
+) -> None:
+    assert "needs --tokens FILE" in refused(capsys, "--web", address)
+    tokens = str(tmp_path / "tokens")
+    assert "needs --tls-certificate and --tls-key" in refused(capsys, "--web", address, "--tokens", tokens)
+
+
+@pytest.mark.parametrize(
+    "address", ["", "x", "0", "65536", "-1", "8080x", "host:8080", "127.0.0.1:", ":8080", "1.2.3:1"]
+)
+def test_what_is_no_address(capsys: pytest.CaptureFixture[str], address: str) -> None:
+    assert "--web is '" in refused(capsys, f"--web={address}")
+
+
+def test_without_serve_there_is_no_page(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["demo", "--web", "8080"]) != 0
+    assert "give --serve" in capsys.readouterr().err
+
+
+def test_the_library_is_named_when_it_is_missing(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real: Callable[..., Any] = builtins.__import__
+
+    def without(name: str, *rest: Any, **named: Any) -> Any:
+        if name == "coordinator.web.server":
+            raise ModuleNotFoundError("No module named 'aiohttp'", name="aiohttp")
+        return real(name, *rest, **named)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    path = tmp_path / "x.sock"
+    err = refused(capsys, "--ipc", str(path), "--web", "8080")
+    assert err == (
+        "canductor: the live page needs aiohttp, which is not installed; run: pip install 'canductor[web]'\n"
+    )
+    assert not path.exists()
