@@ -32,7 +32,7 @@ class DemoReport:
     """Of what was homed."""
     clocks: tuple[ClockProof, ...]
     stray_edges: int
-    """Level changes of pins that are no stepper's."""
+    """Level changes of pins that are nobody's."""
     nodes: tuple[NodeReport, ...]
     frames: int
     frames_lost: int
@@ -121,7 +121,7 @@ class DemoReport:
         lost = [p.axis for p in self.places if not p.holds]
         if lost:
             return f"{', '.join(lost)} is not where the machine believes it to be"
-        return f"{self.stray_edges} changes of pins that are no stepper's"
+        return f"{self.stray_edges} changes of pins that are nobody's"
 
 
 def _node_line(node: NodeReport) -> str:
