@@ -34,7 +34,7 @@ from coordinator.session import Outcome, outcome_of
 
 WATCH_TOKEN, ADMIN_TOKEN = "watch" * 8, "admin" * 8
 LOOK_S = 0.02
-NODES_PRIORITY = 10
+NODES_PRIORITY, SERVICE_PRIORITY = 10, 5
 
 
 class Proved:
@@ -135,6 +135,12 @@ async def _serve(proved: Proved) -> Outcome:
         loop.remove_reader(sys.stdin)
 
 
+def _prefer(pid: int, priority: int) -> None:
+    """Let a process run before others, as far as the user may ask for that; 0 is this one."""
+    with suppress(PermissionError):
+        os.sched_setscheduler(pid, os.SCHED_RR, os.sched_param(priority))
+
+
 def _say(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()
@@ -149,9 +155,11 @@ def main() -> None:
     options = DemoOptions(machine=machine)
     description = load_machine(str(options.machine))
     with Stage(description, options, folder) as stage:
-        for node in stage.processes.values():  # boards do not compete with clients for a processor
-            with suppress(PermissionError):
-                os.sched_setscheduler(node.pid, os.SCHED_FIFO, os.sched_param(NODES_PRIORITY))
+        # What is proved is that clients do no harm through the sockets. Other processes may: a busy computer
+        # was seen to leave the service without a processor for a second, and boards, which have their own.
+        for node in stage.processes.values():
+            _prefer(node.pid, NODES_PRIORITY)
+        _prefer(0, SERVICE_PRIORITY)
         proved = Proved(stage, folder, jobs)
         outcome = asyncio.run(_serve(proved))
         figures = stage.stop_nodes()
