@@ -4,16 +4,16 @@ The control loop says which tables are wanted; the motion worker takes them up w
 taken up makes no step by itself: docs/tables.md tells how it comes into effect.
 """
 
-import math
-from collections.abc import Mapping
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from coordinator.machine.description import MachineDescription
-from coordinator.motion.planner_values import Limits
-from coordinator.motion.specs import StepKinematics
+from coordinator.motion.specs import MotionLimits, StepKinematics
 from coordinator.motion.steps import TABLE_POINTS_MAX, AxisCorrection, StepGenerator
-from coordinator.table.axis_table import AxisTable, TableError
+from coordinator.table.axis_table import AxisTable
 from nodes.records import record
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
 AXES: Final = "xyz"
 NO_CORRECTION: Final = AxisCorrection(0, reverse=False, offset_mm=0.0, lag_mm=0.0)
@@ -36,9 +36,12 @@ class AxisState:
 
 
 class Compensation:
-    """The tables of a machine whose planner has LIMITS. ``want`` and ``states`` may be used by another thread."""
+    """The tables of a machine whose planner has LIMITS.
 
-    def __init__(self, limits: Limits) -> None:
+    ``want`` and ``states`` may be used by another thread than the rest.
+    """
+
+    def __init__(self, limits: MotionLimits) -> None:
         self.wanted: Mapping[str, AxisTable] = {}
         """By axis letter; replaced as a whole, never changed."""
         self._taken: dict[str, AxisTable] = {}
@@ -55,10 +58,12 @@ class Compensation:
 
     def is_due(self, homed: str) -> bool:
         """Tell whether ``take_up`` has something to do, with the axes HOMED (capital letters)."""
-        return self._looked_at != (self.wanted, homed) and self._looked_at_otherwise(homed)
-
-    def _looked_at_otherwise(self, homed: str) -> bool:
-        return any(self._may_use(axis, homed) is not self._taken.get(axis) for axis in AXES)
+        if self._looked_at == (self.wanted, homed):  # most of the time: the same map
+            return False
+        due = any(self._may_use(axis, homed) is not self._taken.get(axis) for axis in AXES)
+        if not due:
+            self._looked_at = (self.wanted, homed)
+        return due
 
     def _may_use(self, axis: str, homed: str) -> AxisTable | None:
         return self.wanted.get(axis) if axis.upper() in homed else None
@@ -84,13 +89,15 @@ class Compensation:
         self.note(steps)
 
     def begin_again(self, before: StepGenerator) -> None:
-        """Take note that another generator follows on BEFORE: it has no tables, and the motors did not move."""
+        """Take note that another generator, without tables, follows on BEFORE; no motor moved."""
         self._carried = before.corrections
         self._taken = {}
+        self._looked_at = ({}, "")
 
     def declared(self, steps: StepGenerator, before: tuple[AxisCorrection, ...], homed: str) -> None:
-        """Let the axes that were not just HOMED (capital letters) keep what they had BEFORE STEPS were told
-        where they stand.
+        """Let axes that were not just HOMED (capital letters) keep what was added to them.
+
+        STEPS were told where the machine stands; BEFORE is what was added until then.
         """
         kept, self._carried = self._carried or before, None
         if any(correction.offset_mm for correction in kept):
@@ -111,15 +118,21 @@ class Compensation:
         }
 
 
-def check_compensable(description: MachineDescription, table: AxisTable) -> None:
-    """Raise TableError unless the coordinator can correct the axis of TABLE."""
-    if table.axis not in AXES or description.carriages is not None or not _is_linear(description):
-        raise TableError(
-            f"axis {table.axis} cannot have a table: only x, y and z of machines whose steppers move in "
-            "proportion to them are corrected, not towers, arms, winches or dual carriages"
+def why_not_corrected(description: MachineDescription, table: AxisTable) -> str:
+    """Return why the coordinator cannot correct the axis of TABLE, a sentence; empty: it can."""
+    if table.axis not in AXES or not _is_linear(description):
+        return (
+            f"axis {table.axis} is not corrected: that is for x, y and z of machines whose steppers move in "
+            "proportion to them, without towers, arms, winches or dual carriages"
         )
     if len(table.positions) > TABLE_POINTS_MAX:
-        raise TableError(
-            f"the table of axis {table.axis} has {len(table.positions)} points, and step generation has room "
-            f"for {TABLE_POINTS_MAX}; thin it out"
+        return (
+            f"axis {table.axis} is not corrected: its table has {len(table.positions)} points, and step "
+            f"generation has room for {TABLE_POINTS_MAX}; thin it out"
         )
+    return ""
+
+
+def _is_linear(description: MachineDescription) -> bool:
+    linear = all(motor.function.kinematics is StepKinematics.LINEAR for motor in description.motors)
+    return linear and description.dual_carriage is None

@@ -258,13 +258,13 @@ class StepGenerator:
         return tuple(AxisCorrection(c.points, bool(c.reverse), c.offset, c.lag) for c in found)
 
     def set_corrections(self, corrections: Sequence[AxisCorrection]) -> None:
-        """Declare that the motors of X, Y and Z stand ``offset_mm`` beyond their axes, on these sides: no steps.
+        """Declare that the motors of X, Y, Z stand ``offset_mm`` beyond their axes, on these sides: no steps.
 
         Raises StepError while appended moves are not yet generated.
         """
         offsets = [correction.offset_mm for correction in corrections]
         if lib.step_set_corrections(self._gen, offsets, [int(c.reverse) for c in corrections]):
-            raise StepError(f"corrections cannot be set to {offsets} mm while moves wait; generate them first")
+            raise StepError(f"corrections cannot become {offsets} mm while moves wait; generate them first")
 
     @property
     def look_ahead_s(self) -> float:
