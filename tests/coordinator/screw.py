@@ -147,11 +147,8 @@ def measure(screw: Screw, folder: Path) -> AxisTable:
 
 
 def workout(seed: int, moves: int) -> list[str]:
-    """Return moves to and fro over all of the travel, at many speeds, some of them on slants and arcs."""
+    """Return moves to and fro over all of the travel, on slants, at many speeds."""
     random = np.random.default_rng(seed)
-    lines = []
-    for x, y, speed in zip(
-        random.uniform(2, 298, moves), random.uniform(0, 250, moves), random.uniform(15, 100, moves), strict=True
-    ):
-        lines.append(f"G1 X{x:.3f} Y{y:.3f} F{60 * speed:.0f}")
-    return lines
+    low, high = (2, 0, 15), (298, 250, 100)
+    places = random.uniform(low, high, (moves, 3))
+    return [f"G1 X{x:.3f} Y{y:.3f} F{60 * speed:.0f}" for x, y, speed in places]
