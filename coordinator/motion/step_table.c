@@ -160,7 +160,8 @@ static double fade_until(const struct course *c, double way) {
     if (phase == 1)
         return c->way[1];
     const double length_s = phase ? c->move->decel_s : c->move->accel_s;
-    return fmin(c->way[phase], way_at(c, time_at(c, way) + fmax(length_s / FADE_PIECES, SHORTEST_FADE_S)));
+    const double until = time_at(c, way) + fmax(length_s / FADE_PIECES, SHORTEST_FADE_S);
+    return until < c->end[phase] ? way_at(c, until) : c->way[phase];
 }
 
 static double next_cut(struct axis_table tables[3], const struct course *c, double way) {

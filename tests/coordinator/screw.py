@@ -49,6 +49,7 @@ rotation_distance: 8
 endstop_pin: ^PA3
 position_endstop: 0
 position_max: 250
+[input_shaper]
 """
 STEP_MM = 8 / (200 * 32)
 KNOT_MM = 1.0

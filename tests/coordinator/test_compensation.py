@@ -4,14 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from coordinator.compensation import NO_CORRECTION, Compensation
-from coordinator.motion.steps import StepGenerator
+from coordinator.motion.shapers import Impulses, shaper_impulses
+from coordinator.motion.steps import TABLE_POINTS_MAX, StepError, StepGenerator
 from coordinator.table.axis_table import AxisTable, Direction
 from tests.coordinator.motion.exact_program import Planned, plan_program
 from tests.coordinator.motion.planner_helpers import LIMITS, homed_planner, planned
 from tests.coordinator.motion.steps_harness import NODES, E, X, Y, Z, stepper
-from tests.coordinator.screw import STEP_MM, Screw, carry_out, measure, motor_mm, planned_mm, workout
+from tests.coordinator.screw import STEP_MM, Floats, Screw, carry_out, measure, motor_mm, planned_mm, workout
 
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "config" / "demo"
@@ -51,21 +53,31 @@ def test_other_screws(tmp_path: Path, screw: Screw) -> None:
     assert corrected.rms_mm <= carry_out(lines, screw, tmp_path, {}).rms_mm / 20
 
 
-def test_steps_come_when_the_corrected_axis_is_there(tmp_path: Path) -> None:
+SHAPED = "SET_INPUT_SHAPER SHAPER_TYPE_X=mzv SHAPER_FREQ_X=40"
+
+
+@pytest.mark.parametrize(
+    "impulses", [((1.0, 0.0),), shaper_impulses("mzv", 40, 0.1)], ids=["plain", "shaped"]
+)
+def test_steps_come_when_the_corrected_axis_is_there(tmp_path: Path, impulses: Impulses) -> None:
     """Against an evaluation of its own: the planned position plus the table's correction, at every step."""
     table = wavy(backlash=0)
-    trial = carry_out(workout(3, 6), Screw(), tmp_path, {"x": table})
+    lines = [*([SHAPED] if len(impulses) > 1 else []), *workout(3, 6)]
+    trial = carry_out(lines, Screw(), tmp_path, {"x": table})
     moves = np.concatenate([moves for _, moves in trial.plan.record.epochs()])
     clock, direction, before = trial.plan.streams()["stepper_x"].expand()
-    spec = trial.plan.steppers[0]
-    times = clock / trial.plan.nodes[spec.node].clock_freq
-    nominal = planned_mm(moves, times)
-    wanted = nominal + np.interp(nominal, table.positions, table.forward)
+    times = clock / trial.plan.nodes[trial.plan.steppers[0].node].clock_freq
+    wanted = sum(share * corrected_mm(moves, times - later_s, table) for share, later_s in impulses)
     off = wanted - (before + direction / 2) * STEP_MM
     speed = np.abs(np.gradient(wanted, times, edge_order=1)) + 1
     assert abs(wanted[0]) < 0.01, "the table begins with no correction: nothing is to be taken up"
     assert np.abs(off / speed).max() < 14e-6, "12.5 µs, and what the speed here is not exact"
     assert len(times) > 200_000
+
+
+def corrected_mm(moves: NDArray[np.void], times_s: Floats, table: AxisTable) -> Floats:
+    planned = planned_mm(moves, times_s)
+    return np.asarray(planned + np.interp(planned, table.positions, table.forward))
 
 
 def test_other_axes_and_filament_go_on_as_before(tmp_path: Path) -> None:
@@ -205,3 +217,48 @@ def test_a_table_corrects_as_it_says() -> None:
     state = compensation.states["x"]
     assert state.side == "reverse"
     assert state.offset_mm == pytest.approx(table.correction(0.0, Direction.REVERSE), abs=1e-12)
+
+
+# ------------------------------------------------------------------------------------- what it must hold
+
+
+def test_fine_tables_of_three_axes_need_more_pieces_than_there_is_room_for() -> None:
+    steps, at = generator(), np.linspace(0, 240, TABLE_POINTS_MAX)
+    for axis in range(3):
+        values = 0.001 * np.sin(at + axis)
+        steps.set_table(axis, list(at), list(values), list(values), take_up_mm_s=5)
+    planner = homed_planner()
+    lines = [f"G1 X{x} Y{240 - x} Z{x} F6000" for x in (240, 0, 240, 0)]
+    moves = np.ascontiguousarray(planned(planner, "\n".join(["G1 X0 Y240", *lines, ""]).encode()))
+    appended = rounds = 0
+    while appended < len(moves):
+        taken = steps.append(np.ascontiguousarray(moves[appended:]), len(moves) - appended)
+        assert taken or rounds, "an empty generator has room for any move"
+        appended, rounds = appended + taken, rounds + 1
+        last = moves[appended - 1]
+        end = last["print_time"] + last["accel_s"] + last["cruise_s"] + last["decel_s"]
+        while not steps.generate(float(end), flush=appended == len(moves)):
+            steps.take_batch(0)
+        steps.take_batch(0)
+    assert rounds > 2
+    assert steps.position(0) == round(float(np.interp(0, at, 0.001 * np.sin(at))) / 0.00625)
+
+
+def test_a_table_does_not_change_while_moves_wait() -> None:
+    steps, planner = generator(), homed_planner()
+    moves = planned(planner, b"G1 X50 F6000\n")
+    steps.append(np.ascontiguousarray(moves), len(moves))
+    with pytest.raises(StepError, match="the table of axis X cannot change while moves wait"):
+        steps.set_table(0, [0, 1], [0, 0], [0, 0], take_up_mm_s=5)
+    with pytest.raises(StepError, match="corrections cannot become"):
+        steps.set_corrections([NO_CORRECTION] * 3)
+
+
+@pytest.mark.parametrize(
+    ("positions", "take_up"),
+    [([1.0], 5.0), ([1.0, 1.0], 5.0), ([0.0, float("nan")], 5.0), ([0.0, 1.0], 0.0), ([*range(2000)], 5.0)],
+)
+def test_bad_tables_are_refused(positions: list[float], take_up: float) -> None:
+    zeros = [0.0] * len(positions)
+    with pytest.raises(StepError, match="the table of axis Z is refused"):
+        generator().set_table(2, positions, zeros, zeros, take_up_mm_s=take_up)
