@@ -67,7 +67,8 @@ def test_steps_come_when_the_corrected_axis_is_there(tmp_path: Path, impulses: I
     moves = np.concatenate([moves for _, moves in trial.plan.record.epochs()])
     clock, direction, before = trial.plan.streams()["stepper_x"].expand()
     times = clock / trial.plan.nodes[trial.plan.steppers[0].node].clock_freq
-    wanted = sum(share * corrected_mm(moves, times - later_s, table) for share, later_s in impulses)
+    parts = [share * corrected_mm(moves, times - later_s, table) for share, later_s in impulses]
+    wanted = np.sum(parts, axis=0)
     off = wanted - (before + direction / 2) * STEP_MM
     speed = np.abs(np.gradient(wanted, times, edge_order=1)) + 1
     assert abs(wanted[0]) < 0.01, "the table begins with no correction: nothing is to be taken up"
