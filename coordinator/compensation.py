@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 from coordinator.machine.description import MachineDescription
 from coordinator.motion.specs import MotionLimits, StepKinematics
 from coordinator.motion.steps import TABLE_POINTS_MAX, AxisCorrection, StepGenerator
-from coordinator.table.axis_table import AxisTable
+from coordinator.table.axis_table import AxisTable, Unit
 from nodes.records import record
 
 if TYPE_CHECKING:
@@ -125,6 +125,8 @@ def why_not_corrected(description: MachineDescription, table: AxisTable) -> str:
             f"axis {table.axis} is not corrected: that is for x, y and z of machines whose steppers move in "
             "proportion to them, without towers, arms, winches or dual carriages"
         )
+    if table.unit is not Unit.MM:
+        return f"axis {table.axis} is not corrected: its table is in degrees, the axis moves in mm"
     if len(table.positions) > TABLE_POINTS_MAX:
         return (
             f"axis {table.axis} is not corrected: its table has {len(table.positions)} points, and step "
