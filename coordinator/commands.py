@@ -122,6 +122,8 @@ class PlanOptions:
     json: bool = False
     dictionaries: Mapping[str, Path] = field(default_factory=dict)
     """By node: its data dictionary as JSON; other nodes take the project's own firmware."""
+    tables: Mapping[str, Path] = field(default_factory=dict)
+    """By axis: its compensation table, a CSV or a COMP_FILE of type 0 in mm."""
 
 
 @record(kw_only=True)

@@ -1,11 +1,13 @@
 """Axis tables in motion: what they are worth on a bad screw, and when they are taken up."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from coordinator import cli
 from coordinator.compensation import NO_CORRECTION, Compensation
 from coordinator.motion.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps import TABLE_POINTS_MAX, StepError, StepGenerator
@@ -263,3 +265,17 @@ def test_bad_tables_are_refused(positions: list[float], take_up: float) -> None:
     zeros = [0.0] * len(positions)
     with pytest.raises(StepError, match="the table of axis Z is refused"):
         generator().set_table(2, positions, zeros, zeros, take_up_mm_s=take_up)
+
+
+def test_a_plan_takes_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table, program = tmp_path / "x.csv", tmp_path / "x.gcode"
+    table.write_text("position_mm,forward_um\n0,0\n100,1000\n")
+    program.write_text("G28\nG1 X100 F6000\n")
+    steps = []
+    for words in ((), ("--table", f"x={table}")):
+        assert cli.main(["plan", str(DEMO / "machine.cfg"), str(program), "--json", *words]) == 0
+        steps.append(json.loads(capsys.readouterr().out.splitlines()[-1])["steps"])
+    assert steps == [2 * 16000, 2 * 16160], "corexy: both motors, 160 steps a mm"
+    words = ("--table", f"w={table}")
+    assert cli.main(["plan", str(DEMO / "machine.cfg"), str(program), *words]) == 1
+    assert "axis w is not corrected: that is for x, y and z" in capsys.readouterr().err
