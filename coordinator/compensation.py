@@ -10,10 +10,12 @@ from coordinator.machine.description import MachineDescription
 from coordinator.motion.specs import MotionLimits, StepKinematics
 from coordinator.motion.steps import TABLE_POINTS_MAX, AxisCorrection, StepGenerator
 from coordinator.table.axis_table import AxisTable, Unit
+from coordinator.table.store import TableStore
 from nodes.records import record
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
 
 AXES: Final = "xyz"
 NO_CORRECTION: Final = AxisCorrection(0, reverse=False, offset_mm=0.0, lag_mm=0.0)
@@ -133,6 +135,27 @@ def why_not_corrected(description: MachineDescription, table: AxisTable) -> str:
             f"generation has room for {TABLE_POINTS_MAX}; thin it out"
         )
     return ""
+
+
+def kept_compensation(
+    description: MachineDescription, folder: "Path", say: "Callable[[str], None]"
+) -> Compensation | None:
+    """Return what corrects axes by the tables that a service kept in FOLDER; None without [axis_tables].
+
+    SAY gets a sentence for each that cannot be used.
+    """
+    if description.axis_tables is None:
+        return None
+    tables, problems = TableStore(folder).load()
+    compensation = Compensation(description.limits)
+    for axis, table in tables.items():
+        if why := why_not_corrected(description, table):
+            problems.append(why)
+        else:
+            compensation.want(axis, table)
+    for problem in problems:
+        say(problem)
+    return compensation
 
 
 def _is_linear(description: MachineDescription) -> bool:

@@ -1,6 +1,7 @@
 """Axis tables in motion: what they are worth on a bad screw, and when they are taken up."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from coordinator import cli
-from coordinator.compensation import NO_CORRECTION, Compensation
+from coordinator.compensation import NO_CORRECTION, Compensation, kept_compensation
+from coordinator.machine.description import load_machine
+from coordinator.machine.model import AxisTablesDescription
 from coordinator.motion.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps import TABLE_POINTS_MAX, StepError, StepGenerator
-from coordinator.table.axis_table import AxisTable, Direction
+from coordinator.table.axis_table import AxisTable, Direction, Unit
+from coordinator.table.store import TableStore
 from tests.coordinator.motion.exact_program import Planned, plan_program
 from tests.coordinator.motion.planner_helpers import LIMITS, homed_planner, planned
 from tests.coordinator.motion.steps_harness import NODES, E, X, Y, Z, stepper
@@ -265,6 +269,19 @@ def test_bad_tables_are_refused(positions: list[float], take_up: float) -> None:
     zeros = [0.0] * len(positions)
     with pytest.raises(StepError, match="the table of axis Z is refused"):
         generator().set_table(2, positions, zeros, zeros, take_up_mm_s=take_up)
+
+
+def test_a_run_without_a_service_takes_what_was_kept(tmp_path: Path) -> None:
+    plain = load_machine(str(DEMO / "machine.cfg"))
+    described = replace(plain, axis_tables=AxisTablesDescription(64, plain.nodes[0].place))
+    store, said = TableStore(tmp_path), list[str]()
+    for table in (flat("x", 0.5), flat("a", 0.5), replace(flat("y", 0.5), unit=Unit.DEG)):
+        store.save(table)
+    assert kept_compensation(plain, tmp_path, said.append) is None
+    compensation = kept_compensation(described, tmp_path, said.append)
+    assert compensation is not None
+    assert dict(compensation.wanted) == {"x": flat("x", 0.5)}
+    assert [line.split(":")[0] for line in said] == ["axis a is not corrected", "axis y is not corrected"]
 
 
 def test_a_plan_takes_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
