@@ -311,6 +311,9 @@ def _declare_plan(command: argparse.ArgumentParser) -> None:
     add("--plot", type=Path, metavar="FILE.svg", help="draw velocity, flow and bus load over print time")
     add("--dictionary", action="append", metavar="NAME=FILE", help="a node's data dictionary, as JSON")
     add("--bitrate", default="1000000", metavar="BIT/S", help="of the CAN buses; 1000000 if not given")
+    add(
+        "--table", action="append", metavar="AXIS=FILE", help="correct an axis by a table, as a machine would"
+    )
 
 
 def _plan(given: argparse.Namespace) -> Job:
@@ -320,7 +323,8 @@ def _plan(given: argparse.Namespace) -> Job:
     if given.plot is not None and given.plot.suffix.lower() != ".svg":
         raise UsageError(f"--plot is '{given.plot}', must be a file that ends in .svg")
     dictionaries = assignments("--dictionary", given.dictionary, Path)
-    for path in dictionaries.values():
+    tables = assignments("--table", given.table, Path)
+    for path in (*dictionaries.values(), *tables.values()):
         existing_file(path)
     options = PlanOptions(
         config=given.config,
@@ -329,6 +333,7 @@ def _plan(given: argparse.Namespace) -> Job:
         plot=given.plot,
         json=given.json,
         dictionaries=dictionaries,
+        tables=tables,
         can_bitrate=whole("--bitrate", given.bitrate, 10_000, 8_000_000),
     )
     return lambda: _runner("coordinator.plan", "plan_file")(options)

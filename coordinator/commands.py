@@ -122,6 +122,8 @@ class PlanOptions:
     json: bool = False
     dictionaries: Mapping[str, Path] = field(default_factory=dict)
     """By node: its data dictionary as JSON; other nodes take the project's own firmware."""
+    tables: Mapping[str, Path] = field(default_factory=dict)
+    """By axis: its compensation table, a CSV or a COMP_FILE of type 0 in mm."""
 
 
 @record(kw_only=True)
@@ -144,7 +146,7 @@ def find_machine(name: str) -> Path:
     try:
         if path.is_file():
             return path
-        examples = {_example_name(p): p for p in sorted(EXAMPLES.rglob("*.cfg"))}
+        examples = {machine_name(p): p for p in sorted(EXAMPLES.rglob("*.cfg"))}
     except (OSError, ValueError):  # a name too long, or with a NUL
         examples = {}
     if name in examples:
@@ -153,6 +155,6 @@ def find_machine(name: str) -> Path:
     raise CanductorError(f"there is no machine '{name}': neither a file nor an example{known}")
 
 
-def _example_name(path: Path) -> str:
-    """Return ``demo`` for demo/machine.cfg and the file's stem for all others."""
+def machine_name(path: Path) -> str:
+    """Return a machine's name: ``demo`` for demo/machine.cfg, and the file's stem for all others."""
     return path.parent.name if path.stem == "machine" else path.stem

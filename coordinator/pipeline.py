@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from coordinator.compensation import Compensation
+
 BatchSink = Callable[[int, bytes], None]
 """Takes a node's index and a piece of its stream (nodes/link/batch.h)."""
 
@@ -131,6 +133,7 @@ class Pipeline:
         nodes: int,
         record: PlanRecord | None = None,
         watch: MoveWatch | None = None,
+        compensation: "Compensation | None" = None,
     ) -> None:
         self.job = job
         self.steps = steps
@@ -138,6 +141,7 @@ class Pipeline:
         self._nodes = nodes
         self._record = record
         self._watch = watch
+        self._compensation = compensation
         self._appended_until = 0.0
         self._shapers: dict[str, Shaper] = {}
         self._weights: dict[str, Position] = {}
@@ -166,7 +170,8 @@ class Pipeline:
         """Carry out EVENT; all moves are generated, and all steps that they cause."""
         match event:
             case PositionSet():
-                self._declare(event.position)
+                self._declare(event)
+                self.compensate()
             case ShaperChange():
                 self._shape(event.axis, Shaper(event.kind, event.frequency_hz, event.damping_ratio))
             case WeightsChange():
@@ -220,10 +225,23 @@ class Pipeline:
             self.steps.set_smooth_time(self.steps.index(stepper), window_s)
             self._windows_s[stepper] = window_s
 
-    def _declare(self, position: Position) -> None:
-        self.steps.set_axis_position(position)
+    def _declare(self, event: PositionSet) -> None:
+        before = self.steps.corrections if self._compensation is not None else ()
+        self.steps.set_axis_position(event.position)
+        if self._compensation is not None:
+            self._compensation.declared(self.steps, before, event.axes)
         if self._record is not None:
-            self._record.declared.append((self._record.count, position))
+            self._record.declared.append((self._record.count, event.position))
+
+    @property
+    def compensation_due(self) -> bool:
+        """Whether ``compensate`` has something to do, when all moves are generated."""
+        return self._compensation is not None and self._compensation.is_due(self.planner.homed)
+
+    def compensate(self) -> None:
+        """Take up the axis tables that are wanted, on homed axes; all moves are generated."""
+        if self._compensation is not None:
+            self._compensation.take_up(self.steps, self.planner.homed)
 
     def at_next_move(self, event: Timed) -> None:
         """Keep EVENT until it is known when the move behind it begins: see ``due``."""

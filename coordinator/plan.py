@@ -3,7 +3,7 @@
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 from coordinator.commands import PlanOptions
 from coordinator.gcode.events import (
@@ -33,6 +33,9 @@ from coordinator.progress import ProgressDisplay
 from nodes.dictionary import Dictionary
 from nodes.errors import CanductorError
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary
+
+if TYPE_CHECKING:
+    from coordinator.compensation import Compensation
 
 ASSUMED_MOVE_COUNT = 1024
 """Queue slots of a node that is not there to be asked."""
@@ -65,6 +68,7 @@ def plan_file(options: PlanOptions) -> PlanReport:
             lambda node, batch: _keep(figures, files, node, batch),
             nodes=len(streams),
             watch=figures.moves,
+            compensation=_compensation(description, options) if options.tables else None,
         )
         display = stack.enter_context(ProgressDisplay(f"planning {program.name}", quiet=options.json))
         try:
@@ -79,6 +83,21 @@ def plan_file(options: PlanOptions) -> PlanReport:
     chips = {name: dictionary.str_constant("MCU", "") for name, dictionary in dictionaries.items()}
     made = Made(description, pipeline, figures, streams, specs, chips, notices, end.print_time_s)
     return write_files(options, made.report())
+
+
+def _compensation(description: MachineDescription, options: PlanOptions) -> "Compensation":
+    """Return what corrects the axes by the tables of OPTIONS; raises TableError."""
+    from coordinator.compensation import Compensation, why_not_corrected  # noqa: PLC0415 (start-up time)
+    from coordinator.table.axis_table import TableError  # noqa: PLC0415
+    from coordinator.table.files import read_table  # noqa: PLC0415
+
+    compensation = Compensation(description.limits)
+    for axis, path in options.tables.items():
+        table = read_table(path, axis=axis)
+        if why := why_not_corrected(description, table):
+            raise TableError(why)
+        compensation.want(axis, table)
+    return compensation
 
 
 def _with_line(error: StepError, program: str, figures: PlanFigures) -> CanductorError:

@@ -5,12 +5,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
-from coordinator.commands import RunOptions
+from coordinator.commands import RunOptions, machine_name
+from coordinator.compensation import kept_compensation
 from coordinator.gcode.program import Program
 from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, load_machine
 from coordinator.progress import Progress, ProgressDisplay
 from coordinator.session import NodeOutcome, Outcome, run_job
+from coordinator.table.store import table_folder
 from nodes.dictionary_cache import DictionaryCache
 
 
@@ -99,6 +101,7 @@ def run_machine(options: RunOptions) -> RunReport:
         )
         _announce(description)
         show = stack.enter_context(_progress(options, program))
+        compensation = kept_compensation(description, table_folder(machine_name(options.config)), _say)
         outcome = run_to_end(
             lambda: run_job(
                 description,
@@ -106,6 +109,7 @@ def run_machine(options: RunOptions) -> RunReport:
                 show,
                 on_told=lambda told: _say(told.text),
                 cache=DictionaryCache.of_user(),
+                compensation=compensation,
             )
         )
         return RunReport(program.name, outcome)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from coordinator.app import Machine, MachineStopped, link_of
 from coordinator.gcode.errors import GCodeError
@@ -21,6 +22,9 @@ from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 from nodes.link import LinkStats
 from nodes.node_states import NodeState
+
+if TYPE_CHECKING:
+    from coordinator.compensation import Compensation
 
 OnProgress = Callable[[Progress], None]
 
@@ -64,10 +68,12 @@ async def run_job(
     on_ready: Callable[[Machine], None] | None = None,
     host: Host | None = None,
     cache: DictionaryCache | None = None,
+    compensation: "Compensation | None" = None,
 ) -> Outcome:
     """Connect to the machine, run PROGRAM on it and return what became of it.
 
     ON_TOLD gets what the program and the machine have to say; dictionaries are kept in CACHE.
+    COMPENSATION corrects the axes.
 
     Raises CanductorError. Whatever ends the job before its end stops all nodes, but for a bad line of the
     program: what came before it is carried out, and the machine stands.
@@ -82,7 +88,7 @@ async def run_job(
     if on_ready is not None:
         on_ready(machine)
     try:
-        return await _print(machine, program, on_progress, record, on_told)
+        return await _print(machine, program, on_progress, record, on_told=on_told, compensation=compensation)
     except GCodeError:
         raise
     except BaseException as error:
@@ -106,7 +112,9 @@ async def _print(
     program: Program,
     on_progress: OnProgress,
     record: PlanRecord | None,
+    *,
     on_told: Callable[[Told], None],
+    compensation: "Compensation | None",
 ) -> Outcome:
     began_ns = machine.host.now()
 
@@ -129,7 +137,9 @@ async def _print(
         machine_state(described),
         machine.modules.vocabulary,
     )
-    streamer = Streamer(machine, job, record=record, on_told=on_told, on_state=show)
+    streamer = Streamer(
+        machine, job, record=record, compensation=compensation, on_told=on_told, on_state=show
+    )
     streamer.began_at = await machine.stepper_positions()
     await streamer.run()
     return await outcome_of(machine, streamer)

@@ -34,6 +34,7 @@ from coordinator.resting import RestTask
 from nodes.errors import CanductorError
 
 if TYPE_CHECKING:
+    from coordinator.compensation import Compensation
     from coordinator.timebase import ClockMap
 
 CYCLE_S: Final = 0.05
@@ -72,7 +73,7 @@ class _Cycle:
 class Streamer:
     """Runs one JOB on MACHINE, whose nodes are READY. ON_TOLD gets replies and notices, ON_STATE progress.
 
-    WITNESS sees the moves and the commands go by.
+    WITNESS sees the moves and the commands go by, COMPENSATION has the tables of the axes.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class Streamer:
         *,
         record: PlanRecord | None = None,
         witness: Witness | None = None,
+        compensation: "Compensation | None" = None,
         on_told: Callable[[Told], None],
         on_state: Callable[[JobState], None],
     ) -> None:
@@ -92,6 +94,7 @@ class Streamer:
         self._on_told = on_told
         self._on_state = on_state
         self._witness = witness
+        self._compensation = compensation
         self._keeps_maps = record is not None
         self._nodes = machine.moving
         self._time_base = machine.time_base()
@@ -120,6 +123,7 @@ class Streamer:
             nodes=len(self._nodes),
             record=self._record,
             watch=None if witness is None else witness.see_moves,
+            compensation=self._compensation,
         )
 
     @property
@@ -231,6 +235,8 @@ class Streamer:
         self.began_at = await self._machine.stepper_positions()
         if self._record is not None:
             self._record.restart()
+        if self._compensation is not None:
+            self._compensation.begin_again(self.steps)
         self._set_up()
         self._begin()
 
@@ -285,6 +291,8 @@ class Streamer:
         now = self.print_time_now()
         told: list[Told] = []
         event = waiting_for
+        if self.pipeline.compensation_due and self._all_generated():
+            self.pipeline.compensate()
         held = self._held is not None and self._failure is None
         if self._failure is None and not held and not self._still_waiting(waiting_for, now):
             self._planner.plan_until_s = now + PLAN_AHEAD_S
@@ -311,6 +319,8 @@ class Streamer:
     def _cycle(self, told: Sequence[Told], event: Event | None) -> _Cycle:
         batches, self._batches = self._batches, []
         due, self.pipeline.due = self.pipeline.due, []
+        if self._compensation is not None:
+            self._compensation.note(self.steps)
         return _Cycle(batches, list(told), event, self._planned(), due)
 
     def _planned(self) -> Planned:

@@ -13,6 +13,7 @@ ffibuilder = builder(
     sources=[
         "coordinator/motion/steps.c",
         "coordinator/motion/step_change.c",
+        "coordinator/motion/step_table.c",
         "coordinator/motion/step_times.c",
         "coordinator/motion/step_axes.c",
         "coordinator/motion/step_smooth.c",

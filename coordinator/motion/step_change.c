@@ -77,7 +77,8 @@ double step_absolute(struct stepper *s, const double *position) {
     return s->angle / s->config.step_distance;
 }
 
-int step_set_axis_position(struct step_gen *gen, const double *position) {
+// The steppers stand at POSITION, corrections included.
+static int set_motor_position(struct step_gen *gen, const double *position) {
     if (gen->moves_from < gen->moves_to || gen->slice > gen->until)
         return STEP_NOT_IDLE;
     for (int i = 0; i < AXES; i++)
@@ -104,6 +105,98 @@ int step_set_axis_position(struct step_gen *gen, const double *position) {
             gen->moves[i % STEP_TRAPEZOIDS].start[j] += shift[j];
     for (int j = 0; j < AXES; j++)
         gen->rest[j] += shift[j];
+    return STEP_OK;
+}
+
+// ------------------------------------------------------------------------------------------ corrections
+
+static bool all_generated(const struct step_gen *gen) {
+    return gen->moves_from == gen->moves_to && gen->slice <= gen->until;
+}
+
+// Where the axes stand, without what is added to them.
+static void planned_position(const struct step_gen *gen, double *position) {
+    step_end_position(gen, position);
+    for (int i = 0; i < 3; i++)
+        position[i] -= gen->tables[i].offset;
+}
+
+int step_set_axis_position(struct step_gen *gen, const double *position) {
+    const int status = set_motor_position(gen, position);
+    if (status)
+        return status;
+    for (int i = 0; i < 3; i++) {
+        gen->tables[i].reverse = 0;
+        step_table_stand(&gen->tables[i], position[i], 0);
+    }
+    gen->corrected = step_table_acts(gen->tables);
+    return STEP_OK;
+}
+
+int step_set_corrections(struct step_gen *gen, const double *offset, const int32_t *reverse) {
+    double planned[AXES], motor[AXES];
+    planned_position(gen, planned);
+    memcpy(motor, planned, sizeof(motor));
+    for (int i = 0; i < 3; i++)
+        motor[i] += offset[i];
+    const int status = set_motor_position(gen, motor);
+    if (status)
+        return status;
+    for (int i = 0; i < 3; i++) {
+        gen->tables[i].reverse = reverse[i] != 0;
+        step_table_stand(&gen->tables[i], planned[i], offset[i]);
+    }
+    gen->corrected = step_table_acts(gen->tables);
+    return STEP_OK;
+}
+
+static bool table_is_legal(int n, const double *position, const double *forward, const double *reverse) {
+    bool ok = n >= 0 && n != 1 && n <= STEP_TABLE_POINTS;
+    for (int i = 0; ok && i < n; i++)
+        ok = fabs(position[i]) < LONGEST_S && fabs(forward[i]) < LONGEST_S && fabs(reverse[i]) < LONGEST_S &&
+             (i == 0 || position[i] > position[i - 1]);
+    return ok;
+}
+
+// A quarter of what the slowest pulses of the axis's steppers allow is left for taking up.
+static double possible_take_up(const struct step_gen *gen, int axis, double take_up) {
+    for (const struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++) {
+        const double weight = fabs(s->config.weights[axis]);
+        const double fastest = s->config.step_distance / s->closest_ticks * s->clock->ticks_per_s;
+        if (s->config.kinematics == STEP_LINEAR && weight > 0)
+            take_up = fmin(take_up, fastest / weight / 4);
+    }
+    return take_up;
+}
+
+int step_set_table(struct step_gen *gen, int axis, int n, const double *position, const double *forward,
+                   const double *reverse, double take_up) {
+    if (axis < AXIS_X || axis > AXIS_Z || !step_in_range(take_up, 0, LONGEST_S) ||
+        !table_is_legal(n, position, forward, reverse))
+        return STEP_BAD_CONFIG;
+    if (!all_generated(gen))
+        return STEP_NOT_IDLE;
+    double planned[AXES], *values = gen->table_values[axis];
+    planned_position(gen, planned);
+    const size_t size = (size_t)n * sizeof(*values);
+    if (size) {
+        memcpy(values, position, size);
+        memcpy(values + STEP_TABLE_POINTS, forward, size);
+        memcpy(values + 2 * STEP_TABLE_POINTS, reverse, size);
+    }
+    struct axis_table *t = &gen->tables[axis];
+    t->n = n, t->position = values, t->side[0] = values + STEP_TABLE_POINTS;
+    t->side[1] = values + 2 * STEP_TABLE_POINTS, t->take_up = possible_take_up(gen, axis, take_up);
+    step_table_stand(t, planned[axis], t->offset);
+    gen->corrected = step_table_acts(gen->tables);
+    return STEP_OK;
+}
+
+int step_get_correction(const struct step_gen *gen, int axis, struct step_correction *out) {
+    if (axis < AXIS_X || axis > AXIS_Z)
+        return STEP_BAD_CONFIG;
+    const struct axis_table *t = &gen->tables[axis];
+    *out = (struct step_correction){t->n, t->reverse, t->offset, t->lag};
     return STEP_OK;
 }
 

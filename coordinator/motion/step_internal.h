@@ -3,6 +3,7 @@
 #ifndef MOTION_STEP_INTERNAL_H
 #define MOTION_STEP_INTERNAL_H
 
+#include "coordinator/motion/step_table.h"
 #include "coordinator/motion/steps.h"
 
 #include <math.h>
@@ -160,6 +161,9 @@ struct step_gen {
     struct trapezoid *moves;                  // ring
     uint64_t kept_from, moves_from, moves_to; // kept, not yet generated, end
     double rest[AXES];                        // mm, where the axes stand before the first kept move
+    struct axis_table tables[3];              // X Y Z; kept moves and REST include what they add
+    double *table_values[3];                  // room for three columns of STEP_TABLE_POINTS each
+    bool corrected;                           // a table acts
     struct shaper shapers[3];
     struct tap taps[STEP_TAPS];
     int tap_count;

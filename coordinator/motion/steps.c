@@ -69,9 +69,12 @@ static struct step_gen *carve(struct arena *arena, const struct step_config *c) 
     struct stepper *steppers = piece(arena, (size_t)c->stepper_count, sizeof(*steppers));
     struct node *nodes = piece(arena, (size_t)c->node_count, sizeof(*nodes));
     struct trapezoid *moves = piece(arena, STEP_TRAPEZOIDS, sizeof(*moves));
+    double *tables = piece(arena, (size_t)9 * STEP_TABLE_POINTS, sizeof(*tables));
     if (gen) {
         memset(gen, 0, (size_t)((uint8_t *)moves - (uint8_t *)gen));
         gen->steppers = steppers, gen->nodes = nodes, gen->moves = moves;
+        for (size_t i = 0; i < 3; i++)
+            gen->table_values[i] = tables + i * 3 * STEP_TABLE_POINTS;
     }
     for (int i = 0; i < c->stepper_count; i++)
         carve_stepper(arena, gen ? &steppers[i] : NULL);
@@ -157,6 +160,22 @@ static bool move_is_legal(struct trapezoid *m) {
            m->cruise_v - m->accel * m->decel_s >= -ROUNDING_MM_S * (1 + m->cruise_v);
 }
 
+static void keep(void *context, const struct trapezoid *move) {
+    struct step_gen *gen = context;
+    gen->moves[gen->moves_to++ % STEP_TRAPEZOIDS] = *move;
+    gen->moves_end = move_end(move);
+}
+
+// Appends a move as its pieces; returns 0 when they may have no room, or a negative step_status.
+static int append_corrected(struct step_gen *gen, const struct trapezoid *m) {
+    const uint64_t most = (uint64_t)step_table_most_pieces(gen->tables, m);
+    if (gen->moves_to - gen->kept_from + most > STEP_TRAPEZOIDS)
+        return gen->moves_from < gen->moves_to ? 0 : -step_fail(gen, STEP_TOO_DENSE, NULL, m->print_time, 0);
+    step_table_cut(gen->tables, m, keep, gen);
+    gen->corrected = step_table_acts(gen->tables);
+    return 1;
+}
+
 int step_append(struct step_gen *gen, const struct trapezoid *moves, int n) {
     int taken = 0;
     for (; taken < n && gen->moves_to - gen->kept_from < STEP_TRAPEZOIDS; taken++) {
@@ -166,8 +185,13 @@ int step_append(struct step_gen *gen, const struct trapezoid *moves, int n) {
         const double earliest = step_next_move(gen);
         if (m.print_time < earliest - ROUNDING_S)
             return -step_fail(gen, STEP_BAD_ORDER, NULL, m.print_time, earliest);
-        gen->moves[gen->moves_to++ % STEP_TRAPEZOIDS] = m;
-        gen->moves_end = move_end(&m);
+        if (!gen->corrected) {
+            keep(gen, &m);
+            continue;
+        }
+        const int status = append_corrected(gen, &m);
+        if (status <= 0)
+            return status ? status : taken;
     }
     return taken;
 }

@@ -37,8 +37,9 @@ enum {
     STEP_MOVE_COUNT_MAX = 65535,
     STEP_SNAP = 65536,
     STEP_PARAMS = 8,
-    STEP_IMPULSES = 8,    // of one axis' shaper
-    STEP_SLACK_TICKS = 2, // room for rounding that steps need beyond what the pulses need
+    STEP_IMPULSES = 8,        // of one axis' shaper
+    STEP_TABLE_POINTS = 1024, // of one axis' table
+    STEP_SLACK_TICKS = 2,     // room for rounding that steps need beyond what the pulses need
 };
 
 enum step_status {
@@ -90,6 +91,12 @@ struct step_config {
     const struct step_node_config *nodes;
     double max_error_s;
     double start[4]; // mm, where the axes stand; steppers count steps from here
+};
+
+// What is added to an axis's planned position, at the end of the last move that was appended.
+struct step_correction {
+    int32_t points, reverse; // of its table; whether its reverse side is in use
+    double offset, lag;      // mm: all of it; the part of it that will still fade
 };
 
 // What went wrong, for the sentence the user reads. Fields that do not apply are -1 or 0.
@@ -154,6 +161,18 @@ int64_t step_clock_at(const struct step_gen *gen, int node, double print_time);
 // The axes stand at POSITION (mm, X Y Z E) from now on, without a step.
 int step_set_axis_position(struct step_gen *gen, const double *position);
 
+// Axis X, Y or Z moves to its planned position plus what its table of N points says there; N = 0: none. How
+// sides change and jumps fade: step_table.h. TAKE_UP: mm/s, the bound of fading, lowered to a quarter of what
+// the steppers' pulses allow. Only linear steppers are corrected rightly. Not a step is made now. Declaring
+// positions makes the offsets 0 and starts on the forward side. STEP_NOT_IDLE as step_set_axis_position.
+int step_set_table(struct step_gen *gen, int axis, int n, const double *position, const double *forward,
+                   const double *reverse, double take_up);
+
+// The motors of X Y Z stand OFFSET beyond their axes' declared positions, with the table's side given.
+int step_set_corrections(struct step_gen *gen, const double *offset, const int32_t *reverse);
+
+int step_get_correction(const struct step_gen *gen, int axis, struct step_correction *out);
+
 // Axis X, Y or Z moves as the sum of its planned motion, moved later by time_s[i] and scaled by amplitude[i].
 // Amplitudes sum to 1, times are centred (sum of amplitude·time 0). STEP_NOT_IDLE unless all has settled.
 int step_set_shaper(struct step_gen *gen, int axis, int n, const double *amplitude, const double *time_s);
@@ -184,6 +203,8 @@ void step_node_stats(const struct step_gen *gen, int node, struct step_node_stat
 void step_last_error(const struct step_gen *gen, struct step_error *out);
 // cffi: end
 
+// mm: an axis that has gone back so far has turned
+#define STEP_TABLE_TURN_MM 0.001
 // s: how much of the newest time is held back so that segments may grow
 #define STEP_HOLD_S 0.050
 // s: how early before its first step a command is due at the latest, when the stepper rested before

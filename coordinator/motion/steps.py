@@ -12,6 +12,8 @@ from nodes.records import record
 
 MAX_ERROR_S = 12.5e-6
 """How far a step may be from its true time by default."""
+TABLE_POINTS_MAX = int(lib.STEP_TABLE_POINTS)
+"""Points of one axis table that step generation has room for."""
 Position = tuple[float, float, float, float]
 
 
@@ -44,6 +46,20 @@ class StepperStats:
     worst_error_s: float
     max_step_rate: float
     """Steps/s."""
+
+
+@record
+class AxisCorrection:
+    """What is added to an axis's planned position, at the end of the last move that was appended."""
+
+    points: int
+    """Of its table; 0: it has none."""
+    reverse: bool
+    """Whether the table's side for travel to smaller positions is in use."""
+    offset_mm: float
+    """All that is added."""
+    lag_mm: float
+    """The part of it that the table does not want: it fades along the moves that follow."""
 
 
 @record
@@ -206,6 +222,49 @@ class StepGenerator:
         """
         if lib.step_set_axis_position(self._gen, ffi.new("double[4]", position)):
             raise StepError(f"the axes cannot be set to {position} mm while moves wait; generate them first")
+
+    def set_table(
+        self,
+        axis: int,
+        positions: Sequence[float],
+        forward: Sequence[float],
+        reverse: Sequence[float],
+        *,
+        take_up_mm_s: float,
+    ) -> None:
+        """Add to the planned positions of axis 0..2 (X Y Z) what a table says (mm); no points: nothing.
+
+        Not a step is made now: what the correction jumps by is taken up along the moves that follow, at
+        TAKE_UP_MM_S at the most. Only for axes of linear steppers. Raises StepError while appended moves are
+        not yet generated.
+        """
+        status = lib.step_set_table(
+            self._gen, axis, len(positions), list(positions), list(forward), list(reverse), take_up_mm_s
+        )
+        what = f"the table of axis {'XYZ'[axis]}"
+        if status == lib.STEP_NOT_IDLE:
+            raise StepError(f"{what} cannot change while moves wait; generate them first")
+        if status:
+            raise StepError(
+                f"{what} is refused: give 2 to {TABLE_POINTS_MAX} ascending positions, and a take-up speed"
+            )
+
+    @property
+    def corrections(self) -> tuple[AxisCorrection, ...]:
+        """What is added to X, Y and Z."""
+        found: Any = ffi.new("struct step_correction[3]")
+        for axis in range(3):
+            lib.step_get_correction(self._gen, axis, found + axis)
+        return tuple(AxisCorrection(c.points, bool(c.reverse), c.offset, c.lag) for c in found)
+
+    def set_corrections(self, corrections: Sequence[AxisCorrection]) -> None:
+        """Declare that the motors of X, Y, Z stand ``offset_mm`` beyond their axes, on these sides: no steps.
+
+        Raises StepError while appended moves are not yet generated.
+        """
+        offsets = [correction.offset_mm for correction in corrections]
+        if lib.step_set_corrections(self._gen, offsets, [int(c.reverse) for c in corrections]):
+            raise StepError(f"corrections cannot become {offsets} mm while moves wait; generate them first")
 
     @property
     def look_ahead_s(self) -> float:

@@ -158,7 +158,14 @@ class MachineService:
     async def _move(self, machine: Machine) -> None:
         care = asyncio.ensure_future(self.tables.care(machine, self.stands))
         try:
-            self.motion = Motion(machine, on_told=self._told, on_cycle=self.look, record=self._record)
+            compensation = self.tables.compensation_of(machine)
+            self.motion = Motion(
+                machine,
+                on_told=self._told,
+                on_cycle=self.look,
+                record=self._record,
+                compensation=compensation,
+            )
             if self.settings.own_process:
                 _pass_by_what_stays()
             self._enter(ServiceState.READY)
@@ -287,6 +294,7 @@ class MachineService:
             wanted = ServiceState.PAUSED if waits else ServiceState.PRINTING
         if wanted is not self.state:
             self._enter(wanted, held or "")
+        self.tables.show_corrections()
 
     def _enter(self, state: ServiceState, cause: str = "") -> None:
         self.state, self.cause = state, cause

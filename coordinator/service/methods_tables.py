@@ -14,7 +14,8 @@ _AXES: Final = Param(
     "axes",
     Kind.LIST,
     "maps: axis; table (its figures, or null); nodes: maps of stepper, node, direction, axle, status, "
-    "generation, points, active, problem",
+    "generation, points, active, problem; active: whether the axis is corrected, on which side, by how much "
+    "(correction_um) and how much of that will still fade (taking_up_um)",
 )
 
 

@@ -5,6 +5,7 @@ import contextlib
 from collections.abc import Callable, Sequence
 
 from coordinator.app import Machine
+from coordinator.compensation import Compensation
 from coordinator.gcode.events import Notice
 from coordinator.motion.planner import Planner
 from coordinator.move_source import JobState, Planned, Told
@@ -24,7 +25,7 @@ class Motion:
     """What moves MACHINE, whose nodes are READY.
 
     ON_TOLD gets replies and notices, ON_CYCLE is called at the end of every cycle. RECORD keeps all that is
-    planned, for a proof.
+    planned, for a proof. COMPENSATION has the tables of the axes.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class Motion:
         on_told: Callable[[Told], None],
         on_cycle: Callable[[], None],
         record: PlanRecord | None = None,
+        compensation: Compensation | None = None,
     ) -> None:
         described = machine.description
         self.feeder = Feeder(
@@ -51,6 +53,7 @@ class Motion:
             self.feeder,
             record=record,
             witness=self.trace,
+            compensation=compensation,
             on_told=on_told,
             on_state=self._cycle_ended,
         )

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.app import Machine
+from coordinator.compensation import Compensation, why_not_corrected
 from coordinator.ipc.state import StateTree
 from coordinator.table.axis_table import AxisTable, TableError, figures, notes
 from coordinator.table.axle_map import StepperTables
@@ -21,6 +22,7 @@ from nodes.table.download import Outcome, Place, download
 from nodes.table.mt import MtStatus, Pair
 
 if TYPE_CHECKING:
+    from coordinator.machine.description import MachineDescription
     from nodes.devices.table import ActiveTable, AxleTable, TableState
     from nodes.node import Node
 
@@ -50,6 +52,8 @@ class TableService:
         self._tables: dict[str, AxisTable] = {}
         self._at: dict[AxleTable, _Side] = {}
         self._one_at_a_time = asyncio.Lock()
+        self._compensation: Compensation | None = None
+        self._description: MachineDescription | None = None
         if store is not None:
             self._tables, problems = store.load()
             for problem in problems:
@@ -59,6 +63,41 @@ class TableService:
     def tables(self) -> dict[str, AxisTable]:
         """The accepted tables by axis."""
         return dict(self._tables)
+
+    def compensation_of(self, machine: Machine) -> Compensation | None:
+        """Return what has MACHINE's axes corrected by their tables; None where axes have none."""
+        self._description = machine.description
+        self._compensation = Compensation(machine.description.limits) if machine.devices.tables else None
+        for axis, table in self._tables.items():
+            self._compensate(axis, table)
+        return self._compensation
+
+    def _compensate(self, axis: str, table: AxisTable | None) -> None:
+        if self._compensation is None or self._description is None:
+            return
+        if table is not None and (why := why_not_corrected(self._description, table)):
+            self._say(why)
+            table = None
+        self._compensation.want(axis, table)
+
+    def show_corrections(self) -> None:
+        """Tell front ends what is corrected now."""
+        if self._compensation is not None:
+            for axis in self._compensation.states:
+                if axis in self._tables or self._tree.get(f"tables.{axis}.active") is not None:
+                    self._tree.update(f"tables.{axis}", self._correction(axis))
+
+    def _correction(self, axis: str) -> dict[str, Any]:
+        """Return what the coordinator does with the table of AXIS."""
+        state = None if self._compensation is None else self._compensation.states.get(axis)
+        if state is None:
+            return {"active": False, "side": "", "correction_um": 0.0, "taking_up_um": 0.0}
+        return {
+            "active": state.applied and axis in self._tables,
+            "side": state.side,
+            "correction_um": round(1000 * state.offset_mm, 3),
+            "taking_up_um": round(1000 * state.lag_mm, 3),
+        }
 
     # ------------------------------------------------------------------------------------------- asked for
 
@@ -220,6 +259,7 @@ class TableService:
         return found
 
     def _changed(self, axis: str, table: AxisTable | None) -> None:
+        self._compensate(axis, table)
         for tell in self.on_change:
             tell(axis, table)
 
@@ -231,7 +271,8 @@ class TableService:
             for place in places
             for direction, side in place.sides.items()
         ]
-        return {"axis": axis, "table": None if table is None else figures(table), "nodes": nodes}
+        told = None if table is None else figures(table)
+        return {"axis": axis, "table": told, "nodes": nodes, **self._correction(axis)}
 
     def _show(self, machine: Machine) -> None:
         for found in self.status(machine):
@@ -245,6 +286,7 @@ class TableService:
                     "nodes_active": sum(bool(side.get("active")) for side in sides),
                     "nodes_all": sum(side["status"] != _NOT_KEPT for side in sides),
                     "problem": problems[0] if problems else "",
+                    **self._correction(axis),
                 },
             )
 

@@ -189,6 +189,77 @@ def test_tables_change_only_while_the_machine_stands(tmp_path: Path) -> None:
     World(tmp_path).live(act)
 
 
+STEEP: dict[str, Any] = {
+    "axis": "x",
+    "positions": [0, 50, 100],
+    "forward": [0, 0.5, 1.0],
+    "reverse": [-0.25, 0.25, 0.75],
+}
+
+
+async def motor_mm(served: Served) -> float:
+    """Return where the motor of X is, by its node, once all stands."""
+    motion, machine = served.service.motion, served.service.machine
+    assert motion is not None
+    assert machine is not None
+    await served.until(lambda: motion.standing, "standstill")
+    (stepper,) = [s for s in machine.description.steppers if s.name == "stepper_x"]
+    at: int = (await machine.stepper_positions())["stepper_x"]
+    return at * stepper.step_distance
+
+
+async def way_mm(served: Served, lines: str) -> float:
+    """Return how far LINES move the motor of X, from standstill to standstill."""
+    before = await motor_mm(served)
+    await served.call("gcode.run", script=lines)
+    return await motor_mm(served) - before
+
+
+def shown(served: Served) -> tuple[Any, ...]:
+    return tuple(served.tree.get(f"tables.x.{name}") for name in ("active", "side", "correction_um"))
+
+
+def test_the_axis_is_corrected_when_it_is_homed_and_as_long_as_there_is_a_table(tmp_path: Path) -> None:
+    exact = 0.03  # two steps
+
+    async def first(served: Served) -> None:
+        await served.call("table.send", **STEEP)
+        assert shown(served)[0] is False, "not homed yet"
+        await served.call("gcode.run", script="G28\nG1 X20 F6000")
+        await motor_mm(served)
+        await served.until(lambda: shown(served) == (True, "forward", 200), "use")
+        assert await way_mm(served, "G1 X100") == pytest.approx(80.8, abs=exact)
+        assert await way_mm(served, "G1 X40") == pytest.approx(-60.6 - 0.25, abs=exact)
+        await served.until(lambda: shown(served) == (True, "reverse", 150), "the other side")
+        await served.call("table.remove", axis="x")
+        await served.until(lambda: shown(served)[:2] == (False, ""), "removal")
+        assert served.tree.get("tables.x.taking_up_um") == 150
+        assert await way_mm(served, "G1 X80") == pytest.approx(40 - 0.15, abs=exact)
+        assert await way_mm(served, "G1 X40") == pytest.approx(-40, abs=exact)
+        await served.until(lambda: shown(served) == (False, "", 0), "nothing to be left")
+        await served.call("table.send", **STEEP)
+        await served.until(lambda: shown(served) == (True, "reverse", 0), "use again")
+        assert await way_mm(served, "G1 X80") == pytest.approx(40.8, abs=exact)
+
+    async def second(served: Served) -> None:
+        await served.call("gcode.run", script="G28\nG1 X20 F6000")
+        assert await way_mm(served, "G1 X100") == pytest.approx(80.8, abs=exact)
+
+    World(tmp_path).live(first, second)
+
+
+def test_homing_another_axis_leaves_the_correction_where_it_is(tmp_path: Path) -> None:
+    async def act(served: Served) -> None:
+        await served.call("table.send", **STEEP)
+        await served.call("gcode.run", script="G28\nG1 X100 F6000")
+        assert await way_mm(served, "G28 Y") == 0
+        assert await way_mm(served, "G1 Y10 F6000") == 0
+        assert await way_mm(served, "G1 X50") == pytest.approx(-50.5 - 0.25, abs=0.03)
+        await served.until(lambda: shown(served) == (True, "reverse", 250), "it")
+
+    World(tmp_path).live(act)
+
+
 @pytest.mark.parametrize(
     ("changes", "problem"),
     [

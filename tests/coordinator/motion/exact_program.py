@@ -1,8 +1,10 @@
 """Plans a program for a machine as ``canductor plan`` does, and keeps all that a proof needs."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from coordinator.compensation import Compensation
 from coordinator.demo.exact_program import program_legs
 from coordinator.gcode.events import End, Full, PositionSet, ShaperChange, SmoothTimeChange, WeightsChange
 from coordinator.gcode.interpreter import Job
@@ -14,6 +16,7 @@ from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps import MAX_ERROR_S, StepGenerator, StepStats
 from coordinator.pipeline import Pipeline, PlanRecord
 from coordinator.program_machine import machine_state
+from coordinator.table.axis_table import AxisTable
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary
 from tests.coordinator.motion.exact_check import StepperProof, Verdict, check
 from tests.coordinator.motion.replay import Stream, replay_all
@@ -51,8 +54,13 @@ class Planned:
         return next(s.cancelled for s in self.stats.steppers if s.name == name)
 
 
-def plan_program(config: Path, gcode: Path) -> Planned:
-    """Plan GCODE for CONFIG; nothing but the streams and the trapezoids is kept."""
+def plan_program(
+    config: Path, gcode: Path, tables: Mapping[str, AxisTable] | None = None, *, stage: bool = False
+) -> Planned:
+    """Plan GCODE for CONFIG; nothing but the streams and the trapezoids is kept.
+
+    TABLES by axis correct it; with STAGE, corrections may act even without any.
+    """
     description = load_machine(str(config))
     devices = MachineDevices(description, description.modules.build(description))
     first = description.nodes[0].name
@@ -70,8 +78,17 @@ def plan_program(config: Path, gcode: Path) -> Planned:
     with Program.open(str(gcode)) as program:
         state = machine_state(description)
         job = Job(program, Planner(description.limits), description.homed_position, state)
+        compensation = Compensation(description.limits) if tables or stage else None
+        for axis, table in (tables or {}).items():
+            assert compensation is not None
+            compensation.want(axis, table)
         pipeline = Pipeline(
-            job, steps, lambda node, batch: batches[node].extend(batch), nodes=len(nodes), record=record
+            job,
+            steps,
+            lambda node, batch: batches[node].extend(batch),
+            nodes=len(nodes),
+            record=record,
+            compensation=compensation,
         )
         end = _run(pipeline)
     return Planned(steppers, nodes, record, steps.stats(), end.print_time_s, batches)
