@@ -12,6 +12,7 @@ from coordinator.machine.problem import ConfigError, Place
 from coordinator.modules.base import Build, Device, Module, Value
 from coordinator.modules.homing import Homing
 from coordinator.modules.motor_power import MotorPower
+from coordinator.modules.save_config import SaveConfig
 from nodes.node_config import NodeConfig
 from nodes.records import record
 
@@ -63,6 +64,7 @@ class ModuleSet:
         self._live: Live | None = None
         self._homing = self.shared(Homing)
         self._motors = self.shared(MotorPower)
+        self.shared(SaveConfig)
 
     def build(self, source: ModuleSource) -> Module:
         """Make the module of SOURCE; raises ConfigError."""
