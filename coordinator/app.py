@@ -63,8 +63,8 @@ class Machine:
 
     ``start``, then ``close`` whatever happened. When a node is lost or shuts down whose policy is fatal, all
     others are stopped at once and ``stopped`` tells why; others are brought back (NodeCare). ON_NOTICE gets
-    sentences for the user; dictionaries are kept in CACHE. RESET_NODES: nodes that are configured as they should
-    be are reset, too. PREPARE_RESTART returns what begins anew (with nodes reset if True), or raises
+    sentences for the user; dictionaries are kept in CACHE. RESET_NODES: nodes that are configured as they
+    should be are reset, too. PREPARE_RESTART returns what begins anew (with nodes reset if True), or raises
     CanductorError when that is not possible.
     """
 

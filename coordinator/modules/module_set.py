@@ -13,6 +13,7 @@ from coordinator.modules.base import Build, Device, Module, Value
 from coordinator.modules.homing import Homing
 from coordinator.modules.motor_power import MotorPower
 from coordinator.modules.save_config import SaveConfig
+from nodes.errors import CanductorError
 from nodes.node_config import NodeConfig
 from nodes.records import record
 
@@ -51,6 +52,23 @@ class ModuleSources:
         return built
 
 
+@contextlib.contextmanager
+def _blamed(kind: type[Module], place: Place) -> Iterator[None]:
+    """Tell the user whose module it was that raised what it must not; a bug of our own stays one."""
+    try:
+        yield
+    except CanductorError:
+        raise
+    except Exception as error:
+        if kind.__module__.partition(".")[0] == "coordinator":
+            raise
+        raise ConfigError(
+            place,
+            f"the module {kind.__module__}.{kind.__name__} failed: {type(error).__name__}: {error}; update or"
+            " remove its package",
+        ) from error
+
+
 class ModuleSet:
     """The modules, by the names of their sections; also what they are to each other."""
 
@@ -58,6 +76,7 @@ class ModuleSet:
         self.pins = pins
         self._machine = machine
         self._modules: list[Module] = []
+        self._places: dict[Module, Place] = {}
         self._devices: dict[str, list[Device]] = {}
         self._commands: dict[str, GCodeCommand] = {}
         self._owners: dict[str, str] = {}
@@ -71,7 +90,8 @@ class ModuleSet:
         build = Build(
             source.section, source.kind.SPEC, self.pins, self._machine, whole=source.whole, share=self._share
         )
-        module = source.kind(build)
+        with _blamed(source.kind, source.section.place):
+            module = source.kind(build)
         build.reader.finish()
         self._add(module, build)
         return module
@@ -91,6 +111,7 @@ class ModuleSet:
 
     def _add(self, module: Module, build: Build) -> None:
         self._modules.append(module)
+        self._places[module] = build.place
         for node, device in build.devices:
             self._devices.setdefault(node, []).append(device)
         for command in build.commands:
@@ -105,7 +126,8 @@ class ModuleSet:
     def link(self) -> None:
         """Let them find each other; raises ConfigError."""
         for module in self._modules:
-            module.link(self)
+            with _blamed(type(module), self._places[module]):
+                module.link(self)
 
     # ---------------------------------------------------------------------------------------- looking up
 
@@ -149,7 +171,8 @@ class ModuleSet:
         """Let all begin to act, then tell them that the machine is ready; raises CanductorError."""
         self._live = live
         for module in self._modules:
-            await module.connect(live)
+            with _blamed(type(module), self._places[module]):
+                await module.connect(live)
         for module in self._modules:
             module.ready()
 
