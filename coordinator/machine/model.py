@@ -115,6 +115,8 @@ class HomingDescription:
     retract_speed: float = 5.0
     positive_dir: bool = False
     """Whether the endstop stands at the upper end."""
+    accel: float | None = None
+    """mm/s² of all that; None: as fast as the axis may."""
 
 
 NO_ENDSTOP = HomingDescription()

@@ -15,7 +15,11 @@ if TYPE_CHECKING:
 
 ENTRY_POINTS: Final = "canductor.modules"
 """Name: the section's first word; value: ``package.module:Class``."""
-_OURS: Final[dict[str, str]] = {}
+_OURS: Final[dict[str, str]] = {
+    "force_move": "coordinator.modules.force_move:ForceMove",
+    "homing_override": "coordinator.modules.homing_override:HomingOverride",
+    "safe_z_home": "coordinator.modules.safe_z_home:SafeZHome",
+}
 """By the section's first word: module and class."""
 _BESIDE: Final[dict[str, str]] = {}
 """By a pattern of section names that the machine's own readers read too: whose further options they are."""
