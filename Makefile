@@ -8,7 +8,7 @@ NATIVE_INPUTS := $(C_SOURCES) $(wildcard firmware/Makefile firmware/tools/*.py) 
 
 C_WARNINGS := -std=gnu11 -Wall -Wextra -Wconversion -Wno-psabi -Werror -I. -Ifirmware
 
-.PHONY: demo test check pytest ctest fuzz sim mutants vcan bench clean setup format
+.PHONY: demo test check pytest live computed ctest fuzz sim mutants vcan bench clean setup format
 .DEFAULT_GOAL := test
 
 setup: $(VENV)/.installed
@@ -42,10 +42,23 @@ ctest: setup
 	$(MAKE) -C tests PYTHON=$(abspath $(BIN)/python)
 	$(MAKE) -C tests/fuzz short
 
+# Tests that only compute. All others talk to processes in real time: they mostly wait, and want to be on time.
+COMPUTING := $(addprefix tests/,sim canbus_tools/test_decoder.py firmware $(addprefix coordinator/,\
+	motion kinematics machine gcode heat table demo test_plan.py test_cli.py))
+
 pytest: setup
 	$(BIN)/pytest
 
-test: check ctest pytest
+live: setup
+	$(BIN)/pytest $(addprefix --ignore=,$(COMPUTING))
+
+computed: setup
+	nice -n 19 $(MAKE) ctest
+	nice -n 19 $(BIN)/pytest $(COMPUTING)
+
+# Side by side: what only computes takes the time that the others leave.
+test: check
+	$(MAKE) -j2 --output-sync=target live computed
 
 # Ten minutes of hostile G-code through the motion engine, under the sanitizers; ctest has a short run of it.
 FUZZ_SECONDS ?= 600

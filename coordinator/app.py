@@ -103,6 +103,11 @@ class Machine:
         self._confirmed_s: dict[str, float] = {}
         self._ready = False
 
+    @property
+    def busy(self) -> bool:
+        """Whether a job has the machine."""
+        return self._job is not None
+
     # ------------------------------------------------------------------------------------------ life
 
     async def start(self) -> None:

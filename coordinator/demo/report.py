@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from coordinator.demo.proof import ClockProof, StepperProof
+from coordinator.demo.truth import PlaceProof
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +28,11 @@ class DemoReport:
     print_time_s: float
     queue_steps: int
     steppers: tuple[StepperProof, ...]
+    places: tuple[PlaceProof, ...]
+    """Of what was homed."""
     clocks: tuple[ClockProof, ...]
     stray_edges: int
-    """Level changes of pins that are no stepper's."""
+    """Level changes of pins that are nobody's."""
     nodes: tuple[NodeReport, ...]
     frames: int
     frames_lost: int
@@ -38,7 +41,8 @@ class DemoReport:
     @property
     def ok(self) -> bool:
         """Whether every stepper did exactly what was planned, and nothing else moved."""
-        return all(stepper.holds for stepper in self.steppers) and self.stray_edges == 0
+        proved = all(s.holds for s in self.steppers) and all(p.holds for p in self.places)
+        return proved and self.stray_edges == 0
 
     def to_json(self) -> Mapping[str, object]:
         """Return the figures by name."""
@@ -54,6 +58,7 @@ class DemoReport:
             "position_error_steps": sum(s.position_error_steps for s in self.steppers),
             "worst_step_error_us": _us(max((s.worst_error_s for s in self.steppers), default=0.0)),
             "worst_band_error_us": _us(max((s.worst_band_error_s for s in self.steppers), default=0.0)),
+            "place_error_um": {place.axis: round(place.error_mm * 1e3, 2) for place in self.places},
             "clock_rms_us": {clock.node: _us(clock.rms_s) for clock in self.clocks},
             "clock_worst_us": {clock.node: _us(clock.worst_s) for clock in self.clocks},
             "retransmitted_bytes": sum(node.retransmitted_bytes for node in self.nodes),
@@ -89,6 +94,11 @@ class DemoReport:
             for s in self.steppers
         ]
         lines += [
+            f"{p.axis}: homed, and at the end {abs(p.error_mm) * 1e3:.1f} µm beside where it believes to be "
+            f"(a step is {p.step_mm * 1e3:.1f} µm)"
+            for p in self.places
+        ]
+        lines += [
             f"clock of {c.node}: {_us(c.rms_s)} µs rms from print time, {_us(c.worst_s)} µs at worst"
             for c in self.clocks
         ]
@@ -108,7 +118,10 @@ class DemoReport:
         failed = [s.stepper for s in self.steppers if not s.holds]
         if failed:
             return f"{', '.join(failed)} did not do what was planned"
-        return f"{self.stray_edges} changes of pins that are no stepper's"
+        lost = [p.axis for p in self.places if not p.holds]
+        if lost:
+            return f"{', '.join(lost)} is not where the machine believes it to be"
+        return f"{self.stray_edges} changes of pins that are nobody's"
 
 
 def _node_line(node: NodeReport) -> str:

@@ -16,6 +16,7 @@ from coordinator.demo.expected_curved import expected_curved
 from coordinator.demo.proof import ClockProof, PrimaryClock, StepperProof, prove_clock, prove_stepper
 from coordinator.demo.report import DemoReport, NodeReport
 from coordinator.demo.stage import Stage
+from coordinator.demo.truth import PlaceProof, prove_places
 from coordinator.gcode.program import Program
 from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, StepperDescription, load_machine
@@ -111,6 +112,10 @@ class Prover:
         """Prove every stepper."""
         return [self._stepper(stepper) for stepper in self._description.steppers]
 
+    def places(self, stage: Stage) -> list[PlaceProof]:
+        """Prove where what was homed stands."""
+        return prove_places(self._description, self._record, stage.axes, stage.motors())
+
     def clocks(self) -> list[ClockProof]:
         """Measure the clocks of the secondary nodes that step."""
         primary = self._description.nodes[0].name
@@ -197,6 +202,7 @@ def report_of(
         print_time_s=outcome.print_time_s,
         queue_steps=outcome.queue_steps,
         steppers=tuple(prover.steppers()),
+        places=tuple(prover.places(stage)),
         clocks=tuple(prover.clocks()),
         stray_edges=prover.stray_edges(),
         nodes=tuple(

@@ -22,8 +22,9 @@ from nodes.errors import CanductorError
 from nodes.transport.socketcan import SocketCanTransport
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.hub import VirtualBus
+from nodes.virtual.plant import Axis
 from nodes.virtual.plant_log import PlantEvent, plant_log
-from nodes.virtual.plant_page import PlantPage
+from nodes.virtual.plant_page import Motor, PlantPage
 from nodes.virtual.processes import Flavour, NodeProcess
 
 BITRATE = 1_000_000
@@ -153,6 +154,15 @@ class Stage:
             plant=self._plants[node.name].write(self._folder),
             plant_log=self._options.serve is None,
         )
+
+    @property
+    def axes(self) -> dict[str, Axis]:
+        """What moves, by the names of axes or of their first steppers."""
+        return {axis.name: axis for plant in self._plants.values() for axis in plant.axes}
+
+    def motors(self) -> dict[str, dict[str, Motor]]:
+        """Return where every stepper truly is, by node and name; also after the nodes have ended."""
+        return {node.name: self.plant_page(node.name).motors for node in self._described.nodes}
 
     def plant_page(self, node: str) -> PlantPage:
         """Return the truth about NODE's plant while it runs, in which faults can be switched."""

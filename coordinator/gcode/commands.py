@@ -32,6 +32,8 @@ class Call:
     """Letters of the axes that are homed then."""
     callers: tuple[str, ...] = ()
     """Names of the replaced commands that it stands in, the outermost first."""
+    extruder: str = ""
+    """The active extruder; empty where there is none."""
 
     def parameters(self, *known: str) -> dict[str, str]:
         """Read NAME=VALUE parameters, of which KNOWN are the names; raises WordError."""
@@ -110,6 +112,9 @@ class Vocabulary:
     """By name; they come before the interpreter's own."""
     home: Callable[[Call, str], Reading] | None = None
     """Reads G28 with the letters of the axes; None: there is nothing to look for."""
+    too_cold: Callable[[str], bool] = lambda _extruder: False
+    """Whether an extruder must not move filament now; asked before each piece of a program, in the reader's
+    thread. One that is only planned is never too cold."""
 
 
 NO_WORDS = Vocabulary({})

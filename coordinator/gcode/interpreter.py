@@ -127,6 +127,8 @@ class Job:
                 raise self._over
             if self._over is not None:
                 return self._over
+            filament = self.machine.filament
+            self.planner.cold = self.vocabulary.too_cold(filament.active if filament is not None else "")
             try:
                 if self._resting is not None:
                     self._rested(self._resting)
@@ -226,7 +228,9 @@ class Job:
         """Return COMMAND with what holds where it stands."""
         planner = self.planner
         callers = tuple(inner.name for inner in self._inner)
-        return Call(command, self.line, planner.toolhead_position, planner.homed, callers)
+        active = self.machine.active
+        extruder = active.name if active is not None else ""
+        return Call(command, self.line, planner.toolhead_position, planner.homed, callers, extruder)
 
     def follow(self, command: Command, reading: Reading) -> bool:
         """Do what READING says; False: the planner has to be emptied first."""

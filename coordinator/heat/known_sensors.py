@@ -46,7 +46,7 @@ THERMISTORS: Final[dict[str, KnownThermistor]] = {
     ),
     "NTC 100K MGB18-104F39050L32": KnownThermistor(
         SteinhartHart.from_beta(25, 100_000, 4100),
-        "data sheet MGB18: beta up to 250 °C, 4100 K",
+        "B = 4100 K up to 250 °C, as this part is used; its name says B25/50 = 3950 K",
     ),
     "SliceEngineering 450": _points(
         "Slice Engineering, RT table of the 450 °C thermistor", (25, 500_000), (200, 3734), (400, 240)

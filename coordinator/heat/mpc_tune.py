@@ -169,6 +169,11 @@ class MpcTune:
         )
 
     @property
+    def watched_c(self) -> float:
+        """What the watch over the heater takes for its target; 0 while it is off."""
+        return 0.0 if self.phase is TunePhase.REST else self.target_c
+
+    @property
     def fan_speeds(self) -> list[float]:
         """The speeds that were measured so far."""
         return fan_speeds(self._transfers)

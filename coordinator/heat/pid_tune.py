@@ -96,6 +96,11 @@ class RelayTune:
         return PidGains(kp, kp / (period_s / 2), kp * period_s / 8)
 
     @property
+    def watched_c(self) -> float:
+        """What the watch over the heater takes for its target."""
+        return self.target_c
+
+    @property
     def swings(self) -> int:
         """Whole swings so far."""
         return max(len(self._swings) - 1, 0)

@@ -11,6 +11,7 @@ from coordinator.machine.read_printer import MAX_ACCEL, MAX_SPEED, PrinterSectio
 from coordinator.machine.read_steppers import MOTOR, read_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_EXTRUDER_OPTIONS
+from coordinator.modules.heater_options import EXTRUDER_HEATER_OPTIONS, LATER_HEATER_OPTIONS
 from coordinator.motion.specs import MotionLimits
 
 NOZZLE_DIAMETER = FloatOption(
@@ -86,7 +87,8 @@ EXTRUDER = SectionSpec(
         PRESSURE_ADVANCE,
         SMOOTH_TIME,
     ),
-    later=LATER_EXTRUDER_OPTIONS,
+    later=LATER_EXTRUDER_OPTIONS + LATER_HEATER_OPTIONS,
+    elsewhere=tuple(option.name for option in EXTRUDER_HEATER_OPTIONS),
 )
 FOLLOWED = TextOption(
     name="extruder",

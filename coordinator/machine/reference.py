@@ -52,6 +52,8 @@ SECTIONS: dict[str, SectionSpec] = {
     "[board_pins], [board_pins NAME]": read_nodes.BOARD_PINS,
     "[duplicate_pin_override]": read_nodes.DUPLICATE_PIN_OVERRIDE,
 }
+MOST_NUMBERED = 3
+"""Options that differ in their number are shown so far; the help says how many there are."""
 
 
 def sections() -> list[str]:
@@ -97,7 +99,7 @@ def section_table(title: str) -> str:
         "| option | value | default | what it is |",
         "|---|---|---|---|",
     ]
-    lines += [_row(option) for option in spec.options]
+    lines += [_row(option) for option in spec.options if not _is_one_of_many(option)]
     if spec.later:
         names = ", ".join(f"`{name}`" for name in spec.later)
         lines += ["", f"Recognised, not yet acting: {names}."]
@@ -107,6 +109,12 @@ def section_table(title: str) -> str:
 def later_sections() -> str:
     """Return the first words of all sections that do not act yet."""
     return ", ".join(f"`{name}`" for name in sorted(LATER_SECTIONS)) + ".\n"
+
+
+def _is_one_of_many(option: Option[object]) -> bool:
+    """Whether OPTION is as those of lower numbers before it (``voltage17``)."""
+    number = option.name.lstrip("abcdefghijklmnopqrstuvwxyz_")
+    return number.isdecimal() and int(number) > MOST_NUMBERED
 
 
 def _row(option: Option[object]) -> str:

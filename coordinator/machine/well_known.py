@@ -12,11 +12,7 @@ def _words(text: str) -> tuple[str, ...]:
 LATER_SECTIONS = frozenset(
     (
         *_words("manual_stepper delta_calibrate"),
-        *_words(
-            "heater_bed heater_generic verify_heater homing_heaters pid_profile thermistor adc_temperature"
-        ),
-        *_words("temperature_sensor temperature_probe temperature_fan adc_scaled ads1x1x ads1118"),
-        *_words("fan heater_fan controller_fan fan_generic"),
+        *_words("homing_heaters pid_profile temperature_probe adc_scaled ads1x1x ads1118"),
         *_words("probe bltouch smart_effector probe_eddy_current axis_twist_compensation load_cell"),
         *_words("load_cell_probe"),
         *_words("dockable_probe z_calibration tools_calibrate"),
@@ -39,21 +35,7 @@ LATER_SECTIONS = frozenset(
 )
 """First words of sections that are recognised and reported as not yet acting."""
 
-LATER_EXTRUDER_OPTIONS = (
-    # the heater and its control
-    *_words("heater_pin max_power control pid_kp pid_ki pid_kd pid_version pid_tolerance pwm_cycle_time"),
-    *_words("min_temp max_temp min_extrude_temp smooth_time max_delta"),
-    *_words("heater_power cooling_fan ambient_temp_sensor filament_density filament_heat_capacity"),
-    *_words("fan_ambient_transfer block_heat_capacity ambient_transfer"),
-    *_words("sensor_responsiveness target_reach_time steady_state_rate min_ambient_change"),
-    # its sensor
-    *_words("sensor_type sensor_pin pullup_resistor inline_resistor adc_voltage voltage_offset sensor_mcu"),
-    *_words("sensor_path tc_type tc_use_50hz_filter tc_averaging_count rtd_nominal_r rtd_reference_r"),
-    *_words("rtd_num_of_wires rtd_use_50hz_filter spi_speed spi_bus"),
-    *_words("spi_software_sclk_pin spi_software_mosi_pin spi_software_miso_pin"),
-    *_words("i2c_address i2c_mcu i2c_bus i2c_speed i2c_software_scl_pin i2c_software_sda_pin"),
-    # filament under pressure
-    *_words("per_move_pressure_advance shared_heater"),
-)
+LATER_EXTRUDER_OPTIONS = _words("per_move_pressure_advance shared_heater")
+"""Those of its heater and sensor that do not act yet: coordinator/modules/heater_options.py."""
 LATER_MCU_OPTIONS = _words("is_non_critical reconnect_interval max_stepper_error")
 LATER_STEPPER_OPTIONS = _words("homing_current min_home_dist use_sensorless_homing")

@@ -148,7 +148,14 @@ class ModuleSet:
     @property
     def vocabulary(self) -> Vocabulary:
         """What programs know through them."""
-        return Vocabulary(self._commands, self._homing.read if self._homing.acts else None)
+        home = self._homing.read if self._homing.acts else None
+        return Vocabulary(self._commands, home, self._too_cold)
+
+    def _too_cold(self, extruder: str) -> bool:
+        from coordinator.modules.heater_sections import ExtruderHeater  # noqa: PLC0415 (start-up time)
+
+        found = self.find(extruder, ExtruderHeater)
+        return found is not None and found.too_cold
 
     @property
     def nodes(self) -> Sequence[str]:

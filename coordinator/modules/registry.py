@@ -16,12 +16,25 @@ if TYPE_CHECKING:
 ENTRY_POINTS: Final = "canductor.modules"
 """Name: the section's first word; value: ``package.module:Class``."""
 _OURS: Final[dict[str, str]] = {
+    "adc_temperature": "coordinator.modules.thermistor:AdcTemperature",
+    "controller_fan": "coordinator.modules.automatic_fans:ControllerFan",
+    "fan": "coordinator.modules.fans:Fan",
+    "fan_generic": "coordinator.modules.fans:FanGeneric",
     "force_move": "coordinator.modules.force_move:ForceMove",
+    "heater_bed": "coordinator.modules.heater_sections:HeaterBed",
+    "heater_fan": "coordinator.modules.automatic_fans:HeaterFan",
+    "heater_generic": "coordinator.modules.heater_sections:HeaterGeneric",
     "homing_override": "coordinator.modules.homing_override:HomingOverride",
     "safe_z_home": "coordinator.modules.safe_z_home:SafeZHome",
+    "temperature_fan": "coordinator.modules.temperature_fan:TemperatureFan",
+    "temperature_sensor": "coordinator.modules.sensor_module:TemperatureSensor",
+    "thermistor": "coordinator.modules.thermistor:Thermistor",
+    "verify_heater": "coordinator.modules.verify_heater:VerifyHeater",
 }
 """By the section's first word: module and class."""
-_BESIDE: Final[dict[str, str]] = {}
+_BESIDE: Final[dict[str, str]] = {
+    r"extruder[0-9]*": "coordinator.modules.heater_sections:ExtruderHeater",
+}
 """By a pattern of section names that the machine's own readers read too: whose further options they are."""
 
 

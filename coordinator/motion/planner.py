@@ -387,6 +387,15 @@ class Planner:
         self._core.limits.position_min[axis] = check_number("position_min", low, -1e6, 1e6)
         self._core.limits.position_max[axis] = check_number("position_max", high, -1e6, 1e6)
 
+    @property
+    def cold(self) -> bool:
+        """Whether moves of filament are refused."""
+        return bool(self._core.cold)
+
+    @cold.setter
+    def cold(self, cold: bool) -> None:
+        self._core.cold = cold
+
     def set_extruder_limits(self, limits: MotionLimits) -> None:
         """Take over what LIMITS say of filament: another extruder is active."""
         check_limits(limits)

@@ -152,6 +152,8 @@ int planner_describe(struct planner *p, struct planned_move *move, const double 
     if (!(fabs(delta[AXIS_E]) <= MAX_EXTRUSION))
         return planner_refuse(p, PLANNER_EXTRUDE_LONG, AXIS_E, delta[AXIS_E], 0,
                               p->limits.max_extrude_only_distance);
+    if (p->cold && fabs(delta[AXIS_E]) >= MIN_LENGTH)
+        return planner_refuse(p, PLANNER_COLD, AXIS_E, delta[AXIS_E], 0, 0);
     if (!(speed >= MIN_SPEED))
         return planner_refuse(p, PLANNER_SPEED, 0, speed, MIN_SPEED, INFINITY);
 

@@ -37,6 +37,7 @@ enum planner_fault_kind {
     PLANNER_SPEED,         // value: mm/s, below the bound low (or not a number)
     PLANNER_TOO_FAR,       // value: mm from the Z axis at the end, bound high
     PLANNER_TOO_NEAR,      // value: mm from the Z axis where the way is nearest, bound low
+    PLANNER_COLD,          // value: mm of filament to be moved by an extruder that is cold
 };
 
 struct planner_fault {
@@ -95,6 +96,7 @@ struct planner {
     double pressure_advance;      // s; holds for the moves added later that print (E forward, X or Y moves)
     int64_t line;                 // of the program, noted with moves added later; 0: none
     uint32_t homed;               // bit per axis X Y Z
+    uint32_t cold;                // whether moves of filament are refused
     double plan_until;            // print time, s: planner_ready says no when trapezoids reach beyond it
     struct planner_fault fault;   // why planner_add said no
 

@@ -48,6 +48,7 @@ class FaultKind(IntEnum):
     SPEED = lib.PLANNER_SPEED
     TOO_FAR = lib.PLANNER_TOO_FAR
     TOO_NEAR = lib.PLANNER_TOO_NEAR
+    COLD = lib.PLANNER_COLD
 
 
 @record
@@ -82,6 +83,10 @@ _FAULTS: Mapping[FaultKind, Callable[[Fault], str]] = {
     FaultKind.EXTRUDE_RATIO: lambda f: (
         f"the move pushes {f.value:.4g} mm of filament per mm of path, more than {f.high:.4g}; "
         "check M82/M83 and G92 E, or raise max_extrude_cross_section of [extruder]"
+    ),
+    FaultKind.COLD: lambda f: (
+        f"the move is to move {f.value:.6g} mm of filament, but the extruder is colder than its"
+        " min_extrude_temp; heat it first with M109, or correct that option of [extruder]"
     ),
     FaultKind.SPEED: lambda f: (
         f"the speed is {f.value:.4g} mm/s, which is not above 0; give a positive F (mm/min)"

@@ -67,6 +67,10 @@ class AnalogIn:
         self._limits: dict[str, int] = {}
         self._unlisten: Callable[[], None] | None = None
 
+    def limit(self, low: float, high: float) -> None:
+        """Take other limits, before its node is configured."""
+        self._low, self._high = low, high
+
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when firmware or pin do not allow it."""
         what = f"the sensor of {self.name}"

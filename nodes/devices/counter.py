@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING, Final
 
-from nodes.clock import ticks_since
 from nodes.devices.ticks import start_clock, ticks_for
 from nodes.message_format import Message
 from nodes.node_config import NodeConfig
@@ -71,6 +70,8 @@ class Counter:
 
     def _came(self, message: Message) -> None:
         """Take a report: from the last change of the report before to the last one of this."""
+        from nodes.clock import ticks_since  # noqa: PLC0415 (planning needs no clock, which draws in numpy)
+
         now = message.integer("count"), message.integer("count_clock")
         last, self._last = self._last, now
         if last is None:

@@ -36,6 +36,8 @@ def prove(folder: Path, *words: str) -> dict[str, Any]:
     )
     assert set(report["clock_rms_us"]) == {"toolhead", "zboard"}
     assert report["min_lead_ms"] > 0
+    assert set(report["place_error_um"]) == set("xyz")
+    assert max(map(abs, report["place_error_um"].values())) < 12.5
     return report
 
 

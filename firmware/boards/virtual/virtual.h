@@ -7,7 +7,9 @@
 #include "boards/board.h"
 #include "boards/virtual/plant.h"
 
-enum { VIRTUAL_PINS = PLANT_PINS, VIRTUAL_ADC_MAX = 4095, VIRTUAL_PWM_MAX = 32768, VIRTUAL_ADC_IDLE = 2048 };
+// Converters idle at what a 100 kOhm thermistor at 25 °C gives below 4.7 kOhm: sensors without a plant are
+// sound.
+enum { VIRTUAL_PINS = PLANT_PINS, VIRTUAL_ADC_MAX = 4095, VIRTUAL_PWM_MAX = 32768, VIRTUAL_ADC_IDLE = 3911 };
 
 // First member of a board's own struct; its first member in turn is the node.
 struct virtual_board {
@@ -32,7 +34,7 @@ struct virtual_variant {
 };
 extern const struct virtual_variant virtual_variant;
 
-// All pins low, all converters in the middle of their range. Outputs that were high are logged as falling.
+// All pins low, all converters idle. Outputs that were high are logged as falling.
 void virtual_pins_reset(struct virtual_board *board);
 
 // From the board: its clock in 64 bits, the true time of that in ns, and more room in (or a flush of) the

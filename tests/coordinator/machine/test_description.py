@@ -148,11 +148,11 @@ def test_aliases_and_pins_shared_on_purpose(tmp_path: Path) -> None:
 
 
 def test_what_waits_for_its_module_is_listed(tmp_path: Path) -> None:
-    text = PRINTER_CFG + "sensor_type: x\n[heater_bed]\nanything: 1\n[tmc2209 stepper_x]\nuart_pin: PA0:x\n"
+    text = PRINTER_CFG + "shared_heater: x\n[led a]\nanything: 1\n[tmc2209 stepper_x]\nuart_pin: PA0:x\n"
     machine = load(tmp_path, text)
     assert [str(entry).replace(f"{tmp_path}/", "") for entry in machine.not_yet_acting] == [
-        "printer.cfg:33: sensor_type of [extruder] recognised, not yet acting",
-        "printer.cfg:41: [heater_bed] recognised, not yet acting",
+        "printer.cfg:33: shared_heater of [extruder] recognised, not yet acting",
+        "printer.cfg:41: [led a] recognised, not yet acting",
         "printer.cfg:43: [tmc2209 stepper_x] recognised, not yet acting",
     ]
 
@@ -180,7 +180,7 @@ def test_users_machines_load_unchanged(name: str) -> None:
     machine = load_machine(str(path))
     assert len(machine.steppers) == 4
     waiting = {entry.section for entry in machine.not_yet_acting}
-    assert not waiting & {"input_shaper", "stepper_x", "stepper_z"}
+    assert not waiting & {"input_shaper", "stepper_x", "stepper_z", "heater_bed", "fan"}
     assert [shaper.kind for shaper in machine.shapers] == (
         ["mzv", "mzv"] if name.startswith("corexy") else []
     )

@@ -47,6 +47,7 @@ def test_out_of_range_the_node_stops_itself_and_its_heater() -> None:
 
     async def main() -> None:
         pin = machine.pins["PC2"]
+        machine.board.set_adc(pin, 2048)
         heater.set(machine.node, machine.clock(0.1), 1.0)
         await asyncio.sleep(1.0)
         machine.board.set_adc(pin, 4090)
@@ -73,6 +74,7 @@ def test_limits_are_those_of_the_ratio() -> None:
         machine = DeviceMachine(analog)
 
         async def main(machine: DeviceMachine = machine, adc: int = adc, dies: bool = dies) -> None:
+            machine.board.set_adc(machine.pins["PC2"], 2000)
             await asyncio.sleep(1.0)
             machine.board.set_adc(machine.pins["PC2"], adc)
             await asyncio.sleep(2.0)

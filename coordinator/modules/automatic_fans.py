@@ -1,0 +1,156 @@
+"""[heater_fan NAME] and [controller_fan NAME]: fans that run while something else is hot or at work."""
+
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from coordinator.machine.options import FloatOption, IntOption, ListOption, SectionSpec
+from coordinator.machine.problem import ConfigError, nearest, shown
+from coordinator.modules.base import Build, Modules
+from coordinator.modules.fan_unit import FanModule, FanUnit, fan_options, shutdown_speed
+from coordinator.modules.heater import HeaterUnit
+from coordinator.modules.heaters import Heaters
+
+if TYPE_CHECKING:
+    from coordinator.modules.live import Live
+
+LOOK_S: Final = 1.0
+FULL: Final = shutdown_speed(1.0)
+OFF: Final = shutdown_speed(0.0)
+HEATER: Final = ListOption(name="heater", help="the heaters it belongs to", default=("extruder",))
+HEATER_TEMP: Final = FloatOption(
+    name="heater_temp",
+    help="it runs while a heater is hotter than this, or has a target",
+    default=50.0,
+    unit="°C",
+    minimum=0,
+    maximum=1500,
+)
+FAN_SPEED: Final = FloatOption(
+    name="fan_speed", help="how fast it then runs", default=1.0, minimum=0, maximum=1
+)
+IDLE_TIMEOUT: Final = IntOption(
+    name="idle_timeout",
+    help="for how long it goes on at idle_speed when nothing is at work any more",
+    default=30,
+    unit="s",
+    minimum=0,
+    maximum=86400,
+)
+IDLE_SPEED: Final = FloatOption(
+    name="idle_speed", help="how fast it runs then; by default fan_speed", minimum=0, maximum=1
+)
+STEPPER: Final = ListOption(name="stepper", help="the steppers it cools; by default all (while a job runs)")
+CONTROLLER_HEATER: Final = ListOption(
+    name="heater", help="the heaters whose drivers it cools", default=("extruder",)
+)
+
+
+class _HeaterNames:
+    """Finds the heaters that an option names."""
+
+    def __init__(self, build: Build, option: ListOption) -> None:
+        self._reader, self._option = build.reader, option
+        self._names = build.get(option)
+        self._given = build.reader.has(option)
+        self._heaters = build.shared(Heaters)
+
+    def find(self) -> list[HeaterUnit]:
+        """Return them; raises ConfigError. A default that does not exist is nobody's mistake."""
+        known = {name: unit for unit in self._heaters.units.values() for name in (unit.key, unit.name)}
+        found = []
+        for name in self._names:
+            if name in known:
+                found.append(known[name])
+            elif self._given:
+                hint = nearest(name, tuple(known)) or f"; there is {', '.join(known) or 'none'}"
+                raise ConfigError(
+                    self._reader.place_of(self._option),
+                    f"'heater' of [{self._reader.name}] names {shown(name)}, which does not exist{hint}",
+                )
+        return found
+
+
+class HeaterFan(FanModule):
+    """A fan that runs while a heater is hot."""
+
+    NAMED: ClassVar = True
+    SPEC: ClassVar = SectionSpec(
+        help="A fan that runs while a heater is hot or is to be, as that of a hot end",
+        options=(*fan_options(FULL), HEATER, HEATER_TEMP, FAN_SPEED),
+    )
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.unit = FanUnit(build, FULL)
+        self._names = _HeaterNames(build, HEATER)
+        self._hot_c = build.get(HEATER_TEMP)
+        self._speed = build.get(FAN_SPEED)
+        self._heaters: list[HeaterUnit] = []
+
+    def link(self, modules: Modules) -> None:
+        """Find its heaters."""
+        del modules
+        self._heaters = self._names.find()
+
+    async def connect(self, live: "Live") -> None:
+        """Begin to look."""
+        await super().connect(live)
+        live.every(LOOK_S, self._look)
+
+    def _look(self) -> None:
+        wanted = any(
+            unit.target_c > 0 or (unit.input.celsius is not None and unit.input.celsius > self._hot_c)
+            for unit in self._heaters
+        )
+        self.unit.set_speed(self._speed if wanted else 0.0)
+
+
+class ControllerFan(FanModule):
+    """A fan that cools a board while it is at work."""
+
+    NAMED: ClassVar = True
+    SPEC: ClassVar = SectionSpec(
+        help="A fan that runs while a job moves the machine or a heater has a target, and some time after",
+        options=(
+            *fan_options(OFF),
+            CONTROLLER_HEATER,
+            STEPPER,
+            FAN_SPEED,
+            IDLE_TIMEOUT,
+            IDLE_SPEED,
+        ),
+    )
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.unit = FanUnit(build, OFF)
+        self._names = _HeaterNames(build, CONTROLLER_HEATER)
+        build.find(STEPPER)
+        self._speed = build.get(FAN_SPEED)
+        idle = build.find(IDLE_SPEED)
+        self._idle_speed = self._speed if idle is None else idle
+        self._idle_s = build.get(IDLE_TIMEOUT)
+        self._heaters: list[HeaterUnit] = []
+        self._live: Live | None = None
+        self._worked_s: float | None = None
+
+    def link(self, modules: Modules) -> None:
+        """Find its heaters."""
+        del modules
+        self._heaters = self._names.find()
+
+    async def connect(self, live: "Live") -> None:
+        """Begin to look."""
+        await super().connect(live)
+        self._live = live
+        live.every(LOOK_S, self._look)
+
+    def _look(self) -> None:
+        assert self._live is not None
+        now_s = self._live.now_s()
+        if self._live.machine.busy or any(unit.target_c > 0 for unit in self._heaters):
+            self._worked_s = now_s
+            self.unit.set_speed(self._speed)
+        elif self._worked_s is not None and now_s - self._worked_s < self._idle_s:
+            self.unit.set_speed(self._idle_speed)
+        else:
+            self.unit.set_speed(0.0)

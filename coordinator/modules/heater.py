@@ -1,0 +1,278 @@
+"""One heater: sensor, controller, output, and what watches over them.
+
+Three nets, each without the one before it: the controller and the watch over the heater here; the node's own
+limits of what its sensor may read; and the node's max_duration, within which it has to hear from the host.
+The host renews the output with every measurement and with nothing else: no measurements, no heat.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Final, Protocol
+
+from coordinator.gcode.words import WordError
+from coordinator.heat.controller import Controller
+from coordinator.heat.mpc import Mpc
+from coordinator.heat.verify import HeaterCheck
+from coordinator.modules.base import Build, Modules, Value
+from coordinator.modules.fan_unit import FanModule
+from coordinator.modules.heater_control import ControlSettings
+from coordinator.modules.heater_options import (
+    AMBIENT_SENSOR,
+    COOLING_FAN,
+    CYCLE_TIME,
+    HEATER_PIN,
+    MAX_DURATION,
+)
+from coordinator.modules.pinned import AHEAD_S, add_pinned
+from coordinator.modules.temperature_input import SensorModule, TemperatureInput
+from coordinator.modules.verify_heater import VerifyHeater, usual
+from nodes.devices.analog_in import RANGE_CHECKS
+from nodes.devices.pwm_out import PwmOut
+from nodes.errors import CanductorError
+from nodes.node_states import NodeState
+
+if TYPE_CHECKING:
+    from coordinator.modules.live import Live
+
+LOOK_S: Final = 1.0
+"""How often it is looked whether there still are measurements."""
+SILENT_LOOKS: Final = 2
+"""So many looks in a row may find none; looks and not seconds, as the host itself may have stood still."""
+
+BAD_MEASUREMENTS: Final = RANGE_CHECKS + 2
+"""So many out of range, and the node should have stopped by itself."""
+
+
+class Tuning(Protocol):
+    """A controller that finds out about its heater."""
+
+    @property
+    def watched_c(self) -> float: ...  # noqa: D102
+    def power(self, now_s: float, measured_c: float, target_c: float = ..., /) -> float: ...  # noqa: D102
+    def settled(self, measured_c: float, target_c: float, /) -> bool: ...  # noqa: D102
+
+
+class HeaterUnit:
+    """The heater of section BUILD, which programs call KEY."""
+
+    def __init__(self, build: Build, key: str) -> None:
+        self.key = key
+        self.name = build.name
+        pin = build.pin(HEATER_PIN)
+        self.input = TemperatureInput(build)
+        self.input.on_measured = self._measured
+        self.settings = ControlSettings(build)
+        self.target_c = 0.0
+        self.power = 0.0
+        """What is applied now, 0..1."""
+        self._controller: Controller | None = self.settings.controller()
+        self.node = pin.node
+        self._output = PwmOut(
+            f"the heater of [{build.name}]",
+            pin=pin.name,
+            cycle_s=build.get(CYCLE_TIME),
+            invert=pin.invert,
+            max_duration_s=build.get(MAX_DURATION),
+        )
+        add_pinned(build, self._output, pin)
+        self._find_fan = build.needed(COOLING_FAN, FanModule) if build.find(COOLING_FAN) else None
+        ambient = build.find(AMBIENT_SENSOR)
+        self._find_ambient = build.needed(AMBIENT_SENSOR, SensorModule) if ambient else None
+        self.fan: FanModule | None = None
+        """What cools it, where the section says so."""
+        self._ambient: SensorModule | None = None
+        self.calibrated: dict[str, str] = {}
+        """Options of the section and their values, as calibration found them."""
+        self._check = HeaterCheck(usual(key))
+        self._tuning: Tuning | None = None
+        self._tuning_failure: CanductorError | None = None
+        self._live: Live | None = None
+        self._on = False
+        self._bad = 0
+
+    # ---------------------------------------------------------------------------------------------- life
+
+    def link(self, modules: Modules) -> None:
+        """Find what belongs to it; raises ConfigError."""
+        self.input.link(modules)
+        verify = modules.find(f"verify_heater {self.key}", VerifyHeater)
+        if verify is not None:
+            self._check = HeaterCheck(verify.options)
+        if self._find_fan is not None:
+            self.fan = self._find_fan(modules)
+        if self._find_ambient is not None:
+            self._ambient = self._find_ambient(modules)
+
+    async def connect(self, live: "Live") -> None:
+        """Begin to act."""
+        self._live = live
+        await self.input.connect(live)
+        live.every(LOOK_S, self._look)
+
+    def keep(self, found: dict[str, str]) -> None:
+        """Have SAVE_CONFIG write what calibration FOUND: options of the section and their values."""
+        self.calibrated = found
+        if self._live is not None:
+            for option, text in found.items():
+                self._live.save(self.name, option, text)
+
+    def end(self, cause: str) -> None:
+        """Act no more: the nodes have their outputs off."""
+        self._live = None
+        self.target_c = self.power = 0.0
+        self.input.end(cause)
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell how it is."""
+        status: dict[str, Value] = {
+            "temperature": _rounded(self.input.celsius),
+            "target": self.target_c,
+            "power": round(self.power, 4),
+        }
+        if isinstance(self._controller, Mpc):
+            status["control_stats"] = {
+                "temp_block": _rounded(self._controller.block_c),
+                "temp_sensor": _rounded(self._controller.sensor_c),
+                "temp_ambient": _rounded(self._controller.ambient_c),
+            }
+        return status
+
+    # ------------------------------------------------------------------------------------------- targets
+
+    def check_target(self, celsius: float) -> None:
+        """Raise WordError unless CELSIUS is a target it may have, or 0 for off."""
+        if celsius and not self.input.min_c <= celsius <= self.input.max_c:
+            raise WordError(
+                f"{celsius:g} °C is outside what [{self.name}] allows, {self.input.min_c:g} to"
+                f" {self.input.max_c:g} °C; correct the program, or min_temp and max_temp"
+            )
+        if celsius and self._controller is None:
+            raise WordError(
+                f"[{self.name}] has to be calibrated before it heats: MPC_CALIBRATE HEATER={self.key}"
+            )
+
+    def set_target(self, celsius: float) -> None:
+        """Heat to CELSIUS, 0: not at all. Off at once, on with the next measurement."""
+        self.target_c = celsius
+        if celsius <= 0:
+            self._apply(0.0)
+
+    @property
+    def settled(self) -> bool:
+        """Whether who waits for the target may go on."""
+        if self.target_c <= 0 or self._controller is None or self.input.celsius is None:
+            return True
+        return self._controller.settled(self.input.celsius, self.target_c)
+
+    async def reach(self) -> None:
+        """Wait until the target is reached; raises CanductorError when the heater ends before."""
+        await self.input.next()  # with the target in force
+        while not self.settled:
+            await self.input.next()
+
+    async def tune(self, tuning: Tuning, each: Callable[[], None] = lambda: None) -> None:
+        """Let TUNING have the heater until it is done, EACH after every measurement; it is off then."""
+        if self._tuning is not None:
+            raise CanductorError(f"[{self.name}] is being calibrated already; wait for its end")
+        self._tuning, self._tuning_failure = tuning, None
+        try:
+            while not tuning.settled(0.0, 0.0):
+                await self.input.next()
+                each()
+                if self._tuning_failure is not None:
+                    raise self._tuning_failure
+        finally:
+            self._tuning = None
+            self.set_target(0.0)
+
+    def use(self, controller: Controller) -> None:
+        """Be controlled by another controller from now on."""
+        self._controller = controller
+
+    # ------------------------------------------------------------------------------------------- control
+
+    def _measured(self, at_s: float, celsius: float) -> None:
+        live = self._live
+        if live is None:
+            return
+        if not self.input.min_c <= celsius <= self.input.max_c:
+            self._out_of_range(live, celsius)
+            return
+        self._bad = 0
+        watched_c = self.target_c if self._tuning is None else self._tuning.watched_c
+        fault = self._check.check(at_s, celsius, watched_c, self.power)
+        if fault is not None:
+            live.stop(f"heater {self.key} {fault}")
+            return
+        self._apply(self._wanted(at_s, celsius))
+
+    def _out_of_range(self, live: "Live", celsius: float) -> None:
+        """Heat no more while what is measured cannot be; its node stops by itself a moment later."""
+        self._bad += 1
+        self._apply(0.0)
+        if self._bad > BAD_MEASUREMENTS:
+            live.stop(
+                f"heater {self.key}: its sensor tells {celsius:.0f} °C, outside {self.input.min_c:g} to"
+                f" {self.input.max_c:g} °C; check the sensor and its wires"
+            )
+
+    def _wanted(self, at_s: float, celsius: float) -> float:
+        if self._tuning is not None:
+            try:
+                return self._tuning.power(at_s, celsius)
+            except CanductorError as error:
+                self._tuning_failure = error
+                return 0.0
+        if self._controller is None:
+            return 0.0
+        if isinstance(self._controller, Mpc):
+            self._tell_model(self._controller)
+        return self._controller.power(at_s, celsius, self.target_c)
+
+    def _tell_model(self, model: Mpc) -> None:
+        if self.fan is not None:
+            model.set_fan(self.fan.unit.speed)
+        if self._ambient is not None and self._ambient.input.celsius is not None:
+            model.set_ambient(self._ambient.input.celsius)
+
+    def _apply(self, power: float) -> None:
+        """Have POWER on the node; off needs no renewal."""
+        live, self.power = self._live, power
+        if live is None or (power <= 0 and not self._on):
+            return
+        node = live.node(self.node)
+        try:
+            clock = live.ticks_at(self.node, live.print_time_now() + AHEAD_S)
+            self._output.set(node, clock, power)
+        except CanductorError as error:
+            self._let_go(str(error))
+            return
+        self._on = power > 0
+
+    def _look(self) -> None:
+        """Notice that there are no measurements any more, and what that means."""
+        live = self._live
+        if live is None or (self.target_c <= 0 and self._tuning is None):
+            return
+        for name in (self.input.node, self.node):
+            if live.node(name).state is not NodeState.READY:
+                self._let_go(f"node {name} is {live.node(name).state.value}")
+                return
+        missed = self.input.missed()
+        if missed > SILENT_LOOKS:
+            live.stop(
+                f"heater {self.key}: its sensor has not said anything for some {missed * LOOK_S:g} s;"
+                f" check node {self.input.node} and its wires"
+            )
+
+    def _let_go(self, why: str) -> None:
+        """Forget the target: a node that may be absent is away, and off."""
+        live, was = self._live, self.target_c
+        self.target_c, self.power, self._on = 0.0, 0.0, False
+        if self._tuning is not None:
+            self._tuning_failure = CanductorError(f"heater {self.key} went off: {why}")
+        if was > 0 and live is not None:
+            live.say(f"heater {self.key} is off, its target of {was:g} °C is forgotten: {why}")
+
+
+def _rounded(celsius: float | None) -> Value:
+    return None if celsius is None else round(celsius, 2)

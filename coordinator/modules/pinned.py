@@ -1,0 +1,41 @@
+"""A device whose pins are known by file and line: what is wrong with them is told there."""
+
+from typing import TYPE_CHECKING, Final
+
+from coordinator.machine.pins import PinDescription
+from coordinator.modules.base import Build, Device
+from nodes.node_config import NodeConfig
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from nodes.node import Node
+
+
+AHEAD_S: Final = 0.4
+"""How far ahead values are sent: late ones would stop the node, and hosts are sometimes slow."""
+
+
+class Pinned:
+    """DEVICE on PINS of its node."""
+
+    def __init__(self, device: Device, *pins: PinDescription) -> None:
+        self._device = device
+        self._pins = pins
+
+    def configure(self, config: NodeConfig) -> None:
+        """Add it to what its node is configured as; ConfigError for a pin the node has not."""
+        found = config.dictionary.enumerations.get("pin")
+        numbers: Mapping[str, int] = found.values if found is not None else {}
+        for pin in self._pins:
+            pin.number(numbers)
+        self._device.configure(config)
+
+    def started(self, node: "Node") -> None:
+        """Its node is ready."""
+        self._device.started(node)
+
+
+def add_pinned(build: Build, device: Device, pin: PinDescription) -> None:
+    """Have DEVICE on the node of PIN."""
+    build.add_device(pin.node, Pinned(device, pin))

@@ -1,0 +1,163 @@
+"""[temperature_fan NAME]: a fan that holds a temperature down."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.words import WordError
+from coordinator.heat.controller import Controller
+from coordinator.heat.pid import Pid, PidGains
+from coordinator.heat.watermark import Watermark
+from coordinator.machine.options import ChoiceOption, FloatOption, SectionSpec
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.fan_unit import FanModule, FanUnit, fan_options, shutdown_speed
+from coordinator.modules.heater_options import MAX_DELTA, PID_KD, PID_KI, PID_KP, SMOOTH_TIME
+from coordinator.modules.heaters import Heaters
+from coordinator.modules.sensor_module import GCODE_ID
+from coordinator.modules.sensor_options import LATER_SENSOR_OPTIONS, SENSOR_OPTIONS
+from coordinator.modules.temperature_input import TemperatureInput
+from coordinator.modules.words_of import one, parameters, value
+
+if TYPE_CHECKING:
+    from coordinator.modules.live import Live
+
+FULL: Final = shutdown_speed(1.0)
+TARGET_TEMP: Final = FloatOption(
+    name="target_temp",
+    help="temperature that is not to be exceeded; 0: the fan is off",
+    default=40.0,
+    unit="°C",
+    minimum=0,
+    maximum=1500,
+)
+MAX_SPEED: Final = FloatOption(name="max_speed", help="its highest speed", default=1.0, above=0, maximum=1)
+MIN_SPEED: Final = FloatOption(
+    name="min_speed", help="its lowest speed while it holds a temperature", default=0.3, minimum=0, maximum=1
+)
+CONTROL: Final = ChoiceOption(
+    name="control",
+    help="how its speed follows the temperature",
+    choices=("pid", "watermark"),
+    later=("curve",),
+)
+MIRROR_C: Final = 5000.0
+"""Controllers heat: mirrored here, too hot becomes too cold."""
+
+
+class TemperatureFans(Module):
+    """The fans with a target."""
+
+    SPEC: ClassVar = SectionSpec(help="What fans with a target have in common", options=())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.by_name: dict[str, TemperatureFan] = {}
+        build.add_command(
+            GCodeCommand(
+                "SET_TEMPERATURE_FAN_TARGET",
+                "set what a temperature_fan holds: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
+                self._set,
+            )
+        )
+
+    def _set(self, call: Call) -> Reading:
+        command = call.command
+        given = parameters(command, ("TEMPERATURE_FAN", "TARGET", "MIN_SPEED", "MAX_SPEED"))
+        fan = self.by_name[one(command, given, "TEMPERATURE_FAN", self.by_name)]
+        target = value(command, given, "TARGET", fan.usual_target_c)
+        low = value(command, given, "MIN_SPEED", fan.min_speed)
+        high = value(command, given, "MAX_SPEED", fan.max_speed)
+        if target and not fan.input.min_c <= target <= fan.input.max_c:
+            raise WordError(
+                f"TARGET={target:g} is outside what [{fan.name}] allows, {fan.input.min_c:g} to"
+                f" {fan.input.max_c:g} °C"
+            )
+        if not 0 <= low <= high <= 1:
+            raise WordError("SET_TEMPERATURE_FAN_TARGET needs 0 <= MIN_SPEED <= MAX_SPEED <= 1")
+
+        def act(_: float) -> None:
+            fan.target_c, fan.min_speed, fan.max_speed = target, low, high
+
+        return InTime(act)
+
+
+class TemperatureFan(FanModule):
+    """A fan that holds a temperature down."""
+
+    NAMED: ClassVar = True
+    SPEC: ClassVar = SectionSpec(
+        help="A fan that holds a temperature down, as that of a board or a chamber",
+        options=(
+            *fan_options(FULL),
+            *SENSOR_OPTIONS,
+            TARGET_TEMP,
+            MIN_SPEED,
+            MAX_SPEED,
+            CONTROL,
+            PID_KP,
+            PID_KI,
+            PID_KD,
+            SMOOTH_TIME,
+            MAX_DELTA,
+            GCODE_ID,
+        ),
+        later=(*LATER_SENSOR_OPTIONS, "pid_deriv_time"),
+    )
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.unit = FanUnit(build, FULL)
+        self.input = TemperatureInput(build)
+        self.input.on_measured = self._measured
+        self.usual_target_c = self.target_c = build.get(TARGET_TEMP)
+        self.min_speed, self.max_speed = build.get(MIN_SPEED), build.get(MAX_SPEED)
+        if self.min_speed > self.max_speed:
+            raise build.reader.bad(MIN_SPEED, f"more than max_speed ({self.max_speed:g})")
+        self._controller = _controller(build)
+        build.shared(Heaters).add_sensor(self.input, build.find(GCODE_ID) or "")
+        build.shared(TemperatureFans).by_name[build.instance] = self
+
+    def link(self, modules: Modules) -> None:
+        """Find the sensor."""
+        self.input.link(modules)
+
+    async def connect(self, live: "Live") -> None:
+        """Begin to act."""
+        await super().connect(live)
+        await self.input.connect(live)
+
+    def stopped(self, cause: str) -> None:
+        """Act no more."""
+        super().stopped(cause)
+        self.input.end(cause)
+
+    def close(self) -> None:
+        """Act no more."""
+        super().close()
+        self.input.end("the machine was closed")
+
+    def _measured(self, at_s: float, celsius: float) -> None:
+        if self.target_c <= 0:
+            self.unit.set_speed(0.0)
+            return
+        wanted = self._controller.power(at_s, MIRROR_C - celsius, MIRROR_C - self.target_c)
+        self.unit.set_speed(min(max(wanted, self.min_speed), self.max_speed))
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell the fan and the temperature."""
+        celsius = self.input.celsius
+        return {
+            **self.unit.status(),
+            "temperature": None if celsius is None else round(celsius, 2),
+            "target": self.target_c,
+        }
+
+
+def _controller(build: Build) -> Controller:
+    delta, smooth = build.get(MAX_DELTA), build.get(SMOOTH_TIME)
+    gains = [PID_KP, PID_KI, PID_KD]
+    if build.get(CONTROL) == "watermark":
+        for gain in gains:
+            build.find(gain)
+        return Watermark(max_delta_k=delta)
+    return Pid(PidGains(*map(build.get, gains)), smooth_s=smooth)

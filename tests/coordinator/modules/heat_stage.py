@@ -1,0 +1,180 @@
+"""A machine that heats, in a simulated world: the real coordinator, links and firmware, and a plant."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+from coordinator.app import Machine, MachineStopped
+from coordinator.demo.plant import PlantSettings, machine_plants
+from coordinator.demo.plant_heat import HeatSettings
+from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, InTime, Reading
+from coordinator.gcode.words import parse
+from coordinator.modules.base import Value
+from coordinator.simulate.scenario import BusSetting, Scenario
+from coordinator.simulate.stage import Stage
+from coordinator.simulate.values import Range
+from nodes.virtual.plant_page import Fault, Kind, PlantPage
+
+TOOLHEAD = "[mcu toolhead]\ncanbus_uuid: 0123456789ac\ncanbus_interface: can0\n"
+BASE = """
+[mcu]
+canbus_uuid: 0123456789ab
+canbus_interface: can0
+
+[mcu toolhead]
+canbus_uuid: 0123456789ac
+canbus_interface: can0
+
+[printer]
+kinematics: cartesian
+max_velocity: 300
+max_accel: 3000
+
+[stepper_x]
+step_pin: PA1
+dir_pin: PA2
+microsteps: 16
+rotation_distance: 40
+position_max: 200
+
+[stepper_y]
+step_pin: PA3
+dir_pin: PA4
+microsteps: 16
+rotation_distance: 40
+position_max: 200
+
+[stepper_z]
+step_pin: PA5
+dir_pin: PA6
+microsteps: 16
+rotation_distance: 8
+position_max: 200
+
+[extruder]
+step_pin: toolhead:PB1
+dir_pin: toolhead:PB2
+microsteps: 16
+rotation_distance: 22
+nozzle_diameter: 0.4
+filament_diameter: 1.75
+heater_pin: toolhead:PB3
+sensor_type: EPCOS 100K B57560G104F
+sensor_pin: toolhead:PB4
+min_temp: 0
+max_temp: 300
+"""
+HOTEND_PID = "control: pid\npid_kp: 22.2\npid_ki: 1.08\npid_kd: 114\n"
+BED = """
+[heater_bed]
+heater_pin: PC1
+sensor_type: Generic 3950
+sensor_pin: PC2
+min_temp: 0
+max_temp: 130
+control: watermark
+"""
+FAN = "\n[fan]\npin: toolhead:PB5\ntachometer_pin: toolhead:PB6\n"
+
+
+class HeatMachine:
+    """The machine of TEXT (what follows BASE). HURRY: how many times faster all gets hot and cold."""
+
+    def __init__(
+        self, folder: Path, text: str, *, seed: int = 1, hurry: float = 1.0, loss: float = 0.0
+    ) -> None:
+        path = folder / "printer.cfg"
+        path.write_text(BASE + text)
+        scenario = Scenario(
+            name=f"heat of {folder.name}",
+            given="heat",
+            about="Heating.",
+            machine=path,
+            expect="completes",
+            causes=(),
+            weight=0.0,
+            buses={"can0": BusSetting(loss=Range(loss, loss))},
+        )
+        self.stage = Stage(scenario, seed)
+        self.world = self.stage._world
+        settings = PlantSettings(seed=seed, heat=HeatSettings(hurry=hurry))
+        self.plants = self.stage.start_plants(machine_plants(self.stage.description, settings).values())
+        self.notices: list[str] = []
+        self.machine: Machine
+
+    def run(self, main: Callable[[], Awaitable[None]]) -> None:
+        async def whole() -> None:
+            self.machine = Machine(self.stage.description, self.stage.host, on_notice=self.notices.append)
+            await self.machine.start()
+            try:
+                await main()
+            finally:
+                await self.machine.close()
+
+        with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
+            runner.run(whole())
+
+    # ------------------------------------------------------------------------------------------ commands
+
+    def read(self, line: str) -> Reading:
+        command = parse(line.encode())
+        assert command is not None
+        return self.machine.modules.vocabulary.commands[command.name].read(Call(command, 1, (0, 0, 0, 0), ""))
+
+    async def do(self, line: str) -> tuple[str, ...]:
+        """Carry out a line as at rest; return what it answers."""
+        reading = self.read(line)
+        if isinstance(reading, AtRest):
+            done: Done | None = await reading.perform()
+            return done.replies if done is not None else ()
+        if isinstance(reading, InTime):
+            reading.act(0.0)
+            return ()
+        assert isinstance(reading, AtOnce)
+        return reading.replies
+
+    def status(self, section: str) -> dict[str, Value]:
+        return dict(self.machine.modules.status()[section])
+
+    async def stopped(self, limit_s: float = 600.0) -> str:
+        """Wait until the machine is stopped; return why."""
+        async with asyncio.timeout(limit_s):
+            stopped: MachineStopped = await self.machine.wait_stopped()
+        return str(stopped)
+
+    # --------------------------------------------------------------------------------------------- truth
+
+    def page(self, node: str = "toolhead") -> PlantPage:
+        return self.plants[node].page
+
+    def true_c(self, body: str = "extruder", node: str = "toolhead") -> float:
+        return self.page(node).temperature(body)
+
+    def fault(self, kind: Kind, fault: Fault, name: str = "extruder", node: str = "toolhead") -> None:
+        self.page(node).set_fault(kind, name, fault)
+
+    def edges(self, pin: str, node: str = "toolhead") -> list[tuple[float, int]]:
+        """Return the changes of an output: true time (s) and level."""
+        truth, number = self.stage.board(node), self.stage.pins(node)[pin]
+        chosen = truth.pin == number
+        times, levels = truth.at_ns[chosen], truth.level[chosen]
+        return [(at * 1e-9, int(level)) for at, level in zip(times.tolist(), levels.tolist(), strict=True)]
+
+    def now_s(self) -> float:
+        return self.world.now_ns * 1e-9
+
+    async def true_range(
+        self, seconds: float, body: str = "extruder", node: str = "toolhead"
+    ) -> tuple[float, float]:
+        """Return the lowest and the highest temperature that BODY truly has for SECONDS."""
+        seen = []
+        for _ in range(round(seconds / 0.25)):
+            await asyncio.sleep(0.25)
+            seen.append(self.true_c(body, node))
+        return min(seen), max(seen)
+
+    def heater_off_after(self, since_s: float, pin: str = "PB3", node: str = "toolhead") -> float:
+        """Return how long after SINCE_S (true time) the heater's pin went low for good, by the pin's log."""
+        at_s, level = self.edges(pin, node)[-1]
+        assert level == 0, "the heater is on"
+        return at_s - since_s
