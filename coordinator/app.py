@@ -52,12 +52,6 @@ def _ignore(_: str) -> None:
     pass
 
 
-def _no_restart() -> Callable[[bool], None]:
-    raise CanductorError(
-        "a machine that runs a single file cannot begin anew; serve it (--ipc), or start the command again"
-    )
-
-
 class Machine:
     """All nodes of DESCRIPTION as one machine, on the ports and in the time of HOST; lives on one loop.
 
@@ -65,7 +59,7 @@ class Machine:
     others are stopped at once and ``stopped`` tells why; others are brought back (NodeCare). ON_NOTICE gets
     sentences for the user; dictionaries are kept in CACHE. RESET_NODES: nodes that are configured as they
     should be are reset, too. PREPARE_RESTART returns what begins anew (with nodes reset if True), or raises
-    CanductorError when that is not possible.
+    CanductorError when that is not possible; None: nobody begins it anew.
     """
 
     def __init__(
@@ -76,7 +70,7 @@ class Machine:
         on_notice: Callable[[str], None] = _ignore,
         cache: DictionaryCache | None = None,
         reset_nodes: bool = False,
-        prepare_restart: Callable[[], Callable[[bool], None]] = _no_restart,
+        prepare_restart: Callable[[], Callable[[bool], None]] | None = None,
     ) -> None:
         self.description = description
         self.host = host

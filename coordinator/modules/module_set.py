@@ -62,11 +62,13 @@ def _blamed(kind: type[Module], place: Place) -> Iterator[None]:
     except Exception as error:
         if kind.__module__.partition(".")[0] == "coordinator":
             raise
-        raise ConfigError(
-            place,
+        sentence = (
             f"the module {kind.__module__}.{kind.__name__} failed: {type(error).__name__}: {error}; update or"
-            " remove its package",
-        ) from error
+            " remove its package"
+        )
+        if place.path:
+            raise ConfigError(place, sentence) from error
+        raise CanductorError(sentence) from error  # it has no section of its own
 
 
 class ModuleSet:

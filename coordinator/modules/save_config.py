@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.machine.options import SectionSpec
 from coordinator.modules.base import Build, Module, Value
+from nodes.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.modules.live import Live
@@ -65,12 +66,20 @@ class SaveConfig(Module):
         machine = self._live.machine
         if not machine.unsaved.pending:
             return Done(("nothing to save: nothing was calibrated since the machine started",))
-        restart = machine.prepare_restart()
+        restart = machine.prepare_restart() if machine.prepare_restart is not None else None
         path = await asyncio.to_thread(machine.unsaved.write)
+        if restart is None:
+            return Done((f"saved into {path}; it counts from the next start on",))
         self._live.say(f"saved into {path}; the machine begins anew")
         restart(False)
         return None
 
     async def _restart(self, *, firmware: bool) -> None:
         assert self._live is not None
-        self._live.machine.prepare_restart()(firmware)
+        prepare = self._live.machine.prepare_restart
+        if prepare is None:
+            raise CanductorError(
+                "a machine that runs a single file cannot begin anew; start the command again, or serve the"
+                " machine with --ipc"
+            )
+        prepare()(firmware)

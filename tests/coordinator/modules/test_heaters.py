@@ -63,7 +63,12 @@ def test_pid_calibration_gives_constants_that_hold(tmp_path: Path) -> None:
         kept = stage.status("heaters")["calibrated"]
         assert kept == {"extruder": dict(line.split(": ") for line in replies[1:])}
         assert stage.status("configfile")["save_config_pending_items"] == kept
-        saved.append(stage.machine.unsaved.write())
+        (told,) = await stage.do("SAVE_CONFIG")
+        path, _, rest = told.removeprefix("saved into ").partition("; ")
+        assert rest == "it counts from the next start on", "nobody restarts this machine"
+        saved.append(path)
+        with pytest.raises(CanductorError, match="cannot begin anew; start the command again"):
+            await stage.do("RESTART")
         await stage.do("M109 S210")
         await asyncio.sleep(15)
         low, high = await stage.true_range(10)
