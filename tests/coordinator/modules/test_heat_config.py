@@ -43,10 +43,10 @@ def error(tmp_path: Path, text: str) -> str:
 
 def test_every_heater_has_the_nodes_own_net(tmp_path: Path) -> None:
     commands = configured(build(tmp_path, HOTEND_PID + BED), "toolhead") + configured(
-        build(tmp_path, HOTEND_PID + BED.replace("[heater_bed]", "[heater_bed]\nmax_duration: 1.5")), "mcu"
+        build(tmp_path, HOTEND_PID + BED.replace("[heater_bed]", "[heater_bed]\nmax_duration: 3")), "mcu"
     )
     outs = [command for command in commands if command.startswith("config_digital_out")]
-    assert [out.split()[-1] for out in outs] == [f"max_duration={n * 168_000_000 // 2}" for n in (6, 3)]
+    assert [out.split()[-1] for out in outs] == [f"max_duration={n * 168_000_000 // 2}" for n in (3, 6)]
     assert all("value=0 default_value=0" in out for out in outs)
 
 

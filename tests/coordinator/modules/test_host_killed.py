@@ -18,7 +18,7 @@ from tests.coordinator.modules.heat_stage import BASE, HOTEND_PID
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 60.0
-MAX_DURATION_S = 3.0
+MAX_DURATION_S = 1.5
 AHEAD_S = 0.4
 """How far ahead of their time the host sends values; and a little for the clocks' estimates."""
 UNCERTAIN_S = 0.05
