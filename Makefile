@@ -44,7 +44,7 @@ ctest: setup
 
 # Tests that only compute. All others talk to processes in real time: they mostly wait, and want to be on time.
 COMPUTING := $(addprefix tests/,sim canbus_tools/test_decoder.py firmware $(addprefix coordinator/,\
-	motion kinematics machine gcode heat table demo test_plan.py test_cli.py))
+	motion kinematics machine gcode heat modules table demo test_plan.py test_cli.py))
 
 pytest: setup
 	$(BIN)/pytest

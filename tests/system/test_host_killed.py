@@ -16,7 +16,7 @@ from nodes.virtual.plant_page import Kind, PlantPage
 from nodes.virtual.processes import NodeProcess
 from tests.coordinator.modules.heat_stage import BASE, HOTEND_PID
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
 MAX_DURATION_S = 1.5
 AHEAD_S = 0.4
