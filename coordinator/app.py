@@ -14,6 +14,7 @@ from coordinator.machine.description import (
     NodePolicy,
     UartConnection,
 )
+from coordinator.machine.saved_config import PendingConfig
 from coordinator.machine_devices import MachineDevices, stream_specs
 from coordinator.modules.live import Live
 from coordinator.motion.specs import NodeStreamSpec
@@ -56,7 +57,9 @@ class Machine:
 
     ``start``, then ``close`` whatever happened. When a node is lost or shuts down whose policy is fatal, all
     others are stopped at once and ``stopped`` tells why; others are brought back (NodeCare). ON_NOTICE gets
-    sentences for the user; dictionaries are kept in CACHE.
+    sentences for the user; dictionaries are kept in CACHE. RESET_NODES: nodes that are configured as they
+    should be are reset, too. PREPARE_RESTART returns what begins anew (with nodes reset if True), or raises
+    CanductorError when that is not possible; None: nobody begins it anew.
     """
 
     def __init__(
@@ -66,6 +69,8 @@ class Machine:
         *,
         on_notice: Callable[[str], None] = _ignore,
         cache: DictionaryCache | None = None,
+        reset_nodes: bool = False,
+        prepare_restart: Callable[[], Callable[[bool], None]] | None = None,
     ) -> None:
         self.description = description
         self.host = host
@@ -74,6 +79,9 @@ class Machine:
         self.devices = MachineDevices(description, self.modules)
         self.nodes: dict[str, Node] = {}
         self.stopped: MachineStopped | None = None
+        self.unsaved = PendingConfig(description.source)
+        self.prepare_restart = prepare_restart
+        self._reset_nodes = reset_nodes
         self._on_notice = on_notice
         self._cache = cache if cache is not None else DictionaryCache()
         self._open: list[_OpenBus] = []
@@ -309,6 +317,7 @@ class Machine:
         )
 
     def _add(self, bus: CanBus | UartBus, node: Node) -> None:
+        node.reset_first = self._reset_nodes
         self.nodes[node.name] = node
         self._bus_of[node] = bus
 

@@ -5,14 +5,14 @@ anything, and whatever is left of it when the steppers are stopped on their node
 """
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from coordinator.app import Machine, link_of
 from coordinator.machine.description import StepperDescription
-from coordinator.motion.specs import StepKinematics
+from coordinator.motion.specs import StepKinematics, StepperSpec
 from coordinator.motion.steps import StepGenerator
 from coordinator.motion.trapezoid_array import TRAPEZOID
 
@@ -90,9 +90,12 @@ def ratio_of(axis: str, direction: int) -> Ratio:
 
 
 class SingleMove:
-    """RAMP along RATIO on MACHINE, beginning START_LEAD_S from its making."""
+    """RAMP along RATIO on MACHINE, beginning START_LEAD_S from its making.
 
-    def __init__(self, machine: Machine, ramp: Ramp, ratio: Ratio) -> None:
+    ALONE: the name of the one stepper that moves, by RATIO's X, whatever it moves otherwise.
+    """
+
+    def __init__(self, machine: Machine, ramp: Ramp, ratio: Ratio, *, alone: str | None = None) -> None:
         self._machine = machine
         self._time_base = machine.time_base()
         self.ramp = ramp
@@ -106,7 +109,10 @@ class SingleMove:
         self.begin_s = now + START_LEAD_S
         self.end_s = self.begin_s + ramp.duration_s
         self._nodes = machine.moving
-        self._steps = StepGenerator(machine.devices.stepper_specs(), machine.stream_specs())
+        specs = machine.devices.stepper_specs()
+        if alone is not None:
+            specs = [_by_itself(spec, moves=spec.name == alone) for spec in specs]
+        self._steps = StepGenerator(specs, machine.stream_specs())
         self._maps = [machine.clock_map(self._time_base, node, now) for node in self._nodes]
         for index, clock_map in enumerate(self._maps):
             piece = clock_map.last
@@ -162,3 +168,8 @@ class SingleMove:
     def planned_steps(self, stepper: StepperDescription, way_mm: float) -> float:
         """Return where a stepper is after WAY_MM, in steps from the begin; a step is due at every half."""
         return self.along(stepper) * way_mm / stepper.step_distance
+
+
+def _by_itself(spec: StepperSpec, *, moves: bool) -> StepperSpec:
+    weights = (1.0 if moves else 0.0, 0.0, 0.0, 0.0)
+    return replace(spec, weights=weights, kinematics=StepKinematics.LINEAR, params=())

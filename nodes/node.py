@@ -70,6 +70,8 @@ class Node:
         self.load: NodeLoad | None = None
         self.pulse_clock: PulseClock | None = None
         """The node's clock by sync pulses, while its bus has such; kept by the bus."""
+        self.reset_first = False
+        """Whether the next start resets the node even when it is configured as it should be."""
         self._connector = connector
         self._build_config = build_config
         self._on_state = on_state
@@ -307,7 +309,9 @@ class Node:
         """Make the node what WANTED says; False when it had to be reset and must be connected anew."""
         found = await get_config(self._talk)
         other = bool(found.integer("is_config")) and found.integer("crc") != wanted.crc
-        if other or found.integer("is_shutdown"):
+        reset_first, self.reset_first = self.reset_first, False
+        if other or reset_first or found.integer("is_shutdown"):
+            # Preferred to a reset of the whole board, with which a USB device or a CAN bridge would vanish.
             if "config_reset" not in self.dictionary.commands:
                 await self._reset()
                 return False

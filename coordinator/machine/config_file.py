@@ -79,8 +79,8 @@ class ConfigFile:
     """By name, in the order of their first mention."""
     saved: dict[str, RawSection] = field(default_factory=dict)
     """What the SAVE_CONFIG block alone says; already merged into sections."""
-    user_lines: list[str] = field(default_factory=list)
-    """The main file's text before the block, untouched, for writing it back."""
+    data: bytes = b""
+    """The main file, untouched, for writing it back."""
     notes: list[str] = field(default_factory=list)
     """Sentences about what was read but has no effect."""
     problems: list[ConfigError] | None = None
@@ -96,10 +96,10 @@ def parse_config(path: str, problems: list[ConfigError] | None = None) -> Config
     budget = ReadBudget()
     place = Place(path, 0)
     config_text.enter_file(path, place, budget)
-    lines = config_text.read_lines(path, place, budget)
-    header = _saved_header(lines)
-    config.user_lines = lines[:header]
-    _Parser(config, config.sections, budget).parse(path, enumerate(config.user_lines, 1))
+    config.data = config_text.read_bytes(path, place, budget)
+    lines = config_text.split_lines(config.data, path)
+    header = saved_header(lines)
+    _Parser(config, config.sections, budget).parse(path, enumerate(lines[:header], 1))
     saved_lines = _saved_lines(path, lines, header)
     _Parser(config, config.saved, None).parse(path, saved_lines)
     for saved in config.saved.values():
@@ -110,7 +110,22 @@ def parse_config(path: str, problems: list[ConfigError] | None = None) -> Config
     return config
 
 
-def _saved_header(lines: list[str]) -> int:
+def parse_saved(path: str, lines: list[str]) -> dict[str, dict[str, str]]:
+    """Return what a block says, of which LINES are all; raises ConfigError."""
+    config = ConfigFile(path)
+    _Parser(config, config.saved, None).parse(path, _saved_lines(path, lines, 0))
+    return saved_values(config)
+
+
+def saved_values(config: ConfigFile) -> dict[str, dict[str, str]]:
+    """Return what the block of CONFIG says."""
+    return {
+        section.name: {option.name: option.value for option in section.options.values()}
+        for section in config.saved.values()
+    }
+
+
+def saved_header(lines: list[str]) -> int:
     """Return the index of the block's first line, or the number of lines when there is no block."""
     return next((i for i, line in enumerate(lines) if _SAVED_HEADER.fullmatch(line)), len(lines))
 
@@ -201,7 +216,7 @@ class _Parser:
         for path in config_text.included_paths(pattern, place, self._budget):
             config_text.enter_file(path, place, self._budget)
             lines = config_text.read_lines(path, place, self._budget)
-            header = _saved_header(lines)
+            header = saved_header(lines)
             if header < len(lines):
                 where = Place(path, header + 1)
                 self._config.notes.append(f"{where}: the SAVE_CONFIG block of an included file is not read")

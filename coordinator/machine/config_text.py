@@ -31,7 +31,11 @@ def read_lines(path: str, place: Place, budget: ReadBudget) -> list[str]:
 
     place: where the file was asked for, named in errors about the file itself. Raises ConfigError.
     """
-    data = _read_bytes(path, place, budget)
+    return split_lines(read_bytes(path, place, budget), path)
+
+
+def split_lines(data: bytes, path: str) -> list[str]:
+    """Return the lines of DATA, which the file PATH holds; raises ConfigError."""
     if (nul := data.find(b"\0")) >= 0:
         raise ConfigError(Place(path, data.count(b"\n", 0, nul) + 1), "a NUL byte: this is not a text file")
     try:
@@ -44,7 +48,8 @@ def read_lines(path: str, place: Place, budget: ReadBudget) -> list[str]:
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
-def _read_bytes(path: str, place: Place, budget: ReadBudget) -> bytes:
+def read_bytes(path: str, place: Place, budget: ReadBudget) -> bytes:
+    """Return what a regular file holds; raises ConfigError."""
     budget.files -= 1
     if budget.files < 0:
         raise ConfigError(place, f"more than {MAX_FILES} files are included")

@@ -3,7 +3,7 @@
 import re
 from dataclasses import replace
 
-from coordinator.machine.config_file import ConfigFile, RawSection, parse_config
+from coordinator.machine.config_file import ConfigFile, RawSection, parse_config, saved_values
 from coordinator.machine.frame import Frame
 from coordinator.machine.model import (
     CanConnection,
@@ -31,6 +31,7 @@ from coordinator.machine.read_shaper import read_shapers
 from coordinator.machine.read_steppers import is_extra_stepper
 from coordinator.machine.read_tables import read_axis_tables
 from coordinator.machine.reading import Reading
+from coordinator.machine.saved_config import ConfigSource
 from coordinator.machine.well_known import LATER_SECTIONS
 from coordinator.modules.module_set import ModuleSource, ModuleSources
 from coordinator.modules.registry import known_kinds, module_for, modules_beside, own_kinds
@@ -114,6 +115,7 @@ def describe(config: ConfigFile) -> MachineDescription:
         not_yet_acting=(),
         notes=tuple(config.notes),
         axis_tables=axis_tables,
+        source=ConfigSource(config.path, config.data, saved_values(config)),
     )
     _check_names(description)
     check_policies(description.nodes, description.steppers)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
 from coordinator.machine.pins import PinDescription
 from coordinator.machine.problem import Place
+from coordinator.machine.saved_config import ConfigSource
 from coordinator.modules.module_set import ModuleSources
 from coordinator.motion.specs import MotionLimits
 from nodes.records import record
@@ -114,6 +115,8 @@ class HomingDescription:
     retract_speed: float = 5.0
     positive_dir: bool = False
     """Whether the endstop stands at the upper end."""
+    accel: float | None = None
+    """mm/s² of all that; None: as fast as the axis may."""
 
 
 NO_ENDSTOP = HomingDescription()
@@ -235,6 +238,8 @@ class MachineDescription:
     """Sentences about what has no effect."""
     axis_tables: AxisTablesDescription | None = None
     """None: axes have no tables."""
+    source: ConfigSource | None = None
+    """The file, for what is saved into it; None: there is none."""
 
     @property
     def homed_position(self) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from coordinator.machine.model import HomingDescription
 from coordinator.machine.options import BoolOption, FloatOption, SectionReader
 from coordinator.machine.pins import PinDescription, PinOption, PinRegistry
-from coordinator.machine.read_printer import MAX_SPEED
+from coordinator.machine.read_printer import MAX_ACCEL, MAX_SPEED
 from coordinator.machine.read_steppers import MAX_POSITION
 
 ENDSTOP_PIN = PinOption(name="endstop_pin", help="the endstop's input", pullable=True, share="endstop")
@@ -44,11 +44,18 @@ RETRACT_SPEED = FloatOption(
     above=0,
     maximum=MAX_SPEED,
 )
+ACCEL = FloatOption(
+    name="homing_accel",
+    help="acceleration while it homes, where max_accel allows more; by default max_accel",
+    unit="mm/s²",
+    above=0,
+    maximum=MAX_ACCEL,
+)
 POSITIVE_DIR = BoolOption(
     name="homing_positive_dir",
     help="whether the endstop is at the upper end; by default the end that is nearer to position_endstop",
 )
-APPROACH = (HOMING_SPEED, SECOND_HOMING_SPEED, RETRACT_DISTANCE, RETRACT_SPEED, POSITIVE_DIR)
+APPROACH = (HOMING_SPEED, SECOND_HOMING_SPEED, RETRACT_DISTANCE, RETRACT_SPEED, ACCEL, POSITIVE_DIR)
 HOMING = (ENDSTOP_PIN, POSITION_ENDSTOP, *APPROACH)
 WAITING = tuple(option.name for option in (ENDSTOP_PIN, *APPROACH))
 """Read and checked, but of rails that homing does not know yet, and of an axis' second endstop."""
@@ -124,4 +131,5 @@ def _homing(
         retract_distance=reader.get(RETRACT_DISTANCE),
         retract_speed=reader.find(RETRACT_SPEED) or speed,
         positive_dir=positive_dir,
+        accel=reader.find(ACCEL),
     )

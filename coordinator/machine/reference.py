@@ -1,9 +1,11 @@
 """The tables of docs/configuration.md, made from the options themselves.
 
-``python -m coordinator.machine.reference`` prints them all.
+``python -m coordinator.machine.reference`` prints them all; with a page's name it puts them there.
 """
 
 import sys
+from pathlib import Path
+from typing import Final
 
 from coordinator.machine import (
     read_delta,
@@ -25,6 +27,8 @@ from coordinator.machine.printer_options import PRINTER_SPECS
 from coordinator.machine.well_known import LATER_SECTIONS
 from coordinator.modules.registry import own_beside, own_modules
 
+_BEGIN: Final = "<!-- The tables below"
+_END: Final = "## Sections that do not act yet\n"
 SECTIONS: dict[str, SectionSpec] = {
     "[mcu], [mcu NAME]": read_nodes.MCU,
     "[printer]": read_printer.PRINTER,
@@ -121,9 +125,22 @@ def _row(option: Option[object]) -> str:
     return f"| `{option.name}` | {option.rule()} | {text} | {option.help} |"
 
 
+def with_tables(page: str) -> str:
+    """Return the text of a page, which has the marks of docs/configuration.md, with the tables of now."""
+    head, _, rest = page.partition(_BEGIN)
+    mark, _, rest = rest.partition("\n")
+    _, _, rest = rest.partition(_END)
+    told = rest[: rest.index("\n`")]
+    tables = "\n".join(section_table(title) for title in sections())
+    return f"{head}{_BEGIN}{mark}\n\n{tables}\n{_END}{told}\n{later_sections()}"
+
+
 def main() -> None:
-    """Print all tables."""
-    sys.stdout.write("\n".join(section_table(title) for title in sections()) + "\n" + later_sections())
+    """Print all tables, or put them into the pages that are named."""
+    if len(sys.argv) == 1:
+        sys.stdout.write("\n".join(section_table(title) for title in sections()) + "\n" + later_sections())
+    for path in map(Path, sys.argv[1:]):
+        path.write_text(with_tables(path.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -17,12 +17,10 @@ LATER_SECTIONS = frozenset(
         *_words("load_cell_probe"),
         *_words("dockable_probe z_calibration tools_calibrate"),
         *_words("bed_mesh bed_tilt bed_screws screws_tilt_adjust z_tilt z_tilt_ng quad_gantry_level"),
-        *_words("skew_correction z_thermal_adjust safe_z_home homing_override endstop_phase"),
+        *_words("skew_correction z_thermal_adjust endstop_phase"),
         *_words("gcode_macro delayed_gcode gcode_arcs gcode_button gcode_shell_command save_variables"),
         *_words("idle_timeout"),
-        *_words(
-            "virtual_sdcard sdcard_loop force_move pause_resume firmware_retraction respond exclude_object"
-        ),
+        *_words("virtual_sdcard sdcard_loop pause_resume firmware_retraction respond exclude_object"),
         *_words("resonance_tester shaketune adxl345 icm20948 lis2dw lis3dh bmi160 mpu9250 angle"),
         *_words(
             "tmc2130 tmc2208 tmc2209 tmc2240 tmc2660 tmc5160 autotune_tmc ad5206 mcp4451 mcp4728 mcp4018"
@@ -40,4 +38,4 @@ LATER_SECTIONS = frozenset(
 LATER_EXTRUDER_OPTIONS = _words("per_move_pressure_advance shared_heater")
 """Those of its heater and sensor that do not act yet: coordinator/modules/heater_options.py."""
 LATER_MCU_OPTIONS = _words("is_non_critical reconnect_interval max_stepper_error")
-LATER_STEPPER_OPTIONS = _words("homing_accel homing_current min_home_dist use_sensorless_homing")
+LATER_STEPPER_OPTIONS = _words("homing_current min_home_dist use_sensorless_homing")

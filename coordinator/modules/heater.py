@@ -81,7 +81,7 @@ class HeaterUnit:
         """What cools it, where the section says so."""
         self._ambient: SensorModule | None = None
         self.calibrated: dict[str, str] = {}
-        """Options of the section and their values, as calibration found them; for who saves them."""
+        """Options of the section and their values, as calibration found them."""
         self._check = HeaterCheck(usual(key))
         self._tuning: Tuning | None = None
         self._tuning_failure: CanductorError | None = None
@@ -107,6 +107,13 @@ class HeaterUnit:
         self._live = live
         await self.input.connect(live)
         live.every(LOOK_S, self._look)
+
+    def keep(self, found: dict[str, str]) -> None:
+        """Have SAVE_CONFIG write what calibration FOUND: options of the section and their values."""
+        self.calibrated = found
+        if self._live is not None:
+            for option, text in found.items():
+                self._live.save(self.name, option, text)
 
     def end(self, cause: str) -> None:
         """Act no more: the nodes have their outputs off."""

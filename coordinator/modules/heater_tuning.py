@@ -5,7 +5,7 @@ from coordinator.heat.mpc_tune import MpcTune
 from coordinator.heat.pid_tune import RelayTune
 from coordinator.modules.heater import HeaterUnit
 
-REMARK = "in use from now on; write them into the configuration to keep them"
+REMARK = "in use from now on; SAVE_CONFIG writes them into the configuration"
 
 
 async def calibrate_pid(unit: HeaterUnit, target_c: float) -> Done:
@@ -55,6 +55,6 @@ async def calibrate_mpc(unit: HeaterUnit, target_c: float, fan_steps: int) -> Do
 
 def _told(unit: HeaterUnit, found: tuple[tuple[str, str | float], ...]) -> Done:
     texts = {name: value if isinstance(value, str) else f"{value:.6g}" for name, value in found}
-    unit.calibrated = texts
+    unit.keep(texts)
     lines = (f"{name}: {text}" for name, text in texts.items())
     return Done((f"[{unit.name}] was calibrated, {REMARK}:", *lines))

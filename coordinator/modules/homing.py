@@ -5,11 +5,12 @@ second_homing_speed. Where it stands then follows from where the endstop is and 
 switched, so how far it overshot does not matter. A rail without an endstop on a pin is taken as home.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.machine.options import SectionSpec
+from coordinator.machine.problem import ConfigError
 from coordinator.modules.base import Build, Module
 from nodes.errors import CanductorError
 
@@ -37,13 +38,25 @@ class Homing(Module):
         super().__init__(build)
         self._described = build.machine
         self._live: Live | None = None
+        self.instead: Callable[[Call, str], Reading] | None = None
+        """Reads G28 in its place; a G28 among the lines that it stands for is homing again."""
         build.add_command(GCodeCommand("M119", "Tell which endstops are pressed", self._read_query))
         build.add_command(GCodeCommand("QUERY_ENDSTOPS", "Tell which endstops are pressed", self._read_query))
 
     @property
     def acts(self) -> bool:
         """Whether there is any endstop that it can look for."""
-        return any(self._can_home(rails) for rails, _ in self._groups())
+        return self.instead is not None or any(self._can_home(rails) for rails, _ in self._groups())
+
+    def replace_by(self, read: Callable[[Call, str], Reading], build: Build) -> None:
+        """Have READ read G28, for the section that BUILD is of; raises ConfigError when another does."""
+        if self.instead is not None:
+            raise ConfigError(
+                build.place,
+                f"[{build.name}] and another section both say what G28 does; remove one:"
+                " [homing_override] can do what [safe_z_home] does",
+            )
+        self.instead = read
 
     async def connect(self, live: "Live") -> None:
         """Take over the machine."""
@@ -51,7 +64,9 @@ class Homing(Module):
 
     def read(self, call: Call, axes: str) -> Reading:
         """Read G28 of AXES (letters)."""
-        return AtRest(lambda: self._home(call, axes))
+        if self.instead is not None and "G28" not in call.callers:
+            return self.instead(call, axes)
+        return AtRest(lambda: self.home(call, axes))
 
     # ----------------------------------------------------------------------------------------- which rails
 
@@ -73,7 +88,8 @@ class Homing(Module):
 
     # ---------------------------------------------------------------------------------------------- homing
 
-    async def _home(self, call: Call, axes: str) -> Done:
+    async def home(self, call: Call, axes: str) -> Done:
+        """Home AXES (letters) from where CALL says that the machine stands; raises CanductorError."""
         described = self._described
         home = dict(zip(_AXES, described.home, strict=True))
         place = dict(zip(_AXES, call.position[:3], strict=True))
@@ -137,7 +153,7 @@ class Homing(Module):
             direction=direction,
             way_mm=way_mm,
             speed=speed,
-            accel=self._accel(axis),
+            accel=self._accel(axis, rails[0]),
         )
 
     async def _go_back(self, rails: Sequence["RailDescription"], axis: str, direction: int) -> None:
@@ -145,12 +161,13 @@ class Homing(Module):
 
         homing = rails[0].homing
         way_mm = homing.retract_distance or AWAY_MM
-        ramp = Ramp(way_mm, homing.retract_speed, self._accel(axis))
+        ramp = Ramp(way_mm, homing.retract_speed, self._accel(axis, rails[0]))
         await SingleMove(self._machine, ramp, ratio_of(axis, direction)).run()
 
-    def _accel(self, axis: str) -> float:
+    def _accel(self, axis: str, rail: "RailDescription") -> float:
         limits = self._described.limits
-        return min(limits.max_accel, limits.max_z_accel) if axis == "z" else limits.max_accel
+        most = min(limits.max_accel, limits.max_z_accel) if axis == "z" else limits.max_accel
+        return min(most, rail.homing.accel or most)
 
     # ------------------------------------------------------------------------------------------- endstops
 

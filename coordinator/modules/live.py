@@ -63,6 +63,10 @@ class Live:
         self._timers.add(timer)
         return timer.end
 
+    def save(self, section: str, option: str, text: str) -> None:
+        """Have SAVE_CONFIG write a value that was calibrated; raises SaveError for a text that it cannot."""
+        self.machine.unsaved.put(section, option, text)
+
     def stop(self, cause: str) -> None:
         """Stop the whole machine for safety: CAUSE is a sentence with what to do."""
         self.machine.stop(cause)

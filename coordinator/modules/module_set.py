@@ -12,6 +12,8 @@ from coordinator.machine.problem import ConfigError, Place
 from coordinator.modules.base import Build, Device, Module, Value
 from coordinator.modules.homing import Homing
 from coordinator.modules.motor_power import MotorPower
+from coordinator.modules.save_config import SaveConfig
+from nodes.errors import CanductorError
 from nodes.node_config import NodeConfig
 from nodes.records import record
 
@@ -50,6 +52,25 @@ class ModuleSources:
         return built
 
 
+@contextlib.contextmanager
+def _blamed(kind: type[Module], place: Place) -> Iterator[None]:
+    """Tell the user whose module it was that raised what it must not; a bug of our own stays one."""
+    try:
+        yield
+    except CanductorError:
+        raise
+    except Exception as error:
+        if kind.__module__.partition(".")[0] == "coordinator":
+            raise
+        sentence = (
+            f"the module {kind.__module__}.{kind.__name__} failed: {type(error).__name__}: {error}; update or"
+            " remove its package"
+        )
+        if place.path:
+            raise ConfigError(place, sentence) from error
+        raise CanductorError(sentence) from error  # it has no section of its own
+
+
 class ModuleSet:
     """The modules, by the names of their sections; also what they are to each other."""
 
@@ -57,19 +78,22 @@ class ModuleSet:
         self.pins = pins
         self._machine = machine
         self._modules: list[Module] = []
+        self._places: dict[Module, Place] = {}
         self._devices: dict[str, list[Device]] = {}
         self._commands: dict[str, GCodeCommand] = {}
         self._owners: dict[str, str] = {}
         self._live: Live | None = None
         self._homing = self.shared(Homing)
         self._motors = self.shared(MotorPower)
+        self.shared(SaveConfig)
 
     def build(self, source: ModuleSource) -> Module:
         """Make the module of SOURCE; raises ConfigError."""
         build = Build(
             source.section, source.kind.SPEC, self.pins, self._machine, whole=source.whole, share=self._share
         )
-        module = source.kind(build)
+        with _blamed(source.kind, source.section.place):
+            module = source.kind(build)
         build.reader.finish()
         self._add(module, build)
         return module
@@ -89,6 +113,7 @@ class ModuleSet:
 
     def _add(self, module: Module, build: Build) -> None:
         self._modules.append(module)
+        self._places[module] = build.place
         for node, device in build.devices:
             self._devices.setdefault(node, []).append(device)
         for command in build.commands:
@@ -103,7 +128,8 @@ class ModuleSet:
     def link(self) -> None:
         """Let them find each other; raises ConfigError."""
         for module in self._modules:
-            module.link(self)
+            with _blamed(type(module), self._places[module]):
+                module.link(self)
 
     # ---------------------------------------------------------------------------------------- looking up
 
@@ -154,7 +180,8 @@ class ModuleSet:
         """Let all begin to act, then tell them that the machine is ready; raises CanductorError."""
         self._live = live
         for module in self._modules:
-            await module.connect(live)
+            with _blamed(type(module), self._places[module]):
+                await module.connect(live)
         for module in self._modules:
             module.ready()
 

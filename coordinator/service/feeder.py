@@ -138,6 +138,12 @@ class Feeder:
         if (resting := ticket.resting) is not None:
             resting.cancelled = True
 
+    def cancel_all(self) -> None:
+        """End what is being done and what waits, each before its next line."""
+        now = self._now
+        for ticket in (*self._waiting, *([now] if now is not None else [])):
+            self.cancel(ticket)
+
     def close(self) -> None:
         """End: ``step`` answers End once all is planned."""
         self._closed = True

@@ -112,6 +112,8 @@ class MachineService:
         self._record = record
         self._figures = Figures(state)
         self._restart = asyncio.Event()
+        self._reset_nodes = False
+        """At the next start, whatever their configuration."""
         self._asked_to_stop: str | None = None
         """By somebody, while there was no machine yet."""
 
@@ -144,8 +146,14 @@ class MachineService:
         try:
             description = await asyncio.to_thread(self._load)
             machine = self.machine = Machine(
-                description, self.host, on_notice=lambda text: self.log.add("notice", text), cache=self._cache
+                description,
+                self.host,
+                on_notice=lambda text: self.log.add("notice", text),
+                cache=self._cache,
+                reset_nodes=self._reset_nodes,
+                prepare_restart=self._prepare_restart,
             )
+            self._reset_nodes = False
             if self._asked_to_stop is not None:
                 machine.stop(self._asked_to_stop)
             await machine.start()
@@ -216,16 +224,30 @@ class MachineService:
         if self.motion is not None:
             self._stopped(self.machine)
 
-    def restart(self) -> None:
-        """Begin anew, nodes and configuration too; raises ApiError while the machine starts or works."""
+    def restart(self, *, firmware: bool = False) -> None:
+        """Begin anew with the configuration read again; raises ApiError while the machine starts or works.
+
+        Nodes are configured anew where they have to be; with FIRMWARE all are reset.
+        """
         if self.state is ServiceState.STARTUP:
             raise ApiError("busy", "the machine is starting already")
         if self.state not in (ServiceState.SHUTDOWN, ServiceState.ERROR):
             motion = self.ready_motion()
             if motion.feeder.busy or not motion.standing:
                 raise ApiError("busy", "the machine moves; wait until it stands, or cancel the job first")
-            motion.finish()
+        self._begin_anew(firmware)
+
+    def _begin_anew(self, firmware: bool) -> None:
+        self._reset_nodes = firmware
         self._restart.set()
+        if self.motion is not None:
+            self.motion.finish_early()
+
+    def _prepare_restart(self) -> Callable[[bool], None]:
+        """Return what a program begins anew with, as its last act; raises ApiError in a job."""
+        if self.active_job is not None:
+            raise ApiError("busy", "a job prints; wait for its end, or cancel it with job.cancel")
+        return self._begin_anew
 
     def start_job(self, work: FileWork) -> JobRun:
         """Print; raises ApiError unless the machine is ready and idle."""

@@ -48,8 +48,8 @@ def machine_methods(service: MachineService) -> Iterator[Method]:
         service.emergency_stop(shown(params["who"] or caller.name))
         return _state(service)
 
-    def restart(_caller: Caller, _params: dict[str, Any]) -> Value:
-        service.restart()
+    def restart(_caller: Caller, params: dict[str, Any]) -> Value:
+        service.restart(firmware=params["firmware"])
         return _state(service)
 
     def tail(_caller: Caller, params: dict[str, Any]) -> Value:
@@ -91,8 +91,17 @@ def machine_methods(service: MachineService) -> Iterator[Method]:
     yield Method(
         "machine.restart",
         Scope.OPERATE,
-        "Read the configuration and start the nodes anew, after a stop, an error, or when idle.",
+        "Read the configuration and start the machine anew, after a stop, an error, or when idle.",
         restart,
+        params=(
+            Param(
+                "firmware",
+                Kind.BOOL,
+                "reset all nodes, also those whose configuration is the same",
+                required=False,
+                default=False,
+            ),
+        ),
         returns=_STATES,
     )
     yield Method(

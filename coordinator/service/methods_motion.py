@@ -9,7 +9,7 @@ from coordinator.gcode.errors import GCodeError
 from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
 from coordinator.service.feeder import FeederFull, Ticket
 from coordinator.service.figures import axes, position_figures
-from coordinator.service.machine_service import MachineService
+from coordinator.service.machine_service import MachineService, ServiceState
 from coordinator.service.motion import Motion, MotionOver, texts
 from coordinator.service.work import (
     ASIDE,
@@ -26,6 +26,8 @@ from coordinator.service.work import (
 from nodes.errors import CanductorError
 
 _DEFAULT_SPEED_MM_S: Final = 25.0
+RESTARTS: Final = {"RESTART": False, "FIRMWARE_RESTART": True}
+"""Commands that also a machine that stopped takes, and whether the nodes are reset."""
 _DISTANCE_MAX_MM: Final = 1e6
 _STEPS_KEPT_S: Final = 0.2
 """What nodes told of their steppers is told again for so long: clients cannot load a bus by asking."""
@@ -54,21 +56,37 @@ _TOLD: Final = (
 )
 
 
+async def _run(service: MachineService, params: dict[str, Any]) -> Value:
+    lines = _lines(params["script"])
+    names = _commands(lines)
+    if EMERGENCY in names:
+        service.emergency_stop(f"{EMERGENCY} of a client")
+        return {"replies": [], "notices": []}
+    if _restarted(service, names):
+        return {"replies": [], "notices": []}
+    work = LinesWork(lines, rest=Rest.STANDSTILL if params["wait"] else Rest.OPEN)
+    motion = service.ready_motion()
+    if service.active_job is None:
+        return _answer(await _done(service, motion, work))
+    _check_aside(lines)
+    return _answer(await _done(service, motion, work, aside=True))
+
+
+def _restarted(service: MachineService, names: list[str]) -> bool:
+    """Begin anew if that is all that a machine which stopped is asked for; return whether it was."""
+    over = service.state in (ServiceState.SHUTDOWN, ServiceState.ERROR)
+    if not over or len(names) != 1 or names[0] not in RESTARTS:
+        return False
+    service.restart(firmware=RESTARTS[names[0]])
+    return True
+
+
 def motion_methods(service: MachineService) -> Iterator[Method]:
     """Return them."""
     steps = _StepsOfNodes(service)
 
     async def run(_caller: Caller, params: dict[str, Any]) -> Value:
-        lines = _lines(params["script"])
-        if EMERGENCY in _commands(lines):
-            service.emergency_stop(f"{EMERGENCY} of a client")
-            return {"replies": [], "notices": []}
-        work = LinesWork(lines, rest=Rest.STANDSTILL if params["wait"] else Rest.OPEN)
-        motion = service.ready_motion()
-        if service.active_job is None:
-            return _answer(await _done(service, motion, work))
-        _check_aside(lines)
-        return _answer(await _done(service, motion, work, aside=True))
+        return await _run(service, params)
 
     async def move_to(_caller: Caller, params: dict[str, Any]) -> Value:
         return await _move(service, params, relative=False)

@@ -75,6 +75,11 @@ class Motion:
         """End at the next standstill."""
         self.feeder.close()
 
+    def finish_early(self) -> None:
+        """End without another line of what is being done, or waits."""
+        self.feeder.cancel_all()
+        self.feeder.close()
+
     # ------------------------------------------------------------------------------------------- doing
 
     async def do(self, work: Work) -> Ticket:

@@ -5,6 +5,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from coordinator.demo.expected import Floats, Ints
 from coordinator.host import Port as HostPort
@@ -215,6 +216,10 @@ class Stage:
     def clock_hz(self, node: str) -> int:
         """Return the nominal frequency of NODE's clock."""
         return self._boards[node].clock_hz
+
+    def edges(self, node: str) -> npt.NDArray[Any]:
+        """Return what NODE's pins did so far: ``pin``, ``level`` and ``true_ps`` of each change."""
+        return self._boards[node].node.edges()
 
     def pins(self, node: str) -> dict[str, int]:
         """Return the numbers of NODE's pins."""

@@ -55,6 +55,10 @@ MATRIX: dict[str, tuple[str, dict[str, Any], str]] = {
     "buses.list": ("watch", {}, "result"),
     "node.command": ("admin", {"node": "mcu", "command": "get_uptime", "response": "uptime"}, "result"),
     "motion.dump": ("watch", {"seconds": 0.1}, "result"),
+    "motion.path": ("watch", {}, "result"),
+    "table.status": ("watch", {}, "result"),
+    "table.send": ("operate", {"x": 1}, "bad_params"),
+    "table.remove": ("operate", {"x": 1}, "bad_params"),
 }
 """By method: the scope that it needs, what to call it with, and what it answers to one who may."""
 

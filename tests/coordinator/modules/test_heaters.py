@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.words import WordError
+from coordinator.machine.check import check_config
 from nodes.errors import CanductorError
 from tests.coordinator.modules.heat_stage import BED, FAN, HOTEND_PID, HeatMachine
 
@@ -53,18 +54,29 @@ def test_a_bed_by_watermark_and_lost_frames(tmp_path: Path) -> None:
 def test_pid_calibration_gives_constants_that_hold(tmp_path: Path) -> None:
     stage = HeatMachine(tmp_path, HOTEND_PID.replace("22.2", "1.0"), hurry=4)
 
+    saved: list[str] = []
+
     async def main() -> None:
         replies = await stage.do("PID_CALIBRATE HEATER=extruder TARGET=210")
         assert [line.partition(":")[0] for line in replies[1:]] == ["control", "pid_kp", "pid_ki", "pid_kd"]
         assert stage.status("extruder")["target"] == 0
         kept = stage.status("heaters")["calibrated"]
         assert kept == {"extruder": dict(line.split(": ") for line in replies[1:])}
+        assert stage.status("configfile")["save_config_pending_items"] == kept
+        (told,) = await stage.do("SAVE_CONFIG")
+        path, _, rest = told.removeprefix("saved into ").partition("; ")
+        assert rest == "it counts from the next start on", "nobody restarts this machine"
+        saved.append(path)
+        with pytest.raises(CanductorError, match="cannot begin anew; start the command again"):
+            await stage.do("RESTART")
         await stage.do("M109 S210")
         await asyncio.sleep(15)
         low, high = await stage.true_range(10)
         assert 209 < low <= high < 211
 
     stage.run(main)
+    assert "\n#*# [extruder]\n#*# control = pid\n#*# pid_kp = " in Path(saved[0]).read_text()
+    assert not check_config(saved[0])
 
 
 def test_mpc_calibration_finds_the_plant(tmp_path: Path) -> None:
