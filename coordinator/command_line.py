@@ -232,6 +232,7 @@ def _declare_demo(command: argparse.ArgumentParser) -> None:
     add("--rate-ppm", action="append", metavar="NAME=X", help="a node's clock error in ppm")
     add("--start-clock", action="append", metavar="NAME=N", help="a node's clock at its start, in ticks")
     add("--keep", type=Path, metavar="DIR", help="keep step logs here")
+    add("--cold", action="store_true", help="let the heaters begin cold; they take their time, as real ones")
     add("--serve", action="store_true", help="keep the virtual machine up for front ends instead of printing")
     add(
         "--socketcan",
@@ -258,6 +259,7 @@ def _demo(given: argparse.Namespace) -> Job:
         rate_ppm=assignments("--rate-ppm", given.rate_ppm, _ppm),
         start_clock=assignments("--start-clock", given.start_clock, _ticks),
         keep=given.keep,
+        cold=given.cold,
         serve=read_serving(given, machine, announce=False) if given.serve else None,
         socketcan=_interfaces(given.socketcan),
     )

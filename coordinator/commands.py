@@ -85,6 +85,8 @@ class DemoOptions:
     """By node: how much faster its clock runs than nominal."""
     start_clock: Mapping[str, int] = field(default_factory=dict)
     """By node: ticks its clock shows when the node starts."""
+    cold: bool = False
+    """The heaters begin cold; else as warm as some minutes after a print."""
     serve: ServeOptions | None = None
     """Serve the virtual machine to front ends instead of printing."""
     keep: Path | None = None

@@ -51,6 +51,8 @@ class HeatSettings:
     """Of sensors by their `sensor_type`, before those known here; see `table_of`."""
     hurry: float = 1.0
     """Capacities are divided by this: 10 warms up in a tenth of the time, to where it would anyway."""
+    warm_c: Mapping[str, float] = field(default_factory=dict)
+    """How warm heated things begin, by the first word of their sections; others are as warm as the air."""
 
 
 @record(kw_only=True)
@@ -174,11 +176,14 @@ class _Maker:
     def _add_heated(self, section: RawSection, name: str, pin: PinDescription) -> None:
         thing = _thing(section)
         heat, hurry = self._heat[pin.node], self._settings.hurry
-        heat.bodies.append(Body(name=name, capacity=thing.capacity / hurry, loss=thing.loss))
+        warm_c = self._settings.warm_c.get(section.kind)
+        heat.bodies.append(Body(name=name, capacity=thing.capacity / hurry, loss=thing.loss, start=warm_c))
         into = name
         if thing.heater_capacity:
             into = f"{name}_heater"
-            heat.bodies.append(Body(name=into, capacity=thing.heater_capacity / hurry, loss=0.0))
+            heat.bodies.append(
+                Body(name=into, capacity=thing.heater_capacity / hurry, loss=0.0, start=warm_c)
+            )
             heat.couples.append(Couple(a=into, b=name, conductance=thing.contact))
         heat.heaters.append(
             Heater(name=name, pin=pin.name, body=into, power=thing.power, inverted=pin.invert)

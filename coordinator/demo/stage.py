@@ -12,6 +12,7 @@ from typing import Any, Self
 
 from coordinator.commands import DemoOptions
 from coordinator.demo.plant import PlantSettings, machine_plants, start_point
+from coordinator.demo.plant_heat import HeatSettings
 from coordinator.machine.description import (
     CanConnection,
     MachineDescription,
@@ -33,8 +34,18 @@ RATES_PPM = (-20.0, 60.0, -110.0, 35.0)
 ROLLOVER_AFTER_S = (1000.0, 20.0, 10.0, 35.0)
 """When the nodes' 32-bit clocks roll over: offsets that make some do it during the demo."""
 JITTER_US = 40
+WARM_C = {"heater_bed": 52.0, "extruder": 190.0}
+"""How warm a machine is that has printed a few minutes ago."""
 START_MM = 8.0
 """How far from where homing leaves it the head begins."""
+
+
+def _plant_settings(description: MachineDescription, options: DemoOptions) -> PlantSettings:
+    return PlantSettings(
+        seed=options.seed + 1,
+        start=start_point(description, START_MM),
+        heat=HeatSettings(warm_c={} if options.cold else WARM_C),
+    )
 
 
 class Stage:
@@ -53,9 +64,7 @@ class Stage:
         self.processes: dict[str, NodeProcess] = {}
         self._stack = ExitStack()
         self._described = description
-        self._plants = machine_plants(
-            description, PlantSettings(seed=options.seed + 1, start=start_point(description, START_MM))
-        )
+        self._plants = machine_plants(description, _plant_settings(description, options))
         self.description = dataclasses.replace(
             description, nodes=tuple(self._virtual(node) for node in description.nodes)
         )

@@ -58,7 +58,8 @@ def test_the_example_is_planned(tmp_path: Path, path: Path) -> None:
     rails = dict(zip(machine.kinematics.step_functions(), travelled(machine, way), strict=False))
     for stepper in machine.motors:
         expected = rails.get(stepper.function, 0.0) / stepper.step_distance  # a parked carriage: 0
-        assert made[stepper.name] == pytest.approx(expected, abs=2 + 2 * len(way)), stepper.name
+        rounding = 2 + 2 * len(way) + (1e-3 * expected if machine.shapers else 0)  # shaped corners are cut
+        assert made[stepper.name] == pytest.approx(expected, abs=rounding), stepper.name
     assert machine.extruder is not None
     assert made["extruder"] == pytest.approx(10 / machine.extruder.stepper.step_distance, abs=1)
     assert all(made[e.name] == 0 for e in machine.extruders[1:])
