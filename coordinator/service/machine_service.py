@@ -5,7 +5,6 @@ One object owns it. All of it runs on the control loop; clients' methods only ch
 
 import asyncio
 import contextlib
-import gc
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,6 +24,7 @@ from coordinator.service.figures import Figures
 from coordinator.service.job_folder import JobFolder
 from coordinator.service.jobs import JobPhase, JobRun
 from coordinator.service.log_ring import Entry, LogRing
+from coordinator.service.memory import give_back, pass_by_what_stays
 from coordinator.service.motion import Motion
 from coordinator.service.tables import TableService
 from coordinator.service.work import FileWork
@@ -175,7 +175,7 @@ class MachineService:
                 compensation=compensation,
             )
             if self.settings.own_process:
-                _pass_by_what_stays()
+                pass_by_what_stays()
             self._enter(ServiceState.READY)
             await self.motion.run()
         except CanductorError as error:
@@ -307,6 +307,8 @@ class MachineService:
             job.look(self.now_s)
             if job.phase is not before:
                 self.log.add("job", f"{job.file}: {job.phase}" + (f": {job.message}" if job.message else ""))
+                if not job.active and self.settings.own_process:
+                    give_back()
         if self.motion is None or self.state in (ServiceState.SHUTDOWN, ServiceState.ERROR):
             return
         held = self.motion.streamer.held
@@ -333,13 +335,3 @@ class MachineService:
                 for _ in self._figures.parts(self):
                     await asyncio.sleep(0)
             await asyncio.sleep(REFRESH_S)
-
-
-def _pass_by_what_stays() -> None:
-    """Have the garbage collector look no more at what there is by now: it held the loop up for 30 to 50 ms.
-
-    What a machine before this one left goes first.
-    """
-    gc.unfreeze()
-    gc.collect()
-    gc.freeze()
