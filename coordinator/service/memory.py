@@ -17,7 +17,7 @@ def pass_by_what_stays() -> None:
 def give_back() -> None:
     """Return to the system what is free: after many messages of all sizes the allocator keeps pieces of it.
 
-    It takes milliseconds, so it is for a machine that stands. Only glibc knows how; elsewhere nothing happens.
+    It takes milliseconds: for a machine that stands. Only glibc knows how; elsewhere nothing happens.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
