@@ -239,8 +239,9 @@ NOT_SHOWN: Final = {
     "position": ("planned", "gcode", "origin"),  # seconds ahead of where the machine is
     "nodes": ("name", "bus", "nodeid", "state_text", "failure"),
     "buses": ("name",),
+    "modules": ("*",),  # each kind of module has fields of its own
 }
-"""Fields of the state tree that are no metrics; of the nodes' and buses', some are labels."""
+"""Fields of the state tree that are no metrics, * for all; of the nodes' and buses', some are labels."""
 
 
 def full_name(metric: Metric) -> str:

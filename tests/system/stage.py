@@ -60,7 +60,7 @@ class Ended:
         """Return the one sentence the command failed with, having checked that it is only one."""
         assert "Traceback" not in self.stdout + self.stderr
         assert self.status == status, self
-        lines = self.stderr.splitlines()
+        lines = [line for line in self.stderr.splitlines() if not line.startswith("printing ")]
         assert len(lines) == 1, lines
         assert lines[0].startswith("canductor: ")
         return lines[0].removeprefix("canductor: ")

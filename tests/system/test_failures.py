@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from tests.system.stage import LONG, Command, Ended, Hardware, write_gcode
+from tests.system.stage import LONG, Command, Ended, Hardware, write_config, write_gcode
 
 MOVING = "taken as already home"
 """Said once the machine is ready and the job has begun."""
@@ -27,7 +27,8 @@ def test_a_start_ended_by_the_user_ends_at_once(
     machine: Hardware, number: signal.Signals, status: int
 ) -> None:
     machine.nodes["mcu"].kill()  # so that the start cannot come to its end before the signal
-    with Command("run", machine.config) as command:
+    config = write_config(machine.folder, name="more.cfg", **{"[fan]": "[bed_screws]\n\n[fan]"})
+    with Command("run", config) as command:
         command.stdout.wait_for("not yet acting")
         command.signal(number)
         ended = command.end()

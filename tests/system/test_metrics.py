@@ -139,5 +139,7 @@ def forgotten(state: dict[str, Any]) -> set[str]:
     return {
         f"{prefix}.{field}"
         for prefix, field in left
-        if field not in labels and not (prefix == "buses" and field.startswith("load_"))
+        if field not in labels
+        and not (prefix == "buses" and field.startswith("load_"))
+        and (prefix, "*") not in known
     }

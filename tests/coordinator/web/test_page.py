@@ -123,6 +123,8 @@ PAINTED = """(canvas) => {
 @pytest.mark.usefixtures("printing")
 def test_the_toolpath_from_above_and_turned(browser: Browser, machine: Demo, visitor: Visitor) -> None:
     tab = visitor
+    tab.until("document.getElementById('speed').textContent > '0.0'")  # homed, and hot
+    tab.until("document.getElementById('job-row').textContent.match(/^[1-9]/)")
     canvas = tab.page.locator("#path")
     tab.page.wait_for_function(PAINTED, arg=canvas.element_handle(), timeout=PATIENCE_MS)
     tab.page.get_by_role("button", name="Pause").click()
