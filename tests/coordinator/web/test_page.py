@@ -171,7 +171,7 @@ def test_the_toolpath_from_above_and_turned(browser: Browser, machine: Demo, vis
     late.visit()
     while not points:
         late.page.wait_for_timeout(50)
-    assert points[0] > 20
+    assert points[0] > 5
     late.close()
     tab.page.get_by_role("button", name="Resume").click()
     tab.until_text("state", "printing")
