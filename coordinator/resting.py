@@ -15,6 +15,7 @@ class RestTask:
 
     def __init__(self, event: Resting) -> None:
         self._event = event
+        self._is_ending = False
         self._task = asyncio.ensure_future(_performed(event.perform()))
 
     def look(self) -> bool:
@@ -23,7 +24,8 @@ class RestTask:
         Raises what performing it raised, but for a CanductorError, which the program gets. Whoever failed or
         was ended on the way may have moved something.
         """
-        if self._event.cancelled:
+        if self._event.cancelled and not self._is_ending:
+            self._is_ending = True  # asked once: a second time would interrupt its tidying up
             self._task.cancel()
         if not self._task.done():
             return False

@@ -1,0 +1,71 @@
+"""What is performed at rest: ended on its way it tidies up undisturbed; the program hears what became of it."""
+
+import asyncio
+
+import pytest
+
+from coordinator.gcode.commands import Done
+from coordinator.gcode.events import Resting
+from coordinator.resting import RestTask
+from nodes.errors import CanductorError
+
+
+async def look_until_over(task: RestTask) -> None:
+    for _ in range(100):
+        if task.look():
+            return
+        await asyncio.sleep(0)
+    raise AssertionError
+
+
+def test_what_is_ended_tidies_up_though_it_is_looked_at_meanwhile() -> None:
+    steps: list[int] = []
+
+    async def perform() -> Done:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            for step in range(5):  # such as stopping one node after the other
+                await asyncio.sleep(0)
+                steps.append(step)
+        raise AssertionError
+
+    async def go() -> Resting:
+        event = Resting(1, 0.0, perform, Done(("planned",)))
+        task = RestTask(event)
+        await asyncio.sleep(0)
+        event.cancelled = True
+        await look_until_over(task)
+        return event
+
+    event = asyncio.run(go())
+    assert steps == [0, 1, 2, 3, 4]
+    assert (event.over, event.moved, event.done, event.failure) == (True, True, None, "")
+
+
+def test_what_fails_is_told_and_may_have_moved() -> None:
+    async def perform() -> Done:
+        raise CanductorError("no switch")
+
+    async def go() -> Resting:
+        event = Resting(1, 0.0, perform, None)
+        await look_until_over(RestTask(event))
+        return event
+
+    event = asyncio.run(go())
+    assert (event.over, event.moved, event.done, event.failure) == (True, True, None, "no switch")
+
+
+@pytest.mark.parametrize("done", [Done(("hot",)), Done(moved=True), None])
+def test_what_is_done_is_kept(done: Done | None) -> None:
+    async def perform() -> Done | None:
+        return done
+
+    async def go() -> Resting:
+        event = Resting(1, 0.0, perform, None)
+        await look_until_over(RestTask(event))
+        return event
+
+    event = asyncio.run(go())
+    assert event.done == (done or Done())
+    assert event.moved is (done is not None and done.moved)
