@@ -1,4 +1,4 @@
-"""What is performed at rest: ended on its way it tidies up undisturbed; the program hears what became of it."""
+"""What is performed at rest: ended on its way it tidies up undisturbed; the program hears what became."""
 
 import asyncio
 
