@@ -1,7 +1,6 @@
 """Asking a live bus who is there: drives the census on an open bus, and options common to those who ask."""
 
 import argparse
-import asyncio
 from typing import Final
 
 from canbus_tools.census import ROUNDS, Census, CensusResult
@@ -28,10 +27,12 @@ async def take_census(bus: BusTalk, rounds: int = ROUNDS) -> CensusResult:
         census.frame(frame.can_id, frame.data)
 
     raise_later: list[CanductorError] = []
-    loop = asyncio.get_running_loop()
     end = bus.on_frame(came)
     try:
-        census.start(_ns(loop.time()))
+        # By a clock of its own, of the time that was waited: what this computer overslept beyond that, the
+        # nodes' answers may have had to wait, too.
+        now_ns = 0
+        census.start(now_ns)
         while census.deadline_ns is not None and not raise_later:
             try:
                 for frame in census.frames_to_send():
@@ -39,8 +40,9 @@ async def take_census(bus: BusTalk, rounds: int = ROUNDS) -> CensusResult:
             except CanductorError:
                 await bus.wait(_CAUSE_S)  # which raises what ended the bus, and that tells more
                 raise
-            await bus.wait(max(0.0, census.deadline_ns * 1e-9 - loop.time()))
-            census.timer(max(_ns(loop.time()), census.deadline_ns))
+            await bus.wait((census.deadline_ns - now_ns) * 1e-9)
+            now_ns = census.deadline_ns
+            census.timer(now_ns)
     finally:
         end()
     if raise_later:
@@ -76,7 +78,3 @@ def where(options: BusOptions) -> str:
     """Return the options of a command line that name the bus."""
     interface = "" if options.interface == "socketcan" else f"-i {options.interface} "
     return f"{interface}-c {options.channel}"
-
-
-def _ns(loop_time_s: float) -> int:
-    return round(loop_time_s * 1e9)

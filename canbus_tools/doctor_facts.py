@@ -29,11 +29,14 @@ from canbus_tools.survey import PROBED, State, SurveyResult, survey
 from canbus_tools.talk import BusTalk
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.errors import CanductorError
+from nodes.link import LinkStats
 
 ASKED: Final = 100
 """Questions to each node."""
 PING_S_MAX: Final = 5.0
 """For one node; a bus that loses much makes every question take long."""
+LATE_S: Final = 0.2
+"""For late answers to the last questions."""
 TRIED_BITRATES: Final = (1_000_000, 500_000, 250_000, 125_000)
 _SYS_NET: Final = Path("/sys/class/net")
 _ARPHRD_CAN: Final = "280"
@@ -262,17 +265,24 @@ async def _ping(bus: BusTalk, nodeid: int) -> PingFacts:
             asked_s = loop.time()
             await talk.ask(*question)
             trips.add(loop.time() - asked_s)
+        if _lost(before, talk.stats):
+            await bus.wait(LATE_S)
         stats = talk.stats
-    late = stats.acks_duplicate - before.acks_duplicate + stats.naks - before.naks
     return PingFacts(
         nodeid=nodeid,
-        lost=max(0, stats.timeouts - before.timeouts - late),
+        lost=_lost(before, stats),
         asked=trips.count,
         repeats=stats.blocks_repeated - before.blocks_repeated,
         invalid_bytes=stats.bytes_invalid - before.bytes_invalid,
         rtt_median_s=trips.quantile_s(0.5),
         rtt_p99_s=trips.quantile_s(0.99),
     )
+
+
+def _lost(before: LinkStats, after: LinkStats) -> int:
+    """Return the time-outs to which no late answer came."""
+    late = after.acks_duplicate - before.acks_duplicate + after.naks - before.naks
+    return max(0, after.timeouts - before.timeouts - late)
 
 
 def try_bitrates(options: BusOptions, listen_s: float) -> dict[int, int]:

@@ -28,8 +28,8 @@ PROBED: Final = range(FIRST_NODEID, 68)
 """Hosts hand out 4, 5, 6, …; ids beyond are tried when something was heard from them, or when asked for."""
 DAMAGED_BLOCK: Final = b"\x05\x10\x00\x00\x7e\x7e"
 """An empty block with a wrong checksum; the second sync byte ends it for parsers that look for one behind."""
-PROBE_PASSES: Final = 2
-"""Frames get lost."""
+PROBE_PASSES: Final = 3
+"""Frames get lost; of nodes that a census does not know one answer is all there is."""
 PROBES_AT_ONCE: Final = 4
 PROBE_PAUSE_S: Final = 0.002
 """Between so many: a fifth of the bus at 1 Mbit/s, all of it for 40 ms at 250 kbit/s."""
@@ -111,10 +111,12 @@ async def survey(
     answering = await probe(bus, candidates)
     hosted = frozenset(bus.hosted)
     shared = _shared_ids(census)
-    asked = sorted(answering - hosted - shared)
+    # Who said that it is here is asked even when no probe was answered: an interview asks again and again.
+    asked = sorted((answering | here) - hosted - shared)
     facts = dict(zip(asked, await _interview_all(bus, asked), strict=True))
-    entries = [_assigned(nodeid, facts[nodeid], census) for nodeid in asked]
-    entries += [_not_asked(node, hosted, shared) for node in census.here if node.nodeid not in facts]
+    silent = {n for n in here - answering if isinstance(facts.get(n), CanductorError)}
+    entries = [_assigned(n, facts[n], census, silent=n in silent) for n in asked]
+    entries += [_not_asked(node, shared) for node in census.here if node.nodeid not in facts]
     entries += [_hosted(nodeid, answers=nodeid in bus.talking) for nodeid in sorted(hosted - here)]
     entries.sort(key=lambda entry: (entry.nodeid or 0, entry.uuid.raw if entry.uuid else b""))
     entries += [_waiting(node) for node in await _still_waiting(bus, census, {e.uuid for e in entries})]
@@ -215,14 +217,13 @@ def _shared_ids(census: CensusResult) -> frozenset[int]:
     return frozenset(twins | {nodeid for nodeid, count in boards.items() if count > 1})
 
 
-def _assigned(nodeid: int, said: Facts | CanductorError, census: CensusResult) -> Entry:
+def _assigned(nodeid: int, said: Facts | CanductorError, census: CensusResult, *, silent: bool) -> Entry:
     ours = next((node for node in census.here if node.nodeid == nodeid), None)
     application = Application.CANDUCTOR if ours else Application.KLIPPER
     if isinstance(said, CanductorError):
         uuid = ours.uuid if ours else None
-        return Entry(
-            nodeid=nodeid, uuid=uuid, application=application, state=State.UNCLEAR, trouble=str(said)
-        )
+        trouble = "it says that it is here, but does not answer on its id" if silent else str(said)
+        return Entry(nodeid=nodeid, uuid=uuid, application=application, state=State.UNCLEAR, trouble=trouble)
     uuid = said.uuid or (ours.uuid if ours else None)
     trouble = "" if said.configured is not None else "its firmware does not tell whether it is configured"
     if said.believed_nodeid not in (None, nodeid):
@@ -244,22 +245,17 @@ def _state(facts: Facts) -> State:
     return State.CONFIGURED if facts.configured else State.IDLE
 
 
-def _not_asked(node: NodeHere, hosted: frozenset[int], shared: frozenset[int]) -> Entry:
-    """Our firmware that said that it is here, and was not talked to or did not answer."""
-    state, trouble = State.UNCLEAR, ""
-    if node.nodeid in shared:
-        trouble = "more than one board has this id; switch them off and on, and let only one host assign ids"
-    elif node.nodeid in hosted:
-        state = State.IN_USE
-    else:
-        trouble = "it says that it is here, but does not answer on its id"
+def _not_asked(node: NodeHere, shared: frozenset[int]) -> Entry:
+    """Our firmware that said that it is here, and has a host or shares its id."""
+    both = "more than one board has this id; switch them off and on, and let only one host assign ids"
+    is_shared = node.nodeid in shared
     return Entry(
         nodeid=node.nodeid,
         uuid=node.uuid,
         application=Application.CANDUCTOR,
-        state=state,
+        state=State.UNCLEAR if is_shared else State.IN_USE,
         twins=node.twins,
-        trouble=trouble,
+        trouble=both if is_shared else "",
     )
 
 

@@ -22,6 +22,7 @@ from nodes.identify import identify
 from nodes.link import Frame, LinkIO, LinkSettings, LinkStats, Response
 from nodes.message_format import Message, Value
 from nodes.node_errors import NodeLost
+from nodes.seams import LinkLike
 from nodes.transport import CanTransport
 from nodes.transport.python_can_bridge import PythonCanBridge
 from nodes.transport.socketcan import SocketCanTransport
@@ -29,7 +30,11 @@ from nodes.transport.virtual import VirtualTransport
 
 LISTEN_S: Final = 1.2
 """How long a node's id must be silent before it is talked to; hosts ask for clocks every 0.98 s."""
-LOST_AFTER_S: Final = 1.0
+LOST_AFTER_S: Final = 2.0
+ASK_TRIES: Final = 2 * QUERY_TRIES
+"""Tools ask where frames get lost; that a node is not there the link tells sooner."""
+PIECE_S: Final = 0.01
+"""Waits are cut into such: a computer that gives turns late, to whoever is waited for too, spoils but one."""
 GENTLE_SHARE: Final = 0.2
 """Of the time, while a host uses the bus: a dictionary read at full speed takes up to 70 % of 1 Mbit/s."""
 DATA_IDS: Final = range(0x102, 0x300)
@@ -97,6 +102,11 @@ class BusTalk:
         """How messages call the bus."""
         return self.options.name
 
+    @property
+    def io(self) -> LinkIO:
+        """For its counters."""
+        return self._io
+
     def send_frame(self, can_id: int, data: bytes) -> None:
         """Send one frame that belongs to no node's conversation; raises CanductorError."""
         self._io.send_frame(can_id, data)
@@ -108,8 +118,7 @@ class BusTalk:
 
     async def wait(self, seconds: float) -> None:
         """Let frames come for SECONDS; raises TalkError when the bus ends meanwhile."""
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._closed.wait(), seconds)
+        await _wait_for(self._closed, seconds)
         if self.closed_because is not None:
             raise TalkError(self.closed_because)
 
@@ -123,8 +132,7 @@ class BusTalk:
 
         end = self.on_frame(came)
         try:
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(heard.wait(), listen_s)
+            await _wait_for(heard, listen_s)
         finally:
             end()
         await self.wait(0)
@@ -159,6 +167,16 @@ class BusTalk:
         self._closed.set()
         for talk in self._open_nodes:
             talk.lost(sentence)
+
+
+async def _wait_for(event: asyncio.Event, seconds: float) -> None:
+    """Wait for EVENT, SECONDS at most: not by the clock, but of turns that this program had."""
+    while not event.is_set():
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(event.wait(), min(seconds, PIECE_S))
+        seconds -= PIECE_S
+        if seconds <= 0:
+            return
 
 
 class Line(Protocol):
@@ -207,6 +225,11 @@ class NodeTalk:
         return self._talk.dictionary
 
     @property
+    def link(self) -> LinkLike:
+        """The way to the node, for what is encoded already."""
+        return self._talk.link
+
+    @property
     def stats(self) -> LinkStats:
         """The link's counters: round trips, repeats, invalid bytes."""
         stats: LinkStats = self._talk.link.stats()
@@ -232,7 +255,7 @@ class NodeTalk:
         args: Mapping[str, Value | str] | None = None,
         *,
         timeout_s: float = QUERY_TIMEOUT_S,
-        tries: int = QUERY_TRIES,
+        tries: int = ASK_TRIES,
     ) -> Answer:
         """Send a command until its RESPONSE comes (``Conversation.ask``); raises CanductorError."""
         return await self._talk.ask(

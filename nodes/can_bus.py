@@ -133,6 +133,11 @@ class CanBus(BusBase):
         """Bit/s; 0 while it is not known."""
         return self.io.stats().bitrate
 
+    @property
+    def load(self) -> float:
+        """Share of the bit rate within the last second, by whomever; 0 while the bit rate is not known."""
+        return self.io.stats().load.total
+
     def nodeid(self, uuid: Uuid) -> int:
         """Return the id UUID has, or gets."""
         return self._nodeids[uuid]

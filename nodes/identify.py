@@ -18,6 +18,9 @@ from nodes.dictionary_parts import DictionaryError
 from nodes.node_errors import NodeLost
 
 IDENTIFY_PIECE: Final = 40
+PIECE_TRIES: Final = 16
+"""A piece takes seven frames, and a dictionary some sixty pieces: where one frame in twenty gets lost, with
+the tries of other queries one start in twenty would fail. Of a node that is silent the link knows sooner."""
 MAX_CANDIDATES: Final = 4
 """Dictionaries with the same beginning that are compared, at two queries each, before downloading."""
 
@@ -88,5 +91,6 @@ async def _piece(talk: Conversation, offset: int) -> bytes:
         "identify_response",
         {"offset": offset, "count": IDENTIFY_PIECE},
         matching={"offset": offset},
+        tries=PIECE_TRIES,
     )
     return answer.message.data("data")

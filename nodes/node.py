@@ -321,13 +321,24 @@ class Node:
             for command in wanted.config_commands:
                 self._talk.send_text(command)
             self._talk.send("finalize_config", crc=wanted.crc)
-            found = await get_config(self._talk)
+            found = await self._finalized()
         self._check_configured(found, wanted)
         self.move_count = found.integer("move_count")
         self._vigil = Vigil(self._talk, wanted.crc)
         for command in wanted.init_commands:
             self._talk.send_text(command)
         return True
+
+    async def _finalized(self) -> Message:
+        """Ask for the configuration state after its last command.
+
+        Answers have no numbers: where one came late and was asked for again, the others come now.
+        """
+        for _ in range(QUERY_TRIES):
+            found = await get_config(self._talk)
+            if found.integer("is_config") or found.integer("is_shutdown") or self.failure is not None:
+                break
+        return found
 
     def _check_configured(self, found: Message, wanted: NodeConfig) -> None:
         if self.failure is not None:

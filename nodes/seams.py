@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from nodes.dictionary import Dictionary
-from nodes.link import Forecast, IOStats, LinkSettings
+from nodes.link import BusLoad, Forecast, IOStats, LinkSettings
 from nodes.node_config import NodeConfig
 
 
@@ -62,6 +62,7 @@ class LinkIOLike(Protocol):
     def learn_bitrate(self, bitrate: int) -> None: ...  # noqa: D102
     def forecast(self) -> Forecast: ...  # noqa: D102
     def stats(self) -> IOStats: ...  # noqa: D102
+    def load(self) -> BusLoad: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
 
 

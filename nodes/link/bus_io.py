@@ -1,8 +1,6 @@
 """The Python skin of a bus's I/O thread (io_thread.h): links, raw frames, events in the asyncio loop."""
 
 import asyncio
-import errno
-import os
 from typing import Any, Self
 
 from nodes.link.handle import BusHandle
@@ -25,11 +23,6 @@ from nodes.link.types import (
 
 _BATCH = 512
 """Events taken from the thread in one call."""
-_ENDED_ADVICE = {
-    errno.ENETDOWN: "somebody set the interface down: set it up with 'ip link set {0} up'",
-    errno.ENODEV: "the interface is gone: plug the adapter in",
-}
-"""What a user can do about an end, by errno; {0} is the transport's name."""
 
 
 class LinkIO:
@@ -147,9 +140,17 @@ class LinkIO:
 
     def stats(self) -> IOStats:
         """Return the counters so far; after close(), the last ones."""
+        self._look()
+        return _convert(self._final, self._lib)
+
+    def load(self) -> BusLoad:
+        """Return what ``stats`` says of the bus's load, in a fraction of the time."""
+        self._look()
+        return _load(self._final, self._lib)
+
+    def _look(self) -> None:
         if self._bus.open:
             self._lib.io_get_stats(self._bus.live(), self._final)
-        return _convert(self._final, self._lib)
 
     def forecast(self) -> Forecast:
         """Return whether the queued motion will be in time; raises LinkError after close()."""
@@ -215,13 +216,11 @@ class LinkIO:
                 link.handle_lost(value)
 
     def _handle_ended(self, cause: int) -> None:
-        reason = os.strerror(cause) if cause else "its other end closed it"
-        advice = _ENDED_ADVICE.get(cause, "check cable and device").format(self.name)
-        self._bus.ended = f"{self.name}: the connection ended ({reason}); {advice}, then start again"
+        text = self._bus.ended_because(cause)
         for link in list(self._links.values()):
-            link.handle_ended(self._bus.ended)
+            link.handle_ended(text)
         if self._on_closed:
-            self._on_closed(self._bus.ended)
+            self._on_closed(text)
 
 
 _COUNTERS = (
@@ -231,21 +230,24 @@ _COUNTERS = (
 )
 
 
+def _load(raw: Any, lib: Any) -> BusLoad:
+    bits, rate = raw.recent_bits, raw.bitrate or 1
+    return BusLoad(
+        motion=bits[lib.LINK_MOTION] / rate,
+        control=bits[lib.LINK_CONTROL] / rate,
+        bulk=bits[lib.LINK_BULK] / rate,
+        acks=bits[lib.SCHEDULE_ACKS] / rate,
+        data=bits[lib.SCHEDULE_DATA] / rate,
+        weak=bits[lib.SCHEDULE_WEAK] / rate,
+    )
+
+
 def _convert(raw: Any, lib: Any) -> IOStats:
-    rate = raw.bitrate or 1
-    flows = {
-        "motion": lib.LINK_MOTION,
-        "control": lib.LINK_CONTROL,
-        "bulk": lib.LINK_BULK,
-        "acks": lib.SCHEDULE_ACKS,
-        "data": lib.SCHEDULE_DATA,
-        "weak": lib.SCHEDULE_WEAK,
-    }
     return IOStats(
         **{name: getattr(raw, name) for name in _COUNTERS},
         motion_bits=raw.sent_bits[lib.LINK_MOTION],
         control_bits=raw.sent_bits[lib.LINK_CONTROL],
         bulk_bits=raw.sent_bits[lib.LINK_BULK],
-        load=BusLoad(**{name: raw.recent_bits[number] / rate for name, number in flows.items()}),
+        load=_load(raw, lib),
         held_s=raw.held_ns * 1e-9,
     )

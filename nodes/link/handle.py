@@ -1,8 +1,16 @@
 """What a bus and its links share: the driver's C side, and the words for its refusals."""
 
+import errno
+import os
 from typing import Any
 
 from nodes.link.types import BusDriver, LinkError
+
+_ENDED_ADVICE = {
+    errno.ENETDOWN: "somebody set the interface down: set it up with 'ip link set {0} up'",
+    errno.ENODEV: "the interface is gone: plug the adapter in",
+}
+"""What a user can do about an end, by errno; {0} is the transport's name."""
 
 
 class BusHandle:
@@ -14,8 +22,6 @@ class BusHandle:
         """The transport's name, for messages."""
         self.ffi = driver.ffi
         self.lib = driver.lib
-        self.ended: str | None = None
-        """One sentence, once the transport has ended by itself."""
         self._bus: Any = driver.bus
 
     @property
@@ -34,13 +40,19 @@ class BusHandle:
         self._bus = None
         self._driver.close()
 
+    def ended_because(self, cause: int) -> str:
+        """Return one sentence for a transport that ended by itself; CAUSE is an errno, or 0."""
+        reason = os.strerror(cause) if cause else "its other end closed it"
+        advice = _ENDED_ADVICE.get(cause, "check cable and device").format(self.name)
+        return f"{self.name}: the connection ended ({reason}); {advice}, then start again"
+
     def check(self, status: int, where: str) -> None:
         """Raise LinkError for what can happen to any call."""
         if status == self.lib.IO_OK:
             return
         if status == self.lib.IO_CLOSED:
-            # The driver may know before the notice has come through the loop.
-            raise LinkError(self.ended or f"{self.name}: the transport has just failed; open it again")
+            # The driver knows before the notice has come through the loop.
+            raise LinkError(self.ended_because(self.lib.io_end_cause(self.live())))
         if status == self.lib.IO_NO_MEMORY:
             raise LinkError(f"{where}: no memory for a further link")
         raise LinkError(f"{where}: refused by the bus (status {status}); an argument is out of range")

@@ -72,6 +72,9 @@ struct io_stats {
 // Fewer than ROOM: the driver tells when there is more.
 size_t io_take(struct io_bus *bus, struct io_event *out, size_t room);
 
+// What IO_ENDED tells, for those who met IO_CLOSED before they took it.
+int32_t io_end_cause(struct io_bus *bus);
+
 // Adds the link of NODEID (1..255; on a serial line 0, and only one); *number names it from now on.
 // IO_TAKEN: there is one with this id, or no place is left.
 enum io_status io_open_link(struct io_bus *bus, unsigned nodeid, const struct link_settings *settings,

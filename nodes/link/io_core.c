@@ -73,6 +73,13 @@ int io_ended(const struct io_bus *bus) {
     return bus->ended;
 }
 
+int32_t io_end_cause(struct io_bus *bus) {
+    io_lock(bus);
+    int32_t cause = bus->ended_errno;
+    io_unlock(bus);
+    return cause;
+}
+
 void io_count_wait(struct io_bus *bus) {
     bus->stats.waits++;
 }

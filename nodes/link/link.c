@@ -240,9 +240,21 @@ static uint64_t lost_deadline(const struct link *link) {
     return waiting ? link->progress_ns + link->settings.lost_after_ns : LINK_NEVER;
 }
 
+// This computer slept much longer than it was to (a busy host of virtual machines may do that to it): nobody
+// asked meanwhile, and what was answered may wait to be read. Only a quarter of the silence counts, so that
+// the node is asked again before it is judged.
+static void forgive_sleep(struct link *link, uint64_t now) {
+    uint64_t lost_ns = lost_deadline(link), repeat_ns = repeat_deadline(link);
+    uint64_t wake_ns = lost_ns < repeat_ns ? lost_ns : repeat_ns;
+    uint64_t quarter_ns = link->settings.lost_after_ns / 4;
+    if (now > wake_ns && now - wake_ns > quarter_ns && now - quarter_ns > link->progress_ns)
+        link->progress_ns = now - quarter_ns;
+}
+
 void link_handle_timer(struct link *link, uint64_t now) {
     if (link->state == LINK_LOST)
         return;
+    forgive_sleep(link, now);
     if (now >= lost_deadline(link)) {
         link->state = LINK_LOST;
         link->cause = link->heard_ns > link->progress_ns ? LINK_CAUSE_STUCK : LINK_CAUSE_SILENT;

@@ -105,7 +105,8 @@ struct link {
     uint64_t clock_at_ns, clock_at_ticks;
     uint8_t rx[LINK_RX_MAX];
     size_t rx_used;
-    uint64_t rx_ns; // arrival of the newest byte in rx
+    uint64_t rx_ns;     // arrival of the newest byte in rx
+    uint8_t rx_excused; // that it waits for more was judged too late once, and so not judged
     struct wire_scanner scanner;
     struct link_stats stats;
 };

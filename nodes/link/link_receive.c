@@ -9,6 +9,8 @@
 // up. Not sooner, though: a bus without room (other nodes' frames first, ENOBUFS at the sender) holds the
 // rest of a sound block back for tens of milliseconds, and a response given up is never sent again.
 #define GAP_NS (100 * NS_PER_MS)
+// Who looks so much later than he was to stood still, as may have who sends the rest: that has as long again.
+#define LATE_NS (10 * NS_PER_MS)
 
 // ----------------------------------------------------------------------------------------- acknowledgement
 
@@ -172,16 +174,28 @@ uint64_t link_partial_deadline(const struct link *link) {
     return link->rx_used ? link->rx_ns + GAP_NS : LINK_NEVER;
 }
 
+static int is_given_up(struct link *link, uint64_t now) {
+    uint64_t deadline_ns = link_partial_deadline(link);
+    if (now < deadline_ns)
+        return 0;
+    if (link->rx_excused || now - deadline_ns <= LATE_NS)
+        return 1;
+    link->rx_excused = 1;
+    link->rx_ns = now;
+    return 0;
+}
+
 int link_receive(struct link *link, const uint8_t **data, size_t *size, uint64_t now,
                  struct link_response *response) {
     response->size = 0;
-    int late = *size == 0 && now >= link_partial_deadline(link);
+    int late = *size == 0 && is_given_up(link, now);
     for (;;) {
         size_t room = LINK_RX_MAX - link->rx_used, taken = *size < room ? *size : room;
         if (taken) {
             memcpy(link->rx + link->rx_used, *data, taken);
             link->rx_used += taken;
             link->rx_ns = now;
+            link->rx_excused = 0;
             link->stats.bytes_received += taken;
             *data += taken;
             *size -= taken;

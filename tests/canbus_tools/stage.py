@@ -20,7 +20,7 @@ from tests import wire_twin
 from tests.canbus_tools.katapult import Katapult
 from tests.vcan.kernel import INTERFACE, why_no_socketcan
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 """Only something broken makes anyone wait so long."""
 
 

@@ -72,7 +72,7 @@ def test_questions_and_arithmetic_on_clocks(node: Place, capsys: Captured) -> No
     assert [c["message"] for c in clocks] == ["clock"] * 3
     ticks = [c["params"]["clock"] for c in clocks]
     freq_hz = two_s["value"] // 2
-    assert all(freq_hz // 2000 < (b - a) % 2**32 < freq_hz for a, b in pairwise(ticks))
+    assert all(freq_hz // 2000 < (b - a) % 2**32 < 20 * freq_hz for a, b in pairwise(ticks))
     assert freq_hz // 500 < passed["value"] < 20 * freq_hz
     assert last["ok"]
     assert last["commands"] == 4
@@ -87,8 +87,8 @@ def test_a_machine_is_set_up_by_a_script(node: Place, tmp_path: Path, capsys: Ca
         "finalize_config crc=7*6\n"
         "\n"
         "get_config\n"
-        "queue_digital_out oid=1 clock=clock+20ms on_ticks=1\n"
-        "/delay 30ms\n"
+        "queue_digital_out oid=1 clock=clock+1s on_ticks=1\n"  # a busy computer may take a part of it
+        "/delay 1100ms\n"
         "get_config\n"
     )
     assert console(node, "--node", str(MAIN), "--force", "--script", str(script)) == 0

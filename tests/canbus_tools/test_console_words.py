@@ -75,7 +75,7 @@ def test_values_by_the_kind_of_their_parameter() -> None:
 
 
 def test_faults_say_what_there_is() -> None:
-    with pytest.raises(ConsoleError, match="nor is it a pin: PA0, PA1"):
+    with pytest.raises(ConsoleError, match="nor is it a pin: ADC_TEMPERATURE, PA0"):
         values("config_digital_out pin=ZZ9")
     with pytest.raises(ConsoleError, match=r"has no parameter 'x'; it is 'get_clock'"):
         values("get_clock x=1")

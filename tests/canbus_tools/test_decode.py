@@ -229,7 +229,7 @@ def test_a_piped_log_is_followed_and_ctrl_c_ends_it_in_order() -> None:
         os.kill(process.pid, signal.SIGINT)
         summary = json.loads(process.stdout.readline())
         process.stdin.close()
-        assert process.wait(10) == 0
+        assert process.wait(60) == 0
     assert (summary["ok"], summary["stopped"], summary["frames"]) == (True, True, 3)
 
 

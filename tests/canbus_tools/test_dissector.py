@@ -25,7 +25,7 @@ from tests.canbus_tools import recorded
 from tests.canbus_tools.tshark import Tshark
 
 NODEID = recorded.NODEID
-WAIT_S = 10.0
+WAIT_S = 30.0
 TOOLHEAD_JSON = firmware_path(TOOLHEAD).with_suffix(".json")
 
 

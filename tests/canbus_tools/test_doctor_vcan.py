@@ -7,10 +7,11 @@ from contextlib import closing, contextmanager
 
 import pytest
 
+from canbus_tools import doctor_facts
 from canbus_tools.link_facts import NoInterface, read_link
 from tests.canbus_tools.command import Command, Said
-from tests.canbus_tools.stage import MAIN, MAIN_ID, Place, set_nodeid
-from tests.canbus_tools.test_doctor import findings, problems, run
+from tests.canbus_tools.stage import MAIN, MAIN_ID, PATIENCE_S, Place, set_nodeid
+from tests.canbus_tools.test_doctor import expect, findings, problems, run
 from tests.vcan.kernel import (
     INTERFACE,
     bad_wire,
@@ -44,8 +45,7 @@ def queue_of(length: int) -> Iterator[None]:
 
 
 def the_finding(said: Said, name: str) -> dict[str, str]:
-    assert (said.status, problems(said)) == (1, {name})
-    return findings(said)[name]
+    return expect(said, name)[name]
 
 
 @has_ip
@@ -68,7 +68,7 @@ def test_a_vcan_with_a_node_is_well(doctor: Command) -> None:
     with KERNEL.start_node("mainboard", MAIN) as node:
         node.wait_ready()
         said = run(doctor)
-    assert problems(said) == set()
+    expect(said)
     assert said.json["checked"] == ["interface", "traffic", "nodes"]
 
 
@@ -101,11 +101,13 @@ def test_a_send_queue_that_is_full(doctor: Command) -> None:
         with tiny_queue(rate_kbit=16):
             said = run(doctor)
     assert said.status == 1
+    assert "send-queue-full" in problems(said), said.out
     assert "ENOBUFS" in findings(said)["send-queue-full"]["seen"]
 
 
 @pytest.mark.skipif(bool(why_no_netem()), reason=why_no_netem())
-def test_lost_frames(doctor: Command) -> None:
+def test_lost_frames(doctor: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor_facts, "PING_S_MAX", PATIENCE_S)  # all questions, however long each takes
     with KERNEL.start_node("mainboard", MAIN) as node:
         node.wait_ready()
         with closing(KERNEL.open()) as host:
@@ -114,9 +116,12 @@ def test_lost_frames(doctor: Command) -> None:
             said = run(doctor)
             dropped = netem_dropped()
     assert said.status == 1
-    assert "frames-lost" in problems(said)
+    assert "frames-lost" in problems(said), said.out
     ping = said.json["pings"][0]
-    assert 0 < ping["lost"] <= dropped
+    assert ping["asked"] == doctor_facts.ASKED
+    # Once in a hundred runs no question got lost, but then pieces of answers did.
+    assert ping["lost"] + ping["invalid_bytes"] > 0
+    assert ping["lost"] <= dropped
 
 
 @controls_interface

@@ -20,7 +20,7 @@ from nodes.option_values import UsageError
 from nodes.virtual.faults import Fault, FaultKind
 from nodes.virtual.hub import VirtualBus
 
-WAIT_S = 10.0
+WAIT_S = 30.0
 QUERY = can.Message(arbitration_id=ADMIN_ID, data=[QUERY_UNASSIGNED], is_extended_id=False)
 
 

@@ -136,7 +136,7 @@ def test_live(place: Place, can_tool: Command) -> None:
     assert said.status == 0
     frames = said.json["frames"]
     assert 20 < frames <= babbler.sent
-    assert said.json["duration_s"] == pytest.approx(1.0, abs=0.5)
+    assert said.json["duration_s"] > 0.99
     bits = frames * bits_on_wire(0x555, b"12345678")
     assert said.json["mean"] == pytest.approx(bits / 250_000 / said.json["duration_s"], rel=1e-3)
     assert list(said.json["ids"]) == ["555"]
@@ -164,7 +164,7 @@ def test_watch_until_ctrl_c_still_reports(
 
 def test_a_silent_bus_is_said_to_be_silent(place: Place, can_tool: Command) -> None:
     said = can_tool("load", "--bitrate", BITRATE, "--duration", "0.1")
-    assert (said.status, "not one frame in 0.1 s" in said.out) == (0, True)
+    assert (said.status, "not one frame in 0." in said.out) == (0, True)
 
 
 def test_bit_rate_must_be_known(place: Place, can_tool: Command) -> None:

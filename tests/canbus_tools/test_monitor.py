@@ -61,8 +61,11 @@ def monitor(place: Place, *words: str) -> Iterator["subprocess.Popen[str]"]:
             process.kill()
 
 
-def talk_until(place: Place, process: "subprocess.Popen[str]", wanted: str) -> list[str]:
-    """Ask the node again and again until the monitor has shown WANTED; return its lines so far."""
+def talk_until(place: Place, process: "subprocess.Popen[str]", wanted: str, times: int = 1) -> list[str]:
+    """Ask the node again and again until the monitor has shown WANTED so often; return its lines so far.
+
+    What it has shown twice had both answers between.
+    """
     seen: list[str] = []
     found = threading.Event()
 
@@ -70,7 +73,7 @@ def talk_until(place: Place, process: "subprocess.Popen[str]", wanted: str) -> l
         assert process.stdout is not None
         for line in process.stdout:
             seen.append(line)
-            if wanted in line:
+            if sum(wanted in line for line in seen) == times:
                 found.set()
                 return
 
@@ -118,7 +121,7 @@ def test_json_and_filters(node: Place) -> None:
         "uptime",
     )
     with monitor(node, *words) as process:
-        seen = talk_until(node, process, '"uptime"')
+        seen = talk_until(node, process, '"uptime"', times=2)
         process.send_signal(signal.SIGINT)
         rest, _ = process.communicate(timeout=PATIENCE_S)
     lines: list[dict[str, Any]] = [json.loads(line) for line in [*seen, *rest.splitlines()]]

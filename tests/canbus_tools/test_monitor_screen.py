@@ -106,14 +106,15 @@ def test_traffic_is_shown_by_names(node: Place) -> None:
     async def test(stand: Stand) -> None:
         await stand.talk.ask("get_canbus_id", "canbus_id")
         await stand.until(lambda: any("canbus_id canbus_uuid" in line for line in stand.log()))
-        (line,) = [line for line in stand.log() if "canbus_id canbus_uuid" in line]
+        # More than one when a busy computer had the question asked again.
+        line, *_ = [line for line in stand.log() if "canbus_id canbus_uuid" in line]
         assert line.endswith(f"4 ← canbus_id canbus_uuid={MAIN} canbus_nodeid=4")
         assert any(line.endswith("4 → get_canbus_id") for line in stand.log())
         assert not any("ack next" in line for line in stand.log())
         await stand.until(lambda: stand.row(MAIN_ID)["mcu"] == "virtual-mainboard")
         row = stand.row(MAIN_ID)
         assert row["node"] == "4"
-        assert int(row["repeated"]) < 3  # a busy computer may take its time with an ack
+        assert int(row["repeated"]) <= stand.talk.stats.blocks_repeated  # a busy computer may be late to ack
         assert int(row["bad"]) < 64  # it may have begun to listen in the middle of a block
         assert float(row["rtt"]) > 0
         assert "uuid" not in row  # no room at 80 columns
@@ -129,7 +130,7 @@ def test_a_long_message_is_shown_whole(node: Place) -> None:
         await stand.talk.ask("get_canbus_status", "canbus_status")
         await stand.until(lambda: any("canbus_status rx_error" in line for line in stand.log()))
         lines = stand.log()
-        (at,) = [n for n, line in enumerate(lines) if "canbus_status rx_error" in line]
+        at, *_ = [n for n, line in enumerate(lines) if "canbus_status rx_error" in line]
         assert lines[at + 1].strip() == "canbus_bus_state=active"
         assert lines[at + 1].index("canbus") == lines[at].index("canbus")
         await stand.pilot.resize_terminal(*WIDE)
@@ -179,7 +180,8 @@ def test_pause_filter_acks_and_clear(node: Place) -> None:
         await stand.pilot.press("c")
         assert stand.log() == []
         await stand.talk.ask("get_uptime", "uptime")
-        await stand.until(lambda: len(stand.log()) == 1)
+        await stand.until(lambda: len(stand.log()) > 0)
+        assert all("← uptime" in line for line in stand.log())
 
     on_screen(node, SMALL, test)
 

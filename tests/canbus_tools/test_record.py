@@ -57,7 +57,7 @@ class Recorder:
     def end(self, number: int = signal.SIGINT) -> tuple[dict[str, Any], int]:
         if number:
             os.kill(self.process.pid, number)
-        out, _ = self.process.communicate(timeout=20)
+        out, _ = self.process.communicate(timeout=60)
         return json.loads(out.splitlines()[-1]), self.process.returncode
 
 
@@ -76,8 +76,8 @@ def send(bus: BusName, frames: list[Frame]) -> None:
         can.Bus(interface=interface, channel=channel) as listener,
     ):
         for frame in frames:
-            sender.send(frame.to_message(), timeout=1)
-            assert listener.recv(5) is not None
+            sender.send(frame.to_message(), timeout=20)
+            assert listener.recv(20) is not None
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -10,12 +10,13 @@ from nodes.assign import AssignError
 from nodes.bus import UartBus
 from nodes.can_bus import CanBus
 from nodes.clock import HostTime
+from nodes.conversation import QUERY_TRIES
 from nodes.errors import CanductorError
 from nodes.node_errors import NodeError, NodeLost, NodeShutdown
 from nodes.node_states import NodeState
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
-from tests.nodes.twin_bus import TwinIO, TwinNode, source_of, without_commands
+from tests.nodes.twin_bus import DELAY_S, TwinIO, TwinLink, TwinNode, source_of, without_commands
 
 if TYPE_CHECKING:
     from nodes.node import Node
@@ -78,6 +79,30 @@ def test_lost_responses_and_frames_are_asked_for_again(seed: int) -> None:
             assert answer.name == "pong"
 
     machine.run(machine.bus.start, check)
+
+
+def test_late_answers_to_an_earlier_question_are_not_taken_for_the_last_word(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A busy computer asked six times whether the node is configured, before it read the first answer."""
+    machine = Machine(TwinNode(), make_config(stepper_x()))
+    said: list[bytes] = []
+    say = TwinLink.say
+
+    def repeat(link: TwinLink, answer: bytes, sent_ns: int = 0) -> None:
+        say(link, answer, sent_ns)
+        if not said and machine.twin.executed[-1] == "get_config":
+            said.append(answer)
+            for n in range(1, QUERY_TRIES):
+                asyncio.get_running_loop().call_later(n * DELAY_S, say, link, answer, sent_ns)
+
+    monkeypatch.setattr(TwinLink, "say", repeat)
+
+    async def check() -> None:
+        assert machine.node.state is NodeState.READY
+
+    machine.run(machine.bus.start, check)
+    assert said
 
 
 def test_a_uart_node_starts_without_an_id() -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, Uuid
 from nodes.dictionary import Dictionary
-from nodes.link import Forecast, IOStats, LinkSettings
+from nodes.link import BusLoad, Forecast, IOStats, LinkSettings
 from nodes.message_format import Message, Value
 from nodes.seams import OnFrame, OnLost, OnResponses
 
@@ -298,6 +298,9 @@ class TwinIO:
 
     def stats(self) -> IOStats:
         raise AssertionError("a twin bus counts nothing")
+
+    def load(self) -> BusLoad:
+        raise AssertionError("a twin bus measures nothing")
 
     def send_frame(self, can_id: int, data: bytes) -> None:
         assert can_id == ADMIN_ID

@@ -164,7 +164,40 @@ static void extreme_clocks_wait(void) {
     CHECK(!link_next_offer(&link, 5, LINK_ALL, &offer));
 }
 
+// This computer stands still for five seconds with one block on its way: it asks again before it judges.
+// A node that answers was never lost; one that stays silent is, within the usual time.
+static void a_host_that_stood_still_asks_first(void) {
+    const uint64_t stall_ns = 5000000000, lost_after_ns = 1000000000;
+    for (int answers = 0; answers < 2; answers++) {
+        struct link link = fresh(192);
+        uint8_t out[LINK_WIRE_MAX], bytes[] = {4};
+        uint64_t now = 1, repeats = 0;
+        CHECK_EQUAL(link_send(&link, LINK_CONTROL, bytes, 1, 0, 0, now), LINK_OK);
+        CHECK(link_next_block(&link, now, LINK_ALL, out) > 0);
+        now += stall_ns;
+        for (unsigned sequence = 0; link.state != LINK_LOST && link_pending(&link); sequence++) {
+            link_handle_timer(&link, now);
+            while (link_next_block(&link, now, LINK_ALL, out))
+                repeats++;
+            if (answers) {
+                uint8_t answer[WIRE_BLOCK_MAX];
+                const uint8_t *at = answer;
+                size_t size = wire_block_finish(answer, 0, sequence);
+                struct link_response response;
+                while (link_receive(&link, &at, &size, now, &response))
+                    ;
+                link_next_block(&link, now, LINK_ALL, out);
+            }
+            now = link_deadline(&link, now, LINK_ALL);
+        }
+        CHECK((link.state == LINK_LOST) == !answers);
+        CHECK(answers || (repeats > 2 && now > stall_ns + lost_after_ns / 2));
+        CHECK(answers || link.cause == LINK_CAUSE_SILENT);
+    }
+}
+
 int main(void) {
+    a_host_that_stood_still_asks_first();
     refuses_what_makes_no_sense();
     a_full_queue_refuses_and_keeps_what_it_has();
     extreme_clocks_wait();

@@ -131,6 +131,24 @@ def test_a_block_may_pause_on_its_way_but_a_rest_that_does_not_come_is_not_waite
     assert [content for content, _ in line.link.receive(sound, line.now)] == [answer(7)]
 
 
+def test_who_stood_still_waits_for_the_rest_of_a_block_once_more() -> None:
+    """A busy computer may keep from its turn who reads and who sends: a response is never sent again."""
+    line = connected()
+    sound = block(line.node.expected, answer(7))
+    for size in range(1, len(sound)):
+        assert line.link.receive(sound[:size], line.now) == []
+        for wait in (400 * MS, 95 * MS):
+            line.now += wait
+            assert line.link.receive(b"", line.now) == []
+        assert [content for content, _ in line.link.receive(sound[size:], line.now)] == [answer(7)]
+    assert line.link.stats.bytes_invalid == 0
+    line.link.receive(sound[:-1], line.now)
+    for bytes_invalid in (0, len(sound) - 1):
+        line.now += 400 * MS
+        assert line.link.receive(b"", line.now) == []
+        assert line.link.stats.bytes_invalid == bytes_invalid
+
+
 def test_a_repeat_starts_with_a_sync_byte_and_a_timeout_flushes_the_node() -> None:
     line = connected()
     line.fault = lambda way, index, data: []

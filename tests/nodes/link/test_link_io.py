@@ -4,6 +4,7 @@ import asyncio
 import os
 import pty
 import struct
+import time
 import tty
 from collections.abc import Callable, Coroutine
 
@@ -27,8 +28,9 @@ def run(test: Coroutine[object, object, None]) -> None:
 
 
 def repeat(action: Callable[[], None]) -> None:
-    """Do it until it is refused, which has to be soon."""
-    for _ in range(100_000):
+    """Do it until it is refused."""
+    end_s = time.monotonic() + TIMEOUT_S
+    while time.monotonic() < end_s:
         action()
 
 
@@ -55,10 +57,13 @@ def test_commands_arrive_in_order_and_answers_come_back(kind: TransportKind, sma
             assert link.pending() == 0
             assert node.executed == commands
             assert [r.content for r in b.inbox.responses] == [answer(i) for i in range(0, 400, 3)]
-            assert all(0 < r.sent_ns < r.received_ns for r in b.inbox.responses)
             stats = link.stats()
+            # Answers to repeated blocks have no time: a busy computer may have kept the twin waiting.
+            timed = [r for r in b.inbox.responses if r.sent_ns]
+            assert len(timed) == 134 or stats.blocks_repeated
+            assert all(r.sent_ns < r.received_ns for r in timed)
             assert stats.commands_sent == 400
-            assert stats.blocks_repeated == stats.bytes_invalid == 0
+            assert stats.bytes_invalid == 0
             assert stats.srtt_s > 0
             assert b.io.stats().bytes_sent >= stats.bytes_sent
 
@@ -160,7 +165,7 @@ def test_a_deaf_peer_stops_sending_without_loss_or_spinning(kind: TransportKind)
             with pytest.raises(TimeoutError):
                 async with asyncio.timeout(0.05):
                     await link.drained()
-            assert b.io.stats().wakeups - before < 40
+            assert b.io.stats().wakeups - before < 200  # spinning would be thousands
             b.peer.listen()
             await link.drained()
             assert node.executed[1:] == commands
@@ -204,6 +209,9 @@ def test_a_peer_that_closes_is_told_once(kind: TransportKind) -> None:
             link.send(ask(1))
             await b.inbox.until(lambda: b.inbox.responses)
             b.peer.close()
+            # Who calls before the loop was told learns as much.
+            with pytest.raises(LinkError, match=r"pair: the connection ended \("):
+                repeat(lambda: link.set_clock(1e6, 1, 1))
             await b.inbox.until(lambda: b.inbox.closed)
             assert b.inbox.closed[0].startswith("pair: the connection ended (")
             with pytest.raises(LinkError, match="the connection ended"):

@@ -30,7 +30,7 @@ from nodes.virtual.hub import VirtualBus
 from tests.vcan.kernel import INTERFACE, why_no_socketcan
 
 BURST = 10_000
-WAIT_S = 10.0
+WAIT_S = 30.0
 
 
 class End(Protocol):
