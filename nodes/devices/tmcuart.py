@@ -1,0 +1,115 @@
+"""The UART of stepper drivers on a node: up to four drivers on one wire, told apart by address.
+
+A write is not answered; but a driver counts the writes that it has understood (IFCNT), so that after a row of
+writes it is known whether all of them arrived.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+from nodes.devices import tmc_datagram
+from nodes.errors import CanductorError
+from nodes.node_config import NodeConfig
+from nodes.node_errors import NodeError
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from nodes.node import Node  # planning needs neither
+
+COMMANDS: Final = ("config_tmcuart", "tmcuart_send")
+BAUD: Final = 40_000
+BAUD_SLOW: Final = 9_000
+"""On 8-bit micro-controllers."""
+SLOW_MCUS: Final = ("at90usb", "atmega")
+TRIES: Final = 5
+"""So often a driver is asked, or written to, before it counts as failed."""
+IFCNT: Final = 0x02
+_COUNTS: Final = 1 << 8
+
+
+class TmcError(CanductorError):
+    """A driver does not do what it is told; the text goes on after "the driver of x "."""
+
+
+class TmcUart:
+    """The wire on RX_PIN, with PULL 1 for a pull-up, and TX_PIN, which may be the same; NAME is for messages.
+
+    Several may use it at a time: each datagram with its answer is one.
+    """
+
+    def __init__(self, name: str, *, rx_pin: str, pull: int, tx_pin: str) -> None:
+        self.name = name
+        self.oid: int | None = None
+        """Its object id; known when its node's configuration is built."""
+        self._rx_pin, self._tx_pin, self._pull = rx_pin, tx_pin, pull
+        self._lock: asyncio.Lock | None = None
+
+    def configure(self, config: NodeConfig) -> None:
+        """Add it to its node's CONFIG; NodeConfigError when firmware or pins do not allow it."""
+        what = f"the UART of {self.name}"
+        config.require(what, COMMANDS)
+        mcu = config.dictionary.constants.get("MCU", "")
+        slow = isinstance(mcu, str) and mcu.startswith(SLOW_MCUS)
+        bit_time = round(config.dictionary.clock_freq_hz / (BAUD_SLOW if slow else BAUD))
+        self.oid = config.create_oid()
+        config.add_config(
+            what,
+            f"config_tmcuart oid={self.oid} rx_pin={self._rx_pin} pull_up={self._pull}"
+            f" tx_pin={self._tx_pin} bit_time={bit_time}",
+        )
+
+    def started(self, node: "Node") -> None:
+        """Take note that its NODE is ready: it is idle."""
+        del node
+
+    async def read(self, node: "Node", address: int, register: int) -> int:
+        """Return what is in a register of a driver; raises TmcError, or what happened to NODE."""
+        async with self._alone():
+            return await self._read(node, address, register)
+
+    async def write(self, node: "Node", address: int, values: Sequence[tuple[int, int]]) -> None:
+        """Set registers of a driver, (register, value) each, in order, and see that it understood them all.
+
+        Raises TmcError, or what happened to NODE.
+        """
+        async with self._alone():
+            for _ in range(TRIES):
+                before = await self._read(node, address, IFCNT)
+                for register, value in values:
+                    await self._send(node, tmc_datagram.write(address, register, value), 0)
+                after = await self._read(node, address, IFCNT)
+                if (after - before) % _COUNTS == len(values):
+                    return
+        raise TmcError(
+            f"did not understand what was written to it, {TRIES} times; check its UART's wiring and for"
+            " other drivers of the same uart_address"
+        )
+
+    async def _read(self, node: "Node", address: int, register: int) -> int:
+        damaged = False
+        for _ in range(TRIES):
+            bits = await self._send(node, tmc_datagram.ask(address, register), tmc_datagram.ANSWER_BYTES)
+            value = tmc_datagram.answered(bits, register)
+            if value is not None:
+                return value
+            damaged = damaged or bool(bits)
+        if damaged:
+            raise TmcError(
+                "gives answers that are damaged; check its UART's wiring and for other drivers of the same"
+                " uart_address"
+            )
+        raise TmcError("does not answer; check that its motor supply is on, and uart_pin and uart_address")
+
+    async def _send(self, node: "Node", bits: bytes, read: int) -> bytes:
+        if self.oid is None:
+            raise NodeError(f"the UART of {self.name} is not configured on any node")
+        answer = await node.query("tmcuart_send", "tmcuart_response", oid=self.oid, write=bits, read=read)
+        return answer.data("read")
+
+    def _alone(self) -> "asyncio.Lock":
+        import asyncio  # noqa: PLC0415 (planning needs none)
+
+        if self._lock is None:
+            self._lock = asyncio.Lock()
+        return self._lock
