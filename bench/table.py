@@ -1,6 +1,10 @@
 """Tables to 14 axes on 6 nodes of a simulated bus: how long it takes, and how well they act together.
 
 The real host, links and firmware under virtual time with true bit timing: times are those of a real bus.
+
+Bounds are of one broadcast: its bits, divided by the sender's share of the bit rate, or by what other traffic
+leaves if that is less. Asking the nodes before and after, the rest until a broadcast has settled, repeats and
+links come on top, and are told apart.
 """
 
 import asyncio
@@ -15,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from nodes.clock import HostTime
 from nodes.devices.table import Activation
+from nodes.table.cost import FRAME_BITS_MAX, RegisterCost
 from nodes.table.download import BUS_SHARE, Report, download
 from nodes.table.mt import transmission
 from nodes.virtual.world import run
@@ -22,7 +27,6 @@ from tests.nodes.table.machines import TableMachine, wavy
 
 T = TypeVar("T")
 
-FRAME_BITS_MAX = 135
 POLL_DELAY_S = 0.002
 """T of an old drive that polls its register a thousand times a second."""
 BUSY, LOSS = 0.7, 0.01
@@ -35,9 +39,9 @@ def main() -> None:
     for points in (32, 128, 256):
         words = len(transmission(wavy(points), [1]))
         bits = -(-words // 2) * FRAME_BITS_MAX
-        bound_ms = bits / 1e6 / BUS_SHARE * 1e3
-        say(f"{points} points: {words} words, at most {bits} bits: {bound_ms:.0f} ms with that share")
-        say(f"  polled register, T = {POLL_DELAY_S * 1e3:g} ms: {words * POLL_DELAY_S * 1e3:.0f} ms")
+        say(f"{points} points: {words} words, at most {bits} bits, however they are stuffed")
+        register = RegisterCost(points, words, 0, POLL_DELAY_S)
+        say(f"  polled register: {register.text()}")
         for name, load, loss in CASES:
             one_table(points, name, load, loss)
     own_tables(64)
@@ -51,7 +55,11 @@ def one_table(points: int, name: str, load: float, loss: float) -> None:
     async def act() -> list[Report]:
         return [await download(wavy(points), machine.places, now_ns=machine.now_ns)]
 
-    told(f"  {name}: one table for all", performed(machine, act, load, loss))
+    reports = performed(machine, act, load, loss)
+    told(f"  {name}: one table for all", reports)
+    (cast,) = reports[0].casts
+    say(f"    {cast.text()}")
+    say(f"    asking {reports[0].asking_s * 1e3:.0f} ms, links {reports[0].links_s * 1e3:.0f} ms")
 
 
 def own_tables(points: int) -> None:
@@ -77,7 +85,7 @@ def skew() -> None:
         at_ns = HostTime(machine.now_ns() + 200_000_000)
         for outcome in report.outcomes:
             place = outcome.place
-            clock = int(place.node.best_clock.ticks_at(at_ns))
+            clock = int(machine.node(place).best_clock.ticks_at(at_ns))
             place.table.activate(place.node, clock=clock, generation=outcome.generation)
         await asyncio.sleep(0.3)
         moments, errors = [], []
@@ -87,7 +95,7 @@ def skew() -> None:
             assert found.activation is Activation.DONE
             clock = board.clock - ((board.clock - found.clock32) & 0xFFFFFFFF)
             moments.append(float(board.true_ps(np.array([clock], np.uint64))[0]) * 1e-6)
-            errors.append((place.node.clock_error_s or 0.0) * 1e6)
+            errors.append((machine.node(place).clock_error_s or 0.0) * 1e6)
         return max(moments) - min(moments), max(errors)
 
     between_us, error_us = performed(machine, act, BUSY, LOSS)
@@ -102,6 +110,7 @@ def performed(machine: TableMachine, act: Callable[[], Awaitable[T]], load: floa
         await machine.bus.start()
         machine.burden(load)
         machine.lose(loss)
+        await asyncio.sleep(1)  # for the load to be known
         try:
             return await act()
         finally:

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 AXES: Final = "xyz"
+WHICH_AXES: Final = (
+    "x, y and z of machines whose steppers move in proportion to them, without towers, arms, winches or dual "
+    "carriages"
+)
 NO_CORRECTION: Final = AxisCorrection(0, reverse=False, offset_mm=0.0, lag_mm=0.0)
 Z_SHARE: Final = 0.2
 """Of Z's top speed, at which Z takes up what a correction jumps by: screws start at no more at once."""
@@ -120,13 +124,16 @@ class Compensation:
         }
 
 
+def corrected_axes(description: MachineDescription) -> str:
+    """Return the letters of the axes that the coordinator can correct by tables; empty: none of this kind."""
+    linear = all(motor.function.kinematics is StepKinematics.LINEAR for motor in description.motors)
+    return AXES if linear and description.dual_carriage is None else ""
+
+
 def why_not_corrected(description: MachineDescription, table: AxisTable) -> str:
     """Return why the coordinator cannot correct the axis of TABLE, a sentence; empty: it can."""
-    if table.axis not in AXES or not _is_linear(description):
-        return (
-            f"axis {table.axis} is not corrected: that is for x, y and z of machines whose steppers move in "
-            "proportion to them, without towers, arms, winches or dual carriages"
-        )
+    if table.axis not in tuple(corrected_axes(description)):
+        return f"axis {table.axis} is not corrected: that is for {WHICH_AXES}"
     if table.unit is not Unit.MM:
         return f"axis {table.axis} is not corrected: its table is in degrees, the axis moves in mm"
     if len(table.positions) > TABLE_POINTS_MAX:
@@ -156,8 +163,3 @@ def kept_compensation(
     for problem in problems:
         say(problem)
     return compensation
-
-
-def _is_linear(description: MachineDescription) -> bool:
-    linear = all(motor.function.kinematics is StepKinematics.LINEAR for motor in description.motors)
-    return linear and description.dual_carriage is None

@@ -10,21 +10,21 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.app import Machine
-from coordinator.compensation import Compensation, why_not_corrected
+from coordinator.compensation import WHICH_AXES, Compensation, corrected_axes, why_not_corrected
 from coordinator.ipc.state import StateTree
 from coordinator.table.axis_table import AxisTable, TableError, figures, notes
 from coordinator.table.axle_map import StepperTables
 from coordinator.table.store import TableStore
 from nodes.clock import HostTime
 from nodes.errors import CanductorError
+from nodes.node import Node
 from nodes.node_states import NodeState
-from nodes.table.download import Outcome, Place, download
+from nodes.table.download import Outcome, Place, Report, download
 from nodes.table.mt import MtStatus, Pair
 
 if TYPE_CHECKING:
     from coordinator.machine.description import MachineDescription
     from nodes.devices.table import ActiveTable, AxleTable, TableState
-    from nodes.node import Node
 
 CARE_S: Final = 0.5
 """How often the nodes are looked at for one that came back, and tables for one that is not in use yet."""
@@ -101,19 +101,24 @@ class TableService:
 
     # ------------------------------------------------------------------------------------------- asked for
 
-    async def send(self, table: AxisTable, machine: Machine, *, stands: Callable[[], bool]) -> list[str]:
-        """Accept TABLE and bring it to its nodes; returns notes. TableError when it cannot be accepted."""
+    async def send(
+        self, table: AxisTable, machine: Machine, *, stands: Callable[[], bool]
+    ) -> tuple[list[str], list[Report]]:
+        """Accept TABLE and bring it to its nodes; returns notes, and what that cost.
+
+        TableError when it cannot be accepted.
+        """
         told = self._check(table, machine)
         if self._store is not None:
             await asyncio.to_thread(self._store.save, table)
         self._tables[table.axis] = table
         self._changed(table.axis, table)
-        await self.bring(machine, [table.axis])
+        reports = await self.bring(machine, [table.axis])
         await self.put_to_use(machine, stands)
-        return told
+        return told, reports
 
-    async def remove(self, axis: str, machine: Machine, *, stands: Callable[[], bool]) -> None:
-        """Forget the table of AXIS, here and on its nodes; raises TableError."""
+    async def remove(self, axis: str, machine: Machine, *, stands: Callable[[], bool]) -> list[Report]:
+        """Forget the table of AXIS, here and on its nodes; returns what that cost. Raises TableError."""
         self._of(machine, axis)
         if axis not in self._tables:
             raise TableError(f"axis {axis} has no table; 'canductor table status' tells which have")
@@ -121,8 +126,9 @@ class TableService:
             await asyncio.to_thread(self._store.remove, axis)
         del self._tables[axis]
         self._changed(axis, None)
-        await self.bring(machine, [axis])
+        reports = await self.bring(machine, [axis])
         await self.put_to_use(machine, stands)
+        return reports
 
     def status(self, machine: Machine | None) -> list[dict[str, Any]]:
         """Return each axis that may have a table, with what is known of its nodes."""
@@ -132,11 +138,12 @@ class TableService:
 
     # --------------------------------------------------------------------------------------------- the nodes
 
-    async def bring(self, machine: Machine, axes: Iterable[str]) -> None:
+    async def bring(self, machine: Machine, axes: Iterable[str]) -> list[Report]:
         """Make sure that the nodes of AXES keep their tables, or none; ``status`` tells what became of it.
 
-        Equal tables go to all their axles in one transmission.
+        Equal tables go to all their axles in one transmission. Returns what each cost.
         """
+        reports = []
         async with self._one_at_a_time:
             missing: dict[tuple[Pair, ...], list[Place]] = {}
             for place, pairs in self._wanted(machine, set(axes)):
@@ -148,20 +155,24 @@ class TableService:
                 else:
                     missing.setdefault(tuple(pairs), []).append(place)
             for table, places in missing.items():
-                await self._send(table, places, machine)
+                report = await self._send(table, places, machine)
+                if report is not None:
+                    reports.append(report)
             self._show(machine)
+        return reports
 
-    async def _send(self, pairs: Sequence[Pair], places: Sequence[Place], machine: Machine) -> None:
+    async def _send(self, pairs: Sequence[Pair], places: Sequence[Place], machine: Machine) -> Report | None:
         try:
             report = await download(pairs, places, now_ns=machine.host.now)
         except CanductorError as error:  # kept from when there was more room
             for place in places:
                 self._tell_once(self._at[place.table], str(error))
-            return
+            return None
         for outcome in report.outcomes:
             side = self._at[outcome.place.table]
             side.took(outcome)
             self._tell_once(side, outcome.problem)
+        return report
 
     def _tell_once(self, side: "_Side", problem: str) -> None:
         if problem and problem != side.problem:
@@ -230,16 +241,24 @@ class TableService:
                 f"the table of axis {table.axis} has {len(table.positions)} points, and there is room for "
                 f"{room}; thin it out, or raise 'points' of [axis_tables]"
             )
+        if why := why_not_corrected(machine.description, table):
+            raise TableError(why)
         rail = next(rail for rail in machine.description.rails if rail.axis == table.axis)
         return notes(table, rail.position_min, rail.position_max)
 
     def _of(self, machine: Machine, axis: str) -> list[StepperTables]:
         found = [place for place in machine.devices.tables if place.axis == axis]
         if not found:
-            axes = ", ".join(sorted(self._axes(machine)))
-            advice = f"axes with tables are {axes}" if axes else "add [axis_tables] to the configuration"
-            raise TableError(f"axis {axis} cannot have a table; {advice}")
+            raise TableError(f"axis {axis} cannot have a table; {self._advice(machine)}")
         return found
+
+    def _advice(self, machine: Machine) -> str:
+        """Tell which axes can have tables."""
+        with_places = self._axes(machine)
+        if not with_places:
+            return "add [axis_tables] to the configuration"
+        axes = [axis for axis in corrected_axes(machine.description) if axis in with_places]
+        return f"axes with tables are {', '.join(axes)}" if axes else f"tables are for {WHICH_AXES}"
 
     @staticmethod
     def _axes(machine: Machine) -> set[str]:
@@ -343,6 +362,7 @@ class _Side:
 
     def activate(self, place: Place, at_ns: HostTime) -> None:
         """Have it used, or no longer used, from AT_NS on."""
+        assert isinstance(place.node, Node), "one of the machine's"
         try:
             clock = int(place.node.best_clock.ticks_at(at_ns))
             place.table.activate(place.node, clock=clock, generation=self._wanted())

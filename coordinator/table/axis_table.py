@@ -173,7 +173,21 @@ def figures(table: AxisTable) -> dict[str, float | int | str]:
         "greatest_correction": max(both),
         "greatest_slope": max(map(abs, (*_slopes(table, table.forward), *_slopes(table, table.reverse)))),
         "greatest_backlash": max(lost),
+        "between_points": round(max(_between(table, table.forward), _between(table, table.reverse)), 9),
     }
+
+
+def _between(table: AxisTable, values: Sequence[float]) -> float:
+    """Return about how far a line between two points is off, at most, as the table bends at its points."""
+    slopes = _slopes(table, values)
+    ways = [b - a for a, b in itertools.pairwise(table.positions)]
+    bends = (
+        abs(after - before) / (w0 + w1) * max(w0, w1) ** 2 / 4
+        for (before, after), (w0, w1) in zip(
+            itertools.pairwise(slopes), itertools.pairwise(ways), strict=True
+        )
+    )
+    return max(bends, default=0.0)
 
 
 def _slopes(table: AxisTable, values: Sequence[float]) -> list[float]:

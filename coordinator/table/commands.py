@@ -1,11 +1,12 @@
 """``canductor table``: what its actions do. On a machine that runs, through its interface."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from coordinator.compensation import corrected_axes, why_not_corrected
 from coordinator.front_end_words import Target
 from coordinator.front_ends import Answer, call
 from coordinator.machine.description import load_machine
@@ -42,6 +43,7 @@ class Checked:
             f"axis {f['axis']}: {f['points']} points from {f['first']:g} to {f['last']:g} {unit}",
             f"  corrections from {f['least_correction']:g} to {f['greatest_correction']:g} {unit}",
             f"  greatest slope {f['greatest_slope']:.3g}, backlash up to {f['greatest_backlash']:g} {unit}",
+            f"  between its points it may miss up to {f['between_points']:.2g} {unit}",
             *(f"  note: {note}" for note in self.notes),
         ]
         if self.output is not None:
@@ -76,12 +78,13 @@ def send(given: argparse.Namespace, target: Target) -> Answer:
         "reverse": list(table.reverse),
     }
     result = call(_patient(target), "table.send", params).result
-    return _answer(result, [f"note: {note}" for note in result["notes"]])
+    return _answer(result, [f"note: {note}" for note in result["notes"]], result["downloads"])
 
 
 def remove(given: argparse.Namespace, target: Target) -> Answer:
     """Take a table away; not ok when a node keeps it. Raises CanductorError."""
-    return _answer(call(_patient(target), "table.remove", {"axis": given.axis}).result, [])
+    result = call(_patient(target), "table.remove", {"axis": given.axis}).result
+    return _answer(result, [], result["downloads"])
 
 
 def status(given: argparse.Namespace, target: Target) -> Answer:
@@ -112,8 +115,10 @@ def _notes(table: AxisTable, config: Path | None) -> list[str]:
         return []
     description = load_machine(str(config))
     rails = {rail.axis: rail for rail in description.rails}
-    if table.axis not in rails:
+    if corrected_axes(description) and table.axis not in rails:
         raise TableError(f"{config} has no axis {table.axis}; its axes are {', '.join(rails)}")
+    if why := why_not_corrected(description, table):
+        raise TableError(why)
     rail = rails[table.axis]
     told = notes(table, rail.position_min, rail.position_max)
     if description.axis_tables is None:
@@ -123,8 +128,8 @@ def _notes(table: AxisTable, config: Path | None) -> list[str]:
     return told
 
 
-def _answer(result: Any, lines: list[str]) -> Answer:
-    """Return it as text too; not ok when a node has a problem."""
+def _answer(result: Any, lines: list[str], downloads: Sequence[Mapping[str, Any]] = ()) -> Answer:
+    """Return it as text too, and what DOWNLOADS cost; not ok when a node has a problem."""
     problems = 0
     for axis in result["axes"]:
         found = axis["table"]
@@ -134,6 +139,9 @@ def _answer(result: Any, lines: list[str]) -> Answer:
         for side in axis["nodes"]:
             problems += bool(side.get("problem"))
             lines.append(f"  {_side(side)}")
+    for one in downloads:
+        axles = ", ".join(map(str, one["axles"]))
+        lines.append(f"  to {'axle' if len(one['axles']) == 1 else 'axles'} {axles}: {one['told']}")
     if not result["axes"]:
         lines.append("no axis of this machine can have a table; add [axis_tables] to its configuration")
     return Answer(result, "\n".join(lines), ok=not problems)
@@ -142,7 +150,11 @@ def _answer(result: Any, lines: list[str]) -> Answer:
 def _side(side: dict[str, Any]) -> str:
     where = f"{side['stepper']} {side['direction']} on node {side['node']} (axle {side['axle']})"
     text = f"{where}: {side['status']}"
-    if "generation" in side:
+    if side["status"] == "ok" and not side["points"]:
+        text = (
+            f"{where}: no table" if side["active"] else f"{where}: no table; the one before is still in use"
+        )
+    elif "generation" in side:
         used = "in use" if side["active"] else "not in use yet"
         text += f", generation {side['generation']}, {side['points']} points, {used}"
     return f"{text}; {side['problem']}" if side.get("problem") else text

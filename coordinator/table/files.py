@@ -4,6 +4,7 @@ import csv
 import itertools
 import math
 import re
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -49,11 +50,16 @@ def read_table(
 
 def _lines(path: Path) -> list[str]:
     try:
-        if path.stat().st_size > FILE_BYTES_MAX:
+        # Looked at before it is opened: a FIFO may block, and a device never end.
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise TableError(f"{path} is not a regular file; give a COMP_FILE or CSV")
+        with path.open("rb") as file:
+            data = file.read(FILE_BYTES_MAX + 1)
+        if len(data) > FILE_BYTES_MAX:
             raise TableError(
                 f"{path}: more than {FILE_BYTES_MAX} bytes are no table of an axis; check the name"
             )
-        return path.read_text(encoding="utf-8-sig").splitlines()
+        return data.decode("utf-8-sig").splitlines()
     except OSError as error:
         raise TableError(f"{path} cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError:

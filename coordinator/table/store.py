@@ -1,14 +1,13 @@
 """Keeps the accepted tables of a machine in a folder, one file an axis, so that they survive a restart."""
 
-import contextlib
 import json
 import os
 import re
-import tempfile
 from pathlib import Path
 from typing import Any, Final
 
 from coordinator.table.axis_table import AxisTable, TableError, Unit
+from coordinator.whole_file import write_whole
 
 _AXIS: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", re.ASCII)
 _SUFFIX: Final = ".table.json"
@@ -45,7 +44,7 @@ class TableStore:
         )
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            _write(path, content)
+            write_whole(path, content.encode())
         except OSError as error:
             raise TableError(
                 f"the table cannot be kept in {self.folder}: {error.strerror or error}"
@@ -77,21 +76,6 @@ class TableStore:
         if not _AXIS.fullmatch(axis):
             raise TableError(f"'{axis}' is no name of an axis; use letters, digits, _ . and -")
         return self.folder / f"{axis}{_SUFFIX}"
-
-
-def _write(path: Path, content: str) -> None:
-    """Write beside it, then rename: a power cut leaves the old file or the new one."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=".part")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(name).replace(path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            Path(name).unlink()
-        raise
 
 
 def _read(path: Path) -> AxisTable:

@@ -7,15 +7,16 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from coordinator.commands import Report
+from coordinator.table.device_words import declare_device, device_job
 from nodes.option_values import UsageError, existing_file
 
 _UNITS: Final = ("mm", "um", "nm", "inch", "deg", "arcmin", "arcsec")
 SUMMARIES: Final = {
     "check": "read a table and tell what it holds, without a machine",
     "plot": "draw a table as an SVG picture",
-    "send": "give a table to an axis of a machine that runs",
+    "send": "give a table to an axis of a machine that runs, or to drives at a device",
     "status": "tell which axes have tables, and what each node keeps",
-    "remove": "take the table of an axis away",
+    "remove": "take the table of an axis away, or those of drives at a device",
 }
 
 
@@ -34,11 +35,11 @@ def declare_table(
             add("--type", default="0", choices=("0", "1"), help="of a COMP_FILE: 0 actual positions, 1 trims")
             add("--unit", default="mm", choices=_UNITS, help="of all numbers of a COMP_FILE; mm if not given")
         if name in ("check", "plot"):
-            add("--axis", default="x", help="which axis it is for; x if not given")
+            add("--axis", type=str.lower, default="x", help="which axis it is for; x if not given")
         else:
-            required = {"required": True} if name != "status" else {}
-            add("--axis", help="which axis; of status: all if not given", **required)  # type: ignore[arg-type]
+            add("--axis", type=str.lower, help="which axis of the machine; of status: all if not given")
             add_target(action)
+            declare_device(action, sends=name != "status", has_file=name == "send")
         if name == "check":
             add("--machine", type=Path, metavar="CONFIG", help="compare with the axis's travel there")
         if name == "plot":
@@ -55,9 +56,13 @@ def _nothing(_: argparse.Namespace) -> Callable[[], Report]:
 def _job(
     name: str, given: argparse.Namespace, target: Callable[[argparse.Namespace], Any]
 ) -> Callable[[], Report]:
-    where = None if name in ("check", "plot") else target(given)
     if name in ("check", "plot", "send"):
         existing_file(given.file)
+    if name not in ("check", "plot") and given.device is not None:
+        return _device_job(name, given)
+    where = None if name in ("check", "plot") else target(given)
+    if name in ("send", "remove"):
+        _check_axis(name, given)
     if name == "check":
         existing_file(given.machine)
     if name == "plot" and given.output.suffix.lower() != ".svg":
@@ -68,3 +73,26 @@ def _job(
         return cast("Report", getattr(module, name)(given, where))
 
     return run
+
+
+def _check_axis(name: str, given: argparse.Namespace) -> None:
+    for option in ("axles", "stepper", "node", "link", "delay"):
+        if getattr(given, option):
+            raise UsageError(f"--{option} goes with --device: what drives or nodes the table is for")
+    if given.axis is None:
+        raise UsageError(f"what '{name}' is for is missing: --axis of a machine that runs, or --device")
+
+
+def _device_job(name: str, given: argparse.Namespace) -> Callable[[], Report]:
+    if given.at is not None:
+        raise UsageError(
+            "--at is a machine that runs, --device what is reached without one; give one of them"
+        )
+    table = None
+    if name == "send":
+        module = importlib.import_module("coordinator.table.files")
+        table = module.read_table(
+            given.file, axis=given.axis or "x", comp_type=int(given.type), unit=given.unit
+        )
+    job = device_job(given, table, sends=name != "status")
+    return lambda: cast("Report", given.on_device(job))

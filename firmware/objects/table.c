@@ -33,8 +33,9 @@ DECL_RESPONSE(table_state,
               "table_state oid=%c table_status=%c generation=%u length=%hu checksum=%u digest=%u words=%u");
 DECL_RESPONSE(table_active, "table_active oid=%c table_activation=%c generation=%u length=%hu clock=%u");
 DECL_RESPONSE(table_pair, "table_pair oid=%c index=%hu x=%i y=%i");
+DECL_RESPONSE(table_found, "table_found axle=%c oid=%c capacity=%hu");
 
-enum { BUFFERS = 3, NO_STEPPER = 255, BYTE_GAP_HZ = 10 };
+enum { BUFFERS = 3, NO_STEPPER = 255, NO_TABLE = 255, BYTE_GAP_HZ = 10 };
 
 struct table {
     struct timer timer; // of an activation
@@ -169,6 +170,20 @@ void command_table_query_active(struct node *node, const struct wire_arg *args) 
             INT(clock));
 }
 DECL_COMMAND(command_table_query_active, "table_query_active oid=%c", ALLOWED_IN_SHUTDOWN);
+
+// Who sends a table and did not configure the node knows axles, and no oids. Of several the first is told.
+void command_table_find(struct node *node, const struct wire_arg *args) {
+    const struct table *table;
+    uint32_t found = NO_TABLE, capacity = 0;
+    for (unsigned oid = 0; (table = oid_next(node, &oid, &table_type));)
+        if (table->receiver.axle == args[0].value) {
+            found = oid - 1;
+            capacity = table->receiver.capacity;
+            break;
+        }
+    RESPOND(node, table_found, INT(args[0].value), INT(found), INT(capacity));
+}
+DECL_COMMAND(command_table_find, "table_find axle=%c", ALLOWED_IN_SHUTDOWN);
 
 // A pair of the table that is kept; zeros beyond its end.
 void command_table_read(struct node *node, const struct wire_arg *args) {

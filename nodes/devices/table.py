@@ -1,7 +1,7 @@
 """A table on a node that MT brings (firmware/objects/table.h): its configuration, and what the node has."""
 
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from nodes.node_config import NodeConfig, NodeConfigError
 from nodes.node_errors import NodeError
@@ -12,13 +12,38 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from nodes.devices.stepper import Stepper
-    from nodes.node import Node  # planning needs no node, which draws in asyncio
+    from nodes.dictionary import Dictionary
+    from nodes.message_format import Message, Value
+    from nodes.seams import LinkLike  # planning needs no node, which draws in asyncio
 
 COMMANDS: Final = ("config_table", "table_query", "table_bytes", "table_activate", "table_query_active")
 CONSTANT: Final = "MT_AXLES"
 """Of the dictionary: the firmware keeps tables; its value is how many axles a mask can select."""
 CAPACITY_MAX: Final = 0xFFFF
+ANSWER_S: Final = 0.25
+ANSWER_TRIES: Final = 6
 _NO_STEPPER: Final = 255
+
+
+class TableNode(Protocol):
+    """What a table needs of its node: one of the coordinator's, or one that a tool talks to."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def dictionary(self) -> "Dictionary": ...  # noqa: D102
+    @property
+    def link(self) -> "LinkLike": ...  # noqa: D102
+    async def query(  # noqa: D102
+        self,
+        name: str,
+        response: str,
+        /,
+        *,
+        timeout_s: float = ...,
+        tries: int = ...,
+        **args: "Value | str",
+    ) -> "Message": ...
 
 
 @record
@@ -99,9 +124,12 @@ class AxleTable:
             f" stepper_oid={stepper_oid}",
         )
 
-    async def state(self, node: "Node") -> TableState:
-        """Ask NODE for what it keeps; raises NodeError."""
-        answer = await node.query("table_query", "table_state", oid=self._oid())
+    async def state(
+        self, node: TableNode, *, timeout_s: float = ANSWER_S, tries: int = ANSWER_TRIES
+    ) -> TableState:
+        """Ask NODE for what it keeps, TRIES times; raises QueryTimeout, NodeError."""
+        oid = self._oid()
+        answer = await node.query("table_query", "table_state", timeout_s=timeout_s, tries=tries, oid=oid)
         status = answer.integer("table_status")
         if status not in tuple(MtStatus):
             raise NodeError(f"{self.name}: node {node.name} answered with an unknown status {status}")
@@ -114,7 +142,7 @@ class AxleTable:
             answer.integer("words"),
         )
 
-    async def active(self, node: "Node") -> ActiveTable:
+    async def active(self, node: TableNode) -> ActiveTable:
         """Ask NODE which table is in use; raises NodeError."""
         answer = await node.query("table_query_active", "table_active", oid=self._oid())
         activation = answer.integer("table_activation")
@@ -127,12 +155,16 @@ class AxleTable:
             answer.integer("clock"),
         )
 
-    def activate(self, node: "Node", *, clock: int, generation: int) -> None:
+    def activate(self, node: TableNode, *, clock: int, generation: int) -> None:
         """Have NODE use the table of GENERATION (0: none) from CLOCK (ticks) on; ``active`` tells whether.
 
         Tables of several nodes come into use together when each gets its own clock of one moment.
         """
-        node.send("table_activate", oid=self._oid(), clock=clock & 0xFFFFFFFF, generation=generation)
+        node.link.send(
+            node.dictionary.encode(
+                "table_activate", oid=self._oid(), clock=clock & 0xFFFFFFFF, generation=generation
+            )
+        )
 
     def _oid(self) -> int:
         if self.oid is None:

@@ -9,11 +9,11 @@ import asyncio
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final, Protocol
 
-from nodes._can_bits import lib
-from nodes.devices.table import AxleTable, TableState
+from nodes.conversation import QueryTimeout
+from nodes.devices.table import AxleTable, TableNode, TableState
 from nodes.errors import CanductorError
-from nodes.node import Node
 from nodes.records import record
+from nodes.table.cost import CanCost, frame_bits
 from nodes.table.mt import MT_CAN_ID, MtError, MtStatus, Pair, to_bytes, to_frames, transmission
 from nodes.table.pace import NS_PER_S, PacedFrames
 
@@ -28,6 +28,9 @@ LINK_BYTES: Final = 48
 LINK_WINDOW_WORDS: Final = 2048
 """Sent and not yet heard: bounds the link's queue."""
 POLL_S: Final = 0.02
+QUICK_S: Final = 0.08
+QUICK_TRIES: Final = 3
+"""Of many answers on a bus that loses frames one is missing nearly always; slow lines get more time then."""
 STUCK_S: Final = 5.0
 """After so long without progress a node is given up."""
 SETTLE_S: Final = 0.01
@@ -43,6 +46,8 @@ class Bus(Protocol):
     def name(self) -> str: ...  # noqa: D102
     @property
     def bitrate(self) -> int: ...  # noqa: D102
+    @property
+    def load(self) -> float: ...  # noqa: D102
     def send_frame(self, can_id: int, data: bytes, /) -> None: ...  # noqa: D102
 
 
@@ -51,7 +56,7 @@ class Place:
     """Where a table goes: TABLE on NODE, which is on BUS; None: on a serial line."""
 
     table: AxleTable
-    node: Node
+    node: TableNode
     bus: Bus | None
 
 
@@ -77,6 +82,26 @@ class Outcome:
 
 
 @record
+class Cast:
+    """The broadcasts on one bus."""
+
+    bus: str
+    cost: CanCost
+    """Of the first; later ones address fewer axles, with as many words."""
+    times: int
+    elapsed_s: float
+    """Of all, from the first frame handed over until the last one had its share of time."""
+
+    def text(self) -> str:
+        """Return it for a reader."""
+        times = "once" if self.times == 1 else f"{self.times} times"
+        return (
+            f"broadcast {times} on {self.bus} in {self.elapsed_s:.3f} s, of which one takes at least "
+            f"{self.cost.bound_s:.3f} s ({self.cost.text()})"
+        )
+
+
+@record
 class Report:
     """What a download did and cost."""
 
@@ -84,14 +109,31 @@ class Report:
     """In the order of the places."""
     words: int
     """Of one transmission."""
-    broadcast_frames: int
-    broadcast_bits: int
+    casts: tuple[Cast, ...]
+    """By bus; empty when there was none."""
+    asking_s: float
+    """Before, between and after broadcasts, until they had settled too."""
+    links_s: float
+    """For those that broadcasts did not reach."""
     elapsed_s: float
+    """All of it."""
 
     @property
     def ok(self) -> bool:
         """Whether every place has the table."""
         return all(outcome.ok for outcome in self.outcomes)
+
+    @property
+    def bound_s(self) -> float:
+        """One broadcast on each bus, nothing lost and nobody asked; 0 without one."""
+        return sum(cast.cost.bound_s for cast in self.casts)
+
+    def text(self) -> str:
+        """Return what it cost, for a reader."""
+        told = [f"{self.words} words in {self.elapsed_s:.3f} s", *(cast.text() for cast in self.casts)]
+        if self.casts:
+            told.append(f"asking the nodes took {self.asking_s:.3f} s, links {self.links_s:.3f} s")
+        return "; ".join(told)
 
 
 class _Aim:
@@ -107,8 +149,12 @@ class _Aim:
 
     async def look(self) -> TableState | None:
         """Ask the node; None (and a problem) when it does not answer."""
+        table, node = self.place.table, self.place.node
         try:
-            self.state = await self.place.table.state(self.place.node)
+            try:
+                self.state = await table.state(node, timeout_s=QUICK_S, tries=QUICK_TRIES)
+            except QueryTimeout:
+                self.state = await table.state(node)
         except CanductorError as error:
             self.state, self.problem = None, str(error)
         return self.state
@@ -164,19 +210,22 @@ async def download(
     buses = {id(aim.place.bus): aim.place.bus for aim in aims if aim.place.bus is not None}
     for bus in buses.values():
         await caster.reach([aim for aim in aims if aim.place.bus is bus], bus, broadcasts_max)
+    links_begin_ns = now_ns()
     await asyncio.gather(*(_by_link(pairs, group) for group in _by_node(aims).values()))
+    casts = tuple(caster.casts.values())
     return Report(
         tuple(aim.outcome() for aim in aims),
         len(words),
-        caster.frames,
-        caster.bits,
+        casts,
+        (links_begin_ns - began_ns) / NS_PER_S - sum(cast.elapsed_s for cast in casts),
+        (now_ns() - links_begin_ns) / NS_PER_S,
         (now_ns() - began_ns) / NS_PER_S,
     )
 
 
-def _by_node(aims: Iterable[_Aim]) -> dict[Node, list[_Aim]]:
+def _by_node(aims: Iterable[_Aim]) -> dict[TableNode, list[_Aim]]:
     """Return those that are not served yet, by node."""
-    groups: dict[Node, list[_Aim]] = {}
+    groups: dict[TableNode, list[_Aim]] = {}
     for aim in aims:
         if not aim.done:
             groups.setdefault(aim.place.node, []).append(aim)
@@ -194,7 +243,8 @@ class _Caster:
     """Broadcasts PAIRS on one bus after another, and counts."""
 
     def __init__(self, pairs: Sequence[Pair], now_ns: Callable[[], int], share: float) -> None:
-        self.frames = self.bits = 0
+        self.casts: dict[int, Cast] = {}
+        """By the id of the bus."""
         self._pairs = pairs
         self._now_ns = now_ns
         self._share = share
@@ -227,8 +277,10 @@ class _Caster:
 
     async def _cast(self, bus: Bus, axles: set[int]) -> None:
         frames = to_frames(transmission(self._pairs, axles))
-        costs = [int(lib.can_frame_bits(MT_CAN_ID, len(frame), frame)) for frame in frames]
-        bits_per_s = self._share * (bus.bitrate or SLOW_BITRATE)
+        costs = frame_bits(frames)
+        bitrate = bus.bitrate or SLOW_BITRATE
+        bits_per_s, began_ns = self._share * bitrate, self._now_ns()
+        cost = CanCost(len(frames), sum(costs), bitrate, self._share, bus.load)
         paced = PacedFrames(costs, bits_per_s, BURST_FRAMES * max(costs), self._now_ns())
         at = 0
         while paced.deadline_ns is not None:
@@ -238,8 +290,10 @@ class _Caster:
             at += count
             if paced.deadline_ns is not None:
                 await asyncio.sleep(max(0, paced.deadline_ns - self._now_ns()) / NS_PER_S)
-        self.frames += len(frames)
-        self.bits += sum(costs)
+        await asyncio.sleep(max(0, paced.paid_ns - self._now_ns()) / NS_PER_S)  # the last one's own time
+        past = self.casts.get(id(bus), Cast(bus.name, cost, 0, 0.0))
+        elapsed_s = past.elapsed_s + (self._now_ns() - began_ns) / NS_PER_S
+        self.casts[id(bus)] = Cast(bus.name, past.cost, past.times + 1, elapsed_s)
         await asyncio.sleep(SETTLE_S)
 
 

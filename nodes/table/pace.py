@@ -34,6 +34,11 @@ class PacedWords:
         self.deadline_ns = now_ns + self._delay_ns if self._words else None
         return word
 
+    def delay(self, by_ns: int) -> None:
+        """Have the next word wait BY_NS longer: so long the last one was under way."""
+        if self.deadline_ns is not None:
+            self.deadline_ns += by_ns
+
 
 class PacedFrames:
     """CAN frames within a budget of bits: those behind have to wait, so that motion does not.
@@ -48,7 +53,7 @@ class PacedFrames:
         self._costs = deque(costs)
         self._ns_per_bit = NS_PER_S / bits_per_s
         self._burst_ns = round(burst_bits * self._ns_per_bit)
-        self._paid_ns = now_ns
+        self.paid_ns = now_ns
         """Until when what was sent uses the budget up."""
 
     @property
@@ -59,13 +64,13 @@ class PacedFrames:
     @property
     def deadline_ns(self) -> int | None:
         """When the next frame is due; None: all are sent."""
-        return self._paid_ns if self._costs else None
+        return self.paid_ns if self._costs else None
 
     def take(self, now_ns: int) -> int:
         """Return how many frames may be sent at NOW_NS."""
-        self._paid_ns = max(self._paid_ns, now_ns - self._burst_ns)
+        self.paid_ns = max(self.paid_ns, now_ns - self._burst_ns)
         count = 0
-        while self._costs and self._paid_ns <= now_ns:
-            self._paid_ns += round(self._costs.popleft() * self._ns_per_bit)
+        while self._costs and self.paid_ns <= now_ns:
+            self.paid_ns += round(self._costs.popleft() * self._ns_per_bit)
             count += 1
         return count

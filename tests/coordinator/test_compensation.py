@@ -1,6 +1,7 @@
 """Axis tables in motion: what they are worth on a bad screw, and when they are taken up."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +20,17 @@ from coordinator.table.store import TableStore
 from tests.coordinator.motion.exact_program import Planned, plan_program
 from tests.coordinator.motion.planner_helpers import LIMITS, homed_planner, planned
 from tests.coordinator.motion.steps_harness import NODES, E, X, Y, Z, stepper
-from tests.coordinator.screw import STEP_MM, Floats, Screw, carry_out, measure, motor_mm, planned_mm, workout
+from tests.coordinator.screw import (
+    PERFECT,
+    STEP_MM,
+    Floats,
+    Screw,
+    carry_out,
+    measure,
+    motor_mm,
+    planned_mm,
+    workout,
+)
 
 ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "config" / "demo"
@@ -57,6 +68,26 @@ def test_other_screws(tmp_path: Path, screw: Screw) -> None:
     lines = workout(2, 8)
     corrected = carry_out(lines, screw, tmp_path, {"x": measure(screw, tmp_path)})
     assert corrected.rms_mm <= carry_out(lines, screw, tmp_path, {}).rms_mm / 20
+
+
+BETWEEN_POINTS_MM = 0.00025
+"""What points half a millimetre apart miss of the wobble (0.12 µm rms), and the way to the first."""
+
+
+@pytest.mark.parametrize(("microsteps", "share"), [(32, 17), (64, 20)])
+def test_a_wobble_alone_is_taken_away_down_to_what_steps_are(
+    tmp_path: Path, microsteps: int, share: int
+) -> None:
+    """A wobble of 12 µm is not 20 times what steps of 1.25 µm are wrong by on a perfect screw."""
+    screw, lines = Screw(stretch=0, backlash_mm=0), workout(1, 10)
+    table = measure(screw, tmp_path, microsteps=microsteps)
+    floor, without, corrected = (
+        carry_out(lines, one, tmp_path, tables, microsteps=microsteps).rms_mm
+        for one, tables in ((PERFECT, {}), (screw, {}), (screw, {"x": table}))
+    )
+    assert math.hypot(floor, BETWEEN_POINTS_MM) >= corrected
+    assert corrected <= without / share
+    assert (without / floor >= 20) == (share >= 20), "where the floor allows it, a twentieth is reached"
 
 
 SHAPED = "SET_INPUT_SHAPER SHAPER_TYPE_X=mzv SHAPER_FREQ_X=40"
@@ -289,7 +320,7 @@ def test_a_plan_takes_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     table.write_text("position_mm,forward_um\n0,0\n100,1000\n")
     program.write_text("G28\nG1 X100 F6000\n")
     steps = []
-    for words in ((), ("--table", f"x={table}")):
+    for words in ((), ("--table", f"X={table}")):
         assert cli.main(["plan", str(DEMO / "machine.cfg"), str(program), "--json", *words]) == 0
         steps.append(json.loads(capsys.readouterr().out.splitlines()[-1])["steps"])
     assert steps == [2 * 16000, 2 * 16160], "corexy: both motors, 160 steps a mm"

@@ -249,6 +249,13 @@ def test_a_table_needs_memory_and_a_stepper_that_is_one() -> None:
     assert host.dies("config_table oid=1 axle=1 capacity=4 stepper_oid=0") == "Invalid oid type"
 
 
+def test_tables_are_found_by_axle(host: Host) -> None:
+    for axle, found in ((1, (1, ROOM)), (2, (2, ROOM)), (3, (255, 0)), (28, (255, 0))):
+        answer = host.ask(f"table_find axle={axle}")
+        assert (answer["axle"], answer["oid"], answer["capacity"]) == (axle, *found)
+    assert Host().ask("table_find axle=1")["oid"] == 255, "nor does a node that is not configured have one"
+
+
 # ------------------------------------------------------------------------------------------ polled register
 
 

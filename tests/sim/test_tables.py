@@ -36,8 +36,9 @@ def with_tables(world: Stage) -> MachineDescription:
 class World:
     """A simulated machine with tables, that coordinators come and go at."""
 
-    def __init__(self, folder: Path, scenario: str = "clean") -> None:
-        self.stage = Stage(load(SCENARIOS / f"{scenario}.toml"), 1)
+    def __init__(self, folder: Path, scenario: str = "clean", machine: Path | None = None) -> None:
+        found = load(SCENARIOS / f"{scenario}.toml")
+        self.stage = Stage(found if machine is None else replace(found, machine=machine), 1)
         self.folder = folder
         self.tables = folder / "tables"
 
@@ -87,6 +88,11 @@ def test_a_table_is_kept_on_the_nodes_and_in_use(tmp_path: Path) -> None:
         assert note.startswith("axis x travels from 0 to 250 mm, the table covers 0 to 100.5; beyond it")
         (axis,) = told["axes"]
         assert axis["table"]["greatest_backlash"] == pytest.approx(0.05)
+        assert [one["axles"] for one in told["downloads"]] == [[1], [2]], "the sides differ"
+        for one in told["downloads"]:
+            assert one["broadcasts"] == 1
+            assert one["elapsed_s"] > one["bound_s"] > 0
+            assert "of which one takes at least" in one["told"]
         assert {(s["direction"], s["axle"], s["status"], s["active"]) for s in axis["nodes"]} == {
             ("forward", 1, "ok", True),
             ("reverse", 2, "ok", True),
@@ -104,8 +110,9 @@ def test_who_compensates_hears_of_every_change(tmp_path: Path) -> None:
 
     async def act(served: Served) -> None:
         served.service.tables.on_change.append(lambda axis, table: heard.append((axis, table)))
-        await served.call("table.send", **SAME)
-        await served.call("table.remove", axis="x")
+        await served.call("table.send", **{**SAME, "axis": "X"})
+        (axis,) = (await served.call("table.remove", axis="X"))["axes"]
+        assert axis["axis"] == "x"
 
     World(tmp_path).live(act)
     table = AxisTable(
@@ -119,7 +126,8 @@ def test_a_removed_table_is_gone_everywhere(tmp_path: Path) -> None:
 
     async def act(served: Served) -> None:
         await served.call("table.send", **TABLE)
-        await served.call("table.remove", axis="x")
+        gone = await served.call("table.remove", axis="x")
+        assert [(one["axles"], one["words"]) for one in gone["downloads"]] == [([1, 2], 10)]
         found = await sides(served)
         assert [(side["points"], side["active"]) for side in found] == [(0, True)] * 2
         with pytest.raises(ApiError, match="axis x has no table"):
@@ -274,6 +282,7 @@ def test_homing_another_axis_leaves_the_correction_where_it_is(tmp_path: Path) -
             | {name: [0] * (POINTS + 1) for name in ("forward", "reverse")},
             "has 33 points, and there is room for 32",
         ),
+        ({"unit": "deg"}, "axis x is not corrected: its table is in degrees, the axis moves in mm"),
     ],
 )
 def test_what_cannot_be_accepted(tmp_path: Path, changes: dict[str, Any], problem: str) -> None:
@@ -284,6 +293,30 @@ def test_what_cannot_be_accepted(tmp_path: Path, changes: dict[str, Any], proble
     world = World(tmp_path)
     world.live(act)
     assert not world.tables.exists()
+
+
+@pytest.mark.parametrize(
+    ("axis", "problem"),
+    [
+        (
+            "a",
+            "axis a is not corrected: that is for x, y and z of machines whose steppers move in proportion",
+        ),
+        ("x", "axis x cannot have a table; tables are for x, y and z of machines whose steppers move in"),
+    ],
+)
+def test_towers_take_no_tables(tmp_path: Path, axis: str, problem: str) -> None:
+    """But one that was kept for a tower can be taken away."""
+    world = World(tmp_path, machine=Path("config/delta.cfg"))
+    TableStore(world.tables).save(AxisTable(axis="b", positions=(0, 1), forward=(0, 0), reverse=(0, 0)))
+
+    async def act(served: Served) -> None:
+        with pytest.raises(ApiError, match=problem):
+            await served.call("table.send", **{**TABLE, "axis": axis})
+        await served.call("table.remove", axis="b")
+
+    world.live(act)
+    assert TableStore(world.tables).load() == ({}, [])
 
 
 def test_a_machine_without_the_section_has_no_tables(tmp_path: Path) -> None:

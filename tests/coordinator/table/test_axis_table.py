@@ -86,6 +86,21 @@ def test_figures() -> None:
     assert found["greatest_backlash"] == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize(("every_mm", "missed_um"), [(1.0, 0.92), (0.5, 0.23)])
+def test_what_a_table_of_a_wobble_misses_between_its_points(every_mm: float, missed_um: float) -> None:
+    """Against the wobble itself, 12 µm once in 8 mm, looked at everywhere."""
+    at = tuple(every_mm * k for k in range(round(16 / every_mm) + 1))
+    wobble = tuple(0.012 * math.sin(math.pi * x / 4) for x in at)
+    found = AxisTable(axis="x", positions=at, forward=wobble, reverse=(0.0,) * len(at))
+    told_um = 1e3 * float(figures(found)["between_points"])
+    assert told_um == pytest.approx(missed_um, rel=0.1)
+    fine = [k / 100 for k in range(1601)]
+    worst = max(abs(found.correction(x, Direction.FORWARD) - 0.012 * math.sin(math.pi * x / 4)) for x in fine)
+    assert told_um == pytest.approx(1e3 * worst, rel=0.1)
+    straight = AxisTable(axis="x", positions=(0.0, 1.0), forward=(0.0, 0.01), reverse=(0.0, 0.0))
+    assert figures(straight)["between_points"] == 0
+
+
 @pytest.mark.parametrize("flat", [0.0, 0.5])
 def test_a_picture(flat: float) -> None:
     picture = draw(table(axis="<x>", unit=Unit.DEG))

@@ -1,6 +1,7 @@
 """Files of tables: both types of COMP_FILE, CSV, and everything that is neither."""
 
 import contextlib
+import os
 from pathlib import Path
 
 import pytest
@@ -95,14 +96,28 @@ def test_what_is_wrong_with_csv(tmp_path: Path, text: str, problem: str) -> None
 def test_files_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(TableError, match="cannot be read: No such file"):
         read_table(tmp_path / "none", axis="x")
-    with pytest.raises(TableError, match="cannot be read"):
-        read_table(tmp_path, axis="x")
     with pytest.raises(TableError, match="is no text file"):
         read_table(write(tmp_path, b"\xff\xfe\x00"), axis="x")
     with pytest.raises(TableError, match="more than 4000000 bytes"):
         read_table(write(tmp_path, b"0 0 0\n" * 700_000), axis="x")
     with pytest.raises(TableError, match="units are mm, um, nm, inch, deg"):
         read_table(write(tmp_path, ""), axis="x", unit="ell")
+
+
+def test_what_is_no_regular_file_is_not_read(tmp_path: Path) -> None:
+    """A device may never end, a FIFO never begin."""
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    for path in (tmp_path, Path("/dev/null"), Path("/dev/zero"), fifo):
+        with pytest.raises(TableError, match=f"^{path} is not a regular file; give a COMP_FILE or CSV$"):
+            read_table(path, axis="x")
+
+
+def test_line_ends_of_all_kinds(tmp_path: Path) -> None:
+    tables = [
+        read_table(write(tmp_path, end.join(("0 0 0", "1 1 1"))), axis="x") for end in ["\n", "\r\n", "\r"]
+    ]
+    assert tables[0] == tables[1] == tables[2]
 
 
 texts = st.text('0123456789 .-+e\n,;_positnfrwardm#"', max_size=200)

@@ -91,7 +91,11 @@ def test_equal_values_cost_a_word_more_each() -> None:
 def test_a_late_sender_leaves_the_drive_its_time() -> None:
     paced = PacedWords([1, 2], 1000, 0)
     assert paced.take(0) == 1
+    paced.delay(500)
+    assert paced.take(1499) is None, "the first was under way for so long"
     assert (paced.take(5000), paced.deadline_ns) == (2, None)
+    paced.delay(500)
+    assert paced.deadline_ns is None
     with pytest.raises(MtError, match="the delay between two words is -1 ns"):
         PacedWords([], -1, 0)
 
