@@ -8,12 +8,15 @@ from typing import Final, cast
 
 from coordinator.commands import Report
 from coordinator.dnc.options import BLOCK_MAX, TRANSMISSIONS_MAX, DncOptions, read_frame
+from coordinator.front_end_words import Target, add_target, read_target
 from nodes.errors import CanductorError
 from nodes.option_values import UsageError, existing_file, number, whole
 from nodes.records import record
 
 CONTROL: Final = "control"
 PERIPHERAL: Final = "peripheral"
+HERE: Final = Target(address=None, token=None, certificate=None, timeout_s=5.0)
+"""The only machine of this user that runs here."""
 
 
 @record(kw_only=True)
@@ -37,7 +40,12 @@ class DncJob:
     once: bool = False
     start: bool = False
     """Print what came, or as it comes."""
-    at: str | None = None
+    numbered: bool = False
+    """N words rise by the same each time."""
+    verify: bool = False
+    """Have it come, or go back, once more, and compare."""
+    machine: Target = HERE
+    """Where it is printed."""
     json: bool = False
 
 
@@ -91,8 +99,20 @@ def _declare_receive(command: argparse.ArgumentParser) -> None:
     add("--folder", type=Path, default=Path(), metavar="DIR", help="where files go; this folder")
     add("--overwrite", action="store_true", help="a file of that name may be there")
     add("--crlf", action="store_true", help="end lines with CR LF; else LF")
+    _declare_verify(command, "have the file come twice")
+    _declare_numbered(command)
     add("--start", action="store_true", help="send the program to a machine that runs, and print it")
-    add("--at", metavar="ADDRESS", help="of that machine")
+    add_target(command)
+
+
+def _declare_numbered(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--numbered", action="store_true", help="N words rise by the same each time; refuse a gap"
+    )
+
+
+def _declare_verify(command: argparse.ArgumentParser, how: str) -> None:
+    command.add_argument("--verify", action="store_true", help=f"{how}; nothing counts unless both are alike")
 
 
 def _declare_send(command: argparse.ArgumentParser) -> None:
@@ -107,6 +127,7 @@ def _declare_send(command: argparse.ArgumentParser) -> None:
         default=CONTROL,
         help="peripheral: wait to be asked",
     )
+    _declare_verify(command, "ask for the file again")
 
 
 def _declare_serve(command: argparse.ArgumentParser) -> None:
@@ -114,6 +135,8 @@ def _declare_serve(command: argparse.ArgumentParser) -> None:
     add("folder", type=Path, help="what the control may see, fetch and add to")
     add("--overwrite", action="store_true", help="files may be replaced")
     add("--read-only", action="store_true", help="take no files")
+    _declare_verify(command, "have each file come twice")
+    _declare_numbered(command)
     add("--crlf", action="store_true", help="end lines with CR LF; else LF")
     add("--once", action="store_true", help="end after one transfer")
 
@@ -121,9 +144,11 @@ def _declare_serve(command: argparse.ArgumentParser) -> None:
 def _declare_drip(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add("file", nargs="?", help="file, pipe or - to feed a control that asks for a program")
-    add("--from", dest="source", metavar="NAME", help="ask a peripheral for NAME, and print it line by line")
-    add("--code", default="D", metavar="K", help="file code; D")
-    add("--at", metavar="ADDRESS", help="with --from: of the machine that prints")
+    add("--from", dest="source", metavar="NAME", help="ask a peripheral for NAME, and print it as it comes")
+    add("--from-control", action="store_true", help="print what a control sends, as it comes")
+    add("--code", default="D", metavar="K", help="file code, with --from; D")
+    _declare_numbered(command)
+    add_target(command)
 
 
 def _options(given: argparse.Namespace, answer_s: str) -> DncOptions:
@@ -154,6 +179,14 @@ def _line(given: argparse.Namespace, answer_s: str = "8") -> Mapping[str, object
     }
 
 
+def _machine(given: argparse.Namespace, printing: str | None, hint: str) -> Target:
+    """Return where to print; raises UsageError when nothing is."""
+    named = [f"--{o}" for o in ("at", "token-file", "certificate") if getattr(given, o.replace("-", "_"))]
+    if printing is None and named:
+        raise UsageError(f"{named[0]} says where to print; {hint}")
+    return HERE if printing is None else read_target(given)
+
+
 def _code(text: str) -> str:
     if len(text) != 1 or not text.isascii() or not (text.isalpha() or text == "%"):
         raise UsageError(f"--code is '{text}', must be one letter such as D, H or S")
@@ -161,8 +194,7 @@ def _code(text: str) -> str:
 
 
 def _receive(given: argparse.Namespace) -> Callable[[], Report]:
-    if given.at is not None and not given.start:
-        raise UsageError("--at says where to print; give --start, too")
+    machine = _machine(given, "--start" if given.start else None, "give --start, too")
     job = DncJob(
         **_line(given),  # type: ignore[arg-type]
         peripheral=given.name is None,
@@ -171,20 +203,25 @@ def _receive(given: argparse.Namespace) -> Callable[[], Report]:
         folder=given.folder,
         overwrite=given.overwrite,
         newline=b"\r\n" if given.crlf else b"\n",
+        numbered=given.numbered,
+        verify=given.verify,
         start=given.start,
-        at=given.at,
+        machine=machine,
     )
     return lambda: _run("receive", job)
 
 
 def _send(given: argparse.Namespace) -> Callable[[], Report]:
     existing_file(given.file)
+    if given.verify and given.role == PERIPHERAL:
+        raise UsageError("--verify asks for the file again, which a peripheral cannot; leave it out")
     job = DncJob(
         **_line(given),  # type: ignore[arg-type]
         peripheral=given.role == PERIPHERAL,
         code="" if given.code is None else _code(given.code),
         name=given.name or given.file.stem,
         file=given.file,
+        verify=given.verify,
     )
     return lambda: _run("send", job)
 
@@ -197,6 +234,8 @@ def _serve(given: argparse.Namespace) -> Callable[[], Report]:
         overwrite=given.overwrite,
         newline=b"\r\n" if given.crlf else b"\n",
         read_only=given.read_only,
+        numbered=given.numbered,
+        verify=given.verify,
         once=given.once,
     )
     return lambda: _run("serve", job)
@@ -208,12 +247,12 @@ def _list(given: argparse.Namespace) -> Callable[[], Report]:
 
 
 def _drip(given: argparse.Namespace) -> Callable[[], Report]:
-    if (given.file is None) == (given.source is None):
+    if (given.file is not None) + (given.source is not None) + given.from_control != 1:
         raise UsageError(
-            "drip takes either a FILE to feed a control with, or --from NAME to print from a peripheral"
+            "drip takes either a FILE to feed a control with, --from NAME to print from a peripheral,"
+            " or --from-control to print what a control sends"
         )
-    if given.at is not None and given.source is None:
-        raise UsageError("--at says where to print; it goes with --from")
+    machine = _machine(given, None if given.file else "--from", "it goes with --from or --from-control")
     if given.file not in (None, "-") and not Path(given.file).is_fifo():
         existing_file(Path(given.file))
     job = DncJob(
@@ -222,8 +261,9 @@ def _drip(given: argparse.Namespace) -> Callable[[], Report]:
         code=_code(given.code),
         name=given.source or "",
         file=None if given.file is None else Path(given.file),
-        start=given.source is not None,
-        at=given.at,
+        numbered=given.numbered,
+        start=given.file is None,
+        machine=machine,
     )
     return lambda: _run("drip", job)
 

@@ -10,17 +10,22 @@ from typing import IO, Final
 
 from coordinator.dnc.blocks import INPUT, OUTPUT, Header
 from coordinator.dnc.command_line import DncJob
-from coordinator.dnc.desk import Desk, FileSource, Library, Outcome, Sink, Source
+from coordinator.dnc.desk import Desk, FileSource, Library, Outcome, Sink, Source, Take
 from coordinator.dnc.driver import Driver
 from coordinator.dnc.engine import Engine
-from coordinator.dnc.feeds import MachineSink, SlowSource
-from coordinator.dnc.files import Check, Entry, Folder, check_lines
+from coordinator.dnc.feeds import SlowSource
+from coordinator.dnc.files import Check, Entry, Folder, check_lines, check_name
+from coordinator.dnc.numbers import numbered
 from coordinator.dnc.port import Port
 from coordinator.dnc.tables import check_table
+from coordinator.dnc.verify import Compare, Twice
 from nodes.errors import CanductorError
 from nodes.records import record
 
 NOT_YET_S: Final = 0.02
+UNREADABLE: Final = "what comes cannot be read; are baud rate and frame those of the control?"
+BETWEEN: Final = 4
+"""Silences between two transfers."""
 
 
 @record
@@ -62,7 +67,11 @@ def _line(job: DncJob) -> Iterator[Driver]:
     try:
         paced = port.is_paced if job.paced is None else job.paced
         options = replace(job.options, paced=paced)
-        driver = Driver(port, Engine(options, time.monotonic(), peripheral=job.peripheral))
+        driver = Driver(
+            port,
+            Engine(options, time.monotonic(), peripheral=job.peripheral),
+            on_unreadable=lambda: _say(job, UNREADABLE),
+        )
         try:
             yield driver
         finally:
@@ -76,15 +85,18 @@ def _play(driver: Driver, desk: Desk) -> Outcome:
     """Go on until a transfer has ended, well or not."""
     try:
         while True:
-            until_s = time.monotonic() + NOT_YET_S if desk.waits_for_line else None
+            until_s = time.monotonic() + NOT_YET_S if desk.looks else None
             for event in driver.wait(until_s):
                 if (outcome := desk.handle(event)) is not None:
                     driver.flush()
                     return outcome
-            if desk.waits_for_line:
+            if desk.looks:
                 desk.go_on()
+    except CanductorError as error:
+        desk.close(str(error))
+        raise
     except BaseException:
-        desk.close()
+        desk.close("canductor dnc was stopped")
         raise
 
 
@@ -96,49 +108,98 @@ def _report(outcome: Outcome, text: str) -> DncReport:
 
 def _sentence(outcome: Outcome) -> str:
     """Tell of a failure which file it was."""
-    return f"{outcome.name}: {outcome.sentence}" if outcome.name else outcome.sentence
+    name = outcome.name
+    named = (
+        outcome.sentence.startswith((f"{name} ", f"{name}.", f"{name}:")) or f"{name!a}" in outcome.sentence
+    )
+    return outcome.sentence if named or not name else f"{outcome.name}: {outcome.sentence}"
 
 
 def receive(job: DncJob, check: Check = check_table) -> DncReport:
     """Take one file into a folder, and print it if asked to; raises CanductorError. CHECK is for tables."""
     assert job.folder is not None
-    folder = Folder(job.folder, overwrite=job.overwrite, newline=job.newline, check=check)
-    with contextlib.closing(folder), _line(job) as driver:
-        desk = Desk(driver.engine, take=lambda header: folder.take(header.code, header.name))
+    with contextlib.ExitStack() as stack:
+        folder = Folder(job.folder, overwrite=job.overwrite, newline=job.newline, check=check)
+        stack.enter_context(contextlib.closing(folder))
+        driver = stack.enter_context(_line(job))
+        twice = stack.enter_context(contextlib.closing(Twice(folder, job.options.block_max)))
+        take = numbered(twice.take if job.verify else folder_take(folder), even=job.numbered)
+        desk = Desk(driver.engine, take=take)
         if job.peripheral:
             _say(job, f"waiting for a control at {job.port} to send a file into {folder.path}")
-        else:
-            desk.begin(Header(job.code, job.name, INPUT))
-        outcome = _play(driver, desk)
-    text = f"{outcome.name}: {outcome.lines} lines are in {job.folder}"
+        outcome = _receive(job, driver, desk)
+        while outcome.ok and (name := twice.waits_for) is not None:
+            if job.peripheral:
+                _say(job, _once(outcome))
+            else:
+                _say(job, f"{name} came; asking for it again, to compare")
+                driver.wait(time.monotonic() + BETWEEN * job.options.character_s)
+            outcome = _receive(job, driver, desk)
+    same = ", the same twice" if job.verify else ""
+    text = f"{outcome.name}: {outcome.lines} lines are in {job.folder}{same}"
     report = _report(outcome, text)
-    if job.start:
+    if not job.start:
+        return report
+    try:
         _print(job, job.folder / outcome.name)
-        return DncReport(report.outcomes, f"{text}, and being printed")
-    return report
+    except CanductorError as error:
+        raise CanductorError(f"{text}, but not printed: {error}") from None
+    return DncReport(report.outcomes, f"{text}, and being printed")
+
+
+def folder_take(folder: Folder) -> Take:
+    """Return what takes files into FOLDER."""
+    return lambda header: folder.take(header.code, header.name)
+
+
+def _receive(job: DncJob, driver: Driver, desk: Desk) -> Outcome:
+    """Take a file once."""
+    if not job.peripheral:
+        desk.begin(Header(job.code, job.name, INPUT))
+    return _play(driver, desk)
 
 
 def send(job: DncJob) -> DncReport:
     """Give one file; raises CanductorError."""
     assert job.file is not None
     code = job.code or Entry(job.file.name, 0).code
-    try:
-        content = job.file.open("rb")
-    except OSError as error:
-        raise CanductorError(f"{job.file} cannot be read: {error.strerror}") from None
-    with content:
+    with contextlib.ExitStack() as stack:
+        content = stack.enter_context(_open(job.file))
         line_max = job.options.block_max - 2
         check_lines(content, job.file.name, line_max, job.options.frame.data_bits)
-        source = FileSource(content, line_max)
-        with _line(job) as driver:
-            desk = Desk(driver.engine, give=lambda _: (job.name, source))
-            if job.peripheral:
-                _say(job, f"waiting for a control at {job.port} to ask for a file; it gets {job.file}")
-            else:
-                desk.begin(Header(code, job.name, OUTPUT))
-            outcome = _play(driver, desk)
+        driver = stack.enter_context(_line(job))
+        desk = Desk(driver.engine, give=lambda _: (job.name, FileSource(content, line_max)))
+        if job.peripheral:
+            _say(job, f"waiting for a control at {job.port} to ask for a file; it gets {job.file}")
+        else:
+            desk.begin(Header(code, job.name, OUTPUT))
+        outcome = _play(driver, desk)
+        if outcome.ok and job.verify:
+            _fetch_back(job, driver, Header(code, job.name, INPUT))
+            outcome = replace(outcome, confirmed=True)
+            return _report(outcome, f"{job.file}: {outcome.lines} lines; the other side has the same")
     how = "was taken" if outcome.confirmed else "was sent, each block acknowledged"
     return _report(outcome, f"{job.file}: {outcome.lines} lines; the file {how}")
+
+
+def _fetch_back(job: DncJob, driver: Driver, header: Header) -> None:
+    """Make sure that the other side has what was sent to it; raises CanductorError."""
+    assert job.file is not None
+    _say(job, f"{job.name} was sent; asking for it, to compare")
+    driver.wait(time.monotonic() + BETWEEN * job.options.character_s)
+    same = Compare(job.name, _open(job.file), job.options.block_max, "delete it at the other side")
+    desk = Desk(driver.engine, take=lambda _: same)
+    desk.begin(header)
+    outcome = _play(driver, desk)
+    if not outcome.ok:
+        raise CanductorError(f"{job.name} was sent, but is not confirmed: {outcome.sentence}")
+
+
+def _open(file: Path) -> IO[bytes]:
+    try:
+        return file.open("rb")
+    except OSError as error:
+        raise CanductorError(f"{file} cannot be read: {(error.strerror or str(error)).lower()}") from None
 
 
 def serve(job: DncJob, check: Check = check_table) -> DncReport:
@@ -148,18 +209,17 @@ def serve(job: DncJob, check: Check = check_table) -> DncReport:
     folder = Folder(job.folder, overwrite=job.overwrite, newline=job.newline, check=check)
     with contextlib.closing(folder), _line(job) as driver:
         library = Library(folder, driver.engine)
-        desk = Desk(
-            driver.engine,
-            give=library.give,
-            take=None if job.read_only else library.take,
-            folder=folder,
-        )
+        twice = Twice(folder, job.options.block_max)
+        take = numbered(twice.take if job.verify else folder_take(folder), even=job.numbered)
+        desk = Desk(driver.engine, give=library.give, take=None if job.read_only else take, folder=folder)
         _say(job, f"serving {folder.path} at {job.port}; Ctrl-C ends it")
-        while True:
-            outcome = _play(driver, desk)
-            _say(job, _told(outcome))
-            if job.once:
-                return _report(outcome, "")
+        with contextlib.closing(twice):
+            while True:
+                outcome = _play(driver, desk)
+                once = outcome.ok and twice.waits_for is not None and twice.waits_for == outcome.name
+                _say(job, _once(outcome) if once else _told(outcome))
+                if job.once and not once:
+                    return _report(outcome, "")
 
 
 def list_files(job: DncJob) -> DncReport:
@@ -175,7 +235,7 @@ def list_files(job: DncJob) -> DncReport:
 
 
 def drip(job: DncJob) -> DncReport:
-    """Feed a control line by line, or print what a peripheral feeds; raises CanductorError."""
+    """Feed a control line by line, or print what the other side sends; raises CanductorError."""
     if job.file is None:
         return _drip_to_machine(job)
     with contextlib.ExitStack() as stack:
@@ -189,31 +249,44 @@ def drip(job: DncJob) -> DncReport:
 
 
 def _open_stream(file: Path, stack: contextlib.ExitStack) -> IO[bytes]:
-    if str(file) == "-":
-        return sys.stdin.buffer
-    try:
-        return stack.enter_context(file.open("rb"))
-    except OSError as error:
-        raise CanductorError(f"{file} cannot be read: {error.strerror}") from None
+    return sys.stdin.buffer if str(file) == "-" else stack.enter_context(_open(file))
 
 
 def _drip_to_machine(job: DncJob) -> DncReport:
-    from coordinator.ipc.blocking import BlockingClient  # noqa: PLC0415 (others do without)
+    from coordinator.dnc.machine import MachineSink  # noqa: PLC0415 (others do without)
+    from coordinator.front_ends import tls_of  # noqa: PLC0415 (likewise)
+    from coordinator.ipc.blocking import BlockingClient  # noqa: PLC0415 (likewise)
 
-    with BlockingClient(job.at, name="canductor dnc") as client, _line(job) as driver:
-        sink: Sink = MachineSink(client.call, job.name)
-        desk = Desk(driver.engine, take=lambda _: sink)
-        desk.begin(Header(job.code, job.name, INPUT))
-        outcome = _play(driver, desk)
-    return _report(outcome, f"{outcome.name}: {outcome.lines} lines were printed as they came")
+    at = job.machine
+    options = {"token": at.token, "tls": tls_of(at), "timeout_s": at.timeout_s, "name": "canductor dnc"}
+    sinks: list[MachineSink] = []
+    with BlockingClient(at.address, **options) as client:
+
+        def print_as_it_comes(header: Header) -> Sink:
+            sinks.append(MachineSink(client, check_name(header.name or "NONAME")))
+            return sinks[-1]
+
+        with _line(job) as driver:
+            desk = Desk(driver.engine, take=numbered(print_as_it_comes, even=job.numbered))
+            if job.peripheral:
+                _say(job, f"waiting for a control at {job.port} to send a program; it is printed as it comes")
+            else:
+                desk.begin(Header(job.code, job.name, INPUT))
+            outcome = _play(driver, desk)
+        report = _report(outcome, f"{outcome.name}: {outcome.lines} lines were printed as they came")
+        _say(job, f"{outcome.name}: all {outcome.lines} lines came; waiting for the machine")
+        sinks[-1].wait_until_over()
+    return report
 
 
 def _print(job: DncJob, file: Path) -> None:
-    from coordinator.front_end_words import Target  # noqa: PLC0415 (others do without)
-    from coordinator.front_ends import send as send_to_machine  # noqa: PLC0415 (likewise)
+    from coordinator.front_ends import send as send_to_machine  # noqa: PLC0415 (others do without)
 
-    target = Target(address=job.at, token=None, certificate=None, timeout_s=5.0)
-    send_to_machine(target, file, file.name, replace=job.overwrite, start=True, quiet=job.json)
+    send_to_machine(job.machine, file, file.name, replace=job.overwrite, start=True, quiet=job.json)
+
+
+def _once(outcome: Outcome) -> str:
+    return f"{outcome.name} came once, {outcome.lines} lines; send it once more, to compare"
 
 
 def _told(outcome: Outcome) -> str:

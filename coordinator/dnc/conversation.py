@@ -52,6 +52,10 @@ class Conversation:
         self._busy_until_s = now_s
         self._deadline_s: float | None = None
         self._held = False
+        self._wants_line = False
+        """The owner was told that a line is wanted, and has not given it."""
+        self._heard = 0
+        """Characters since the transfer began."""
         self._maybe_acked = False
         """There was an ACK in the noise since the block was sent."""
         self._listing = bytearray()
@@ -59,6 +63,16 @@ class Conversation:
         """Of the block that was taken last."""
         self._last_ack = False
         """The last answer given was ACK: after NAK no end can come."""
+
+    @property
+    def held(self) -> bool:
+        """Whether the other side asked for a pause, by DC3: no line should be given now."""
+        return self._held
+
+    @property
+    def _what(self) -> str:
+        """What the transfer that is on is about, for sentences."""
+        return "the directory" if self.header is None else "the file"
 
     @property
     def noise_bytes(self) -> int:
@@ -98,9 +112,9 @@ class Conversation:
     def _begin(self, header: Header | None) -> None:
         assert self.state in (State.IDLE, State.ASKED)
         self.header = header
-        self.lines = 0
+        self.lines = self._heard = 0
         self._tries = 0
-        self._held = False
+        self._held = self._wants_line = False
         self._last_ack = True
 
     def _transmit(self, start: int, content: bytes) -> None:
@@ -115,6 +129,8 @@ class Conversation:
         # The tolerance is for two clocks that differ; an answer before DC1 is one.
         block_s = (len(self._sent) - self.options.dc1) * self.options.character_time_s
         self._left_s = self._busy_until_s - self.options.dc1 * self.options.character_time_s - 0.08 * block_s
+        # Where it is not known when it leaves, an answer may come that late, after another that is none.
+        self._scanner.nak_extra_s = 0.0 if self.options.paced else 1.1 * block_s
 
     def _say(self, data: bytes) -> None:
         self._output += data
@@ -131,7 +147,9 @@ class Conversation:
             self._wait(State.LINE_WANTED, self.options.decide_s)
         else:
             self._wait(State.LINE_WANTED, None)
-            self._events.append(events.LineWanted())
+            if not self._wants_line:
+                self._wants_line = True
+                self._events.append(events.LineWanted())
 
     def _wait(self, state: State, patience_s: float | None) -> None:
         self.state = state
@@ -146,6 +164,7 @@ class Conversation:
     def _end(self, event: events.Event) -> None:
         """End the transfer; what the owner has not yet heard of it and could no longer answer, is void."""
         self._idle()
+        self._wants_line = False
         self._events = [e for e in self._events if isinstance(e, events.Failed | events.Sent)]
         self._events.append(event)
 
@@ -156,13 +175,15 @@ class Conversation:
             )
         elif self.state is State.ERROR_SENT:
             self._end(events.Failed("the other side did not answer the error it was told"))
+        elif self._heard and self.state in (State.HEADER_SENT, State.LISTING):
+            self.fail("what the other side answers cannot be read; check baud rate, parity and the cable")
         else:
             what = {
                 State.HEADER_SENT: "the header",
                 State.RECEIVING: f"line {self.lines}, the last one that came"
                 if self.lines
                 else "the header's answer",
-                State.ETX_SENT: "the end of the file",
+                State.ETX_SENT: f"the end of {self._what}",
                 State.LISTING: "the request for the directory",
             }.get(self.state, f"line {self.lines + 1}")
             self.fail(f"nothing came after {what} in time; check the cable, the other side and its settings")

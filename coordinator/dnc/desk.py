@@ -37,6 +37,13 @@ class Sink(Protocol):
 
     name: str
     size_bytes: int
+    is_live: bool
+    """Whether ``ready`` shall be asked now and then, also while nothing comes."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether another line may come; raises CanductorError when none may any more."""
+        ...
 
     def write(self, line: bytes) -> None:
         """Take a line; raises CanductorError."""
@@ -44,8 +51,8 @@ class Sink(Protocol):
     def keep(self) -> None:
         """Make all of it count; raises CanductorError."""
 
-    def drop(self) -> None:
-        """Forget it; without effect after ``keep``."""
+    def drop(self, why: str = "") -> None:
+        """Forget it, for the reason WHY; without effect after ``keep``."""
 
 
 class FileSource:
@@ -113,9 +120,15 @@ class Desk:
         self._sink: Sink | None = None
         self._source: Source | None = None
         self._name = ""
+        """Of the file of the transfer that is on: as asked for, and once it is open, as it is called here."""
         self._why = ""
-        self.waits_for_line = False
-        """The source has no line yet: call ``go_on`` now and then."""
+        self._waits_for_line = False
+        """The source has no line yet."""
+
+    @property
+    def looks(self) -> bool:
+        """Whether ``go_on`` shall be called now and then."""
+        return self._waits_for_line or (self._sink is not None and self._sink.is_live)
 
     def begin(self, header: Header) -> None:
         """Control: fetch or send the file of HEADER; raises CanductorError."""
@@ -128,6 +141,12 @@ class Desk:
 
     def handle(self, event: events.Event) -> Outcome | None:
         """Act on EVENT; return what became of a transfer that it ended."""
+        outcome = self._act(event)
+        if outcome is not None:
+            self._name = ""  # what comes next is not about that file
+        return outcome
+
+    def _act(self, event: events.Event) -> Outcome | None:
         match event:
             case events.Asked(header=header):
                 self._asked(header)
@@ -148,13 +167,19 @@ class Desk:
         return None
 
     def go_on(self) -> None:
-        """Give the next line, if there is one yet."""
+        """Give the next line, if there is one yet; let the next one come, if there is room."""
+        if self._sink is not None:
+            self._look_for_room(self._sink)
+            return
         if self._engine.state is not State.LINE_WANTED or self._source is None:
-            self.waits_for_line = False
+            self._waits_for_line = False
+            return
+        if self._engine.held:
+            self._waits_for_line = True
             return
         try:
             line = self._source.next_line()
-            self.waits_for_line = line is NOT_YET
+            self._waits_for_line = line is NOT_YET
             if line is None:
                 self._engine.give_end()
             elif isinstance(line, bytes):
@@ -162,20 +187,29 @@ class Desk:
         except CanductorError as error:
             self._end_with(error)
 
-    def close(self) -> None:
-        """Drop what is not complete."""
+    def _look_for_room(self, sink: Sink) -> None:
+        try:
+            if sink.ready and self._engine.state is State.LINE_GIVEN:
+                self._engine.line_taken()
+        except CanductorError as error:
+            if self._engine.state in (State.RECEIVING, State.LINE_GIVEN):
+                self._end_with(error)
+
+    def close(self, why: str = "") -> None:
+        """Drop what is not complete, for the reason WHY."""
         if self._sink is not None:
-            self._sink.drop()
+            self._sink.drop(why)
         if self._source is not None:
             self._source.close()
         self._sink = self._source = None
-        self.waits_for_line = False
+        self._waits_for_line = False
 
     # --------------------------------------------------------------------------------------------- acts
 
     def _asked(self, header: Header) -> None:
         self.close()
         self._why = ""
+        self._name = header.name
         try:
             if header.mode == INPUT:
                 self._open_source(header)
@@ -201,10 +235,12 @@ class Desk:
         assert self._sink is not None
         try:
             self._sink.write(text)
+            ready = self._sink.ready
         except CanductorError as error:
             self._end_with(error)
         else:
-            self._engine.line_taken()
+            if ready:
+                self._engine.line_taken()
 
     def _end_with(self, error: CanductorError) -> None:
         """End the transfer because of this side."""
@@ -244,11 +280,13 @@ class Desk:
             return Outcome(did="failed", sentence=str(error))
 
     def _failed(self, sentence: str) -> Outcome:
-        self.close()
         why, self._why = self._why or sentence, ""
+        self.close(why)
         return Outcome(did="failed", name=self._name, code=self._code, lines=self._engine.lines, sentence=why)
 
     def _tell_directory(self) -> None:
+        self.close()
+        self._name = self._why = ""
         if self._folder is None or self._give is None:
             self._end_with(
                 FileRefused("the other side asked for the directory, but there is none", "NO DIRECTORY")
@@ -283,10 +321,6 @@ class Library:
             content.close()
             raise
         return found, FileSource(content, line_max)
-
-    def take(self, header: Header) -> Sink:
-        """See Take."""
-        return self._folder.take(header.code, header.name)
 
     def _next_name(self, code: str) -> str:
         """Return the next file's name; after the last one, none, and then the first again."""

@@ -46,6 +46,7 @@ class Engine(Reactions):
         """Take bytes of the line, of which the last came at NOW_S."""
         self.handle_timer(now_s - len(data) * self.options.character_time_s)
         self._now_s = max(self._now_s, now_s)
+        self._heard += len(data)
         if self.state is State.LISTING:
             self._take_listing(data)
         self._judge(self._scanner.receive(data, now_s))
@@ -101,6 +102,8 @@ class Engine(Reactions):
     def give_directory(self, text: bytes) -> None:
         """Peripheral: answer ``DirectoryAsked``."""
         self._say(text + bytes((ETX,)))
+        # The tolerance is as for a block: for two clocks that differ.
+        self._left_s = self._busy_until_s - (0.5 + 0.08 * len(text)) * self.options.character_time_s
         self._wait(State.ETX_SENT, self.options.answer_s)
         self._tries = self.options.transmissions  # it is no block: not repeated
 
@@ -115,6 +118,7 @@ class Engine(Reactions):
         if b"\r" in text or b"\n" in text or not is_text(text, self.options.frame.data_bits):
             raise BadText(f"line {self.lines + 1} has {_odd(text, self.options.frame.data_bits)}")
         self._tries = 0
+        self._wants_line = False
         self._transmit(STX, text + CRLF)
         self._wait(State.BLOCK_SENT, self.options.answer_s)
 
@@ -122,6 +126,7 @@ class Engine(Reactions):
         """Say that the line before was the last."""
         assert self.state is State.LINE_WANTED
         self._tries = 1
+        self._wants_line = False
         if self.is_peripheral:
             self._say_etx()
         else:

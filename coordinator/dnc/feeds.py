@@ -1,13 +1,12 @@
-"""Jobs that have no end yet: lines from a pipe that come when they come, lines to a machine that runs."""
+"""Programs that have no end yet: lines from a pipe that come when they come."""
 
 import contextlib
 import queue
 import threading
-from collections.abc import Callable, Mapping
-from typing import IO, Any, Final
+from typing import IO, Final
 
 from coordinator.dnc.desk import NOT_YET, Pause
-from coordinator.dnc.files import FileRefused, read_lines
+from coordinator.dnc.files import read_lines
 from nodes.errors import CanductorError
 
 QUEUED_LINES_MAX: Final = 64
@@ -56,32 +55,3 @@ class SlowSource:
                 self._lines.put(line, timeout=0.1)
                 return True
         return False
-
-
-class MachineSink:
-    """A machine that runs carries out each line as it comes; its answer is what lets the next one come.
-
-    The machine plans a few seconds ahead and answers when it has read a line, so that a peripheral feeds it
-    exactly as fast as it moves. CALL is a client's.
-    """
-
-    def __init__(self, call: Callable[[str, Mapping[str, Any]], Any], name: str) -> None:
-        self.name = name
-        self.size_bytes = 0
-        self._call = call
-
-    def write(self, line: bytes) -> None:
-        """See Sink: raises what the machine answers."""
-        self.size_bytes += len(line) + 1
-        try:
-            text = line.decode("ascii").strip()
-        except UnicodeDecodeError:
-            raise FileRefused(f"{self.name} has a line that is not ASCII", "BAD CHARACTER") from None
-        if text and not text.startswith("%"):
-            self._call("gcode.run", {"script": text, "wait": False})
-
-    def keep(self) -> None:
-        """See Sink."""
-
-    def drop(self) -> None:
-        """See Sink: what was carried out cannot be taken back."""

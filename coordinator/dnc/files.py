@@ -176,6 +176,9 @@ class Folder:
 class Incoming:
     """A file that comes: nobody sees it before ``keep``, which shows it whole, after the disk has it."""
 
+    is_live = False
+    ready = True
+
     def __init__(self, folder: Folder, fd: int, name: str, check: Check | None) -> None:
         self.name = name
         self.size_bytes = 0
@@ -187,7 +190,7 @@ class Incoming:
             self._file = os.fdopen(os.open(self._partial, _CREATE, 0o644, dir_fd=fd), "wb")
         except OSError as error:
             raise FileRefused(
-                f"nothing can be written in {folder.path}: {_why(error)}", "DISK ERROR"
+                f"nothing can be written in {folder.path}: {_why(error)}; name another folder", "DISK ERROR"
             ) from None
 
     def write(self, line: bytes) -> None:
@@ -200,17 +203,25 @@ class Incoming:
         try:
             self._file.write(data)
         except OSError as error:
-            raise FileRefused(f"{self.name} cannot be written: {_why(error)}", "DISK ERROR") from None
+            raise self._disk_error(error) from None
+
+    def content(self) -> IO[bytes]:
+        """Return what came so far, to be read; raises FileRefused."""
+        try:
+            self._file.flush()
+            return os.fdopen(os.open(self._partial, _READ, dir_fd=self._folder_fd), "rb")
+        except OSError as error:
+            raise FileRefused(f"{self.name} cannot be read again: {_why(error)}", "DISK ERROR") from None
 
     def keep(self) -> None:
         """Check the file and show it under its name; raises CanductorError, and then there is none."""
         try:
             self._file.flush()
             os.fsync(self._file.fileno())
-            self._file.close()
             if self._check is not None:
-                with os.fdopen(os.open(self._partial, _READ, dir_fd=self._folder_fd), "rb") as content:
+                with self.content() as content:
                     self._check(content.read(CHECKED_MAX), self.name)
+            self._file.close()
             self._show()
             os.fsync(self._folder_fd)
         except FileExistsError:
@@ -221,17 +232,23 @@ class Incoming:
             ) from None
         except OSError as error:
             self.drop()
-            raise FileRefused(f"{self.name} cannot be written: {_why(error)}", "DISK ERROR") from None
+            raise self._disk_error(error) from None
         except CanductorError:
             self.drop()
             raise
 
-    def drop(self) -> None:
+    def drop(self, why: str = "") -> None:  # noqa: ARG002 (others tell it)
         """Forget the file; after ``keep`` without effect."""
         with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):
             os.unlink(self._partial, dir_fd=self._folder_fd)
+
+    def _disk_error(self, error: OSError) -> FileRefused:
+        return FileRefused(
+            f"{self.name} cannot be written: {_why(error)}; make room there, or name another folder",
+            "DISK ERROR",
+        )
 
     def _show(self) -> None:
         names = {"src_dir_fd": self._folder_fd, "dst_dir_fd": self._folder_fd}

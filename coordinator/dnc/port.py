@@ -1,8 +1,10 @@
 """The serial line itself: a device, a pseudo-terminal, or a pyserial URL such as socket://HOST:PORT."""
 
 import contextlib
+import errno
 import os
 import queue
+import re
 import select
 import stat
 import termios
@@ -18,6 +20,7 @@ READ_SIZE: Final = 4096
 _QUEUED_MAX: Final = 256
 """Pieces of READ_SIZE that wait, from a port without a file descriptor."""
 _PSEUDO_MAJORS: Final = range(136, 144)
+_IN_TEXT: Final = re.compile(r"(?:\[Errno |\()(-?\d+)(?:\]|,) '?([^')]*)")
 
 
 class PortError(CanductorError):
@@ -159,13 +162,26 @@ def _mark_parity_errors(fd: int, *, on: bool) -> None:
 
 
 def _cannot_open(name: str, options: DncOptions, error: Exception) -> str:
-    why = getattr(error, "strerror", None) or str(error)
-    code = getattr(error, "errno", None)
-    if isinstance(error, PermissionError) or code == 13:
-        return f"{name} may not be opened; add yourself to the group 'dialout' and log in again"
-    if isinstance(error, FileNotFoundError) or code == 2:
-        return f"there is no serial port {name}; check its plug ('ls /dev/serial/by-id')"
-    if code in (11, 16):
-        return f"{name} is in use by another program; close that first"
+    code, why = _reason(error)
+    if "://" in name and code is not None:
+        return f"{name} cannot be reached: {why}; check host, port, and that the serial server runs"
+    match code:
+        case errno.EACCES | errno.EPERM:
+            return f"{name} may not be opened; add yourself to the group 'dialout' and log in again"
+        case errno.ENOENT | errno.ENODEV | errno.ENXIO:
+            return f"there is no serial port '{name}'; check its plug ('ls /dev/serial/by-id')"
+        case errno.EAGAIN | errno.EBUSY:
+            return f"{name} is in use by another program; close that first"
+        case errno.ENOTTY | errno.EISDIR:
+            return f"{name} is no serial port; name a device such as /dev/ttyUSB0, or socket://HOST:PORT"
     settings = f"{options.baud} baud {options.frame}"
-    return f"{name} cannot be opened at {settings}: {why.lower()}; check name and settings"
+    return f"{name} cannot be opened at {settings}: {why}; check name and settings"
+
+
+def _reason(error: Exception) -> tuple[int | None, str]:
+    """Return number and text of ERROR; pyserial leaves them in a text of its own, now and then."""
+    text = getattr(error, "strerror", None) or str(error)
+    code = getattr(error, "errno", None)
+    if (found := _IN_TEXT.search(text)) is not None:
+        code, text = int(found[1]), found[2].partition(":")[0]
+    return code, text.lower()

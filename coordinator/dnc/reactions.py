@@ -6,7 +6,7 @@ from typing import ClassVar, Final
 from coordinator.dnc import events
 from coordinator.dnc.blocks import ACK, EOT, INPUT, NAK, OUTPUT, read_header, strip_text
 from coordinator.dnc.conversation import Conversation, State
-from coordinator.dnc.scanner import Kind, Sign
+from coordinator.dnc.signs import Kind, Sign
 
 _TRANSFER: Final = frozenset(State) - {State.IDLE, State.ASKED, State.ERROR_SENT, State.LISTING}
 _QUIET: Final = (Kind.NOISE, Kind.HOLD, Kind.GO_ON)
@@ -93,13 +93,15 @@ class Reactions(Conversation):
     def _too_early(self, sign: Sign) -> bool:
         """End a transfer in which an answer came before its block can have: it was the one before's."""
         early = self.options.paced and sign.at_s < self._left_s
-        if early:
+        if early and self.header is None:
+            self.fail("the control ended the directory before all of it was sent")
+        elif early:
             self.fail("an answer came before its block was sent: one before was noise; nothing is kept")
         return early
 
     def _naked_end(self, _: Sign) -> None:
         if self._tries >= self.options.transmissions:
-            self.fail("the end of the file was refused; check baud rate, parity and the cable")
+            self.fail(f"the end of {self._what} was refused; check baud rate, parity and the cable")
             return
         self._tries += 1
         self.repeats += 1
@@ -111,7 +113,9 @@ class Reactions(Conversation):
         if sign.at_s - self._left_s > self.options.answer_s / 2:
             # The control that gives up says the same as the one that has all.
             self._end(
-                events.Failed("the control ended the transfer late: whether it has the file is not known")
+                events.Failed(
+                    f"the control ended the transfer late: whether it has {self._what} is not known"
+                )
             )
         else:
             self._end(events.Sent(confirmed=True))

@@ -35,55 +35,15 @@ from coordinator.dnc.blocks import (
     is_text,
 )
 from coordinator.dnc.options import DncOptions
-from nodes.records import record
+from coordinator.dnc.signs import Kind, Sign
 
 STARTS: Final = (SOH, STX)
 BLOCK_LIKE: Final = 16
 """Characters in one go that cannot be noise alone."""
 
 
-class Kind(Enum):
-    """What a sign is."""
-
-    BLOCK = auto()
-    HEADER = auto()
-    ACK = auto()
-    NAK = auto()
-    ETX = auto()
-    END = auto()
-    """ETX EOT."""
-    EOT = auto()
-    DIRECTORY = auto()
-    HOLD = auto()
-    """DC3: the other side asks for a pause."""
-    GO_ON = auto()
-    """DC1 by itself."""
-    DAMAGED = auto()
-    """A block it was, but not as it was sent."""
-    OVERRUN = auto()
-    """The other side went on without an answer to a damaged block: it took noise for one."""
-    CONFLICT = auto()
-    """NAK and another answer to one block: one of them is noise."""
-    NOISE = auto()
-    """What means nothing; CONTENT is an ACK if one was in it."""
-
-
 _TEXT: Final = re.compile(rb"[\r\n -\xff]+")
 _SIMPLE: Final = {ACK: Kind.ACK, NAK: Kind.NAK, ETX: Kind.ETX, EOT: Kind.EOT}
-
-
-@record
-class Sign:
-    """What was on the line, and when its last character was."""
-
-    kind: Kind
-    at_s: float
-    content: bytes = b""
-    """Of a block or header: what is between its first character and ETB."""
-    check: int = 0
-    """The block check that came."""
-    reason: str = ""
-    """Of what is damaged: why, to complete 'the block ...'."""
 
 
 class _State(Enum):
@@ -121,6 +81,9 @@ class Scanner:
         self._block_like = False
         self._unit_ended = False
         """An ETB and a check character have gone by."""
+        self._first_part = b""
+        """Of a block within which the line fell silent; its rest may still come."""
+        self._rest = bytearray()
         self._etx_stands = False
         """What is junk now followed an ETX."""
         self._ends_with_eot = False
@@ -129,6 +92,8 @@ class Scanner:
         """Else it is answers that are expected, and what is like a block matters less."""
         self.answer_leads = False
         """An ACK may be followed by a block at once, as that of a header is."""
+        self.nak_extra_s = 0.0
+        """For the answer to the block itself to come after a NAK that belongs to something before it."""
         self.noise_bytes = 0
 
     def reset(self) -> None:
@@ -189,9 +154,8 @@ class Scanner:
             case _State.SIMPLE:
                 if len(self._data) > 1:
                     return options.settle_s
-                return {NAK: options.nak_quiet_s, ETX: options.character_s}.get(
-                    self._data[0], options.settle_s
-                )
+                nak_s = options.nak_quiet_s + self.nak_extra_s
+                return {NAK: nak_s, ETX: options.character_s}.get(self._data[0], options.settle_s)
             case _:
                 return options.character_s
 
@@ -209,6 +173,7 @@ class Scanner:
                 self._emit(Kind.END if len(self._data) > 1 else _SIMPLE[self._data[0]])
             case _State.BLOCK | _State.CHECK:
                 self._end_unfinished("has no end")
+                self._first_part = bytes(self._data)
             case _State.COMMAND:
                 self._noise(len(self._data))
             case _:
@@ -220,8 +185,11 @@ class Scanner:
         self._emit(kind, content=bytes(self._data[1:-1]), check=self._check)
 
     def _end_unfinished(self, reason: str) -> None:
+        first_part, self._first_part = self._first_part, b""
         if self._ends_with_eot:
             self._emit(Kind.EOT)
+        elif first_part and _is_whole(first_part + self._rest):
+            self._emit(Kind.NOISE)  # the line was slow; a second NAK would ask for two repeats
         elif self._block_like and not self._is_told:
             self._emit(Kind.DAMAGED, reason=reason)
         elif self._etx_stands:
@@ -260,6 +228,7 @@ class Scanner:
         if character in STARTS:
             self._start = character
             self._data = bytearray((character,))
+            self._first_part = b""
             self._block_like = True
             self._state = _State.BLOCK
         elif character in _SIMPLE:
@@ -365,6 +334,8 @@ class Scanner:
             self._begin(character)
             return
         self._junk_bytes += 1
+        if len(self._rest) <= self._options.block_max + 2:
+            self._rest.append(character)
         self._holds_ack = self._holds_ack or character == ACK
         if self._awaits_check:
             self._unit_ended = True
@@ -394,9 +365,12 @@ class Scanner:
     def _to_junk(self, reason: str, character: int) -> None:
         if self._state is not _State.JUNK:
             self._junk_bytes = 0
+            self._rest.clear()
+            self._first_part = self._first_part if self._state is _State.IDLE else b""
             self._holds_ack = self._state is _State.SIMPLE and self._data[0] == ACK
             self._reason = reason
         self._junk_bytes += 1
+        self._rest.append(character)
         self._awaits_check = character == ETB
         self._ends_with_eot = character == EOT
         self._state = _State.JUNK
@@ -410,3 +384,11 @@ class Scanner:
             content = bytes((ACK,)) if self._holds_ack else b""
             self._noise(self._junk_bytes)
         self._signs.append(Sign(kind, self._last_s, content, check, reason))
+
+
+def _is_whole(data: bytes) -> bool:
+    """Tell whether DATA is a whole block, with DC1 or without."""
+    return any(
+        len(block) > 2 and block[-2] == ETB and block_check(block[:-1]) == block[-1]
+        for block in (data, data.removesuffix(bytes((DC1,))))
+    )

@@ -146,9 +146,9 @@ class Owner:
     def look(self, now_s: float) -> None:
         while happened := self.engine.take_events():
             for event in happened:
-                self._act(event)
+                self.act(event)
 
-    def _act(self, event: events.Event) -> None:
+    def act(self, event: events.Event) -> None:
         match event:
             case events.Asked(header=header):
                 assert self.kept is None, "a second header was taken"

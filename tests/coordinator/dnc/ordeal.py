@@ -4,7 +4,7 @@ Each ends with the identical file or with a sentence and no file; no line is eve
 whoever is told that his file was kept is told the truth.
 
 Usage, from the project's root: python -m tests.coordinator.dnc.ordeal
-[--transfers N] [--seed N] [--any-damage] [--trace]
+[--transfers N] [--seed N] [--any-damage] [--verify N] [--trace]
 """
 
 import argparse
@@ -75,24 +75,52 @@ def make_case(number: int, *, visible: bool = True) -> Case:
     return Case(number, options, faults, lines, chance.random() < 0.5)
 
 
-def build(case: Case) -> tuple[Line, Owner, Owner]:
-    """Return the line, the control and the peripheral."""
+def build(case: Case, again: int = 0) -> tuple[Line, Owner, Owner]:
+    """Return the line, the control and the peripheral; AGAIN: with other faults."""
     control = Engine(case.options, 0.0, peripheral=False)
     peripheral = Engine(case.options, 0.0, peripheral=True)
     owners = (
         Owner(control, case.lines if case.control_sends else None),
         Owner(peripheral, None if case.control_sends else case.lines),
     )
-    chances = [random.Random(case.number * 3 + i) for i in range(3)]
+    chances = [random.Random(case.number * 3 + i + again * 1_000_003) for i in range(3)]
     wires = (Wire(case.faults, case.options, chances[0]), Wire(case.faults, case.options, chances[1]))
     (control.send if case.control_sends else control.fetch)("D", "PART1")
     return Line(owners, wires, chances[2]), *owners
+
+
+def judge_twice(case: Case, times: range = range(1, 2)) -> tuple[bool, bool]:
+    """Play CASE twice, with each of TIMES as the second; AssertionError: both bring the same wrong file.
+
+    Returns whether the first brought a wrong one, and whether any two were alike.
+    """
+    first, alike = _received(case, 0), False
+    if first is None:
+        return False, False
+    for again in times:
+        second = _received(case, again)
+        alike = alike or second == first
+        assert second != first or first == case.lines, f"the same wrong file twice ({again})"
+    return first != case.lines, alike
+
+
+def _received(case: Case, again: int) -> tuple[bytes, ...] | None:
+    """Return the lines that are kept."""
+    line, control, peripheral = build(case, again)
+    line.run()
+    kept = (peripheral if case.control_sends else control).kept
+    return None if kept is None else tuple(kept)
 
 
 def judge(case: Case) -> Verdict:
     """Play CASE; raises AssertionError if it ends as no transfer may."""
     line, control, peripheral = build(case)
     line.run()
+    return verdict_of(case, control, peripheral)
+
+
+def verdict_of(case: Case, control: Owner, peripheral: Owner) -> Verdict:
+    """Tell what became of CASE; raises AssertionError if it ended as no transfer may."""
     sender, receiver = (control, peripheral) if case.control_sends else (peripheral, control)
     unseen = False
     if receiver.kept is not None:
@@ -127,8 +155,13 @@ def main() -> int:
     parser.add_argument("--transfers", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0, help="number of the first transfer")
     parser.add_argument("--any-damage", action="store_true", help="also damage that nobody can see; counted")
+    parser.add_argument(
+        "--verify", type=int, default=0, metavar="N", help="compare with N second transfers each"
+    )
     parser.add_argument("--trace", action="store_true", help="show what went over the line")
     given = parser.parse_args()
+    if given.verify:
+        return verify(given)
     tally: collections.Counter[str] = collections.Counter(kept=0, failed=0, wrong=0)
     why: collections.Counter[str] = collections.Counter()
     for number in range(given.seed, given.seed + given.transfers):
@@ -150,6 +183,24 @@ def main() -> int:
     for sentence, count in why.most_common(25):
         sys.stdout.write(f"{count:6} {sentence}\n")
     sys.stdout.write(f"{given.transfers} transfers: {dict(tally)}\n")
+    return 1 if tally["wrong"] else 0
+
+
+def verify(given: argparse.Namespace) -> int:
+    """Play each N times more, and compare; tell how many that came wrong were found out."""
+    tally: collections.Counter[str] = collections.Counter(wrong=0)
+    for number in range(given.seed, given.seed + given.transfers):
+        try:
+            was_wrong, alike = judge_twice(
+                make_case(number, visible=not given.any_damage), range(1, 1 + given.verify)
+            )
+        except AssertionError as error:
+            tally["wrong"] += 1
+            sys.stdout.write(f"transfer {number}: {error}\n")
+        else:
+            tally["alike"] += alike
+            tally["came wrong and found out"] += was_wrong
+    sys.stdout.write(f"{given.transfers} transfers, {given.verify} second ones each: {dict(tally)}\n")
     return 1 if tally["wrong"] else 0
 
 

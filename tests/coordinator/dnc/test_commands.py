@@ -269,10 +269,18 @@ def _rfc2217_server(listener: socket.socket, name: str) -> None:
 @pytest.mark.parametrize(
     ("words", "status", "sentence"),
     [
-        (("list", "-p", "/dev/none"), 1, "there is no serial port /dev/none; check its plug"),
-        (("list", "-p", "loop:/x"), 1, "there is no serial port loop:/x"),
+        (("list", "-p", "/dev/none"), 1, "there is no serial port '/dev/none'; check its plug"),
+        (("list", "-p", "loop:/x"), 1, "there is no serial port 'loop:/x'"),
         (("list", "-p", "what://x"), 1, "cannot be opened at 9600 baud 7E1"),
-        (("list", "-p", "socket://127.0.0.1:1"), 1, "cannot be opened"),
+        (
+            ("list", "-p", "socket://127.0.0.1:1"),
+            1,
+            "socket://127.0.0.1:1 cannot be reached: connection refused",
+        ),
+        (("list", "-p", "rfc2217://127.0.0.1:1"), 1, "connection refused; check host, port, and that the"),
+        (("list", "-p", "/dev/null"), 1, "/dev/null is no serial port; name a device such as /dev/ttyUSB0"),
+        (("list", "-p", "."), 1, ". is no serial port; name a device"),
+        (("list", "-p", ""), 1, "there is no serial port ''; check its plug"),
         (("list", "-p", "X", "--frame", "9Z1"), 2, "the character frame is '9Z1', must be like 7E1"),
         (("list", "-p", "X", "--baud", "fast"), 2, "--baud is 'fast', must be a whole number"),
         (("list", "-p", "X", "--silence", "9"), 2, "an answer may take 8 s, must be longer"),
@@ -285,6 +293,11 @@ def _rfc2217_server(listener: socket.socket, name: str) -> None:
         (("send", "ok.nc", "-p", "X", "--code", "77"), 2, "--code is '77', must be one letter"),
         (("receive", "A", "-p", "X", "--at", "Y"), 2, "--at says where to print; give --start, too"),
         (("drip", "-p", "X"), 2, "drip takes either a FILE"),
+        (("drip", "ok.nc", "--from", "A", "-p", "X"), 2, "drip takes either a FILE"),
+        (("drip", "--from", "A", "--from-control", "-p", "X"), 2, "drip takes either a FILE"),
+        (("drip", "ok.nc", "-p", "X", "--at", "Y"), 2, "--at says where to print; it goes with --from"),
+        (("send", "ok.nc", "--as", "peripheral", "--verify", "-p", "X"), 2, "which a peripheral cannot"),
+        (("receive", "A", "-p", "X", "--start", "--token-file", "no"), 1, "there is no file 'no'"),
         (("serve", "nowhere", "-p", "X"), 1, "the folder nowhere cannot be opened"),
         (("drip", "--from", "JOB", "-p", "X", "--at", "/none.sock"), 1, "/none.sock"),
         ((), 2, "COMMAND"),
@@ -307,6 +320,43 @@ def test_sentences(
     assert sentence in said
     assert said.count("\n") == 1
     assert said.startswith("canductor: ")
+
+
+def test_nobody_answers_and_a_port_that_is_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "ok.nc").write_bytes(b"ok\n")
+    at = ("--header-timeout", "0.2", "--answer-timeout", "0.4")
+    with Cable() as cable:
+        for words, what in (
+            (("list",), "the request for the directory"),
+            (("receive", "A", "--folder", str(tmp_path)), "the header"),
+            (("send", str(tmp_path / "ok.nc")), "the header"),
+        ):
+            assert main(["dnc", *words, "-p", cable.names[0], *at]) == 1
+            assert f"nothing came after {what} in time; check the cable" in capsys.readouterr().err
+        with started("serve", ".", "-p", cable.names[0], folder=tmp_path):
+            assert main(["dnc", "list", "-p", cable.names[0]]) == 1
+            assert "is in use by another program; close that first" in capsys.readouterr().err
+
+
+def test_the_wrong_baud_rate(tmp_path: Path) -> None:
+    """Both sides are told what it may be."""
+
+    def garble(_: int, data: bytes) -> bytes:
+        return bytes(c * 7 + 3 & 0x7F | 0x40 for c in data)
+
+    with (
+        Cable(change=garble) as cable,
+        started("serve", ".", "-p", cable.names[0], folder=tmp_path) as server,
+    ):
+        long = "A" * 30  # a NAK comes back
+        asked = run("receive", long, "-p", cable.names[1], "--header-timeout", "3", folder=tmp_path)
+        assert asked.stderr == (
+            f"canductor: {long}.nc: what the other side answers cannot be read; check baud rate, parity and"
+            " the cable\n"
+        )
+        server.terminate()
+        _, told = server.communicate(timeout=PATIENCE_S)
+        assert told.startswith("what comes cannot be read; are baud rate and frame those of the control?\n")
 
 
 def test_a_line_to_oneself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

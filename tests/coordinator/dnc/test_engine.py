@@ -17,92 +17,10 @@ from coordinator.dnc.blocks import (
     Header,
     write_block,
 )
-from coordinator.dnc.engine import Engine, State
-from coordinator.dnc.files import Entry
-from coordinator.dnc.listing import read_listing, write_listing
+from coordinator.dnc.engine import State
 from coordinator.dnc.options import DncOptions, Frame
 from nodes.errors import CanductorError
-
-
-class Bench:
-    """One engine, fed by hand; time passes by ``wait`` alone."""
-
-    def __init__(self, *, peripheral: bool, start_s: float = 0.0, **options: Any) -> None:
-        self.options = DncOptions(**({"baud": 9600} | options))
-        self.now_s = start_s
-        self.engine = Engine(self.options, start_s, peripheral=peripheral)
-        self.events: list[events.Event] = []
-
-    def wait(self, seconds: float) -> bytes:
-        until_s = self.now_s + seconds
-        while (due_s := self.engine.next_deadline()) is not None and due_s <= until_s:
-            self.now_s = max(self.now_s, due_s)
-            self.engine.handle_timer(self.now_s)
-        self.now_s = until_s
-        return self.said()
-
-    def come(self, data: bytes, then_s: float = 0.05) -> bytes:
-        """DATA comes over the line, and silence THEN_S long."""
-        self.now_s += len(data) * self.options.character_time_s
-        self.engine.receive(data, self.now_s)
-        return self.wait(then_s)
-
-    def said(self) -> bytes:
-        self.events += self.engine.take_events()
-        return self.engine.take_output()
-
-    def happened(self) -> list[events.Event]:
-        self.said()
-        happened, self.events = self.events, []
-        return happened
-
-    def failure(self) -> str:
-        (event,) = self.happened()
-        assert isinstance(event, events.Failed)
-        return event.sentence
-
-
-def block(text: bytes, dc1: bool = True) -> bytes:
-    return write_block(STX, text + b"\r\n", dc1=dc1)
-
-
-def receiving(*, mode: str = "A", **options: Any) -> Bench:
-    """An engine that waits for the first block: of a control's output, or of an input it asked for."""
-    bench = Bench(peripheral=mode == "A", **options)
-    if mode == "A":
-        assert bench.come(write_block(SOH, b"DPARTA", dc1=True)) == b""
-        bench.engine.accept()
-        bench.happened()
-        assert bench.said() == b""
-    else:
-        bench.engine.fetch("D", "PART")
-        bench.said()
-        bench.wait(0.1)
-        bench.come(bytes([ACK]))
-    assert bench.engine.state is State.RECEIVING
-    return bench
-
-
-def sending(**options: Any) -> Bench:
-    """A control whose first line is on its way."""
-    bench = Bench(peripheral=False, **options)
-    bench.engine.send("D", "PART")
-    bench.said()
-    bench.wait(0.1)
-    bench.come(bytes([ACK]))
-    assert bench.happened() == [events.LineWanted()]
-    bench.engine.give_line(b"X1")
-    assert bench.said() == block(b"X1")
-    bench.wait(0.1)
-    return bench
-
-
-def take(bench: Bench) -> bytes:
-    (event,) = bench.happened()
-    assert isinstance(event, events.Line)
-    bench.engine.line_taken()
-    assert bench.said() == bytes([ACK])
-    return event.text
+from tests.coordinator.dnc.bench import Bench, block, receiving, sending, take
 
 
 @pytest.mark.parametrize("start_s", [0.0, 4294967.0, 1e9])
@@ -170,6 +88,21 @@ def test_a_damaged_stx_is_refused(damaged: bytes) -> None:
     bench = receiving(mode="E")
     assert bench.come(damaged + block(b"X1")[1:], 0.6) == bytes([NAK])
     assert bench.happened() == []
+
+
+@pytest.mark.parametrize("at", range(1, 7))
+def test_a_line_that_is_slow_within_a_block_is_refused_once(at: int) -> None:
+    """Its rest is known by the check character; a second NAK would ask for two repeats, and double a line."""
+    bench, whole = receiving(), block(b"X1")
+    assert bench.come(whole[:at], 0.5) == bytes([NAK]), "it has no end"
+    assert bench.come(whole[at:], 0.5) == b""
+    bench.come(whole)
+    assert take(bench) == b"X1"
+    bench.wait(0.1)
+    assert bench.come(block(b"X2" * 20)[:3], 0.5) == bytes([NAK])
+    assert bench.come(block(b"X2" * 20)[3:].replace(b"X2", b"X3", 1), 0.6) == bytes([NAK])
+    bench.come(block(b"X2" * 20))
+    assert take(bench) == b"X2" * 20
 
 
 def test_an_etb_too_early_is_none() -> None:
@@ -323,37 +256,6 @@ def test_a_peripheral_tells_an_error() -> None:
     assert peripheral.engine.state is State.IDLE
 
 
-def test_directory() -> None:
-    control, peripheral = Bench(peripheral=False), Bench(peripheral=True)
-    control.engine.ask_directory()
-    request = control.said()
-    assert request == DIRECTORY_REQUEST == bytes.fromhex("131b113020440d0a")
-    peripheral.come(request)
-    assert peripheral.happened() == [events.DirectoryAsked()]
-    peripheral.engine.give_directory(write_listing([Entry("15.H", 513), Entry("A B.NC", 1)], 10_000))
-    control.come(peripheral.said(), 0.1)
-    assert control.wait(0.3) == bytes([EOT])
-    (event,) = control.happened()
-    assert isinstance(event, events.Directory)
-    listing = read_listing(event.text)
-    assert (listing.sectors, listing.free_sectors) == ({"15.H": 2}, 19)
-    peripheral.come(bytes([EOT]))
-    assert peripheral.happened() == [events.Sent(confirmed=True)]
-
-
-def test_a_damaged_directory_is_told() -> None:
-    with pytest.raises(CanductorError, match="damaged"):
-        read_listing(b"\r\n\r\n\r\n\r\n      15\x00H 2\r\n")
-
-
-def test_a_peripheral_without_directory() -> None:
-    control = Bench(peripheral=False)
-    control.engine.ask_directory()
-    control.said()
-    assert control.come(write_block(SOH, b"NO DIRECTORY", dc1=True)) == bytes([ACK, EOT])
-    assert control.failure() == "the peripheral says: NO DIRECTORY"
-
-
 def test_the_control_begins_anew() -> None:
     bench = receiving()
     bench.come(block(b"X1"))
@@ -371,6 +273,19 @@ def test_a_pause_by_dc3() -> None:
     assert bench.happened() == []
     bench.come(b"\x11")
     assert bench.happened() == [events.LineWanted()]
+
+
+def test_a_line_is_wanted_once() -> None:
+    """Whatever pauses are asked for before it is given."""
+    bench = sending()
+    bench.come(bytes([ACK]))
+    bench.come(b"\x13")
+    assert bench.engine.held
+    bench.come(b"\x11")
+    assert not bench.engine.held
+    assert bench.happened() == [events.LineWanted()]
+    bench.engine.give_line(b"X2")
+    assert bench.said() == block(b"X2")
 
 
 def test_noise_without_end_does_not_keep_a_transfer_alive() -> None:

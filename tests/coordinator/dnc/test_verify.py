@@ -1,0 +1,170 @@
+"""Files that have to come twice: whatever the block check lets pass is no file."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from coordinator.dnc.blocks import Header
+from coordinator.dnc.files import FileRefused, Folder
+from coordinator.dnc.verify import Compare, Twice
+from tests.coordinator.dnc.cable import Cable
+from tests.coordinator.dnc.ordeal import judge_twice, make_case
+from tests.coordinator.dnc.test_commands import FAST, PATIENCE_S, PROGRAM, run, started
+
+HEADER = Header("D", "PART", "A")
+LINES = [b"G28", b"", b"G1 X1"]
+
+
+def come(twice: Twice, lines: list[bytes], header: Header = HEADER) -> None:
+    sink = twice.take(header)
+    try:
+        for line in lines:
+            sink.write(line)
+        sink.keep()
+    except FileRefused:
+        sink.drop()
+        raise
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_same_twice_is_kept(tmp_path: Path) -> None:
+    twice = Twice(Folder(tmp_path, newline=b"\r\n"), 100)
+    come(twice, LINES)
+    assert twice.waits_for == "PART.nc"
+    assert [name[:5] for name in names(tmp_path)] == [".dnc-"]
+    come(twice, LINES)
+    assert twice.waits_for is None
+    assert names(tmp_path) == ["PART.nc"]
+    assert (tmp_path / "PART.nc").read_bytes() == b"G28\r\n\r\nG1 X1\r\n"
+
+
+@pytest.mark.parametrize(
+    ("second", "line"),
+    [
+        ([b"G28", b"", b"G1 X2"], 3),
+        ([b"G28", b""], 3),  # truncated
+        ([b"G28", b"G1 X1"], 2),  # a line is missing
+        ([b"G28", b"G28", b"", b"G1 X1"], 2),  # one is doubled
+        ([*LINES, b""], 4),
+    ],
+)
+def test_what_differs_is_not_kept(tmp_path: Path, second: list[bytes], line: int) -> None:
+    twice = Twice(Folder(tmp_path), 100)
+    come(twice, LINES)
+    with pytest.raises(FileRefused, match=f"line {line} of PART.nc is not the same twice: one of them came"):
+        come(twice, second)
+    assert names(tmp_path) == []
+    come(twice, LINES)
+    come(twice, LINES)
+    assert names(tmp_path) == ["PART.nc"]
+
+
+def test_another_file_makes_the_one_before_forgotten(tmp_path: Path) -> None:
+    twice = Twice(Folder(tmp_path), 100)
+    come(twice, LINES)
+    come(twice, LINES, Header("D", "OTHER", "A"))
+    assert twice.waits_for == "OTHER.nc"
+    come(twice, LINES)
+    assert twice.waits_for == "PART.nc"
+    assert len(names(tmp_path)) == 1
+    twice.close()
+    assert names(tmp_path) == []
+
+
+def test_a_second_time_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
+    twice = Twice(Folder(tmp_path), 100)
+    come(twice, LINES)
+    sink = twice.take(HEADER)
+    assert isinstance(sink, Compare)
+    sink.write(LINES[0])
+    sink.drop("the line broke")
+    assert names(tmp_path) == []
+
+
+def unseen(who: int, data: bytes) -> bytes:
+    """Flip one bit in two characters of a block: the check character is right all the same."""
+    return data.replace(b"X77.5", b"X66.5")
+
+
+def test_asked_for_twice(tmp_path: Path) -> None:
+    """The first time comes damaged, so that nobody sees it; then both are alike."""
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    ours.mkdir()
+    theirs.mkdir()
+    (ours / "part.nc").write_bytes(PROGRAM)
+    times = [0]
+
+    def change(who: int, data: bytes) -> bytes:
+        times[0] += b"X77.5" in data
+        return unseen(who, data) if times[0] == 1 else data
+
+    quick = (*FAST, "--silence", "0.05")
+    with Cable(change=change) as cable, started("serve", ".", "-p", cable.names[0], *quick, folder=ours):
+        words = ("receive", "PART", "-p", cable.names[1], *quick, "--verify")
+        bad = run(*words, folder=theirs)
+        assert bad.returncode == 1
+        assert "line 12 of PART.nc is not the same twice: one of them came damaged" in bad.stderr
+        assert names(theirs) == []
+        good = run(*words, folder=theirs)
+        assert good.stdout == "PART.nc: 60 lines are in ., the same twice\n"
+    assert (theirs / "PART.nc").read_bytes() == PROGRAM
+    assert names(ours) == ["part.nc"]
+
+
+def test_what_a_control_sends_twice(tmp_path: Path) -> None:
+    """At once, and something else in between."""
+    (tmp_path / "part.nc").write_bytes(PROGRAM)
+    (tmp_path / "other.nc").write_bytes(b"M30\n")
+    (tmp_path / "there").mkdir()
+    with (
+        Cable() as cable,
+        started(
+            "receive", "-p", cable.names[0], *FAST, "--verify", "--folder", "there", folder=tmp_path
+        ) as taking,
+    ):
+        for name in ("part.nc", "other.nc", "part.nc", "part.nc"):
+            assert list((tmp_path / "there").glob("*.nc")) == []
+            assert run("send", name, "-p", cable.names[1], *FAST, folder=tmp_path).returncode == 0
+        out, err = taking.communicate(timeout=PATIENCE_S)
+        assert (taking.returncode, out) == (0, "part.nc: 60 lines are in there, the same twice\n")
+        once = "came once, {} lines; send it once more, to compare\n"
+        assert err == f"part.nc {once.format(60)}other.nc {once.format(1)}part.nc {once.format(60)}"
+    assert (tmp_path / "there" / "part.nc").read_bytes() == PROGRAM
+
+
+def test_sent_and_fetched_back(tmp_path: Path) -> None:
+    (tmp_path / "part.nc").write_bytes(PROGRAM)
+    times = [0]
+
+    def change(who: int, data: bytes) -> bytes:
+        times[0] += who == 1 and b"X77.5" in data
+        return unseen(who, data) if times[0] == 2 and who == 1 else data
+
+    (tmp_path / "there").mkdir()
+    quick = (*FAST, "--silence", "0.05")
+    with (
+        Cable(change=change) as cable,
+        started("serve", "there", "-p", cable.names[0], *quick, folder=tmp_path),
+    ):
+        words = ("send", "part.nc", "-p", cable.names[1], *quick, "--verify", "--json")
+        good = run(*words, "--name", "GOOD", folder=tmp_path)
+        bad = run(*words, "--name", "BAD", folder=tmp_path)
+    assert json.loads(good.stdout.splitlines()[-1])["confirmed"] is True
+    assert bad.stderr.splitlines()[-1] == (
+        "canductor: BAD was sent, but is not confirmed: line 12 of BAD is not the same twice:"
+        " delete it at the other side"
+    )
+
+
+WRONG = (424, 671, 3638, 4130, 4581, 4786, 4892, 5136, 5215, 5586, 5712, 6962, 7855, 9900)
+"""Of the first 10,000 cases with any damage, those of which a single transfer brings a wrong file."""
+
+
+@pytest.mark.parametrize("number", WRONG[::4])
+def test_damage_that_nobody_can_see_is_seen_in_two(number: int) -> None:
+    was_wrong, _ = judge_twice(make_case(number, visible=False), range(1, 3))
+    assert was_wrong
