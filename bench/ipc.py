@@ -186,6 +186,11 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / 100
 
 
+def stolen_s() -> float:
+    """Return how long the host of a virtual machine had processors run something else, all together."""
+    return int(Path("/proc/stat").read_text().split()[8]) / 100
+
+
 def stalled(path: Path, seconds: float) -> str:
     """Watch everything at 50 Hz, listen, and stop reading."""
     peer = Peer(path, "msgpack")
@@ -287,6 +292,8 @@ class Print:
     grown_kib: int
     said: str
     computer_load: float
+    stolen: float
+    """Share of the processors that a virtual machine's host gave to others: from 1 % on p99 tells of that."""
 
 
 class Served:
@@ -333,7 +340,7 @@ def print_under(load: str, gcode: Path, seconds: float) -> Print:
     try:
         pid = served.process.pid
         time.sleep(2)  # for the look-ahead to be full, and memory to be taken
-        before_s, before_kib = cpu_s(pid), memory_kib(pid)
+        before_s, before_kib, stolen_before_s = cpu_s(pid), memory_kib(pid), stolen_s()
         said = ""
         if load == QUIET:
             time.sleep(seconds)
@@ -341,14 +348,18 @@ def print_under(load: str, gcode: Path, seconds: float) -> Print:
             command = [sys.executable, __file__, "--load", load, str(served.path), str(seconds)]
             said = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
         spent = cpu_s(pid) - before_s
-        wanted = ["machine.lead_min_ms", "nodes.*.lead_min_ms", "job.state"]
+        stolen = (stolen_s() - stolen_before_s) / seconds / (os.cpu_count() or 1)
+        wanted = ["machine.lead_min_ms", "nodes.*.lead_min_ms", "job.state", "machine.cause"]
         fields = served.ask("state.get", {"fields": wanted})["values"]
+        cause = fields.pop("machine.cause")
+        if cause:
+            sys.exit(f"the machine stopped under {load}: {cause}")
         if fields.pop("job.state") != "printing":
             sys.exit(f"{gcode} is printed in less than {seconds:g} s; give a longer file, or fewer --seconds")
         lead_ms = fields.pop("machine.lead_min_ms")
         command_lead_ms = min(value for value in fields.values() if value is not None)
         grown_kib = memory_kib(pid) - before_kib
-        return Print(lead_ms, command_lead_ms, spent / seconds, grown_kib, said, os.getloadavg()[0])
+        return Print(lead_ms, command_lead_ms, spent / seconds, grown_kib, said, os.getloadavg()[0], stolen)
     finally:
         served.close()
 
@@ -363,7 +374,8 @@ def compare(gcode: Path, rounds: int, seconds: float, stall_s: float) -> None:
             runs.append(run)
             print(
                 f"  {name:42} lead {run.lead_ms:5.0f} ms, command {run.command_lead_ms:5.1f} ms, "
-                f"CPU {run.cpu:4.0%}, memory {run.grown_kib:+6,} KiB, load {run.computer_load:.1f}  "
+                f"CPU {run.cpu:4.0%}, memory {run.grown_kib:+6,} KiB, load {run.computer_load:.1f}, "
+                f"stolen {run.stolen:5.2%}  "
                 f"{run.said}",
                 flush=True,
             )

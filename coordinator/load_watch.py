@@ -1,5 +1,6 @@
 """Sees coming that a bus cannot carry the motion that is planned on it, and says so before a step is late."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -28,10 +29,10 @@ class LoadWatch:
     name: str
     _late_since_ns: int | None = None
 
-    def look(self, forecast: Forecast, now: HostTime, repeated: float) -> None:
+    def look(self, forecast: Forecast, now: HostTime, repeated: Callable[[], float]) -> None:
         """Take the newest forecast; raises BusOverload when motion would be late for certain.
 
-        REPEATED: the share of the blocks on this bus that had to be sent again.
+        REPEATED tells the share of the blocks on this bus that had to be sent again, when that matters.
         """
         warning_s = forecast.warning_s
         if warning_s is None:
@@ -42,9 +43,9 @@ class LoadWatch:
         if now - self._late_since_ns < PERSISTS_S * 1e9 and warning_s > URGENT_S:
             return
         late = f"the first step commands would be late in {max(warning_s, 0):.1f} s"
-        if repeated > LOSSY:
+        if (share := repeated()) > LOSSY:
             raise BusOverload(
-                f"bus {self.name} loses too much: {repeated:.0%} of the blocks on it had to be sent again, "
+                f"bus {self.name} loses too much: {share:.0%} of the blocks on it had to be sent again, "
                 f"and {late}; check its cable, its termination and the bit rate of all nodes"
             )
         raise BusOverload(

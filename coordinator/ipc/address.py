@@ -1,5 +1,6 @@
 """Where a machine is found: its address in words."""
 
+import socket
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -45,6 +46,8 @@ def read_address(text: str | None) -> Address:
 
 def _only_machine() -> Address:
     folder, found = socket_folder(), host_sockets()
+    if len(found) > 1:  # one is taken as it is: connecting tells the same, and a stop shall not wait
+        found = [path for path in found if _is_served(path)] or found[:1]
     if len(found) == 1:
         return Address(path=found[0])
     if not found:
@@ -52,3 +55,16 @@ def _only_machine() -> Address:
             f"no machine runs here: there is no socket in {folder}; name one with --at ADDRESS"
         )
     raise CanductorError(f"several machines run here; name one with --at: {', '.join(map(str, found))}")
+
+
+def _is_served(path: Path) -> bool:
+    """Return whether somebody may be there: only a socket that a program left behind refuses. Never waits."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except OSError:  # too many wait there, or it may not be asked: it is up to the user to choose
+            return True
+    return True

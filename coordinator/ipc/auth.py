@@ -2,7 +2,6 @@
 
 import hmac
 import os
-import stat
 from dataclasses import dataclass
 from ipaddress import IPv6Address, ip_address
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Final
 
 from coordinator.ipc.methods import Scope
 from nodes.errors import CanductorError
+from nodes.secret_file import read_secret
 
 TOKEN_LENGTH_MIN: Final = 32
 FAILURES_MAX: Final = 5
@@ -40,14 +40,7 @@ class Tokens:
     @classmethod
     def read(cls, path: Path) -> "Tokens":
         """Read the file PATH; raises CanductorError when others may read it, or a line is none."""
-        try:
-            with path.open(encoding="utf-8") as file:
-                status = os.fstat(file.fileno())
-                text = file.read()
-        except (OSError, UnicodeDecodeError) as error:
-            raise CanductorError(f"the tokens' file {path} cannot be read: {error}") from None
-        if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) & 0o077:
-            raise CanductorError(f"the tokens' file {path} must be yours alone; chmod 600 it, and own it")
+        text, status = read_secret(path, "the tokens' file")
         grants: dict[str, Grant] = {}
         for number, line in enumerate(text.splitlines(), 1):
             words = line.split("#", 1)[0].split()

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import threading
 from collections.abc import AsyncGenerator, Coroutine, Generator, Iterable, Mapping
+from concurrent.futures import Future
 from typing import Any, Self, TypeVar
 
 from coordinator.ipc.client import Client
@@ -44,6 +45,10 @@ class BlockingClient:
     def call(self, method: str, params: Mapping[str, Value] | None = None) -> Any:
         """Call METHOD with PARAMS and return its result; raises ApiError, ConnectionLost."""
         return self._wait(self._client.call(method, params))
+
+    def begin(self, method: str, params: Mapping[str, Value] | None = None) -> Future[Any]:
+        """Do the same without waiting: calls reach the machine in the order in which they were begun."""
+        return asyncio.run_coroutine_threadsafe(self._client.call(method, params), self._loop)
 
     def watch(self, fields: Iterable[str] = ("*",), rate_hz: float = 10.0) -> Generator[Update, None, None]:
         """Yield updates as ``Client.watch`` does."""

@@ -10,6 +10,7 @@ from typing import Any, Final, Self
 from coordinator.ipc.address import Address, read_address
 from coordinator.ipc.client_feeds import Event, Feed, Update, Watch
 from coordinator.ipc.methods import ApiError, Scope, Value
+from coordinator.ipc.no_answer import doubt, why_no_answer, why_refused
 from coordinator.ipc.session_methods import API_VERSION
 from coordinator.ipc.settings import Limits
 from coordinator.ipc.wire import LENGTH_MAX, Encoder, Encoding, Fault, WireReader
@@ -242,13 +243,13 @@ class Client:
                 self._reader, self._writer = await asyncio.open_connection(
                     address.host, address.port, ssl=tls
                 )
-        except (OSError, ssl.SSLError) as error:
-            raise ConnectionLost(f"{address} does not answer: {error.strerror or error}") from None
+        except OSError as error:
+            raise ConnectionLost(why_no_answer(address, error)) from None
         self._wire = WireReader(LIMITS, checked=False)
         hello = asyncio.create_task(self._ask("api.hello", self._introduction))
         try:
             while not hello.done():
-                await self._read_some()
+                await self._read_some(doubt(address))
                 await asyncio.sleep(0)
             told = hello.result()
         finally:
@@ -327,14 +328,14 @@ class Client:
 
     # ---------------------------------------------------------------------------------------- reading
 
-    async def _read_some(self) -> None:
-        """Take what comes next; raises ConnectionLost."""
+    async def _read_some(self, addition: str = "") -> None:
+        """Take what comes next; raises ConnectionLost. ADDITION: to be added when the server says nothing."""
         try:
             data = await self._reader.read(READ_BYTES)
-        except (OSError, ssl.SSLError) as error:
-            raise ConnectionLost(f"{self.address} is gone: {error.strerror or error}") from None
+        except OSError as error:
+            raise ConnectionLost(f"{self.address} is gone{addition}: {error.strerror or error}") from None
         if not data:
-            raise ConnectionLost(f"{self.address} has closed the connection")
+            raise ConnectionLost(f"{self.address} has closed the connection{addition}")
         self._wire.feed(data, 0.0)
         while (message := self._wire.next_message()) is not None:
             if isinstance(message, Fault):
@@ -368,9 +369,8 @@ class Client:
 
     def _take_fault(self, fault: ApiError) -> None:
         """Tell whoever waits for an answer why there will be none."""
-        refused = (
-            ConnectionLost(fault.sentence) if fault.code == "closing" else Refused(fault.code, fault.sentence)
-        )
+        sentence = why_refused(self.address, fault)
+        refused = ConnectionLost(sentence) if fault.code == "closing" else Refused(fault.code, sentence)
         for answer in self._answers.values():
             if not answer.done():
                 answer.set_exception(refused)

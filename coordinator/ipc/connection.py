@@ -23,7 +23,7 @@ HANG_UP_CHECK_S: Final = 0.5
 """Between looks at whether a client that has closed its side is still there for its answers."""
 
 
-class Connection(asyncio.Protocol):
+class Connection(asyncio.BufferedProtocol):
     """A client; ADMIT makes its session once it is there, ON_GONE hears when it has left."""
 
     def __init__(
@@ -44,7 +44,7 @@ class Connection(asyncio.Protocol):
         self.session: Session
         self.transport: asyncio.Transport
 
-    # ------------------------------------------------------------------------------- asyncio.Protocol
+    # ----------------------------------------------------------------------- asyncio.BufferedProtocol
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Begin."""
@@ -54,7 +54,16 @@ class Connection(asyncio.Protocol):
         self.transport.set_write_buffer_limits(high=self.session.common.limits.output_bytes)
         self._turn()
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Tell where to put what comes: memory of its own for each message would cost as much as the rest."""
+        del sizehint
+        return self._turns.received
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Take what has come there."""
+        self.receive(self._turns.received[:nbytes])
+
+    def receive(self, data: bytes | memoryview) -> None:
         """Take DATA."""
         self.session.receive(data, self._loop.time())
         self._turn()
@@ -103,6 +112,9 @@ class Connection(asyncio.Protocol):
         for task in self._tasks.values():
             task.cancel()
         self._turns.leave(self)
+        if (caller := self.session.caller) is not None:
+            for leave in caller.at_end:
+                leave(caller)
         self._on_gone(self)
 
     # ------------------------------------------------------------------------------------------- work

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 from typing import Any, Final
 
@@ -36,8 +36,7 @@ class Scope(IntEnum):
 class ApiError(CanductorError):
     """A call that failed; CODE is for programs and stays the same, SENTENCE is for people.
 
-    Codes in use: bad_params, not_allowed, no_such_method, busy, not_ready, stopped, no_such_file, cancelled,
-    failed, internal; a method may have more (a-z, 0-9 and _).
+    Codes are words of a-z and _; all in use are in the tables of docs/ipc.md.
     """
 
     def __init__(self, code: str, sentence: str) -> None:
@@ -102,6 +101,8 @@ class Caller:
 
     name: str
     scope: Scope
+    at_end: list[Callable[["Caller"], None]] = field(default_factory=list, compare=False, repr=False)
+    """Called on the control loop when the client has left; what a method keeps for it goes then."""
 
 
 Call = Callable[[Caller, dict[str, Any]], Awaitable[Value] | Value]
@@ -122,7 +123,8 @@ class Method:
     returns: tuple[Param, ...] = ()
     """Fields of the map that it returns."""
     urgent: bool = False
-    """Called while the message is received, ahead of everything that waits; must be a plain function."""
+    """Called while the message is received, ahead of everything that waits, and whatever is wrong with its
+    parameters; must be a plain function, and require none."""
 
     def schema(self) -> dict[str, Value]:
         """Return the declaration as "api.methods" shows it."""
@@ -155,6 +157,24 @@ class Method:
             raise ApiError("bad_params", f"{self.name} has no parameter {unknown}; it takes {known}")
         return checked
 
+    def check_urgent(self, given: object) -> tuple[dict[str, Any], str]:
+        """Return the parameters GIVEN with defaults for what is wrong or missing, and what was wrong.
+
+        That is a sentence, empty when nothing was.
+        """
+        try:
+            return self.check(given), ""
+        except ApiError as error:
+            wrong = error.sentence
+        usable: dict[str, Any] = {}
+        for param in self.params:
+            one = {param.name: given[param.name]} if isinstance(given, dict) and param.name in given else {}
+            try:
+                usable[param.name] = replace(self, params=(param,)).check(one)[param.name]
+            except ApiError:
+                usable[param.name] = param.default
+        return usable, wrong
+
 
 class Registry:
     """The methods of one interface, by name."""
@@ -165,6 +185,7 @@ class Registry:
     def add(self, method: Method) -> None:
         """Add METHOD; its name must be new."""
         assert method.name not in self.methods, method.name
+        assert not (method.urgent and any(param.required for param in method.params)), method.name
         self.methods[method.name] = method
 
     def schema(self) -> list[Value]:

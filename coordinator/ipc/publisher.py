@@ -26,8 +26,10 @@ class Publisher:
 
     def filter(self, globs: list[str]) -> FieldFilter:
         """Return the filter of GLOBS, the same for all who want the same."""
-        made = FieldFilter(globs)
-        kept = self._filters.setdefault(made.globs, made)
+        wanted = tuple(sorted(set(globs)))
+        kept = self._filters.get(wanted)
+        if kept is None:
+            kept = self._filters[wanted] = FieldFilter(wanted)
         while len(self._filters) > FILTERS_MAX:
             del self._filters[next(iter(self._filters))]
         return kept

@@ -14,6 +14,7 @@ from typing import Final
 
 from coordinator.ipc.auth import FailureBrake, Grant, Tokens, stamp_of
 from coordinator.ipc.connection import Connection
+from coordinator.ipc.door import BACKLOG, HANDSHAKES_MAX, Door
 from coordinator.ipc.methods import Registry, Scope, Value
 from coordinator.ipc.publisher import Publisher
 from coordinator.ipc.session import Common, Session, SessionCounters
@@ -26,7 +27,6 @@ from nodes.errors import CanductorError
 
 _PEER: Final = struct.Struct("3i")
 """Of SO_PEERCRED: pid, uid, gid."""
-BACKLOG: Final = 128
 TOKENS_LOOK_S: Final = 1.0
 """Between looks at whether the tokens' file has changed."""
 REFUSALS_MAX: Final = 32
@@ -56,6 +56,7 @@ class IpcServer:
         self._encoder = Encoder()
         self._common = Common(registry, Publisher(state, self._encoder), settings.limits)
         self._servers: list[asyncio.AbstractServer] = []
+        self._door: Door | None = None
         self._connections: set[Connection] = set()
         self._brake = FailureBrake()
         self._on_notice = on_notice
@@ -97,6 +98,8 @@ class IpcServer:
             self._watch.cancel()
         for server in self._servers:
             server.close()
+        if self._door is not None:
+            self._door.close()
         for connection in list(self._connections):
             connection.session.end(Fault("closing", "the server ends"))
             connection.flush()
@@ -132,7 +135,7 @@ class IpcServer:
                 counted[name] += value
         return {
             "connections": len(self._connections),
-            "refused_connections": self._refused,
+            "refused_connections": self._refused + (0 if self._door is None else self._door.refused),
             "unsendable": self._unsendable + self._common.publisher.unsendable,
             **counted,
         }
@@ -156,22 +159,21 @@ class IpcServer:
     async def _open_tcp(self, tcp: TcpSettings, turns: Turns) -> None:
         context = await asyncio.to_thread(_tls_of_tcp, tcp)
         self._tokens = await asyncio.to_thread(Tokens.read, tcp.tokens)
+        most = self._settings.tcp_connections_max
+        door = self._door = Door(
+            lambda: Connection(self._admit_tcp, self._drop, turns),
+            context,
+            handshakes_max=min(HANDSHAKES_MAX, most),
+            may_enter=lambda entering: entering + self._over_tcp() < most + REFUSALS_MAX,
+        )
         try:
-            server = await asyncio.get_running_loop().create_server(
-                lambda: Connection(self._admit_tcp, self._drop, turns),
-                tcp.host,
-                tcp.port,
-                ssl=context,
-                ssl_handshake_timeout=None if context is None else self._common.limits.message_timeout_s,
-                backlog=BACKLOG,
-            )
+            await door.open(tcp.host, tcp.port)
         except OSError as error:
             raise CanductorError(
                 f"port {tcp.port} of {tcp.host} cannot be opened: {error.strerror}"
             ) from None
-        self._servers.append(server)
-        self.tcp_port = server.sockets[0].getsockname()[1]
-        self.tcp_addresses = [opened.getsockname()[0] for opened in server.sockets]
+        self.tcp_port = door.names[0][1]
+        self.tcp_addresses = [address for address, _ in door.names]
 
     # ----------------------------------------------------------------------------------------- tokens
 
@@ -242,14 +244,17 @@ class IpcServer:
             address = str((transport.get_extra_info("peername") or ("unknown",))[0])
         session = self._session(connection, address, address)
         wait_s = self._brake.shut_out_s(address, asyncio.get_running_loop().time())
-        others = self._connections - {connection}
-        over_tcp = sum(1 for other in others if other.session.granted is None)
-        if over_tcp >= self._settings.tcp_connections_max:
+        if self._over_tcp(besides=connection) >= self._settings.tcp_connections_max:
             self._refuse(session, Fault("busy", "there are too many connections over TCP; close others"))
         elif wait_s > 0:
             sentence = f"too many wrong tokens from {address}; wait {wait_s:.0f} s"
             self._refuse(session, Fault("too_many_failures", sentence))
         return session
+
+    def _over_tcp(self, besides: Connection | None = None) -> int:
+        """Return how many connections came over TCP; BESIDES is on its way in and has no session yet."""
+        others = (other for other in self._connections if other is not besides)
+        return sum(1 for other in others if other.session.granted is None)
 
     def _session(self, connection: Connection, peer: str, address: str) -> Session:
         self._sessions += 1

@@ -33,11 +33,15 @@ PHASES: Final = 8
 
 @dataclass(slots=True, eq=False)
 class Request:
-    """A request with its parameters, checked. ID is None when no answer is wanted."""
+    """A request with its parameters, checked. ID is None when no answer is wanted.
+
+    IGNORED tells what was wrong with an urgent one, which is carried out all the same; empty: nothing.
+    """
 
     id: int | None
     method: Method
     params: dict[str, Any]
+    ignored: str = ""
 
 
 @dataclass(slots=True)
@@ -166,7 +170,7 @@ class Session:
         """Bytes that wait for ``take_output``."""
         return self._out_bytes
 
-    def receive(self, data: bytes, now_s: float) -> None:
+    def receive(self, data: bytes | memoryview, now_s: float) -> None:
         """Take DATA that has arrived; ``read`` looks at it."""
         self._reader.feed(data, now_s)
 
@@ -264,6 +268,8 @@ class Session:
         self._forget(request)
         if request.id is None or self.fault is not None:
             return
+        if request.ignored and isinstance(result, dict):
+            result = result | {"ignored": request.ignored}
         try:
             self._send({"id": request.id, "result": result})
         except ValueError as error:
@@ -287,27 +293,53 @@ class Session:
 
     def _take(self, message: dict[str, Any], urgent: list[Request], now_s: float) -> None:
         request_id, name = message.get("id"), message.get("method")
-        if type(name) is not str or len(name) > METHOD_LENGTH_MAX:
+        if type(name) is not str:
             self.end(Fault("bad_message", "a request must be a map with method, and with id and params"))
             return
-        if request_id is not None and not (type(request_id) is int and 0 <= request_id <= ID_MAX):
-            self.end(
-                Fault("bad_message", f"an id is a whole number from 0 to 2^53 - 1, not {shown(request_id)}")
-            )
+        if len(name) > METHOD_LENGTH_MAX:
+            self.end(Fault("bad_message", f"the name of a method has at most {METHOD_LENGTH_MAX} characters"))
+            return
+        is_id = request_id is None or (type(request_id) is int and 0 <= request_id <= ID_MAX)
+        if not is_id and not self._is_urgent(name):
+            self._end_for_id(request_id)
             return
         self.counters.requests += 1
         try:
-            method = self._method(name, request_id)
-            request = Request(request_id, method, method.check(message.get("params")))
+            request = self._request(request_id if is_id else None, name, message.get("params"))
         except ApiError as error:
             self._refuse(request_id, error)
             if self.caller is None:
                 self.end(Fault(error.code, error.sentence))
             return
         self._sort(request, urgent, now_s)
+        if not is_id:
+            self._end_for_id(request_id, f"; {name} was carried out all the same")
 
-    def _method(self, name: str, request_id: int | None) -> Method:
-        """Return the method NAME if it may be called now; raises ApiError."""
+    def _end_for_id(self, request_id: object, addition: str = "") -> None:
+        sentence = f"an id is a whole number from 0 to 2^53 - 1, not {shown(request_id)}{addition}"
+        self.end(Fault("bad_message", sentence))
+
+    def _is_urgent(self, name: str) -> bool:
+        try:
+            return self._method(name).urgent
+        except ApiError:
+            return False
+
+    def _request(self, request_id: int | None, name: str, params: object) -> Request:
+        """Return the request; an urgent one whatever is wrong with it, if the client may. Raises ApiError."""
+        method = self._method(name)
+        taken = ""
+        if request_id is not None and request_id in self._ids:
+            taken = f"the id {request_id} is that of a request without answer yet"
+        if method.urgent:
+            usable, wrong = method.check_urgent(params)
+            return Request(request_id, method, usable, "; ".join(filter(None, (taken, wrong))))
+        if taken:
+            raise ApiError("bad_params", taken)
+        return Request(request_id, method, method.check(params))
+
+    def _method(self, name: str) -> Method:
+        """Return the method NAME if this client may call it now; raises ApiError."""
         if self.caller is None and name != session_methods.HELLO:
             raise ApiError("no_hello", "the first request must be api.hello")
         method = self.common.registry.methods.get(name)
@@ -316,8 +348,6 @@ class Session:
         if self.caller is not None and method.scope > self.caller.scope:
             needed, has = method.scope.word, self.caller.scope.word
             raise ApiError("not_allowed", f"{name} needs the scope {needed}, this client has {has}")
-        if request_id in self._ids:
-            raise ApiError("bad_params", f"the id {request_id} is that of a request without answer yet")
         return method
 
     def _sort(self, request: Request, urgent: list[Request], now_s: float) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope, Value, printable
+from coordinator.ipc.state import costly_stars
 from coordinator.ipc.wire import Fault
 
 if TYPE_CHECKING:
@@ -13,7 +14,12 @@ API_VERSION: Final = 1
 """Rises when a program written against the version before would no longer work."""
 HELLO: Final = "api.hello"
 GLOB_LENGTH_MAX: Final = 128
+STARS_MAX: Final = 16
+"""In the middle of globs: each is a search in every path, on the loop that all share."""
 CLIENT_NAME_MAX: Final = 64
+RATE_HZ_MIN: Final = 0.01
+RATE_HZ_MAX: Final = 50
+"""Of the updates of one subscription."""
 
 Handler = Callable[["Session", dict[str, Any], float], Value]
 """Gets the session, checked parameters and the time in s."""
@@ -52,6 +58,7 @@ def _hello(session: "Session", params: dict[str, Any], now_s: float) -> Value:
         "message_bytes_max": limits.message_bytes,
         "pending_requests_max": limits.pending_requests,
         "subscriptions_max": limits.subscriptions,
+        "rate_hz_max": RATE_HZ_MAX,
     }
 
 
@@ -98,8 +105,6 @@ def _watch(session: "Session", params: dict[str, Any], now_s: float) -> Value:
             "busy", f"a client may watch {limits.subscriptions} times at once; api.unwatch ends one"
         )
     rate_hz = params["rate_hz"]
-    if rate_hz > limits.rate_hz_max:
-        raise ApiError("bad_params", f"api.watch: rate_hz is {rate_hz:g}, at most {limits.rate_hz_max:g}")
     wanted = publisher.filter(_globs(session, params, "fields"))
     taken = publisher.state.snapshot(wanted)
     number = session.subscribe(wanted, 1 / rate_hz, taken.sequence, now_s)
@@ -126,6 +131,11 @@ def _globs(session: "Session", params: dict[str, Any], name: str) -> list[str]:
     if len(globs) > most or any(type(g) is not str or len(g) > GLOB_LENGTH_MAX for g in globs):
         raise ApiError(
             "bad_params", f"{name} must be at most {most} strings of at most {GLOB_LENGTH_MAX} characters"
+        )
+    if costly_stars(globs) > STARS_MAX:
+        raise ApiError(
+            "bad_params",
+            f"{name} must have at most {STARS_MAX} * that are not at the end of theirs; ask for more at once",
         )
     return globs
 
@@ -186,6 +196,7 @@ _METHODS: Final = (
             Param("message_bytes_max", Kind.INT, "of a request", "bytes"),
             Param("pending_requests_max", Kind.INT, "requests that may wait"),
             Param("subscriptions_max", Kind.INT, "subscriptions at a time"),
+            Param("rate_hz_max", Kind.FLOAT, "updates of one subscription", "1/s"),
         ),
     ),
     _method(
@@ -207,7 +218,16 @@ _METHODS: Final = (
         "Return the fields' values, and send what changes from then on.",
         (
             _FIELDS,
-            Param("rate_hz", Kind.FLOAT, "at most so often", "1/s", required=False, default=10.0, low=0.01),
+            Param(
+                "rate_hz",
+                Kind.FLOAT,
+                "at most so often",
+                "1/s",
+                required=False,
+                default=10.0,
+                low=RATE_HZ_MIN,
+                high=RATE_HZ_MAX,
+            ),
         ),
         (Param("subscription", Kind.INT, "its number in updates"), _SEQUENCE, _VALUES),
     ),

@@ -27,7 +27,6 @@ class Limits:
     subscriptions: int = 16
     filters: int = 64
     """Globs of one subscription."""
-    rate_hz_max: float = 50.0
     output_bytes: int = 65_536
     """Beyond this much unsent, requests wait, updates are merged, notifications are dropped."""
     output_bytes_max: int = 4_194_304

@@ -10,6 +10,7 @@ from typing import Final, Protocol
 
 ROUND_S: Final = 0.004
 TURN_S: Final = 0.001
+RECEIVE_BYTES: Final = 65_536
 
 
 class Worker(Protocol):
@@ -32,6 +33,8 @@ class Turns:
         self._waiting: dict[Worker, None] = {}  # in the order in which they came
         self._spent_s = 0.0  # in this round, and in those before it that nobody had to wait in
         self._round_is_due = False
+        self.received = memoryview(bytearray(RECEIVE_BYTES))
+        """Where a connection puts what it reads, until it has taken it: at once."""
 
     def ask(self, worker: Worker) -> None:
         """Let WORKER work: now, or when those before it did."""

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import msgpack
 
+from coordinator.ipc.json_values import has_more_items
 from coordinator.ipc.methods import Value
 from coordinator.ipc.packed_values import has_more_values
 from coordinator.ipc.settings import Limits
@@ -103,7 +104,7 @@ class WireReader:
         self._begun_s: float | None = None  # since when a message is incomplete
         self._fault: Fault | None = None
 
-    def feed(self, data: bytes, now_s: float) -> None:
+    def feed(self, data: bytes | memoryview, now_s: float) -> None:
         """Take DATA that has arrived."""
         self._fed_s = now_s
         if self._fault is None:
@@ -203,20 +204,35 @@ class WireReader:
 
     def _decode(self, body: bytes) -> object:
         try:
-            if self.encoding is Encoding.JSON:
-                return json.loads(body.decode(), parse_constant=_refuse_constant)
-            items, values = self._limits.items, self._limits.values
-            if self._checked and has_more_values(body, 2 * values + 1):  # keys count here, too
-                return _too_many(self._limits)
-            return msgpack.unpackb(body, max_array_len=items, max_map_len=items, max_ext_len=0)
+            return self._from_json(body) if self.encoding is Encoding.JSON else self._from_msgpack(body)
         except (RecursionError, msgpack.StackError):
             return _too_deep(self._limits)
-        except (ValueError, msgpack.UnpackException):  # also what is no UTF-8
-            word = "JSON" if self.encoding is Encoding.JSON else "msgpack"
-            return Fault(
-                "bad_message",
-                f"a message is no {word}, or has lists of more than {self._limits.items:,} items",
-            )
+        except UnicodeDecodeError:
+            return Fault("bad_message", "a message has text that is no UTF-8")
+
+    def _from_json(self, body: bytes) -> object:
+        if self._checked and has_more_items(body, self._limits.values):
+            return _too_many(self._limits)
+        text = body.decode()
+        try:
+            return json.loads(text, parse_constant=_refuse_constant)
+        except _ConstantError as error:
+            return Fault("bad_message", f"{error} is no number of JSON; numbers are finite")
+        except json.JSONDecodeError as error:
+            return Fault("bad_message", f"a message is no JSON: {error.msg}, at character {error.pos + 1}")
+        except ValueError:  # of int()
+            return Fault("bad_message", "a whole number has too many digits")
+
+    def _from_msgpack(self, body: bytes) -> object:
+        items, values = self._limits.items, self._limits.values
+        if self._checked and has_more_values(body, 2 * values + 1):  # keys count here, too
+            return _too_many(self._limits)
+        try:
+            return msgpack.unpackb(body, max_array_len=items, max_map_len=items, max_ext_len=0)
+        except (UnicodeDecodeError, msgpack.StackError):
+            raise
+        except (ValueError, msgpack.UnpackException):
+            return Fault("bad_message", f"a message is no msgpack, or has lists of more than {items:,} items")
 
 
 def _too_many(limits: Limits) -> Fault:
@@ -227,8 +243,12 @@ def _too_deep(limits: Limits) -> Fault:
     return Fault("too_deep", f"a message is nested more than {limits.nesting} deep")
 
 
+class _ConstantError(ValueError):
+    """NaN, Infinity or -Infinity."""
+
+
 def _refuse_constant(word: str) -> None:
-    raise ValueError(word)
+    raise _ConstantError(word)
 
 
 _PLAIN: Final = (int, bool, type(None))

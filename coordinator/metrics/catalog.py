@@ -107,6 +107,7 @@ JOB: Final = Group(
         Metric("read_bytes", "job_read_bytes", "of the file, read"),
         Metric("line", "job_line", "line that is carried out"),
         Metric("lines_read", "job_lines_read", "lines read, some seconds ahead"),
+        Metric("lines_fed", "job_lines_fed", "lines that came, of a job without a file"),
         Metric("print_time_s", "job_print_time_seconds", "time printed, without pauses"),
         Metric("elapsed_s", "job_elapsed_seconds", "time since it began, with pauses"),
     ),
@@ -197,6 +198,21 @@ BUSES: Final = Group(
         Metric("send_waits", "bus_send_waits", "times the kernel took no more", Kind.COUNTER),
     ),
 )
+MODULES: Final = Group(
+    "modules",
+    "Each heater, sensor and fan",
+    ("section",),
+    (
+        Metric("temperature", "temperature_celsius", "as it was measured last"),
+        Metric("target", "temperature_target_celsius", "what it is to be; 0: off"),
+        Metric("power", "heater_power_ratio", "what a heater is given now"),
+        Metric("held_s", "heater_held_seconds", "how long a target is held, in steady state; absent before"),
+        Metric("held_low", "heater_held_low_celsius", "the lowest measured in that time"),
+        Metric("held_high", "heater_held_high_celsius", "the highest"),
+        Metric("speed", "fan_speed_ratio", "of a fan, as it was set"),
+        Metric("rpm", "fan_turns_per_second", "by its tachometer", scale=1 / 60),
+    ),
+)
 API: Final = Group(
     "api",
     "The interface for other programs",
@@ -230,16 +246,17 @@ SELF: Final = Group(
         Metric("scrapes", "metrics_requests", "answers to Prometheus", Kind.COUNTER),
         Metric("refused", "metrics_refused_requests", "other requests, and too many at once", Kind.COUNTER),
         Metric("collect_s", "metrics_collect_seconds", "what it took to make the last answer but this"),
-        Metric("left_out", "metrics_left_out", "nodes and buses beyond the most that are shown"),
+        Metric("left_out", "metrics_left_out", "nodes, buses and sections beyond the most that are shown"),
     ),
 )
-GROUPS: Final = (MACHINE, JOB, POSITION, NODES, BUSES, API, SELF)
+GROUPS: Final = (MACHINE, JOB, POSITION, NODES, BUSES, MODULES, API, SELF)
 NOT_SHOWN: Final = {
-    "job": ("file", "message"),  # words without end: one more series for each
+    # Words and numbers without end: one more series for each.
+    "job": ("file", "message", "interrupted_file", "interrupted_line"),
     "position": ("planned", "gcode", "origin"),  # seconds ahead of where the machine is
     "nodes": ("name", "bus", "nodeid", "state_text", "failure"),
     "buses": ("name",),
-    "modules": ("*",),  # each kind of module has fields of its own
+    "modules": ("*",),  # but for heat, each kind of module has fields of its own
 }
 """Fields of the state tree that are no metrics, * for all; of the nodes' and buses', some are labels."""
 

@@ -17,14 +17,17 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 from coordinator.ipc.methods import Value, printable
-from coordinator.metrics.catalog import BUSES, GROUPS, NODES, PREFIX, Group, Kind, Metric
+from coordinator.metrics.catalog import BUSES, GROUPS, MODULES, NODES, PREFIX, Group, Kind, Metric
 
 ENTITIES_MAX: Final = 256
-"""Nodes, and buses, that are shown; each is some eighty series."""
+"""Nodes, buses, and sections, that are shown; each node is some eighty series."""
 LABEL_MAX: Final = 80
 """Characters of a label's value."""
 _NUMBER: Final = re.compile(r"\d[\d.,]*")
 _SOMEBODY: Final = re.compile(r"(emergency stop by).*", re.DOTALL)
+
+_SEVERAL: Final = (NODES, BUSES, MODULES)
+_OF_MODULES: Final = {metric.field for metric in MODULES.metrics}
 
 Fields = Mapping[str, Value]
 
@@ -34,7 +37,10 @@ class Figures(Collector):
 
     def __init__(self, fields: Fields) -> None:
         self._trees = _split(fields)
-        self.left_out = sum(max(0, len(self._trees[group.prefix]) - ENTITIES_MAX) for group in (NODES, BUSES))
+        self._trees[MODULES.prefix] = {
+            path: own for path, own in self._trees[MODULES.prefix].items() if own.keys() & _OF_MODULES
+        }
+        self.left_out = sum(max(0, len(self._trees[group.prefix]) - ENTITIES_MAX) for group in _SEVERAL)
 
     def collect(self) -> Iterator[Family]:
         """Return all metrics, those without any figure too."""
@@ -54,8 +60,8 @@ def registry_of(fields: Fields) -> CollectorRegistry:
 
 
 def _split(fields: Fields) -> dict[str, dict[str, dict[str, Value]]]:
-    """Return the fields by group and entity: of nodes and buses there are several, of others one, ""."""
-    several = {NODES.prefix, BUSES.prefix}
+    """Return the fields by group and entity: of some groups there are several, of others one, ""."""
+    several = {group.prefix for group in _SEVERAL}
     trees: dict[str, dict[str, dict[str, Value]]] = {
         group.prefix: {} if group.prefix in several else {"": {}} for group in GROUPS
     }
@@ -78,7 +84,7 @@ def _labels(group: Group, entities: Sequence[tuple[str, Fields]]) -> list[list[s
         name = _label(fields.get("name"))
         name = path if name in names else name
         names.add(name)
-        named = {"node": name, "bus": _label(fields.get("bus")) if group is NODES else name}
+        named = {"node": name, "bus": _label(fields.get("bus")) if group is NODES else name, "section": path}
         labels.append([named[label] for label in group.labels])
     return labels
 

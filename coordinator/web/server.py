@@ -8,6 +8,7 @@ from typing import Final
 
 from aiohttp import WSMsgType, web
 
+from coordinator.ipc.door import Door
 from coordinator.ipc.methods import Scope
 from coordinator.ipc.server import IpcServer, tls_context
 from coordinator.web.files import PageFile, page_files
@@ -18,12 +19,11 @@ from nodes.errors import CanductorError
 
 SOCKET_PATH: Final = "/socket"
 CONNECTIONS_MAX: Final = 256
-"""Open at a time, WebSockets included; further ones are closed."""
+"""Open at a time, WebSockets and TLS handshakes included; further ones are closed."""
 REQUEST_S: Final = 30.0
 """A connection that is no WebSocket is closed after so long: who only fetches files is done by then."""
 HEARTBEAT_S: Final = 15.0
 """Between looks at whether a browser is still there."""
-HANDSHAKE_S: Final = 10.0
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'"
@@ -48,7 +48,7 @@ class WebServer:
         self._settings = settings
         self._files = page_files()
         self._names = own_names()
-        self._server: asyncio.Server | None = None
+        self._door: Door | None = None
         self._sockets: set[asyncio.BaseProtocol] = set()
         """Connections that have become WebSockets."""
         quiet = logging.getLogger("canductor.web")
@@ -67,13 +67,8 @@ class WebServer:
         if settings.certificate is not None and settings.private_key is not None:
             context = await asyncio.to_thread(tls_context, settings.certificate, settings.private_key)
         try:
-            self._server = await asyncio.get_running_loop().create_server(
-                self._protocol,
-                settings.host,
-                settings.port,
-                ssl=context,
-                ssl_handshake_timeout=None if context is None else HANDSHAKE_S,
-            )
+            self._door = Door(self._protocol, context, may_enter=self._may_enter)
+            await self._door.open(settings.host, settings.port)
         except OSError as error:
             raise CanductorError(
                 f"the live page's port {settings.port} of {settings.host} cannot be opened: {error.strerror};"
@@ -83,8 +78,8 @@ class WebServer:
     @property
     def port(self) -> int:
         """The port, once open."""
-        assert self._server is not None
-        return int(self._server.sockets[0].getsockname()[1])
+        assert self._door is not None
+        return self._door.names[0][1]
 
     @property
     def url(self) -> str:
@@ -93,16 +88,19 @@ class WebServer:
 
     async def close(self) -> None:
         """Let go of every browser; the IPC server has told them why when it was closed before."""
-        if self._server is not None:
-            self._server.close()
+        if self._door is not None:
+            self._door.close()
         await self._http.shutdown(timeout=1.0)
 
     # ------------------------------------------------------------------------------------ connections
 
+    def _may_enter(self, entering: int) -> bool:
+        if len(self._http.connections) + entering < CONNECTIONS_MAX:
+            return True
+        self.refused += 1
+        return False
+
     def _protocol(self) -> asyncio.BaseProtocol:
-        if len(self._http.connections) >= CONNECTIONS_MAX:
-            self.refused += 1
-            return _Refusal()
         protocol = self._http()
         asyncio.get_running_loop().call_later(REQUEST_S, self._end_idle, protocol)
         return protocol
@@ -170,7 +168,7 @@ class WebServer:
                     await socket.close(code=1003, message=b"messages are JSON, as text")
                     break
                 begun = True
-                connection.data_received(message.data.encode() + b"\n")
+                connection.receive(message.data.encode() + b"\n")
                 await pipe.readable()
         finally:
             pipe.abort()
@@ -187,11 +185,3 @@ def _send(file: PageFile, request: web.BaseRequest) -> web.Response:
     if "gzip" in request.headers.get("Accept-Encoding", ""):
         return web.Response(body=file.packed, headers={**headers, "Content-Encoding": "gzip"})
     return web.Response(body=file.content, headers=headers)
-
-
-class _Refusal(asyncio.Protocol):
-    """Takes no connection."""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        transport.abort()

@@ -14,7 +14,7 @@ def forecast(now_s: float, late_in_s: float | None, ratio: float = 1.3) -> Forec
 
 
 def look(watch: LoadWatch, now_s: float, late_in_s: float | None, repeated: float = 0.01) -> None:
-    watch.look(forecast(now_s, late_in_s), HostTime(round(now_s * 1e9)), repeated)
+    watch.look(forecast(now_s, late_in_s), HostTime(round(now_s * 1e9)), lambda: repeated)
 
 
 def test_a_passing_doubt_is_no_overload() -> None:

@@ -10,11 +10,12 @@ import { Login } from "./login.js";
 import { node_cards } from "./nodes.js";
 import { Path } from "./path.js";
 import { Stop } from "./stop.js";
+import { table_cards } from "./tables.js";
 import { choose_colours } from "./theme.js";
 import { View } from "./view.js";
 
 const FAST = ["machine.", "job.", "position."];
-const SLOW = ["nodes.", "buses."];
+const SLOW = ["nodes.", "buses.", "tables."];
 const SAMPLE_MS = 500;
 const HIDDEN_MS = 3000; // a tab that is hidden for so long is told nothing more until it is seen
 
@@ -31,6 +32,7 @@ const job = new Job(link);
 const terminal = new Console(link);
 const nodes = node_cards();
 const buses = bus_cards();
+const tables = table_cards();
 let may = false;
 let heard = null; // Date of the last update
 let down = null; // {since, next_ms}
@@ -176,9 +178,11 @@ setInterval(() => {
   if (link.up && heard) {
     nodes.sample(fields, now_s);
     buses.sample(fields, now_s);
+    tables.sample(fields, now_s);
   }
   nodes.show(fields, now_s);
   buses.show(fields, now_s);
+  tables.show(fields, now_s);
 }, SAMPLE_MS);
 
 choose_colours(() => view.colours());

@@ -3,15 +3,17 @@
 import asyncio
 import contextlib
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from coordinator.ipc.methods import Caller, Kind, Method, Param, Registry, Scope, Value
 from coordinator.ipc.server import IpcServer
-from coordinator.ipc.settings import IpcSettings
+from coordinator.ipc.settings import IpcSettings, TcpSettings
 from coordinator.ipc.state import StateTree
+
+TOKENS = {scope: f"{scope.word}-token-of-at-least-32-characters" for scope in Scope}
 
 
 @dataclass
@@ -41,6 +43,12 @@ class Served:
         self.writers.append(opened[1])
         return opened
 
+    async def server_has(self, entering: int) -> None:
+        """Wait until so many connections are on their way in."""
+        assert self.server._door is not None
+        while len(self.server._door._entering) != entering:  # noqa: ASYNC110 (it tells nobody)
+            await asyncio.sleep(0.01)
+
     async def script(self, **hello: Any) -> "Script":
         """Connect and say hello."""
         script = Script(*await self.dial())
@@ -61,8 +69,8 @@ def registry_of(served: Served) -> Registry:
     def raw(_: Caller, params: dict[str, Any]) -> Value:
         return {"said": params["command"]}
 
-    def stop(caller: Caller, _: dict[str, Any]) -> Value:
-        served.stops.append(caller.name)
+    def stop(caller: Caller, params: dict[str, Any]) -> Value:
+        served.stops.append(params["who"] or caller.name)
         served.order.append("stop")
         return {"state": "shutdown"}
 
@@ -81,11 +89,12 @@ def registry_of(served: Served) -> Registry:
         return {"x": float("nan"), "y": 2**80}
 
     x = Param("x_mm", Kind.FLOAT, "where to", "mm", low=0, high=200)
+    whom = (Param("who", Kind.STR, required=False, high=100), Param("why", Kind.STR, required=False, high=9))
     for method in (
         Method("machine.info", Scope.WATCH, "Tell.", info),
         Method("move.to", Scope.OPERATE, "Move.", move, (x,)),
         Method("node.command", Scope.ADMIN, "Command.", raw, (Param("command", Kind.STR),)),
-        Method("machine.emergency_stop", Scope.OPERATE, "Stop.", stop, urgent=True),
+        Method("machine.emergency_stop", Scope.OPERATE, "Stop.", stop, whom, urgent=True),
         Method("wait", Scope.WATCH, "Wait for ever.", wait),
         Method("broken", Scope.WATCH, "Fail.", broken),
         Method("unsendable", Scope.WATCH, "Return too much.", unsendable),
@@ -112,6 +121,27 @@ async def serving(folder: Path, **settings: Any) -> AsyncIterator[Served]:
         await asyncio.sleep(0)
 
 
+def run(folder: Path, body: Callable[[Served], Awaitable[None]], **settings: Any) -> None:
+    """Serve at FOLDER/m.sock and let BODY test what is served."""
+
+    async def main() -> None:
+        async with asyncio.timeout(60), serving(folder, **settings) as served:
+            await body(served)
+
+    asyncio.run(main())
+
+
+def tokens_file(folder: Path, mode: int = 0o600) -> Path:
+    path = folder / "tokens"
+    path.write_text("# ours\n" + "".join(f"{s.word} of-{s.word} {t}\n" for s, t in TOKENS.items()))
+    path.chmod(mode)
+    return path
+
+
+def plain_tcp(folder: Path, host: str = "127.0.0.1") -> TcpSettings:
+    return TcpSettings(host=host, port=0, tokens=tokens_file(folder), plain_on_loopback=True)
+
+
 class Script:
     """A client that speaks JSON lines, byte by byte as the test wants."""
 
@@ -122,7 +152,7 @@ class Script:
         self.writer.write(json.dumps({"id": request_id, "method": method, "params": params}).encode() + b"\n")
 
     async def receive(self) -> Any:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             return json.loads(await self.reader.readline())
 
     async def ask(self, method: str, request_id: int = 1, **params: Any) -> Any:
@@ -131,5 +161,5 @@ class Script:
 
     async def rest(self) -> list[Any]:
         """Return what comes until the server closes."""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             return [json.loads(line) for line in (await self.reader.read()).splitlines()]

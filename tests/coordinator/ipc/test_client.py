@@ -1,8 +1,7 @@
 import asyncio
-import shutil
 import ssl
-import subprocess
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +11,13 @@ from coordinator.ipc.address import read_address
 from coordinator.ipc.blocking import BlockingClient
 from coordinator.ipc.client import Client, ConnectionLost, Refused
 from coordinator.ipc.methods import ApiError, Scope
+from coordinator.ipc.no_answer import why_no_answer
 from coordinator.ipc.server import IpcServer
 from coordinator.ipc.settings import TcpSettings
 from coordinator.ipc.wire import Encoding
 from nodes.errors import CanductorError
-from tests.coordinator.ipc.served import Served, registry_of, serving
-from tests.coordinator.ipc.test_server import TOKENS, plain_tcp
+from tests.coordinator.certificates import make_certificate
+from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, registry_of, serving
 
 
 def run(folder: Path, body: Callable[[Served], Awaitable[None]], **settings: Any) -> None:
@@ -182,17 +182,6 @@ def test_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         read_address(None)
 
 
-@pytest.fixture
-def certificate(tmp_path: Path) -> tuple[Path, Path]:
-    if (openssl := shutil.which("openssl")) is None:
-        pytest.skip("openssl is not installed, which makes the certificate for this test")
-    pem, key = tmp_path / "cert.pem", tmp_path / "key.pem"
-    options = f"req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -out {pem} -keyout {key}"
-    names = ["-subj", "/CN=machine", "-addext", "subjectAltName=IP:127.0.0.1"]
-    subprocess.run([openssl, *options.split(), *names], check=True, capture_output=True)
-    return pem, key
-
-
 def test_tls(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
     pem, key = certificate
     tokens = plain_tcp(tmp_path).tokens
@@ -203,10 +192,65 @@ def test_tls(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
         trusting = ssl.create_default_context(cafile=str(pem))
         async with Client.connect(address, token=TOKENS[Scope.OPERATE], tls=trusting) as client:
             assert (await client.call("machine.info"))["scope"] == "operate"
-        with pytest.raises(ConnectionLost, match="does not answer"):  # a server that nothing vouches for
+        with pytest.raises(ConnectionLost, match="cannot be trusted"):  # a server that nothing vouches for
             await Client.connect(address, token=TOKENS[Scope.OPERATE]).__aenter__()
         reader, writer = await served.dial(tcp=True)  # without TLS
         writer.write(b'{"id":1,"method":"api.hello","params":{"version":1}}\n')
         assert b"result" not in await reader.read()
 
     run(tmp_path, body, tcp=tcp)
+
+
+async def refusal(at: str, token: str | None = None, trusted: Path | None = None) -> str:
+    tls = None if trusted is None else ssl.create_default_context(cafile=trusted)
+    with pytest.raises(CanductorError) as failure:
+        await Client.connect(at, token=token, tls=tls).__aenter__()
+    return str(failure.value)
+
+
+def test_who_may_have_taken_the_wrong_address_or_certificate_is_told(
+    tmp_path: Path, certificate: tuple[Path, Path]
+) -> None:
+    pem, key = certificate
+    tcp = plain_tcp(tmp_path)
+    token = TOKENS[Scope.OPERATE]
+    (tmp_path / "other").mkdir()
+    other, _ = make_certificate(tmp_path / "other")
+
+    async def with_tls(served: Served) -> None:
+        port = served.server.tcp_port
+        tls_at, plain_at = f"tls://127.0.0.1:{port}", f"tcp://127.0.0.1:{port}"
+        assert f"before it said a word; a port with TLS is named {tls_at}" in await refusal(plain_at, token)
+        for trusted in (None, other):
+            told = await refusal(tls_at, token, trusted)
+            assert told.startswith(
+                f"the certificate of {tls_at} cannot be trusted: self-signed certificate; "
+            )
+            assert told.endswith("name the one that it must have with --certificate PEM")
+        told = await refusal(f"tls://localhost:{port}", token, pem)
+        assert "is not valid for 'localhost'; call it by a name that is in its certificate" in told
+        assert await refusal(tls_at, None, pem) == (
+            f"{tls_at} wants a token; name the file that holds it with --token-file (programs: token)"
+        )
+
+    async def without(served: Served) -> None:
+        port = served.server.tcp_port
+        tls_at, plain_at = f"tls://127.0.0.1:{port}", f"tcp://127.0.0.1:{port}"
+        told = await refusal(tls_at, token, pem)
+        assert told == f"{tls_at} does not speak TLS; a port without TLS is named {plain_at}"
+        await served.server.close()
+        assert (
+            await refusal(plain_at, token) == f"{plain_at} does not answer: no program listens at this port"
+        )
+
+    run(tmp_path, with_tls, tcp=replace(tcp, certificate=pem, private_key=key))
+    run(tmp_path, without, tcp=tcp)
+
+
+def test_a_certificate_of_yesterday_is_called_so() -> None:
+    error = ssl.SSLCertVerificationError(1, "certificate verify failed")
+    error.verify_code, error.verify_message = 10, "certificate has expired"
+    assert why_no_answer(read_address("tls://printer.local:7130"), error) == (
+        "the certificate of tls://printer.local:7130 cannot be trusted: certificate has expired; "
+        "check the clocks of both computers, and make a new one if they are right"
+    )

@@ -307,7 +307,8 @@ def test_sockets_and_announcements_in_one_table(tmp_path: Any, monkeypatch: pyte
             nobody.bind(str(folder / "left-behind.sock"))  # and nobody listens
 
         def ready(found: Discovered) -> bool:
-            return {here.at[0], other.at[0]} <= {address for each in found.machines for address in each.at}
+            addresses = {address for each in found.machines for address in each.at}
+            return {str(served.path), here.at[0], other.at[0]} <= addresses
 
         async with announced(here, other):
             found = await discover(ready)

@@ -1,11 +1,13 @@
 """The examples of docs/ipc.md, byte for byte."""
 
+import ast
 import asyncio
 import re
 from pathlib import Path
 
 import msgpack
 
+from coordinator.ipc.session_methods import RATE_HZ_MAX, RATE_HZ_MIN
 from coordinator.ipc.settings import IpcSettings, Limits
 from coordinator.ipc.wire import Encoder, Encoding, WireReader
 from tests.coordinator.ipc.served import Served, serving
@@ -53,10 +55,50 @@ def test_the_lines(tmp_path: Path) -> None:
         assert (await reader.readline()).decode() == update[0][2:] + "\n"
 
     async def main() -> None:
-        async with asyncio.timeout(20), serving(tmp_path) as served:
+        async with asyncio.timeout(60), serving(tmp_path) as served:
             await body(served)
 
     asyncio.run(main())
+
+
+def codes_of(path: Path) -> set[str]:
+    """Return the codes of the errors that a file of the source makes."""
+    found: set[str] = set()
+    for call in ast.walk(ast.parse(path.read_text())):
+        if isinstance(call, ast.Call) and ast.unparse(call.func) in ("ApiError", "Fault", "super().__init__"):
+            parts = (part for first in call.args[:1] for part in ast.walk(first))
+            words = (part.value for part in parts if isinstance(part, ast.Constant))
+            found |= {word for word in words if isinstance(word, str) and re.fullmatch("[a-z_]+", word)}
+    return found
+
+
+def test_the_codes_are_those_of_the_program() -> None:
+    """Each code in the source is in a table, and none is there that the source does not know."""
+    folder = Path(__file__).parents[3] / "coordinator"
+    paths = [path for path in folder.rglob("*.py") if "coordinator.ipc." in path.read_text()]
+    known = set().union(*map(codes_of, paths)) - {"code"}  # which a client reads out of an answer
+    section = DOC[DOC.index("## Errors") : DOC.index("## Watching")]
+    told = {
+        code
+        for row in re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
+        for code in re.findall(r"`([a-z_]+)`", row)
+    }
+    assert {"bad_gcode", "file_exists", "no_job", "bad_move", "bad_params", "too_many_failures"} <= known
+    assert told == known
+
+
+def test_a_field_of_the_state_is_told_once() -> None:
+    doc = (Path(__file__).parents[3] / "docs" / "run.md").read_text()
+    section = doc[doc.index("## State") : doc.index("Lines of the log come")]
+    fields = [
+        (words[0] if "." not in words[0] else words[0].rpartition(".")[0], word.strip().rpartition(".")[2])
+        for row in re.findall(r"^\| ([a-z]+\..*?) \|", section, re.MULTILINE)
+        for words in [row.split(", ")]
+        for word in words
+    ]
+    assert len(fields) > 40
+    assert [field for field in fields if fields.count(field) > 1] == []
+    assert ("modules.NAME", "*") in fields
 
 
 def test_the_limits() -> None:
@@ -69,7 +111,7 @@ def test_the_limits() -> None:
         f"{limits.running_requests} requests running and {limits.pending_requests} waiting",
         f"{limits.subscriptions} subscriptions of up to {limits.filters} globs",
         f"{settings.connections_max} connections",
-        f"(0.01 to {limits.rate_hz_max:g})",
+        f"({RATE_HZ_MIN:g} to {RATE_HZ_MAX:g})",
         f"At most {limits.notifications} wait",
         f"{limits.output_bytes_max >> 20} MiB of answers",
     ):

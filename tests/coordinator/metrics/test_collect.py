@@ -54,6 +54,14 @@ FIELDS: dict[str, Value] = {
     "buses.can0.load_acks": 0.125,
     "buses.can0.load_total": 0.625,
     "buses.can0.frames_sent": 2**40,
+    "modules.extruder.temperature": 219.5,
+    "modules.extruder.target": 220.0,
+    "modules.extruder.power": 0.4,
+    "modules.extruder.held_low": None,
+    "modules.extruder.control_stats": {"temp_block": 220.25},
+    "modules.fan.speed": 0.5,
+    "modules.fan.rpm": 3000.0,
+    "modules.gcode_macro START.variables": {"x": 1},
     "api.connections": 4,
     "api.requests": 99,
     "metrics.version": "0.1.0",
@@ -110,6 +118,13 @@ def test_what_the_fields_become() -> None:
     assert value("bus_load_ratio", bus="can0", **{"class": "total"}) is None
     assert value("bus_load_all_ratio", bus="can0") == 0.625
     assert value("bus_sent_frames_total", bus="can0") == 2**40
+    assert value("temperature_celsius", section="extruder") == 219.5
+    assert value("temperature_target_celsius", section="extruder") == 220
+    assert value("heater_power_ratio", section="extruder") == 0.4
+    assert value("heater_held_low_celsius", section="extruder") is None
+    assert value("fan_speed_ratio", section="fan") == 0.5
+    assert value("fan_turns_per_second", section="fan") == pytest.approx(50)
+    assert not any("START" in str(key) for key in samples)
     assert value("api_clients") == 4
     assert value("api_requests_total") == 99
     assert not any("secret" in str(key) for key in samples)
@@ -158,6 +173,13 @@ def test_series_are_bounded() -> None:
     assert sum(name == "canductor_node_sent_bytes_total" for name, _ in samples) == ENTITIES_MAX
     assert all(len(value) <= LABEL_MAX for _, labels in samples for _, value in labels)
     assert samples["canductor_metrics_left_out", ()] == 10
+
+
+def test_sections_without_figures_do_not_push_out_those_with() -> None:
+    fields: dict[str, Value] = {f"modules.macro{n}.variables": 1 for n in range(ENTITIES_MAX + 10)}
+    fields["modules.extruder.temperature"] = 20.5
+    assert Figures(fields).left_out == 0
+    assert read(fields)["canductor_temperature_celsius", (("section", "extruder"),)] == 20.5
 
 
 def test_names_that_are_shortened_to_the_same_stay_apart() -> None:

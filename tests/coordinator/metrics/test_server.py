@@ -115,7 +115,7 @@ def test_whoever_reaches_an_open_one_may_call_it_what_he_likes() -> None:
 
 
 def test_long_slow_and_many_connections_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coordinator.metrics.server.REQUEST_S", 0.5)
+    monkeypatch.setattr("coordinator.metrics.server.REQUEST_S", 2.0)
 
     async def body(server: MetricsServer, looks: list[int]) -> None:
         status, _, _ = await ask(server, b"GET /metrics HTTP/1.1\r\nX: " + b"x" * 4 * REQUEST_BYTES_MAX)

@@ -4,7 +4,8 @@ import json
 import shutil
 import signal
 import socket
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, ViewportSize, sync_playwright
 
+from coordinator.commands import DEMO_MACHINE
 from coordinator.ipc.blocking import BlockingClient
 from tests.system.stage import Command
 
@@ -75,7 +77,10 @@ class Demo:
         jobs = self.folder / "jobs"
         jobs.mkdir(exist_ok=True)
         (jobs / "part.gcode").write_text(long_job())
-        self.command = Command("demo", "--serve", "--ipc", self.path, "--web", str(self.port), "--jobs", jobs)
+        machine = self.folder / "demo.cfg"
+        machine.write_text(f"{DEMO_MACHINE.read_text(encoding='utf-8')}\n[axis_tables]\n", encoding="utf-8")
+        words = ("--serve", "--ipc", self.path, "--web", str(self.port), "--jobs", jobs)
+        self.command = Command("demo", "--machine", machine, *words)
         self.command.stdout.wait_for("ready")
 
     def end(self) -> None:
@@ -95,8 +100,8 @@ class Demo:
 def demo(folder: Path) -> Iterator[Demo]:
     """Serve a virtual machine."""
     served = Demo(folder)
-    served.start()
     try:
+        served.start()
         yield served
     finally:
         if served.command is not None:
@@ -136,6 +141,7 @@ class Visitor:
         """Open the page and wait until it knows the machine."""
         self.page.goto(self.url)
         self.until("document.getElementById('name').textContent === 'demo'")
+        self.until("document.getElementById('job-files').value !== ''")  # the last thing that it asks for
         return self
 
     def until(self, condition: str) -> None:
@@ -146,6 +152,13 @@ class Visitor:
     def until_text(self, element: str, text: str) -> None:
         """Wait until the text of the element with an id is TEXT."""
         self.until(f"document.getElementById({json.dumps(element)}).textContent === {json.dumps(text)}")
+
+    def wait_for(self, true: Callable[[], bool], what: str) -> None:
+        """Wait until TRUE, while what the browser tells is heard."""
+        end_s = time.monotonic() + PATIENCE_MS / 1e3
+        while not true():
+            assert time.monotonic() < end_s, f"{what} did not come"
+            self.page.wait_for_timeout(50)
 
     def text(self, element: str) -> str:
         return self.page.text_content(f"#{element}") or ""

@@ -20,8 +20,11 @@ def browser() -> Iterator[Browser]:
 def machine(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Demo]:
     """One machine for all; each test leaves it ready, or printing."""
     del browser  # without one there is nothing to serve
-    with demo(tmp_path_factory.mktemp("page")) as served:
-        yield served
+    folder = tmp_path_factory.mktemp("page")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(folder / "state"))
+        with demo(folder) as served:
+            yield served
 
 
 @pytest.fixture
@@ -45,6 +48,9 @@ def printing(machine: Demo) -> None:
         machine.ask("job.start", file="part.gcode")
 
 
+TABLE = {"axis": "x", "positions": [0, 100], "forward": [0, 0.01], "reverse": [-0.02, -0.01]}
+
+
 def start_again(tab: Visitor) -> None:
     tab.page.get_by_role("button", name="Start the machine again").click()
     tab.until_text("state", "ready")
@@ -53,17 +59,34 @@ def start_again(tab: Visitor) -> None:
 # --------------------------------------------------------------------------------------------- what it shows
 
 
+def test_axis_tables_come_and_go(visitor: Visitor, machine: Demo) -> None:
+    tab = visitor
+    tab.until_text("state", "ready")
+    tab.until("!document.getElementById('tables-part').hidden")
+    tab.until("document.querySelector('[data-axis=x]').textContent.includes('no table')")
+    machine.ask("table.send", **TABLE)
+    tab.until("document.querySelector('[data-axis=x]').textContent.includes('2 of 2 ok, 2 in use')")
+    tab.until(
+        "document.querySelector('[data-axis=x] .pill').textContent === 'waits for homing and standstill'"
+    )
+    machine.ask("gcode.run", script="G28 X\nG1 X50 F6000")
+    tab.until("document.querySelector('[data-axis=x] .pill').textContent === 'corrected'")
+    tab.until("document.querySelector('[data-axis=x]').textContent.includes('5.0 µm')")
+    tab.until("document.querySelector('[data-axis=x]').textContent.includes('forward')")
+    machine.ask("table.remove", axis="x")
+    tab.until("document.querySelector('[data-axis=x]').textContent.includes('no table')")
+
+
 def test_a_print_from_start_to_cancel(visitor: Visitor, machine: Demo) -> None:
     tab = visitor
     tab.until_text("state", "ready")
     assert tab.text("about").startswith("canductor ")
     tab.page.get_by_role("button", name="Print").click()
     tab.until_text("state", "printing")
-    places = set()
-    for _ in range(4):  # the head moves on: each time another place
-        places.add((tab.text("pos-x"), tab.text("pos-y")))
+    places: set[str] = set()
+    while len(places) < 3:  # the head moves on
+        places.add(tab.text("pos-x"))
         tab.until(f"document.getElementById('pos-x').textContent !== '{tab.text('pos-x')}'")
-    assert len(places) >= 3
     tab.until("document.getElementById('speed').textContent > '0.0'")
     before = tab.page.locator("#job-progress").evaluate("(progress) => progress.value")
     tab.until(f"document.getElementById('job-progress').value > {before}")
@@ -74,7 +97,7 @@ def test_a_print_from_start_to_cancel(visitor: Visitor, machine: Demo) -> None:
     tab.page.get_by_role("button", name="Pause").click()
     tab.until_text("state", "paused")
     assert machine.ask("job.status")["state"] == "paused"
-    assert tab.text("speed") == "0.0"
+    tab.until_text("speed", "0.0")
     tab.page.get_by_role("button", name="Resume").click()
     tab.until_text("state", "printing")
 
@@ -91,7 +114,7 @@ def test_every_node_and_bus_is_there_with_its_figures(visitor: Visitor) -> None:
     cards = tab.page.locator(".node")
     tab.until("document.querySelectorAll('.node').length === 3")
     assert cards.locator("h3").all_text_contents() == ["mcu", "toolhead", "zboard"]
-    assert set(cards.locator(".pill").all_text_contents()) == {"ready"}
+    tab.until("[...document.querySelectorAll('.node .pill')].every((e) => e.textContent === 'ready')")
     tab.until(  # every figure of the boards that print has a value
         "[...document.querySelectorAll('.node[data-node=mcu] dd, .node[data-node=toolhead] dd')]"
         ".every((e) => e.textContent !== '\\u2013')"
@@ -99,7 +122,7 @@ def test_every_node_and_bus_is_there_with_its_figures(visitor: Visitor) -> None:
     for name in ("Drift, ppm", "Offset gained, ms", "Queue", "Load, %", "Lead of commands, ms"):
         chart = tab.page.locator(".node[data-node=mcu]").get_by_role("img", name=re.compile(f"^{name}: "))
         chart.scroll_into_view_if_needed()
-        assert NONE not in (chart.get_attribute("aria-label") or "")
+        tab.page.wait_for_function(TOLD, arg=chart.element_handle(), timeout=PATIENCE_MS)
         tab.page.wait_for_function(PAINTED, arg=chart.element_handle(), timeout=PATIENCE_MS)
     bus = tab.page.locator(".bus").filter(has=tab.page.get_by_role("heading", name="can0.bus"))
     load = bus.get_by_role("img")
@@ -108,8 +131,8 @@ def test_every_node_and_bus_is_there_with_its_figures(visitor: Visitor) -> None:
     tab.until("document.querySelector('.bus .keys b').textContent > '0.0 %'")
 
 
-NONE = "\u2013"
-"""What the page shows where there is no value."""
+TOLD = """(chart) => !chart.getAttribute("aria-label").includes("\u2013")"""
+"""Whether a chart has a value: a dash stands for none."""
 PAINTED = """(canvas) => {
   const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
   const seen = new Set();
@@ -124,7 +147,8 @@ PAINTED = """(canvas) => {
 def test_the_toolpath_from_above_and_turned(browser: Browser, machine: Demo, visitor: Visitor) -> None:
     tab = visitor
     tab.until("document.getElementById('speed').textContent > '0.0'")  # homed, and hot
-    tab.until("document.getElementById('job-row').textContent.match(/^[1-9]/)")
+    # Far enough that a travel is behind the head: its picture without it is another one.
+    tab.until("Number(document.getElementById('job-row').textContent.replace(',', '')) > 16")
     canvas = tab.page.locator("#path")
     tab.page.wait_for_function(PAINTED, arg=canvas.element_handle(), timeout=PATIENCE_MS)
     tab.page.get_by_role("button", name="Pause").click()
@@ -169,8 +193,7 @@ def test_the_toolpath_from_above_and_turned(browser: Browser, machine: Demo, vis
     points: list[int] = []
     late.page.on("websocket", lambda s: s.on("framereceived", lambda data: points.extend(path_points(data))))
     late.visit()
-    while not points:
-        late.page.wait_for_timeout(50)
+    late.wait_for(lambda: bool(points), "the path")
     assert points[0] > 5
     late.close()
     tab.page.get_by_role("button", name="Resume").click()
@@ -234,8 +257,12 @@ def test_emergency_stop_stops(visitor: Visitor, machine: Demo) -> None:
     assert "Emergency stop by 'the live page (127.0.0.1)'." in tab.text("stopped")
     tab.until_text("job-state", "stopped")
     assert tab.page.get_by_role("button", name="Print", exact=True).is_disabled()
-    told = machine.ask("state.get", fields=["machine.stop_confirmed_ms"])["values"]
-    assert set(told["machine.stop_confirmed_ms"]) == {"mcu", "toolhead", "zboard"}
+
+    def confirmed() -> set[str]:
+        told = machine.ask("state.get", fields=["machine.stop_confirmed_ms"])["values"]
+        return set(told.get("machine.stop_confirmed_ms") or ())
+
+    tab.wait_for(lambda: confirmed() == {"mcu", "toolhead", "zboard"}, "all confirmations")
     start_again(tab)
     assert machine.ask("machine.state")["state"] == "ready"
 
@@ -247,13 +274,13 @@ def test_the_stop_has_a_way_of_its_own(browser: Browser, machine: Demo) -> None:
 
     def route(socket: WebSocketRoute) -> None:
         opened.append(socket)
-        if len(opened) > 1:
+        if len(opened) == 2:  # and none that follows, should the stuck one be given up
             socket.connect_to_server()
 
     tab.page.route_web_socket(re.compile("/socket$"), route)
     tab.page.goto(machine.url)
     tab.until("document.getElementById('stop').dataset.line === 'up'")
-    assert tab.text("state") == "connecting"
+    assert tab.text("state") in ("connecting", "no connection")
     tab.page.keyboard.press("Control+Shift+.")
     tab.page.get_by_text("All nodes were told to stop").wait_for()
     assert machine.ask("machine.state")["state"] == "shutdown"
@@ -323,24 +350,27 @@ def test_it_comes_back_when_the_coordinator_does(visitor: Visitor, machine: Demo
     tab.until_text("state", "ready")
     tab.page.get_by_text("the coordinator was started again").wait_for()
     assert tab.page.get_by_role("button", name="Print", exact=True).is_enabled()
-    tab.wrong = [text for text in tab.wrong if "ERR_CONNECTION_REFUSED" not in text]
+    # Nobody listens meanwhile, or whoever did just ends: the browser has many words for it.
+    tab.wrong = [text for text in tab.wrong if not text.startswith("WebSocket connection to ")]
 
 
 def test_a_hidden_tab_is_told_nothing(browser: Browser, machine: Demo) -> None:
     tab = Visitor(browser, machine.url)
     sent: list[str] = []
     tab.page.on("websocket", lambda s: s.on("framesent", lambda data: sent.append(str(data))))
+
+    def twice(method: str) -> None:
+        tab.wait_for(lambda: [watches(text) for text in sent].count(method) == 2, f"{method} twice")
+
     tab.visit()
-    assert [watches(text) for text in sent].count("api.watch") == 2
+    twice("api.watch")
     sent.clear()
     tab.page.evaluate(HIDE, True)
-    while [watches(text) for text in sent].count("api.unwatch") < 2:
-        tab.page.wait_for_timeout(50)
+    twice("api.unwatch")
     assert "motion.path" not in "".join(sent[-2:])
     sent.clear()
     tab.page.evaluate(HIDE, False)
-    while [watches(text) for text in sent].count("api.watch") < 2:
-        tab.page.wait_for_timeout(50)
+    twice("api.watch")
     assert tab.wrong == []
     tab.close()
 
@@ -362,6 +392,7 @@ def watches(text: str) -> str:
 def test_nothing_is_asked_of_anybody_else(browser: Browser, machine: Demo) -> None:
     tab = Visitor(browser, machine.url).visit()
     tab.until("document.querySelectorAll('.node').length === 3")
+    tab.wait_for(lambda: sum(url.endswith("/socket") for url in tab.asked) >= 2, "two connections")
     hosts = {urlsplit(url).netloc for url in tab.asked}
     assert hosts == {f"127.0.0.1:{machine.port}"}
     assert len([url for url in tab.asked if url.endswith("/socket")]) == 2
@@ -369,7 +400,7 @@ def test_nothing_is_asked_of_anybody_else(browser: Browser, machine: Demo) -> No
         "() => fetch('https://example.com/').then(() => 'sent', (error) => String(error))"
     )
     assert "TypeError" in stopped
-    assert any("Content Security Policy" in text for text in tab.wrong)
+    tab.wait_for(lambda: any("Content Security Policy" in text for text in tab.wrong), "the refusal")
     tab.close()
 
 

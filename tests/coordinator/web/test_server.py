@@ -16,6 +16,7 @@ from coordinator.ipc.methods import Scope
 from coordinator.ipc.settings import Limits
 from coordinator.web import server as web_server
 from coordinator.web.files import FOLDER
+from coordinator.web.settings import WebSettings
 from tests.coordinator.web.paged import Paged, ask, paging, receive, rest
 
 TOKEN = "t" * 32
@@ -285,11 +286,10 @@ def small_socket(info: Any) -> socket.socket:
 
 
 def test_connections_that_do_nothing_are_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web_server, "REQUEST_S", 0.2)
-
     async def go(paged: Paged) -> None:
         async with paged.socket() as page:
             await ask(page, "api.hello", version=1)
+            monkeypatch.setattr(web_server, "REQUEST_S", 0.2)  # now: a busy computer's page may take longer
             for begun in (b"", b"GET / HT", b"GET /socket HTTP/1.1\r\nHost: localhost\r\n"):
                 reader, writer = await asyncio.open_connection("127.0.0.1", paged.page.port)
                 writer.write(begun)
@@ -312,6 +312,28 @@ def test_only_so_many_connections(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert "result" in await ask(pages[0], "api.hello", version=1)
         for page in pages:
             await page.close()
+
+    run(tmp_path, go)
+
+
+def test_silence_before_tls_counts_as_a_connection(
+    tmp_path: Path, certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(web_server, "CONNECTIONS_MAX", 3)
+    settings = WebSettings(host="127.0.0.1", port=0, certificate=certificate[0], private_key=certificate[1])
+
+    async def go(paged: Paged) -> None:
+        page = web_server.WebServer(paged.served.server, settings)
+        await page.start()
+        silent = [await asyncio.open_connection("127.0.0.1", page.port) for _ in range(5)]
+        ends = [asyncio.ensure_future(reader.read()) for reader, _ in silent]
+        await asyncio.wait(ends[3:])
+        assert not any(end.done() for end in ends[:3])
+        assert page.refused == 2
+        await page.close()
+        await asyncio.wait(ends)
+        for _, writer in silent:
+            writer.close()
 
     run(tmp_path, go)
 

@@ -1,0 +1,122 @@
+"""Who comes over TCP and never gets as far as a hello."""
+
+import asyncio
+import logging
+import resource
+import socket
+import ssl
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from coordinator.ipc import door as door_module
+from coordinator.ipc.client import Client
+from coordinator.ipc.door import FILES_MAX, Door, raise_files_limit
+from coordinator.ipc.methods import Scope
+from coordinator.ipc.settings import TcpSettings
+from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, run
+
+
+@pytest.fixture
+def files_limit() -> Iterator[tuple[int, int]]:
+    """Return how many files may be open, and put it back after the test."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    yield limits
+    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def with_tls(folder: Path, certificate: tuple[Path, Path]) -> TcpSettings:
+    pem, key = certificate
+    tokens = plain_tcp(folder).tokens
+    return TcpSettings(host="127.0.0.1", port=0, tokens=tokens, certificate=pem, private_key=key)
+
+
+def test_silence_before_tls_takes_no_more_places_than_there_are(
+    tmp_path: Path, certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(door_module, "HANDSHAKE_S", 600.0)
+
+    async def body(served: Served) -> None:
+        assert served.server._door is not None
+        silent = [await served.dial(tcp=True) for _ in range(6)]
+        ends = [asyncio.ensure_future(reader.read()) for reader, _ in silent]
+        await asyncio.wait(ends[2:])
+        assert not any(end.done() for end in ends[:2]), "two may take their time"
+        assert served.server._door.refused == 4
+        assert served.server.figures()["refused_connections"] == 4
+        assert "result" in await (await served.script()).ask("machine.info"), "the owner gets in"
+        silent[0][1].close()
+        await served.server_has(1)
+        trusting = ssl.create_default_context(cafile=str(certificate[0]))
+        address = f"tls://127.0.0.1:{served.server.tcp_port}"
+        async with Client.connect(address, token=TOKENS[Scope.OPERATE], tls=trusting) as client:
+            assert (await client.call("machine.info"))["scope"] == "operate"
+        ends[1].cancel()
+
+    run(tmp_path, body, tcp=with_tls(tmp_path, certificate), tcp_connections_max=2)
+
+
+def test_a_handshake_that_does_not_come_ends(
+    tmp_path: Path, certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(door_module, "HANDSHAKE_S", 0.1)
+
+    async def body(served: Served) -> None:
+        reader, _ = await served.dial(tcp=True)
+        assert await reader.read() == b""
+        await served.server_has(0)
+
+    run(tmp_path, body, tcp=with_tls(tmp_path, certificate))
+
+
+def test_without_files_left_connections_wait_and_nothing_is_said(
+    caplog: pytest.LogCaptureFixture, files_limit: tuple[int, int]
+) -> None:
+    async def main() -> None:
+        come: asyncio.Queue[None] = asyncio.Queue()
+
+        class Guest(asyncio.Protocol):
+            def connection_made(self, transport: asyncio.BaseTransport) -> None:
+                come.put_nowait(None)
+                transport.close()
+
+        door = Door(Guest, None)
+        await door.open("127.0.0.1", 0)
+        await asyncio.sleep(0)  # it listens, and accepts
+        guest = socket.create_connection(door.names[0])
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, files_limit[1]))  # what is open stays so
+        while not door.starved:  # noqa: ASYNC110 (it tells nobody)
+            await asyncio.sleep(0.01)
+        resource.setrlimit(resource.RLIMIT_NOFILE, files_limit)
+        await come.get()
+        door.close()
+        guest.close()
+
+    async def in_time() -> None:
+        async with asyncio.timeout(60):
+            await main()
+
+    with caplog.at_level(logging.ERROR):
+        asyncio.run(in_time())
+    assert not caplog.records
+
+
+def test_who_resets_at_once_leaves_nothing_behind(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
+    async def body(served: Served) -> None:
+        for _ in range(5):
+            with socket.create_connection(("127.0.0.1", served.server.tcp_port or 0)) as left:
+                left.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        await served.server_has(0)
+        assert "result" in await (await served.script()).ask("machine.info")
+
+    run(tmp_path, body, tcp=with_tls(tmp_path, certificate))
+
+
+def test_a_service_may_open_as_many_files_as_the_system_lets_it(files_limit: tuple[int, int]) -> None:
+    _, hard = files_limit
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+    raise_files_limit()
+    most = FILES_MAX if hard == resource.RLIM_INFINITY else min(hard, FILES_MAX)
+    assert resource.getrlimit(resource.RLIMIT_NOFILE) == (most, hard)
