@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from coordinator.gcode import machine_commands
+from coordinator.gcode import machine_commands, state_commands
 from coordinator.gcode.commands import AtRest, Done
 from coordinator.gcode.events import Emergency, Reply, Wait
 from coordinator.gcode.words import Command, WordError, number, quoted
+from coordinator.motion.language import ARC_LETTERS, Plane
 from coordinator.motion.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus
 
 if TYPE_CHECKING:
@@ -118,6 +119,8 @@ def _set_accel(job: Job, command: Command) -> bool:
     _positive(command, words)
     if "S" in words:
         words = {"S": words["S"]}
+    elif len(words) == 1:
+        return True  # P or T alone has no effect, as users of such programs know it
     for accel in words.values():
         _cap(job, "the acceleration", accel, job.planner.limits.max_accel)
     job.planner.set_accel_words(words)
@@ -203,17 +206,58 @@ def _ignore(_job: Job, _command: Command) -> bool:
     return True
 
 
-def _refuse_arc(_job: Job, command: Command) -> bool:
+def _say(job: Job, command: Command) -> bool:
+    job.emit(Reply(job.line, f"echo: {command.text.strip()}"))
+    return True
+
+
+def _refuse_spline(_job: Job, command: Command) -> bool:
     raise WordError(f"{command.name} curves are not supported; have the slicer write straight moves (G1)")
+
+
+def _arc(job: Job, command: Command) -> bool:
+    """G2, G3 that the hot path refused: unusual words, an impossible arc."""
+    planner = job.planner
+    if not planner.arc_open:
+        words = command.words()
+        for letter in words.keys() - set(ARC_LETTERS):
+            job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
+        numbers = {letter: number(command.name, words, letter) for letter in words if letter in ARC_LETTERS}
+        fault = planner.begin_arc(numbers, clockwise=command.name.startswith("G2"))
+        if fault is not None:
+            raise WordError(f"{command.name} {fault}")
+    status = planner.go_on_with_arc()
+    if status is FeedStatus.LIMIT:
+        raise WordError(str(planner.fault))
+    return status is not FeedStatus.FULL
+
+
+def _plane(plane: Plane) -> Handler:
+    def handle(job: Job, _command: Command) -> bool:
+        job.planner.plane = plane
+        return True
+
+    return handle
 
 
 _heat = _without_module("heater and fan commands")
 _motors_off = _without_module("motor-off commands")
+BESIDE = frozenset(
+    (
+        *("M73", "M105", "M112", "M114", "M117", "M118", "M204", "M220", "M221"),
+        *("GET_POSITION", "SET_GCODE_OFFSET", "SET_PRESSURE_ADVANCE", "SET_VELOCITY_LIMIT"),
+    )
+)
+"""Commands that neither move nor wait: a client may give them while a job prints."""
 HANDLERS: Mapping[str, Handler] = {
     "G0": _move,
     "G1": _move,
-    **dict.fromkeys(("G2", "G3", "G5"), _refuse_arc),
+    **dict.fromkeys(("G2", "G3"), _arc),
+    "G5": _refuse_spline,
     "G4": _dwell,
+    "G17": _plane(Plane.XY),
+    "G18": _plane(Plane.ZX),
+    "G19": _plane(Plane.YZ),
     "G20": _unit(25.4),
     "G21": _unit(1.0),
     "G28": _home,
@@ -221,7 +265,8 @@ HANDLERS: Mapping[str, Handler] = {
     "G91": _relative(relative=True),
     "G92": _set_origin,
     **dict.fromkeys(("M18", "M84"), _motors_off),
-    **dict.fromkeys(("M73", "M117", "M118"), _ignore),
+    **dict.fromkeys(("M73", "M117"), _ignore),
+    "M118": _say,
     "M82": _relative_extrusion(relative=False),
     "M83": _relative_extrusion(relative=True),
     **dict.fromkeys(("M104", "M105", "M106", "M107", "M109", "M140", "M190"), _heat),
@@ -232,4 +277,5 @@ HANDLERS: Mapping[str, Handler] = {
     "M400": _wait_for_moves,
     "SET_VELOCITY_LIMIT": _set_velocity_limit,
     **machine_commands.HANDLERS,
+    **state_commands.HANDLERS,
 }

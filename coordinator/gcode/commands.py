@@ -6,15 +6,23 @@ checks the parameters (WordError) and returns what is to be done and when. It ch
 ===========  ================================================================================================
 AtOnce       is done when it is read: an answer, or a value for the lines to come
 InTime       is done when the moves before it are carried out, without stopping them: a fan
+ToProgram    acts on the program that reads it: on its modes, on where its moves go
 AtRest       is done when the machine stands, and the program waits for it: a heater to become hot, homing
 Lines        is replaced by other lines: a macro
+BuiltIn      is what the interpreter makes of another name: a command that a macro has taken the name of
 ===========  ================================================================================================
 """
 
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from coordinator.gcode.words import Command, WordError, quoted
 from nodes.records import record
+
+if TYPE_CHECKING:
+    from coordinator.gcode.interpreter import Job
+    from coordinator.motion.planner import Planner
 
 Position = tuple[float, float, float, float]
 
@@ -34,6 +42,10 @@ class Call:
     """Names of the replaced commands that it stands in, the outermost first."""
     extruder: str = ""
     """The active extruder; empty where there is none."""
+    figures: Callable[[], Mapping[str, Mapping[str, object]]] = dict
+    """Tells ``toolhead`` and ``gcode_move`` as they are there (gcode/figures.py)."""
+    beside: bool = False
+    """Whether a client gives it while a job prints, which must not wait for it."""
 
     def parameters(self, *known: str) -> dict[str, str]:
         """Read NAME=VALUE parameters, of which KNOWN are the names; raises WordError."""
@@ -57,6 +69,8 @@ class Done:
     """Letters of the axes whose place is not known any more."""
     moved: bool = False
     """Whether steppers were moved past the program's own moves."""
+    second_carriage_mm: float | None = None
+    """Where the second carriage was homed; None: where the configuration says."""
 
 
 @record
@@ -86,12 +100,32 @@ class AtRest:
 
 @record
 class Lines:
-    """TEXT takes the command's place."""
+    """TEXT takes the command's place; before that, REPLIES are told."""
 
     text: str
+    replies: tuple[str, ...] = ()
+    where: Callable[[int], str] | None = None
+    """Names the place that a line of the text (from 1) comes from, for messages."""
 
 
-Reading = AtOnce | InTime | AtRest | Lines
+@record
+class ToProgram:
+    """ACT changes what holds for the program's lines to come; False: with the planner emptied, once more.
+
+    It is called in the reader's thread, also when a program is only planned; raises WordError.
+    """
+
+    act: "Callable[[Job], bool]"
+
+
+@record
+class BuiltIn:
+    """The interpreter's own command of NAME acts."""
+
+    name: str
+
+
+Reading = AtOnce | InTime | AtRest | Lines | ToProgram | BuiltIn
 
 
 @record
@@ -102,6 +136,23 @@ class GCodeCommand:
     help: str
     """One sentence, without a full stop."""
     read: Callable[[Call], Reading]
+    beside: bool = False
+    """Whether a client may give it while a job prints, between two lines of the job: it neither moves nor
+    waits."""
+
+
+def renamed(command: GCodeCommand | None, name: str, rename: str, *, beside: bool) -> GCodeCommand:
+    """Return what NAME was, under another name: COMMAND, or without one the interpreter's own.
+
+    BESIDE: whether that one may be given beside a job.
+    """
+    if command is None:
+        return GCodeCommand(rename, f"What {name} is by itself", lambda _: BuiltIn(name), beside=beside)
+
+    def read(call: Call) -> Reading:
+        return command.read(replace(call, command=Command(name, call.command.text)))
+
+    return GCodeCommand(rename, command.help, read, beside=command.beside)
 
 
 @record
@@ -115,6 +166,10 @@ class Vocabulary:
     too_cold: Callable[[str], bool] = lambda _extruder: False
     """Whether an extruder must not move filament now; asked before each piece of a program, in the reader's
     thread. One that is only planned is never too cold."""
+    interrupting: frozenset[str] = frozenset()
+    """Commands that may pause or cancel a job: PAUSE, CANCEL_PRINT, and macros in which they come."""
+    set_ups: "tuple[Callable[[Planner], None], ...]" = ()
+    """Called for every program that begins."""
 
 
 NO_WORDS = Vocabulary({})

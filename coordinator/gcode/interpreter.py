@@ -5,19 +5,22 @@ real-time streamer drive the same ``step`` and act on its events (events.py).
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 from coordinator.gcode import basic_commands, machine_commands
 from coordinator.gcode.commands import (
     NO_WORDS,
     AtOnce,
     AtRest,
+    BuiltIn,
     Call,
     Done,
     InTime,
     Lines,
     Reading,
+    ToProgram,
     Vocabulary,
 )
 from coordinator.gcode.errors import GCodeError
@@ -33,15 +36,20 @@ from coordinator.gcode.events import (
     Resting,
     Timed,
 )
+from coordinator.gcode.figures import gcode_figures
 from coordinator.gcode.machine_state import MachineState
+from coordinator.gcode.print_control import PrintControl
 from coordinator.gcode.program import Program
 from coordinator.gcode.words import Command, WordError, parse, quoted
+from coordinator.motion.language import READ_IN_C
 from coordinator.motion.planner import Feed, FeedStatus, Planner
 
 MAX_NOTICES = 100
 """Different notices a job gives; a file of garbage must not flood the screen."""
 MAX_DEPTH = 30
 """Commands that stand in for a command that stands in for a command ..."""
+MAX_PLACES = 4
+"""Of such commands that a message names all; of more, it names the outermost and the innermost one."""
 
 
 @dataclass(slots=True)
@@ -64,11 +72,14 @@ class _Inner:
     """Of the line that comes next."""
     at: int = 0
     """Of the line that is being carried out."""
+    where: Callable[[int], str] | None = None
+    """Names the place of a line."""
 
     @property
-    def line(self) -> int:
-        """Number of that."""
-        return self.data.count(b"\n", 0, self.at) + 1
+    def place(self) -> str:
+        """Where the line stands that is being carried out."""
+        line = self.data.count(b"\n", 0, self.at) + 1
+        return f"{self.name}:{line}" if self.where is None else self.where(line)
 
     def line_end(self) -> int:
         end = self.data.find(b"\n", self.start)
@@ -91,6 +102,9 @@ class Job:
         homed_position: Mapping[str, float],
         machine: MachineState | None = None,
         vocabulary: Vocabulary = NO_WORDS,
+        *,
+        beside: bool = False,
+        prints: PrintControl | None = None,
     ) -> None:
         self.program = program
         self.planner = planner
@@ -98,6 +112,11 @@ class Job:
         """What the program may change; it is changed in place."""
         self.vocabulary = vocabulary
         self.homed_position = dict(homed_position)
+        self.beside = beside
+        """Whether its lines come between those of a job that prints: then only some are carried out."""
+        self.prints = prints
+        """Has the jobs; None: there are none, this program is all there is."""
+        self._breaks = False
         self.recorded: dict[str, Recorded] = {}
         """By command name."""
         self._events: deque[Event] = deque()
@@ -105,6 +124,10 @@ class Job:
         self._resting: Resting | None = None
         self._over: Event | GCodeError | None = None
         self._told: set[str] = set()
+        planner.forget_line()
+        planner.leave_out(READ_IN_C if beside else vocabulary.commands)
+        for set_up in vocabulary.set_ups:
+            set_up(planner)
         machine_commands.begin(self)
 
     @property
@@ -123,6 +146,9 @@ class Job:
         Waits for input only where the program's source does (pipes, standard input).
         """
         while not self._events:
+            if self._breaks and self.at_line:
+                self._breaks = False
+                return self._progress()
             if isinstance(self._over, GCodeError):
                 raise self._over
             if self._over is not None:
@@ -140,6 +166,40 @@ class Job:
                 self._over = error
         return self._events.popleft()
 
+    @property
+    def at_line(self) -> bool:
+        """Whether it stands between two lines of its program, with nothing left of the one before."""
+        return not self._inner and self.settled and not self.planner.arc_open
+
+    @property
+    def settled(self) -> bool:
+        """Whether all is taken over that was done at rest, and all is told."""
+        return self._resting is None and not self._events
+
+    def break_after_line(self) -> None:
+        """Let ``step`` return as soon as the line at hand is done, with all that it stands for."""
+        self._breaks = True
+
+    def attend_others(self) -> Event | None:
+        """Return that there is nothing: it is all there is."""
+        return None
+
+    def pending(self) -> Event | None:
+        """Take over what was done at rest, and return what is to be told without reading on; None: nothing.
+
+        Raises GCodeError.
+        """
+        if self._resting is not None and not self._events:
+            try:
+                self._rested(self._resting)
+            except GCodeError as error:
+                self._over = error
+                raise
+        return self._events.popleft() if self._events else None
+
+    def _progress(self) -> Progress:
+        return Progress(self.planner.lines, self.program.done_bytes, self.program.size_bytes)
+
     # ---- One piece ----
 
     def _advance(self) -> None:
@@ -155,8 +215,7 @@ class Job:
         else:
             program.check_line_length(self.line)
             more = program.refill()
-            progress = Progress(self.planner.lines, program.done_bytes, program.size_bytes)
-            self._events.append(progress if more else Idle())
+            self._events.append(self._progress() if more else Idle())
 
     def _refused(self, feed: Feed) -> None:
         if feed.status is FeedStatus.LIMIT:
@@ -212,15 +271,27 @@ class Job:
     def _act(self, command: Command) -> bool:
         known = self.vocabulary.commands.get(command.name)
         if known is not None:
+            self._check_beside(command, allowed=known.beside)
             return self.follow(command, known.read(self.call(command)))
+        return self._act_built_in(command)
+
+    def _act_built_in(self, command: Command) -> bool:
         handler = basic_commands.HANDLERS.get(command.name)
         if handler:
+            self._check_beside(command, allowed=command.name in basic_commands.BESIDE)
             return handler(self, command)
         if machine_commands.is_tool(command.name):
+            self._check_beside(command, allowed=False)
             return machine_commands.select_tool(self, command)
         what = quoted(command.name).strip("'")
         self.notice(f"unknown command {what}", "unknown commands are skipped")
         return True
+
+    def _check_beside(self, command: Command, *, allowed: bool) -> None:
+        if self.beside and not allowed:
+            raise WordError(
+                f"{command.name} cannot run while a job prints; pause it first, or wait for its end"
+            )
 
     # ---- What modules make of a command ----
 
@@ -230,7 +301,8 @@ class Job:
         callers = tuple(inner.name for inner in self._inner)
         active = self.machine.active
         extruder = active.name if active is not None else ""
-        return Call(command, self.line, planner.toolhead_position, planner.homed, callers, extruder)
+        position, figures = planner.toolhead_position, partial(gcode_figures, self)
+        return Call(command, self.line, position, planner.homed, callers, extruder, figures, self.beside)
 
     def follow(self, command: Command, reading: Reading) -> bool:
         """Do what READING says; False: the planner has to be emptied first."""
@@ -249,8 +321,14 @@ class Job:
                 self._events.append(self._resting)
             case Lines():
                 if len(self._inner) >= MAX_DEPTH:
-                    raise WordError(f"{command.name} stands in for itself, {MAX_DEPTH} levels deep; end that")
-                self._inner.append(_Inner(command.name, reading.text.encode(errors="replace")))
+                    raise WordError(self._too_deep(command.name))
+                self._reply(reading.replies)
+                data = reading.text.encode(errors="replace")
+                self._inner.append(_Inner(command.name, data, where=reading.where))
+            case ToProgram():
+                return reading.act(self)
+            case BuiltIn():
+                return self._act_built_in(Command(reading.name, command.text))
         return True
 
     def _rested(self, event: Resting) -> None:
@@ -272,7 +350,7 @@ class Job:
         planner.set_position(done.position)
         planner.clear_gcode_base(done.homed)
         planner.homed = planner.homed + done.homed
-        machine_commands.home_carriages(self, done.homed)
+        machine_commands.home_carriages(self, done.homed, done.second_carriage_mm)
         self._events.append(PositionSet(self.line, done.homed, done.position, planner.print_time_end_s))
 
     def _reply(self, texts: tuple[str, ...]) -> None:
@@ -280,8 +358,20 @@ class Job:
 
     # ---- For the handlers ----
 
+    def _too_deep(self, name: str) -> str:
+        """Say how NAME comes to stand in too many others."""
+        callers = [inner.name for inner in self._inner]
+        if name not in callers:
+            return f"{name} stands in {MAX_DEPTH} others, one in another; let there be fewer"
+        last = len(callers) - callers[::-1].index(name)
+        by_way_of = f" by way of {' and '.join(callers[last:])}" if callers[last:] else ""
+        return f"{name} calls itself{by_way_of}, {MAX_DEPTH} levels deep; end that"
+
     def _error(self, problem: str, line: int | None = None) -> GCodeError:
-        within = "".join(f"{inner.name}:{inner.line}: " for inner in self._inner)
+        places = [inner.place for inner in self._inner]
+        if len(places) > MAX_PLACES:
+            places = [places[0], "…", places[-1]] if places[0] != places[-1] else places[:1]
+        within = "".join(f"{place}: " for place in places)
         return GCodeError(self.program.name, line or self.line, f"{within}{problem}")
 
     def notice(self, what: str, remark: str) -> None:

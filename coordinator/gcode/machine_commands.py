@@ -8,6 +8,7 @@ generation as an event with its print time.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from coordinator.gcode.events import PositionSet, Reply, ShaperChange, SmoothTimeChange, WeightsChange
@@ -42,8 +43,11 @@ def begin(job: Job) -> None:
     _keep_apart(job)
 
 
-def home_carriages(job: Job, axes: str) -> None:
-    """After homing, the first carriage is the head and the second is parked; the machine is at rest."""
+def home_carriages(job: Job, axes: str, second_mm: float | None = None) -> None:
+    """After homing, the first carriage is the head and the second is parked; the machine is at rest.
+
+    SECOND_MM: where the second one stands, if that is not exactly its home.
+    """
     machine = job.machine
     if (
         machine.carriages is None
@@ -52,7 +56,9 @@ def home_carriages(job: Job, axes: str) -> None:
     ):
         return
     changed = machine.carriage_state.modes != machine.carriages.home.modes
-    machine.carriage_state = machine.carriages.home
+    home = machine.carriages.home
+    second_mm = home.positions[1] if second_mm is None else second_mm
+    machine.carriage_state = replace(home, positions=(home.positions[0], second_mm))
     _keep_apart(job)
     if changed:
         weights = machine.carriages.weights(machine.carriage_state)
@@ -112,6 +118,11 @@ def set_pressure_advance(job: Job, command: Command) -> bool:
     needed = smooth if smooth is not None else extruder.smooth_s
     window = needed if advance or extruder.window_s else 0.0
     if window != extruder.window_s:
+        if job.beside:
+            raise WordError(
+                f"{command.name} needs a standstill for the first ADVANCE, and for another SMOOTH_TIME; pause"
+                " the job first"
+            )
         if not come_to_rest(job, window):
             return False
         extruder.window_s = window

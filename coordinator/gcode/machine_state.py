@@ -7,6 +7,7 @@ change to step generation at its print time.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from coordinator.kinematics.base import Weights
 from coordinator.kinematics.dual_carriage import CarriageState, DualCarriage
 from coordinator.kinematics.extruder import ExtruderMotion
 from coordinator.motion.specs import MotionLimits
@@ -51,6 +52,24 @@ class Extruder:
             self.window_s = self.smooth_s
 
 
+@record
+class SavedState:
+    """What holds for the lines to come, as SAVE_GCODE_STATE found it; X Y Z E, mm."""
+
+    position: tuple[float, float, float, float]
+    """In the machine's frame."""
+    base: tuple[float, float, float, float]
+    offset: tuple[float, float, float, float]
+    unit_mm: float
+    relative: bool
+    relative_extrusion: bool
+    speed_mm_s: float
+    speed_factor: float
+    extrude_factor: float
+    homed: str = ""
+    """Letters of the axes that were homed."""
+
+
 @dataclass(slots=True)
 class MachineState:
     """What the machine is like for the next line."""
@@ -64,6 +83,10 @@ class MachineState:
     """None on a machine with one carriage."""
     shapers: dict[str, Shaper] = field(default_factory=dict)
     """By axis letter."""
+    saved: dict[str, SavedState] = field(default_factory=dict)
+    """By name."""
+    follows: Mapping[str, Weights] = field(default_factory=dict)
+    """What motors (by name) follow whose axes are corrected; others follow what they are described to."""
 
     @property
     def active(self) -> Extruder | None:

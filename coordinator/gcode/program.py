@@ -65,14 +65,20 @@ class Program:
     The owner of the window moves ``start`` on and calls ``refill`` when no whole line is left.
     """
 
-    def __init__(self, source: ByteSource, name: str, *, size_bytes: int | None = None) -> None:
+    def __init__(
+        self, source: ByteSource, name: str, *, size_bytes: int | None = None, modified_ns: int = 0
+    ) -> None:
         self.name = name
         self.size_bytes = size_bytes
         """None where it is not known (pipes)."""
+        self.modified_ns = modified_ns
+        """When the file was written last, since the epoch; 0: not known."""
         self.data = b""
         self.start = 0
         self.final = False
         """Whether the window reaches the end of the program."""
+        self.end_bytes: int | None = None
+        """Where it ends for whoever wants to read no further."""
         self._source = source
         self._read_bytes = 0
 
@@ -113,7 +119,8 @@ class Program:
         Raises CanductorError when reading fails or a line is longer than MAX_LINE_BYTES.
         """
         try:
-            piece = self._source.read(CHUNK_BYTES)
+            left = CHUNK_BYTES if self.end_bytes is None else self.end_bytes - self._read_bytes
+            piece = self._source.read(min(CHUNK_BYTES, left)) if left > 0 else b""
         except OSError as error:
             reason = (error.strerror or str(error)).lower()
             raise CanductorError(f"reading {self.name} failed: {reason}; copy the file again") from error
@@ -128,6 +135,16 @@ class Program:
         self._read_bytes += len(piece)
         self.data = self.data[self.start :] + piece
         self.start = 0
+        return True
+
+    def skip_lines(self, count: int) -> bool:
+        """Go on behind the next COUNT lines; False when there are fewer. Raises CanductorError."""
+        for _ in range(count):
+            while (end := self.data.find(b"\n", self.start)) < 0:
+                self.check_line_length(0)
+                if self.final or not self.refill():
+                    return False
+            self.start = end + 1
         return True
 
     def line_end(self) -> int:

@@ -14,7 +14,7 @@ _BARE_WORD = re.compile(r"[XYZEFxyzef][+-]?\.?\d", re.ASCII)
 _LINE_NUMBER = re.compile(rb"[Nn]\d+[ \t]*")
 _CHECKSUM = re.compile(rb"\*[ \t]*(\S*)[ \t]*$")
 _WORD = re.compile(r"\s*([A-Za-z])([+-]?(?:\d+\.?\d*|\.\d+)|(?=\s|$))\s*", re.ASCII)
-_PARAMETER = re.compile(r"\s*([A-Za-z_]\w*)=(\"[^\"]*\"|\S*)\s*", re.ASCII)
+_PARAMETER = re.compile(r"\s*([A-Za-z_]\w*)=(\"[^\"]*\"|'[^']*'|\S*)(?:\s+|$)", re.ASCII)
 _QUOTED_MAX = 40
 _LINE_MAX = 4096
 
@@ -55,9 +55,13 @@ class Command:
             match = _PARAMETER.match(self.text, at)
             if not match:
                 raise WordError(f"{self.name} has {quoted(self.text[at:])} where NAME=VALUE belongs")
-            parameters[match[1].upper()] = match[2].strip('"')
+            parameters[match[1].upper()] = _unquoted(match[2])
             at = match.end()
         return parameters
+
+
+def _unquoted(text: str) -> str:
+    return text[1:-1] if len(text) > 1 and text[0] in "\"'" and text[-1] == text[0] else text.strip('"')
 
 
 def quoted(text: str) -> str:

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "coordinator/motion/gcode_lines.h"
+#include "coordinator/motion/gcode_internal.h"
 #include <math.h>
 #include <string.h>
 
@@ -121,8 +121,6 @@ size_t gcode_number(const char *text, size_t size, double *value) {
 // ---- Lines
 // -------------------------------------------------------------------------------------------------
 
-enum line_kind { LINE_BLANK, LINE_MOVE, LINE_ORIGIN, LINE_ACCEL, LINE_OTHER };
-
 static inline char upper(char c) {
     return c >= 'a' && c <= 'z' ? (char)(c - 32) : c;
 }
@@ -177,7 +175,7 @@ static const char *skip_line_number(const char *at, const char *end) {
 }
 
 // "G1", "M204", "G01" and the like; NULL for what has no place here.
-static const char *read_command(const char *at, const char *end, enum line_kind *kind) {
+static const char *read_command(const char *at, const char *end, enum gcode_kind *kind) {
     if (at == end)
         return NULL;
     char letter = upper(*at);
@@ -186,11 +184,13 @@ static const char *read_command(const char *at, const char *end, enum line_kind 
     if (!at || (at < end && *at == '.'))
         return NULL;
     if (letter == 'G' && code <= 1)
-        *kind = LINE_MOVE;
+        *kind = GCODE_MOVE;
+    else if (letter == 'G' && code <= 3)
+        *kind = code == 2 ? GCODE_ARC_CW : GCODE_ARC_CCW;
     else if (letter == 'G' && code == 92)
-        *kind = LINE_ORIGIN;
+        *kind = GCODE_ORIGIN;
     else if (letter == 'M' && code == 204)
-        *kind = LINE_ACCEL;
+        *kind = GCODE_ACCEL;
     else
         return NULL;
     return at;
@@ -198,8 +198,9 @@ static const char *read_command(const char *at, const char *end, enum line_kind 
 
 // 1 + index into gcode_words.value; 0 for letters that have none.
 static inline int word_place(char letter) {
-    static const uint8_t PLACE[32] = {['X' & 31] = 1, ['Y' & 31] = 2, ['Z' & 31] = 3, ['E' & 31] = 4,
-                                      ['F' & 31] = 5, ['S' & 31] = 6, ['P' & 31] = 7, ['T' & 31] = 8};
+    static const uint8_t PLACE[32] = {['X' & 31] = 1, ['Y' & 31] = 2,  ['Z' & 31] = 3,  ['E' & 31] = 4,
+                                      ['F' & 31] = 5, ['S' & 31] = 6,  ['P' & 31] = 7,  ['T' & 31] = 8,
+                                      ['I' & 31] = 9, ['J' & 31] = 10, ['K' & 31] = 11, ['R' & 31] = 12};
     return (letter & 0xC0) == 0x40 ? PLACE[letter & 31] : 0;
 }
 
@@ -231,55 +232,27 @@ static int read_words(const char *line, const char *at, const char *end, const c
     return 1;
 }
 
-static enum line_kind read_line(const char *line, const char *end, const char *readable,
-                                struct gcode_words *words) {
-    static const uint32_t ALLOWED[] = {[LINE_MOVE] = GCODE_MOVE_WORDS,
-                                       [LINE_ORIGIN] = GCODE_AXIS_WORDS,
-                                       [LINE_ACCEL] = GCODE_ACCEL_WORDS,
-                                       [LINE_OTHER] = 0};
+static enum gcode_kind read_line(const char *line, const char *end, const char *readable,
+                                 struct gcode_words *words) {
+    static const uint32_t ALLOWED[] = {[GCODE_MOVE] = GCODE_MOVE_WORDS,   [GCODE_ORIGIN] = GCODE_AXIS_WORDS,
+                                       [GCODE_ACCEL] = GCODE_ACCEL_WORDS, [GCODE_ARC_CW] = GCODE_ARC_WORDS,
+                                       [GCODE_ARC_CCW] = GCODE_ARC_WORDS, [GCODE_OTHER] = 0};
     const char *at = skip_blanks(line, end);
     if (at == end || *at == ';')
-        return LINE_BLANK;
-    enum line_kind kind = LINE_OTHER;
+        return GCODE_BLANK;
+    enum gcode_kind kind = GCODE_OTHER;
     at = read_command(skip_line_number(at, end), end, &kind);
-    return at && read_words(line, at, end, readable, ALLOWED[kind], words) ? kind : LINE_OTHER;
+    return at && read_words(line, at, end, readable, ALLOWED[kind], words) ? kind : GCODE_OTHER;
 }
 
 // ---- What a line does
 // --------------------------------------------------------------------------------------
 
-static void set_origin(struct gcode_state *state, const struct gcode_words *words) {
-    for (int axis = 0; axis < 4; axis++) {
-        double scale = axis == AXIS_E ? state->unit * state->extrude_factor : state->unit;
-        double value = words->given >> axis & 1 ? words->value[axis] : 0;
-        if (!words->given || words->given >> axis & 1)
-            state->base[axis] = state->position[axis] - value * scale;
-    }
+double gcode_speed(const struct gcode_state *state, const struct gcode_words *words) {
+    return words->given >> GCODE_F & 1 ? words->value[GCODE_F] * state->unit / 60 : state->speed;
 }
 
-int gcode_accel(struct gcode_state *state, struct planner *planner, const struct gcode_words *words) {
-    double print = state->print_accel, travel = state->travel_accel, accel;
-    if (words->given >> GCODE_S & 1) {
-        print = travel = 0;
-        accel = words->value[GCODE_S];
-    } else {
-        print = words->given >> GCODE_P & 1 ? words->value[GCODE_P] : print;
-        travel = words->given >> GCODE_T & 1 ? words->value[GCODE_T] : travel;
-        accel = print == 0 || (travel != 0 && travel < print) ? travel : print;
-    }
-    for (int i = GCODE_S; i <= GCODE_T; i++)
-        if (words->given >> i & 1 && !(words->value[i] >= MIN_ACCEL))
-            return -1;
-    if (!words->given || !(accel <= planner->limits.max_accel))
-        return -1;
-    state->print_accel = print;
-    state->travel_accel = travel;
-    planner->accel = accel;
-    return 0;
-}
-
-int gcode_move(struct gcode_state *state, struct planner *planner, const struct gcode_words *words) {
-    double target[4], speed = state->speed;
+void gcode_target(const struct gcode_state *state, const struct gcode_words *words, double target[4]) {
     for (int axis = 0; axis < 4; axis++) {
         target[axis] = state->position[axis];
         if (!(words->given >> axis & 1))
@@ -290,14 +263,77 @@ int gcode_move(struct gcode_state *state, struct planner *planner, const struct 
             value *= state->extrude_factor;
         target[axis] = value + (relative ? state->position[axis] : state->base[axis]);
     }
-    if (words->given >> 4 & 1)
-        speed = words->value[4] * state->unit / 60;
-    planner->line = (int64_t)state->lines + 1;
-    if ((words->given & 15) && planner_add(planner, target, speed * state->speed_factor))
+}
+
+int gcode_go(struct gcode_state *state, struct planner *planner, const double target[4], double speed) {
+    if (!state->excluded && planner_add(planner, target, speed * state->speed_factor))
         return -1;
-    memcpy(state->position, target, sizeof target);
+    memcpy(state->position, target, sizeof state->position);
+    if (target[AXIS_E] > state->filament_top)
+        state->filament_top = target[AXIS_E];
+    return 0;
+}
+
+static void set_origin(struct gcode_state *state, const struct gcode_words *words) {
+    for (int axis = 0; axis < 4; axis++) {
+        double scale = axis == AXIS_E ? state->unit * state->extrude_factor : state->unit;
+        double value = words->given >> axis & 1 ? words->value[axis] : 0;
+        if (!words->given || words->given >> axis & 1)
+            state->base[axis] = state->position[axis] - value * scale;
+    }
+}
+
+int gcode_accel(struct planner *planner, const struct gcode_words *words) {
+    const double print = words->value[GCODE_P], travel = words->value[GCODE_T];
+    const int both = words->given >> GCODE_P & words->given >> GCODE_T & 1;
+    double accel = planner->accel;
+    if (words->given >> GCODE_S & 1)
+        accel = words->value[GCODE_S];
+    else if (both)
+        accel = travel < print ? travel : print;
+    for (int i = GCODE_S; i <= GCODE_T; i++)
+        if (words->given >> i & 1 && !(words->value[i] >= MIN_ACCEL))
+            return -1;
+    if (!words->given || !(accel <= planner->limits.max_accel))
+        return -1;
+    planner->accel = accel;
+    return 0;
+}
+
+int gcode_move(struct gcode_state *state, struct planner *planner, const struct gcode_words *words) {
+    double target[4], speed = gcode_speed(state, words);
+    gcode_target(state, words, target);
+    planner->line = (int64_t)state->lines + 1;
+    if ((words->given & GCODE_AXIS_WORDS) && gcode_go(state, planner, target, speed))
+        return -1;
     state->speed = speed;
     return 0;
+}
+
+// Whether the line was carried out; *STATUS says why not.
+static int act(struct gcode_state *state, struct planner *planner, enum gcode_kind kind,
+               const struct gcode_words *words, int *status) {
+    *status = GCODE_OTHER_LINE;
+    if (kind == GCODE_OTHER || state->left_out >> kind & 1)
+        return 0;
+    if (kind == GCODE_ACCEL)
+        return !gcode_accel(planner, words);
+    if (kind == GCODE_ORIGIN)
+        set_origin(state, words);
+    if (kind == GCODE_BLANK || kind == GCODE_ORIGIN)
+        return 1;
+    *status = GCODE_FULL;
+    if (!planner_ready(planner))
+        return 0;
+    if (kind == GCODE_MOVE) {
+        *status = GCODE_LIMIT;
+        return !gcode_move(state, planner, words);
+    }
+    *status = GCODE_OTHER_LINE; // the caller says what is wrong with the arc
+    if (gcode_arc_begin(state, planner, words, kind == GCODE_ARC_CW))
+        return 0;
+    *status = gcode_arc_go_on(state, planner);
+    return *status == GCODE_NEED_DATA;
 }
 
 int gcode_feed(struct gcode_state *state, struct planner *planner, const char *text, size_t size,
@@ -308,24 +344,17 @@ int gcode_feed(struct gcode_state *state, struct planner *planner, const char *t
         const char *stop = memchr(line, '\n', (size_t)(end - line));
         if (!stop && !final)
             break;
-        struct gcode_words words;
-        enum line_kind kind = read_line(line, stop ? stop : end, end, &words);
-        if (kind == LINE_OTHER || (kind == LINE_ACCEL && gcode_accel(state, planner, &words))) {
-            status = GCODE_OTHER_LINE;
-            break;
-        }
-        if (kind == LINE_MOVE) {
-            if (!planner_ready(planner)) {
-                status = GCODE_FULL;
+        if (state->arc.done < state->arc.pieces) { // of this line, which the planner had no room for
+            status = gcode_arc_go_on(state, planner);
+            if (status != GCODE_NEED_DATA)
                 break;
-            }
-            if (gcode_move(state, planner, &words)) {
-                status = GCODE_LIMIT;
+        } else {
+            struct gcode_words words;
+            enum gcode_kind kind = read_line(line, stop ? stop : end, end, &words);
+            if (!act(state, planner, kind, &words, &status))
                 break;
-            }
+            status = GCODE_NEED_DATA;
         }
-        if (kind == LINE_ORIGIN)
-            set_origin(state, &words);
         state->lines++;
         line = stop ? stop + 1 : end;
     }

@@ -106,6 +106,7 @@ def job_figures(job: "JobRun | None", now_s: float) -> dict[str, Value]:
         "progress": round(job.progress, 4),
         "line": job.line,
         "lines_read": job.lines_read,
+        "lines_fed": job.lines_fed,
         "print_time_s": round(job.print_time_s, 1),
         "elapsed_s": round((job.ended_s or now_s) - job.began_s, 1),
         "message": job.message,

@@ -80,7 +80,7 @@ class JobFolder:
         if not stat.S_ISREG(status.st_mode):
             os.close(fd)
             raise NoSuchJob(f"{_shown(name)} in the job folder is not a file")
-        return Program(FileIO(fd), "/".join(parts), size_bytes=status.st_size)
+        return Program(FileIO(fd), "/".join(parts), size_bytes=status.st_size, modified_ns=status.st_mtime_ns)
 
 
 def _parts(name: str) -> tuple[str, ...]:

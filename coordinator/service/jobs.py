@@ -37,6 +37,9 @@ class JobRun:
     def __init__(self, motion: Motion, work: FileWork, now_s: float) -> None:
         self.file = work.name
         self.size_bytes = work.program.size_bytes or 0
+        """Of one that is fed: 0, until it is done."""
+        self.lines_fed: int | None = None
+        """Lines that came so far; None: it is a file."""
         self.phase = JobPhase.PRINTING
         self.message = ""
         """Why it failed or stopped."""
@@ -46,8 +49,11 @@ class JobRun:
         """For which it has moved, pauses left out."""
         self.line = 0
         """Being carried out."""
+        self.filament_mm = 0.0
+        """Of the extruder, drawn in since the begin."""
         self._trail = Trail()
         self._looked_s = now_s
+        self._began_e = motion.moment().position[3]
         self._motion = motion
         self._ticket: Ticket = motion.feeder.submit(work, is_job=True)
 
@@ -55,6 +61,11 @@ class JobRun:
     def active(self) -> bool:
         """Whether it is on its way."""
         return self.phase in ACTIVE
+
+    @property
+    def gives_way(self) -> bool:
+        """Whether others may move between two of its lines."""
+        return self.phase in (JobPhase.PAUSING, JobPhase.PAUSED) and self._feeder.paused
 
     @property
     def lines_read(self) -> int:
@@ -74,7 +85,9 @@ class JobRun:
     @property
     def progress(self) -> float:
         """The part that is carried out, 0..1."""
-        return min(1.0, self.done_bytes / self.size_bytes) if self.size_bytes else 0.0
+        if self.size_bytes:
+            return min(1.0, self.done_bytes / self.size_bytes)
+        return 1.0 if self.phase is JobPhase.DONE else 0.0
 
     def pause(self) -> None:
         """Come to a standstill between two moves."""
@@ -103,19 +116,30 @@ class JobRun:
         """Take note of how far it is at NOW_S, any clock in s."""
         if not self.active:
             return
-        if not self._motion.paused:
+        self._follow_programs()
+        if self.phase is not JobPhase.PAUSED and not self._motion.paused:
             self.print_time_s += now_s - self._looked_s
         self._looked_s = now_s
         moment = self._motion.moment()
         began_s = self._ticket.begun_at_s
+        self.filament_mm = moment.position[3] - self._began_e
         if moment.moving and moment.line and began_s is not None and self._motion.now_s >= began_s:
-            self.line = moment.line
+            self.line = max(self.line, moment.line)  # others that come between count from 1
         ticket = self._ticket
         self._trail.look(ticket.progress.line, ticket.progress.done_bytes, self.line)
         if ticket.done:
             self._ended(ticket, now_s)
         elif self.phase is JobPhase.PAUSING and self._motion.paused:
             self.phase = JobPhase.PAUSED
+
+    def _follow_programs(self) -> None:
+        """Take note of what a program has asked for: to pause, to go on, to cancel."""
+        if self._ticket.cancelled:
+            self.phase = JobPhase.CANCELLING
+        elif self._feeder.paused and self.phase is JobPhase.PRINTING:
+            self.phase = JobPhase.PAUSING
+        elif not self._feeder.paused and self.phase in (JobPhase.PAUSING, JobPhase.PAUSED):
+            self.phase = JobPhase.PRINTING
 
     def _ended(self, ticket: Ticket, now_s: float) -> None:
         self._feeder.resume()  # a pause that came too late must not hold what comes next
@@ -124,6 +148,8 @@ class JobRun:
         elif ticket.cancelled:
             self._end(JobPhase.CANCELLED, "", now_s)
         else:
+            self.size_bytes = self.size_bytes or ticket.progress.done_bytes
+            self.line = ticket.progress.line
             self._end(JobPhase.DONE, "", now_s)
 
     def _end(self, phase: JobPhase, message: str, now_s: float) -> None:

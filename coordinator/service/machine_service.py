@@ -20,17 +20,21 @@ from coordinator.ipc.state import StateTree
 from coordinator.machine.description import MachineDescription
 from coordinator.move_source import Told
 from coordinator.pipeline import PlanRecord
+from coordinator.service.fed import FedJobs
 from coordinator.service.figures import Figures
 from coordinator.service.job_folder import JobFolder
 from coordinator.service.jobs import JobPhase, JobRun
 from coordinator.service.log_ring import Entry, LogRing
-from coordinator.service.memory import give_back, pass_by_what_stays
+from coordinator.service.memory import give_back, keep_small, pass_by_what_stays
 from coordinator.service.motion import Motion
+from coordinator.service.programs import Programs
+from coordinator.service.recovery import Recovery
 from coordinator.service.tables import TableService
 from coordinator.service.work import FileWork
 from coordinator.table.store import TableStore
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
+from nodes.node_errors import NodeShutdown
 
 REFRESH_S: Final = 0.1
 """How often the state tree is brought up to date."""
@@ -111,16 +115,21 @@ class MachineService:
         self._cache = cache
         self._record = record
         self._figures = Figures(state)
+        self.programs = Programs(self)
+        self.recovery = Recovery(self)
+        self.fed = FedJobs(self)
         self._restart = asyncio.Event()
         self._reset_nodes = False
         """At the next start, whatever their configuration."""
         self._asked_to_stop: str | None = None
-        """By somebody, while there was no machine yet."""
+        """By somebody, while it starts."""
 
     # ------------------------------------------------------------------------------------------- life
 
     async def run(self) -> None:
         """Be the machine. Cancelled while it moves, it stops all nodes, as Ctrl-C does."""
+        if self.settings.own_process:
+            keep_small()
         refresh = asyncio.ensure_future(self._refresh())
         try:
             while True:
@@ -135,6 +144,7 @@ class MachineService:
             refresh.cancel()
             await asyncio.gather(refresh, return_exceptions=True)
             await self._let_go()
+            await asyncio.to_thread(self.recovery.close)
 
     async def _live_once(self) -> None:
         """Start, move, and return when that is over, with ``state`` telling why."""
@@ -142,30 +152,45 @@ class MachineService:
         self.confirmed_s = {}
         self.starts += 1
         self._enter(ServiceState.STARTUP)
-        machine = None
+        self.machine = None
         try:
             description = await asyncio.to_thread(self._load)
-            machine = self.machine = Machine(
-                description,
-                self.host,
-                on_notice=lambda text: self.log.add("notice", text),
-                cache=self._cache,
-                reset_nodes=self._reset_nodes,
-                prepare_restart=self._prepare_restart,
-            )
-            self._reset_nodes = False
-            if self._asked_to_stop is not None:
-                machine.stop(self._asked_to_stop)
-            await machine.start()
+            try:
+                machine = await self._start(description)
+            except NodeShutdown as error:
+                if self._asked_to_stop is not None:
+                    raise
+                # The service before this one was killed a moment ago, and the node misses it.
+                self.log.add("notice", f"{error}; all nodes are reset, and started once more")
+                self._reset_nodes = True
+                machine = await self._start(description)
         except CanductorError as error:
-            stopped = None if machine is None else machine.stopped
+            stopped = None if self.machine is None else self.machine.stopped
             self._enter(ServiceState.SHUTDOWN if stopped else ServiceState.ERROR, str(stopped or error))
             return
         await self._move(machine)
 
+    async def _start(self, description: MachineDescription) -> Machine:
+        """Return the machine, ready; raises CanductorError."""
+        machine = self.machine = Machine(
+            description,
+            self.host,
+            on_notice=lambda text: self.log.add("notice", text),
+            cache=self._cache,
+            reset_nodes=self._reset_nodes,
+            prepare_restart=self._prepare_restart,
+        )
+        self._reset_nodes = False
+        if self._asked_to_stop is not None:
+            machine.stop(self._asked_to_stop)
+        await machine.start()
+        return machine
+
     async def _move(self, machine: Machine) -> None:
         care = asyncio.ensure_future(self.tables.care(machine, self.stands))
         try:
+            self.programs.begin(machine)
+            self.recovery.open()
             compensation = self.tables.compensation_of(machine)
             self.motion = Motion(
                 machine,
@@ -198,6 +223,7 @@ class MachineService:
         cause = str(machine.stopped)
         if self.job is not None:
             self.job.stop(cause, self.now_s)
+            self.fed.look()
         self._enter(ServiceState.SHUTDOWN, cause)
 
     async def _stop_if_moving(self) -> None:
@@ -217,8 +243,9 @@ class MachineService:
     def emergency_stop(self, who: str) -> None:
         """Stop all nodes, ahead of everything queued; takes effect before this returns."""
         cause = f"{BY_USER} {who}"
+        if self.state is ServiceState.STARTUP:
+            self._asked_to_stop = cause  # whatever machine is there by then
         if self.machine is None:
-            self._asked_to_stop = cause
             return
         self.machine.stop(cause)
         if self.motion is not None:
@@ -249,15 +276,21 @@ class MachineService:
             raise ApiError("busy", "a job prints; wait for its end, or cancel it with job.cancel")
         return self._begin_anew
 
-    def start_job(self, work: FileWork) -> JobRun:
-        """Print; raises ApiError unless the machine is ready and idle."""
+    def start_job(self, work: FileWork, *, behind_others: bool = False, fed: bool = False) -> JobRun:
+        """Print; raises ApiError unless the machine is ready and idle, or BEHIND_OTHERS without a job.
+
+        FED: its lines come from a client.
+        """
         motion = self.ready_motion()
-        if motion.feeder.busy:
+        if motion.feeder.busy and (not behind_others or self.active_job is not None):
             raise ApiError(
                 "busy", "the machine is busy; wait for its moves, or cancel them, then start the job"
             )
+        self.up_machine().modules.job_begins()
         motion.toolpath.clear()
         self.job = JobRun(motion, work, self.now_s)
+        self.job.lines_fed = 0 if fed else None
+        self.recovery.begin(self.job, work.program)
         self.log.add("job", f"{self.job.file}: started")
         self.look()
         return self.job
@@ -309,6 +342,9 @@ class MachineService:
                 self.log.add("job", f"{job.file}: {job.phase}" + (f": {job.message}" if job.message else ""))
                 if not job.active and self.settings.own_process:
                     give_back()
+        self.fed.look()
+        self.programs.look()
+        self.recovery.look()
         if self.motion is None or self.state in (ServiceState.SHUTDOWN, ServiceState.ERROR):
             return
         held = self.motion.streamer.held

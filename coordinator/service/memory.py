@@ -2,6 +2,30 @@
 
 import ctypes
 import gc
+from typing import Final
+
+_TRIM_THRESHOLD: Final = -1
+_MMAP_THRESHOLD: Final = -3
+_ARENA_MAX: Final = -8
+"""Parameters of glibc's mallopt(3)."""
+LARGE_BYTES: Final = 128 << 10
+"""What is this large has memory of its own, which goes back whole. By itself glibc raises the limit to the
+largest piece that was ever freed, and cuts what is smaller out of what the small ones use."""
+SPARE_BYTES: Final = 256 << 10
+ARENAS: Final = 2
+"""Pools of memory that threads share; one for each thread would keep what each of them once needed."""
+
+
+def keep_small() -> None:
+    """Have the allocator hold about what is in use. Only glibc knows how; elsewhere nothing happens."""
+    libc = ctypes.CDLL(None)
+    if hasattr(libc, "mallopt"):
+        for parameter, value in (
+            (_MMAP_THRESHOLD, LARGE_BYTES),
+            (_TRIM_THRESHOLD, SPARE_BYTES),
+            (_ARENA_MAX, ARENAS),
+        ):
+            libc.mallopt(parameter, value)
 
 
 def pass_by_what_stays() -> None:

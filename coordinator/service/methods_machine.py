@@ -85,7 +85,12 @@ def machine_methods(service: MachineService) -> Iterator[Method]:
         "Stop every node at once, ahead of everything queued.",
         stop,
         params=(Param("who", Kind.STR, "whom the log names as cause", required=False, high=_CAUSE_MAX),),
-        returns=_STATES,
+        returns=(
+            *_STATES,
+            Param(
+                "ignored", Kind.STR, "what was wrong with the request; only if something was", required=False
+            ),
+        ),
         urgent=True,
     )
     yield Method(

@@ -1,18 +1,20 @@
 """Methods that move: g-code lines, single moves; and positions in all frames."""
 
 import asyncio
+import contextlib
 from collections.abc import Iterator
 from typing import Any, Final
 
 from coordinator.app import Machine
+from coordinator.gcode.basic_commands import BESIDE
 from coordinator.gcode.errors import GCodeError
 from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
+from coordinator.modules.module_set import INTERRUPTING
 from coordinator.service.feeder import FeederFull, Ticket
 from coordinator.service.figures import axes, position_figures
 from coordinator.service.machine_service import MachineService, ServiceState
 from coordinator.service.motion import Motion, MotionOver, texts
 from coordinator.service.work import (
-    ASIDE,
     EMERGENCY,
     LINES_BYTES_MAX,
     LINES_MAX,
@@ -66,10 +68,15 @@ async def _run(service: MachineService, params: dict[str, Any]) -> Value:
         return {"replies": [], "notices": []}
     work = LinesWork(lines, rest=Rest.STANDSTILL if params["wait"] else Rest.OPEN)
     motion = service.ready_motion()
-    if service.active_job is None:
-        return _answer(await _done(service, motion, work))
-    _check_aside(lines)
-    return _answer(await _done(service, motion, work, aside=True))
+    job = service.active_job
+    interrupting = motion.feeder.vocabulary.interrupting.intersection(names)
+    stay = bool(interrupting & INTERRUPTING)
+    with service.programs.interrupted(stay=stay) if interrupting else contextlib.nullcontext():
+        if job is None or job.gives_way:  # they come between two lines of it, and may move
+            return _answer(await _done(service, motion, work))
+        work.beside = True
+        _check_beside(motion, names)
+        return _answer(await _done(service, motion, work, aside=True))
 
 
 def _restarted(service: MachineService, names: list[str]) -> bool:
@@ -103,16 +110,18 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
     async def position(_caller: Caller, params: dict[str, Any]) -> Value:
         motion = service.ready_motion()
         told = position_figures(motion)
+        told["offset"] = axes(motion.planned.offset)
         told["steppers"] = _stepper_figures(service.up_machine(), motion)
         if params["ask_nodes"]:
-            told["nodes_steps"] = await steps.ask()
+            told |= _node_figures(service.up_machine(), await steps.ask())
         return told
 
     yield Method(
         "gcode.run",
         Scope.OPERATE,
         "Run lines of g-code. While a job prints only such as neither move nor wait: "
-        + " ".join(sorted(ASIDE)),
+        + " ".join(sorted(BESIDE))
+        + ", and those of modules that say so. While a job is paused any.",
         run,
         params=(Param("script", Kind.STR, "lines", high=LINES_BYTES_MAX), _WAIT),
         returns=_TOLD,
@@ -152,8 +161,16 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
             Param("planned", Kind.MAP, "where the last move read ends, machine's frame, mm"),
             Param("gcode", Kind.MAP, "the same in the program's frame and units"),
             Param("origin", Kind.MAP, "the program's origin in the machine's frame, mm"),
+            Param("offset", Kind.MAP, "the part of the origin that is SET_GCODE_OFFSET's, mm"),
             Param("steppers", Kind.MAP, "by name: steps sent, and mm of them"),
             Param("nodes_steps", Kind.MAP, "by stepper: steps as its node counts them; when asked for"),
+            Param(
+                "rails",
+                Kind.MAP,
+                "by stepper: where those steps have it, mm (rad where it turns); empty before homing",
+                required=False,
+            ),
+            Param("kinematic", Kind.MAP, "where the head is, by those, mm", required=False),
         ),
     )
 
@@ -202,20 +219,21 @@ def _commands(lines: list[str]) -> list[str]:
         raise ApiError("bad_gcode", str(error)) from None
 
 
-def _check_aside(lines: list[str]) -> None:
-    """Refuse what would disturb the job."""
-    for name in _commands(lines):
-        if name not in ASIDE:
+def _check_beside(motion: Motion, names: list[str]) -> None:
+    """Refuse commands that would disturb the job."""
+    known = motion.feeder.vocabulary.commands
+    for name in names:
+        if not (known[name].beside if name in known else name in BESIDE):
             raise ApiError(
                 "busy",
-                f"{name} cannot run while a job prints; wait for its end, or cancel it with job.cancel",
+                f"{name} cannot run while a job prints; pause it with job.pause, or wait for its end",
             )
 
 
 def _idle_motion(service: MachineService) -> Motion:
     motion = service.ready_motion()
-    if service.active_job is not None:
-        raise ApiError("busy", "a job prints; wait for its end, or cancel it with job.cancel")
+    if service.active_job is not None and not service.active_job.gives_way:
+        raise ApiError("busy", "a job prints; pause it with job.pause, or wait for its end")
     return motion
 
 
@@ -244,16 +262,29 @@ def _stepper_figures(machine: Machine, motion: Motion) -> Value:
     }
 
 
+def _node_figures(machine: Machine, steps: dict[str, int]) -> dict[str, Value]:
+    """Return what follows from the STEPS that the nodes count."""
+    places = machine.rails.places(steps)
+    head = machine.rails.head(places)
+    return {
+        "nodes_steps": dict(steps),
+        "rails": {name: round(place, 6) for name, place in places.items()},
+        "kinematic": None
+        if head is None
+        else {axis: round(at, 6) for axis, at in zip("xyz", head, strict=True)},
+    }
+
+
 class _StepsOfNodes:
     """Asks the nodes for their steppers' positions: one question at a time, however many clients ask."""
 
     def __init__(self, service: MachineService) -> None:
         self._service = service
-        self._asking: asyncio.Task[Value] | None = None
-        self._told: Value = None
+        self._asking: asyncio.Task[dict[str, int]] | None = None
+        self._told: dict[str, int] = {}
         self._told_s = float("-inf")
 
-    async def ask(self) -> Value:
+    async def ask(self) -> dict[str, int]:
         """Return steps by stepper; raises CanductorError."""
         loop = asyncio.get_running_loop()
         if loop.time() - self._told_s < _STEPS_KEPT_S:
@@ -262,9 +293,9 @@ class _StepsOfNodes:
             self._asking = loop.create_task(self._ask())
         return await asyncio.shield(self._asking)
 
-    async def _ask(self) -> Value:
+    async def _ask(self) -> dict[str, int]:
         try:
-            found: Value = dict(await self._service.up_machine().stepper_positions())
+            found = dict(await self._service.up_machine().stepper_positions())
         except ApiError:
             raise
         except CanductorError as error:

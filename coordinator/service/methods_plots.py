@@ -106,7 +106,7 @@ class _Sender:
         self.name = name
         self.dictionary = dictionary
         self.batches = motion.trace.batches(index)
-        self.piece = motion.streamer.maps[index].last
+        self.piece = motion.streamer.worker.maps[index].last
 
     def print_time(self, ticks: int) -> float:
         """Return the print time of TICKS, good for seconds around the present."""

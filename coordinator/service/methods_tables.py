@@ -1,21 +1,30 @@
 """Methods about axis tables."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from coordinator.app import Machine
 from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
 from coordinator.service.machine_service import MachineService
 from coordinator.table.axis_table import POINTS, AxisTable, TableError, Unit
+from nodes.table.download import Report
 
 _AXIS_MAX: Final = 64
-_AXIS: Final = Param("axis", Kind.STR, "x, y, z or another of the machine's", high=_AXIS_MAX)
+_AXIS: Final = Param("axis", Kind.STR, "x, y or z, also in capitals", high=_AXIS_MAX)
 _AXES: Final = Param(
     "axes",
     Kind.LIST,
     "maps: axis; table (its figures, or null); nodes: maps of stepper, node, direction, axle, status, "
     "generation, points, active, problem; active: whether the axis is corrected, on which side, by how much "
     "(correction_um) and how much of that will still fade (taking_up_um)",
+)
+
+
+_DOWNLOADS: Final = Param(
+    "downloads",
+    Kind.LIST,
+    "what was sent to nodes; maps: axles, words, broadcasts, elapsed_s, bound_s (what one broadcast takes at "
+    "least, within its share of the bus and what others leave), told (a sentence)",
 )
 
 
@@ -29,21 +38,22 @@ class _Tables:
         machine = self._idle_machine()
         try:
             columns = {name: _numbers(name, params[name]) for name in ("positions", "forward", "reverse")}
-            table = AxisTable(axis=params["axis"], unit=Unit(params["unit"]), **columns)
-            told = await self._service.tables.send(table, machine, stands=self._service.stands)
+            table = AxisTable(axis=params["axis"].lower(), unit=Unit(params["unit"]), **columns)
+            told, cost = await self._service.tables.send(table, machine, stands=self._service.stands)
         except TableError as error:
             raise ApiError("bad_params", str(error)) from None
         self._service.log.add("notice", f"{caller.name} sent a table for axis {table.axis}")
-        return {"notes": list(told), **self._status([table.axis])}
+        return {"notes": list(told), "downloads": _downloads(cost), **self._status([table.axis])}
 
     async def remove(self, caller: Caller, params: dict[str, Any]) -> Value:
         machine = self._idle_machine()
+        axis = params["axis"].lower()
         try:
-            await self._service.tables.remove(params["axis"], machine, stands=self._service.stands)
+            cost = await self._service.tables.remove(axis, machine, stands=self._service.stands)
         except TableError as error:
             raise ApiError("bad_params", str(error)) from None
-        self._service.log.add("notice", f"{caller.name} removed the table of axis {params['axis']}")
-        return self._status([params["axis"]])
+        self._service.log.add("notice", f"{caller.name} removed the table of axis {axis}")
+        return {"downloads": _downloads(cost), **self._status([axis])}
 
     def status(self, _caller: Caller, _params: dict[str, Any]) -> Value:
         return self._status(None)
@@ -75,7 +85,7 @@ def table_methods(service: MachineService) -> Iterator[Method]:
             Param("reverse", Kind.LIST, "likewise, travelling down", high=POINTS[-1]),
             Param("unit", Kind.STR, "of all numbers", required=False, default="mm", choices=tuple(Unit)),
         ),
-        returns=(Param("notes", Kind.LIST, "sentences about what one should know"), _AXES),
+        returns=(Param("notes", Kind.LIST, "sentences about what one should know"), _DOWNLOADS, _AXES),
     )
     yield Method(
         "table.remove",
@@ -83,7 +93,7 @@ def table_methods(service: MachineService) -> Iterator[Method]:
         "Take the compensation table of an axis away.",
         tables.remove,
         params=(_AXIS,),
-        returns=(_AXES,),
+        returns=(_DOWNLOADS, _AXES),
     )
     yield Method(
         "table.status",
@@ -92,6 +102,20 @@ def table_methods(service: MachineService) -> Iterator[Method]:
         tables.status,
         returns=(_AXES,),
     )
+
+
+def _downloads(reports: Sequence[Report]) -> list[dict[str, Any]]:
+    return [
+        {
+            "axles": [outcome.place.table.axle for outcome in report.outcomes],
+            "words": report.words,
+            "broadcasts": sum(cast.times for cast in report.casts),
+            "elapsed_s": round(report.elapsed_s, 6),
+            "bound_s": round(report.bound_s, 6),
+            "told": report.text(),
+        }
+        for report in reports
+    ]
 
 
 def _numbers(name: str, values: list[Any]) -> tuple[float, ...]:

@@ -58,6 +58,8 @@ class Motion:
             on_state=self._cycle_ended,
         )
         self._on_cycle = on_cycle
+        self.works = 0
+        """Done so far."""
         self._ending: list[Ticket] = []
         self._waited_for: dict[Ticket, asyncio.Future[None]] = {}
 
@@ -134,7 +136,7 @@ class Motion:
         self.planned = state.planned
         now_s = self.now_s
         comes_to_rest = state.planned.stands_from_s is not None
-        self.lead.look(now_s, self.streamer.steps.generated_until, comes_to_rest=comes_to_rest)
+        self.lead.look(now_s, self.streamer.worker.steps.generated_until, comes_to_rest=comes_to_rest)
         self.trace.forget_before_s = now_s - KEEP_S
         self.toolpath.add(self.trace.take_fresh())
         with contextlib.suppress(IndexError):
@@ -146,9 +148,10 @@ class Motion:
     def _settle(self, ticket: Ticket, now_s: float) -> bool:
         """Tell that TICKET is done once its last move is executed; return whether it is."""
         assert ticket.ends_at_s is not None
-        if now_s < ticket.ends_at_s + self.streamer.steps.lag_s and ticket.ends_at_s:
+        if now_s < ticket.ends_at_s + self.streamer.worker.steps.lag_s and ticket.ends_at_s:
             return False
         ticket.done = True
+        self.works += 1
         done = self._waited_for.get(ticket)
         if done is not None and not done.done():
             done.set_result(None)

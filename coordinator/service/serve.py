@@ -14,6 +14,7 @@ from coordinator.host import LinuxHost
 from coordinator.interrupts import run_to_end
 from coordinator.ipc.announcement import Announcement, bracketed, host_word
 from coordinator.ipc.announcer import Announcer
+from coordinator.ipc.door import raise_files_limit
 from coordinator.ipc.methods import Registry, Value
 from coordinator.ipc.server import IpcServer
 from coordinator.ipc.session_methods import API_VERSION
@@ -69,6 +70,7 @@ def serve(
     load: Callable[[], MachineDescription], options: ServeOptions, *, cache: DictionaryCache | None = None
 ) -> ServeReport:
     """Serve the machine that LOAD describes; raises as ``serve_machine``."""
+    raise_files_limit()
     hall = _Hall(load, options, cache)
     try:
         run_to_end(hall.serve)

@@ -92,6 +92,17 @@ class MotionTrace:
         kept: Moves = every[ends > since_s]
         return kept
 
+    def heights(self, since_s: float) -> tuple[float, float] | None:
+        """Return between which heights the moves begin that end after SINCE_S, mm; None: there is none."""
+        found: list[NDArray[np.float64]] = []
+        for piece in reversed(self._pieces):
+            ends = piece["print_time"] + piece["accel_s"] + piece["cruise_s"] + piece["decel_s"]
+            found.append(piece["start"][ends > since_s][:, 2])
+            if ends[0] <= since_s:
+                break
+        every = np.concatenate(found) if found else np.empty(0)
+        return (float(every.min()), float(every.max())) if len(every) else None
+
     def take_fresh(self) -> Moves:
         """Return the moves that came since this was called last; of too many the newest."""
         new: list[Moves] = []

@@ -13,6 +13,7 @@ from coordinator.gcode.commands import Vocabulary
 from coordinator.gcode.events import End, Event, Full, Idle, Progress
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import MachineState
+from coordinator.gcode.print_control import PrintControl
 from coordinator.gcode.program import Program
 from coordinator.gcode.words import WordError, parse
 from coordinator.motion.planner import AXIS_LETTERS, FeedStatus, Planner
@@ -21,10 +22,6 @@ from nodes.errors import CanductorError
 LINES_MAX: Final = 500
 """Lines a client may send at once: they are looked through on the control loop, in some 2 ms."""
 LINES_BYTES_MAX: Final = 32_768
-ASIDE: Final = frozenset(
-    ["M73", "M105", "M114", "M117", "M118", "M204", "M220", "M221", "SET_VELOCITY_LIMIT"]
-)
-"""Commands that neither move nor wait: a client may give them while a job prints."""
 EMERGENCY: Final = "M112"
 
 
@@ -40,10 +37,19 @@ class Setting:
     machine: MachineState
     homed_position: Mapping[str, float]
     vocabulary: Vocabulary
+    prints: PrintControl | None = None
 
-    def job(self, program: Program) -> Job:
-        """Return what reads PROGRAM."""
-        return Job(program, self.planner, self.homed_position, self.machine, self.vocabulary)
+    def job(self, program: Program, *, beside: bool = False) -> Job:
+        """Return what reads PROGRAM; BESIDE: between two lines of a job that prints."""
+        return Job(
+            program,
+            self.planner,
+            self.homed_position,
+            self.machine,
+            self.vocabulary,
+            beside=beside,
+            prints=self.prints,
+        )
 
 
 class Rest(Enum):
@@ -73,6 +79,20 @@ class Work(Protocol):
 
     def step(self) -> Event:
         """Go on; raises CanductorError when it cannot."""
+        ...
+
+    def pending(self) -> Event | None:
+        """Tell what is left to tell without going on; raises CanductorError."""
+        ...
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to tell or to take over."""
+        ...
+
+    @property
+    def at_line(self) -> bool:
+        """Whether it stands between two lines."""
         ...
 
     def progress(self) -> Progress:
@@ -107,6 +127,8 @@ class LinesWork:
     lines: Sequence[str]
     name: str = "client"
     rest: Rest = Rest.STANDSTILL
+    beside: bool = False
+    """Whether they come between two lines of a job that prints: then none of them may move."""
     _job: Job | None = None
 
     def begin(self, setting: Setting) -> None:
@@ -114,7 +136,21 @@ class LinesWork:
         text = "".join(line.rstrip("\r\n") + "\n" for line in self.lines)
         program = Program(_Text(text.encode(errors="replace")), self.name, size_bytes=None)
         setting.planner.lines = 0
-        self._job = setting.job(program)
+        self._job = setting.job(program, beside=self.beside)
+
+    def pending(self) -> Event | None:
+        """Tell what is left to tell."""
+        return None if self._job is None else self._job.pending()
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to tell or to take over."""
+        return self._job is None or self._job.settled
+
+    @property
+    def at_line(self) -> bool:
+        """Whether it stands between two lines."""
+        return self._job is None or self._job.at_line
 
     def step(self) -> Event:
         """Go on."""
@@ -148,6 +184,20 @@ class FileWork:
         setting.planner.reset_modes()
         setting.planner.lines = 0
         self._job = setting.job(self.program)
+
+    def pending(self) -> Event | None:
+        """Tell what is left to tell."""
+        return None if self._job is None else self._job.pending()
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to tell or to take over."""
+        return self._job is None or self._job.settled
+
+    @property
+    def at_line(self) -> bool:
+        """Whether it stands between two lines."""
+        return self._job is None or self._job.at_line
 
     def step(self) -> Event:
         """Go on."""
@@ -186,6 +236,20 @@ class MoveWork:
         for letter, value in self.axes.items():
             axis = AXIS_LETTERS.index(letter)
             self.target[axis] = value + (self.target[axis] if self.relative else 0.0)
+
+    def pending(self) -> Event | None:
+        """Tell nothing: it is one move."""
+        return None
+
+    @property
+    def settled(self) -> bool:
+        """Tell that nothing is left to tell."""
+        return True
+
+    @property
+    def at_line(self) -> bool:
+        """Tell that nothing is left of it: it is one move."""
+        return True
 
     def step(self) -> Event:
         """Plan it."""

@@ -140,9 +140,7 @@ def test_moves_within_lines_are_refused_like_others() -> None:
 
 
 def test_lines_that_stand_for_themselves_end() -> None:
-    with pytest.raises(
-        GCodeError, match=rf"part\.gcode:1: .*GO stands in for itself, {MAX_DEPTH} levels deep"
-    ):
+    with pytest.raises(GCodeError, match=rf"part\.gcode:1: .*GO calls itself, {MAX_DEPTH} levels deep"):
         events(job("GO", GO=Lines("GO")))
 
 

@@ -82,10 +82,10 @@ def test_an_open_end_leaves_the_moves_to_be_joined(feeder: Feeder) -> None:
 
 
 def test_a_bad_line_ends_its_own_work_at_rest(feeder: Feeder) -> None:
-    bad = feeder.submit(LinesWork(["G28", "G1 X10 F6000", "G2 X1", "G1 X20"]))
+    bad = feeder.submit(LinesWork(["G28", "G1 X10 F6000", "G5 X1", "G1 X20"]))
     good = feeder.submit(LinesWork(["M114"]))
     drive(feeder)
-    assert "client:3: G2 curves" in str(bad.error)
+    assert "client:3: G5 curves" in str(bad.error)
     assert good.error is None
     assert [told.text for told in good.told] == ["X:10.000 Y:0.000 Z:0.000 E:0.000"]
 

@@ -1,0 +1,42 @@
+"""[respond]: RESPOND shows a line to the user, with a prefix that tells its kind; so does M118."""
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.words import WordError, quoted
+from coordinator.machine.options import ChoiceOption, SectionSpec, TextOption
+from coordinator.modules.base import Build, Module
+from coordinator.modules.words import parameters
+
+PREFIXES = {"echo": "echo:", "command": "//", "error": "!!"}
+TYPE = ChoiceOption(
+    name="default_type", help="Kind of a line without one", default="echo", choices=tuple(PREFIXES)
+)
+PREFIX = TextOption(name="default_prefix", help="Stands before a line, instead of that of default_type")
+
+
+class Respond(Module):
+    """Its commands."""
+
+    SPEC = SectionSpec("Lines that programs show to the user", (TYPE, PREFIX))
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._prefix = build.find(PREFIX) or PREFIXES[build.get(TYPE)]
+        build.add_command(GCodeCommand("M118", "Show a line", self._echo, beside=True))
+        build.add_command(
+            GCodeCommand("RESPOND", "Show MSG, after PREFIX or that of TYPE", self._respond, beside=True)
+        )
+
+    def _echo(self, call: Call) -> Reading:
+        return AtOnce((f"{self._prefix} {call.command.text.strip()}",))
+
+    def _respond(self, call: Call) -> Reading:
+        values = parameters(call.command, ("TYPE", "PREFIX", "MSG"))
+        prefix = self._prefix
+        if "TYPE" in values:
+            kind = values["TYPE"].lower()
+            if kind == "echo_no_space":
+                return AtOnce((PREFIXES["echo"] + values.get("MSG", ""),))
+            if kind not in PREFIXES:
+                raise WordError(f"TYPE of RESPOND is {quoted(kind)}; there are {' '.join(PREFIXES)}")
+            prefix = PREFIXES[kind]
+        return AtOnce((f"{values.get('PREFIX', prefix)} {values.get('MSG', '')}",))

@@ -1,0 +1,101 @@
+"""Axes that lean: what is measured, what steppers follow instead, and where the head is called to be."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from coordinator.gcode.events import PositionSet, WeightsChange
+from coordinator.machine.description import load_machine
+from coordinator.machine.problem import ConfigError
+from coordinator.modules.skew_correction import Skew, Skews
+from tests.coordinator.modules.stage import ProgramStage
+from tests.coordinator.modules.test_gcode_macro import program_error
+
+PROFILE = "[skew_correction cold]\nxy_skew: 0.01\nxz_skew: -0.002\nyz_skew: 0.003\n"
+
+
+def leaning(side: float, tangent: float) -> str:
+    """Return AC,BD,AD of a square whose upper side is shifted."""
+    up, shift = side * math.cos(math.atan(tangent)), side * math.sin(math.atan(tangent))
+    return f"{math.hypot(side + shift, up)},{math.hypot(side - shift, up)},{side}"
+
+
+def test_what_is_believed_and_made_are_each_others_inverse() -> None:
+    skew = Skew(xy=0.01, xz=-0.002, yz=0.003)
+    at = (100.0, 200.0, 50.0, 7.0)
+    assert skew.made(skew.wanted(at)) == pytest.approx(at)
+    believed = skew.wanted(at)
+    for straight in ((1, 0, 0, 0), (1, 1, 0, 0), (1, -1, 0, 0), (0, 0.5, 2, 0)):
+        follows = skew.weights(straight)
+        assert sum(w * p for w, p in zip(follows, at, strict=True)) == pytest.approx(
+            sum(w * p for w, p in zip(straight, believed, strict=True))
+        )
+
+
+@pytest.mark.parametrize("tangent", [0.0, 0.01, -0.03])
+def test_a_measured_square_tells_how_it_leans(tmp_path: Path, tangent: float) -> None:
+    machine = ProgramStage(tmp_path, "[skew_correction]\n")
+    measured = leaning(140, tangent)
+    ac, bd, ad = measured.split(",")
+    machine.run("G28", f"SET_SKEW XY={measured}")
+    told = f"{math.atan(tangent):.6f} radians, {math.degrees(math.atan(tangent)):.2f} degrees"
+    assert machine.run("GET_CURRENT_SKEW")[0].replace("-0.000000", "0.000000") == f"XY: {told}"
+    (calculated,) = machine.run(f"CALC_MEASURED_SKEW AC={ac} BD={bd} AD={ad}")
+    assert calculated.replace("-0.000000", "0.000000") == f"Calculated skew: {told}"
+    assert machine.modules.status()["skew_correction"]["xy_skew"] == pytest.approx(tangent)
+
+
+def test_the_head_stays_where_it_is_and_is_called_by_another_place(tmp_path: Path) -> None:
+    machine = ProgramStage(tmp_path, PROFILE)
+    machine.run("G28", "G90", "G1 X100 Y100 Z10 F6000")
+    events = machine.events("SKEW_PROFILE LOAD=cold")
+    skew = Skew(0.01, -0.002, 0.003)
+    place = skew.made((100.0, 100.0, 10.0, 0.0))
+    (told,) = [event for event in events if isinstance(event, PositionSet)]
+    assert told.position == pytest.approx(place)
+    (change,) = [event for event in events if isinstance(event, WeightsChange)]
+    assert change.weights["stepper_x"] == pytest.approx(skew.weights((1, 1, 0, 0)))
+    assert change.weights["stepper_z"] == (0, 0, 1, 0)
+    assert "extruder" not in change.weights
+    (reply,) = machine.run("M114")
+    assert reply == f"X:{place[0]:.3f} Y:{place[1]:.3f} Z:{place[2]:.3f} E:0.000"
+    machine.run("SKEW_PROFILE SAVE=other", "SET_SKEW CLEAR=1")
+    assert machine.planner.toolhead_position == pytest.approx((100, 100, 10, 0))
+    machine.run("SKEW_PROFILE LOAD=other")
+    (skews,) = machine.modules.of(Skews)
+    restoring = skews.restoring
+    machine.run("SET_SKEW CLEAR=1")
+    assert not skews.restoring
+    machine.run(restoring)
+    assert machine.planner.toolhead_position == pytest.approx(place)
+    machine.run("SKEW_PROFILE LOAD=other")
+    assert machine.modules.status()["skew_correction"] == {
+        "current_profile_name": "other", "xy_skew": 0.01, "xz_skew": -0.002, "yz_skew": 0.003
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("SET_SKEW XY=1,2", "XY of SET_SKEW is '1,2'; give AC,BD,AD in mm, as measured"),
+        ("SET_SKEW XY=200,100,100", "is no square that leans a little"),
+        ("SET_SKEW XZ=1,2,x", "AD of SET_SKEW is 'x', which is not a number"),
+        ("SET_SKEW XZ=0,0,0", "is no square that leans a little"),
+        ("SET_SKEW", "SET_SKEW has nothing to set"),
+        ("SKEW_PROFILE LOAD=warm", "there is no 'warm'"),
+        ("SKEW_PROFILE SAVE=a-b", "'a-b' cannot be a profile's name"),
+        ("SKEW_PROFILE", "SKEW_PROFILE takes LOAD=name or SAVE=name"),
+    ],
+)
+def test_mistakes_are_told(tmp_path: Path, line: str, sentence: str) -> None:
+    assert sentence in program_error(ProgramStage(tmp_path, PROFILE), line)
+
+
+def test_a_machine_that_is_no_sum_of_axes_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "printer.cfg"
+    path.write_text(Path("config/delta.cfg").read_text(encoding="utf-8") + "\n[skew_correction]\n")
+    with pytest.raises(
+        ConfigError, match="needs a machine whose motors move along X, Y and Z or sums of them"
+    ):
+        load_machine(str(path))

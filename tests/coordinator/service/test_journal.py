@@ -1,0 +1,85 @@
+"""The journal of jobs: whatever cuts it off, what it says is true."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from coordinator.service.journal import FILE_BYTES_MAX, NAME, Interrupted, Journal, read_journal
+
+
+def written(folder: Path, *entries: tuple[int, Mapping[str, object]], ended: bool = False) -> Path:
+    failures: list[str] = []
+    journal = Journal(folder / NAME, failures.append)
+    journal.begin("part.gcode", 1000, 77)
+    for line, held in entries:
+        journal.note(line, held)
+    if ended:
+        journal.end()
+    journal.close()
+    assert not failures
+    return folder / NAME
+
+
+def test_the_last_line_is_known(tmp_path: Path) -> None:
+    held = {"offset": [0, 0, 0.1, 0], "heaters": {"extruder": 210.0}}
+    found = read_journal(written(tmp_path, (5, {}), (9, held)))
+    assert found == Interrupted("part.gcode", 1000, 77, 9, {**held, "line": 9})
+
+
+def test_what_has_ended_is_not_interrupted(tmp_path: Path) -> None:
+    assert read_journal(written(tmp_path, (5, {}), ended=True)) is None
+    assert read_journal(written(tmp_path)) is None  # nothing was carried out yet
+    assert read_journal(tmp_path / "none") is None
+
+
+def test_a_new_job_makes_the_old_one_forgotten(tmp_path: Path) -> None:
+    written(tmp_path, (5, {}))
+    found = read_journal(written(tmp_path, (2, {})))
+    assert found is not None
+    assert found.line == 2
+
+
+def test_wherever_it_is_cut_off_it_tells_an_earlier_line_or_none(tmp_path: Path) -> None:
+    path = written(tmp_path, (5, {"x": "é"}), (9, {}), (13, {}), ended=True)
+    data = path.read_bytes()
+    lines = set()
+    for length in range(len(data)):
+        path.write_bytes(data[:length])
+        found = read_journal(path)
+        lines.add(None if found is None else found.line)
+    assert lines == {None, 5, 9, 13}
+
+
+@pytest.mark.parametrize(
+    "text", ["", "nonsense", "[1]\n{}", '{"journal":2,"file":"a","size":1,"modified_ns":1}\n{"line":3}',
+             '{"journal":1,"file":"a"}\n{"line":3}', '{"line":3}',
+             '{"journal":1,"file":"a","size":"x","modified_ns":1}\n{"line":3}',
+             '{"journal":1,"file":"a","size":1,"modified_ns":1}\n{"line":"x"}', "[" * 100_000],
+)  # fmt: skip
+def test_what_is_no_journal_tells_nothing(tmp_path: Path, text: str) -> None:
+    path = tmp_path / NAME
+    path.write_text(text, encoding="utf-8")
+    assert read_journal(path) is None
+
+
+def test_it_stays_small(tmp_path: Path) -> None:
+    long = {"text": "x" * (FILE_BYTES_MAX // 10)}
+    path = written(tmp_path, *((n, long) for n in range(1, 40)))
+    assert path.stat().st_size <= FILE_BYTES_MAX
+    assert json.loads(path.read_bytes().split(b"\n")[0])["file"] == "part.gcode"
+    found = read_journal(path)
+    assert found is not None
+    assert found.line == 39
+
+
+def test_a_disk_that_cannot_be_written_is_told_once(tmp_path: Path) -> None:
+    told: list[str] = []
+    journal = Journal(tmp_path / "none" / NAME, told.append)
+    journal.begin("part.gcode", 1, 1)
+    journal.note(1, {})
+    journal.note(2, {})
+    journal.close()
+    assert len(told) == 1
+    assert "no such file" in told[0]

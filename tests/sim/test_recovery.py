@@ -1,0 +1,128 @@
+"""A job that its service's end cuts off, on a printer that is hot: it goes on where nothing is guessed."""
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import takewhile
+from pathlib import Path
+
+import pytest
+
+from coordinator.ipc.methods import ApiError
+from tests.sim.printer import PRINTING, Printer, gcode
+from tests.system.service_stage import Served
+
+LAYER_MM = 0.3
+LAYERS = 3
+A_MM, B_MM = 60.0, 180.0
+"""Where the two objects are in X."""
+SECTIONS = PRINTING + "[fan_generic box]\npin: PB4\n"
+
+
+def outline(name: str, x: float) -> str:
+    corners = ((x, 100), (x + 20, 100), (x + 20, 120), (x, 120), (x, 100))
+    lines = [f"EXCLUDE_OBJECT_START NAME={name}", f"G1 X{x} Y100 F12000"]
+    lines += [f"G1 X{cx} Y{cy} E0.8 F1500" for cx, cy in corners[1:]]
+    return "\n".join([*lines, f"EXCLUDE_OBJECT_END NAME={name}"])
+
+
+def job() -> str:
+    lines = ["M140 S60", "M104 S200", "G28", "M190 S60", "M109 S200", "G90", "M83", "M106 S128"]
+    lines += ["EXCLUDE_OBJECT_DEFINE NAME=A", "EXCLUDE_OBJECT_DEFINE NAME=B"]
+    for n in range(1, LAYERS + 1):
+        lines += [f"G1 Z{n * LAYER_MM:.1f} F9000", outline("A", A_MM), outline("B", B_MM)]
+    return "\n".join([*lines, "M106 S0", "M104 S0", "M140 S0", ""])
+
+
+def height(printer: Printer) -> float:
+    return round(printer.true_mm("z"), 2)
+
+
+@contextmanager
+def watched(printer: Printer) -> Iterator[list[tuple[float, float, float, float]]]:
+    """Collect where the head truly is (x y z) and how hot its nozzle truly is."""
+    seen: list[tuple[float, float, float, float]] = []
+
+    async def watch() -> None:
+        while True:
+            place = (printer.true_mm("x"), printer.true_mm("y"), printer.true_mm("z"))
+            seen.append((*place, printer.true_c("extruder")))
+            await asyncio.sleep(0.05)
+
+    task = asyncio.ensure_future(watch())
+    try:
+        yield seen
+    finally:
+        task.cancel()
+
+
+async def print_until(printer: Printer, stage: Served, at_mm: float, further_s: float) -> None:
+    """Print up to some time into the layer at AT_MM, with B left out from the first one on."""
+    stage.write_job(job())
+    await gcode(stage, "SET_FAN_SPEED FAN=box SPEED=0.4", "SET_GCODE_OFFSET Z=0.05")
+    await stage.call("job.start", file="job.gcode")
+    await stage.until(lambda: len(str(printer.status("exclude_object")["objects"])) > 20, "objects")
+    await gcode(stage, "EXCLUDE_OBJECT NAME=B")
+    await stage.until(lambda: height(printer) == at_mm, f"{at_mm} mm")
+    await asyncio.sleep(further_s)
+
+
+def test_it_heats_homes_above_the_part_and_goes_on(tmp_path: Path) -> None:
+    printer = Printer(tmp_path, SECTIONS)
+
+    async def first(stage: Served) -> None:
+        await print_until(printer, stage, 0.65, 1.0)
+
+    async def second(stage: Served) -> None:
+        z_mm = printer.true_mm("z")
+        assert z_mm == pytest.approx(0.65, abs=0.01)
+        line = stage.tree.get("job.interrupted_line")
+        assert isinstance(line, int)
+        assert any(f"job.gcode was interrupted at line {line}; job.recover" in told for told in stage.lines)
+        await asyncio.sleep(3)  # it gets cold
+        with pytest.raises(ApiError, match="X and Y and Z must be homed before"):
+            await stage.call("job.recover")
+        with watched(printer) as seen:
+            await stage.call("job.recover", home=True)
+            await stage.until(lambda: height(printer) == 0.65, "the part")
+            assert printer.status("exclude_object")["excluded_objects"] == ["B"]
+        cold = [place for *place, _ in takewhile(lambda each: each[3] < 195, seen)]
+        assert len(cold) > 10
+        assert all(place == cold[0] for place in cold), "it moves before it is hot"
+        assert min(z for _, _, z, _ in seen) > z_mm - 0.01
+        around = [(x, y, z) for x, y, z, _ in seen if x < 40 or y > 140]
+        assert around
+        assert min(z for _, _, z in around) > 5.6, "it homes above the part"
+        with watched(printer) as seen:
+            await stage.until_job("done")
+        assert not any(x > B_MM + 1 for x, _, _, _ in seen), "B is left out"
+        assert printer.true_mm("z") == pytest.approx(LAYERS * LAYER_MM + 0.05, abs=0.01)
+        assert printer.status("fan_generic box")["speed"] == 0.4
+        assert stage.tree.get("job.interrupted_file") is None
+
+    printer.run(first, second)
+
+
+def test_where_z_is_not_known_it_asks(tmp_path: Path) -> None:
+    printer = Printer(tmp_path, SECTIONS)
+
+    async def first(stage: Served) -> None:
+        await print_until(printer, stage, 0.65, 2.4)  # what is planned has the next layer's height in it
+
+    async def second(stage: Served) -> None:
+        z_mm = printer.true_mm("z")
+        with pytest.raises(ApiError, match="so Z is not known: home X Y Z where the part is not in the way"):
+            await stage.call("job.recover", home=True)
+        assert printer.true_mm("z") == z_mm
+        assert printer.status("extruder")["target"] == 0
+        line = job().split("\n").index("G1 X200.0 Y100 E0.8 F1500") + 1
+        await gcode(stage, f"RESUME_INTERRUPTED HOME=1 Z={z_mm:.3f} LINE={line}")
+        with watched(printer) as seen:
+            await stage.until(lambda: stage.job_state == "printing", "the job")
+            await stage.until_job("done")
+        over_b = [z for x, _, z, _ in seen if x > B_MM + 1]
+        assert not over_b, "it begins within B, which is left out"
+        assert min(z for _, _, z, _ in seen) > 0.34
+        assert printer.true_mm("z") == pytest.approx(LAYERS * LAYER_MM + 0.05, abs=0.01)
+
+    printer.run(first, second)
