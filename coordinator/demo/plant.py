@@ -4,15 +4,17 @@ Every stepper is counted where it is driven; every rail's endstop stands where t
 switches by the steppers of all nodes that move its axis. The heat is in ``plant_heat.py``.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import field, replace
 from typing import Final
 
 import numpy as np
 
 from coordinator.demo.plant_heat import HeatSettings, machine_heat
+from coordinator.demo.plant_tmc import machine_drivers
 from coordinator.kinematics.base import Point
 from coordinator.machine.description import MachineDescription, RailDescription, StepperDescription
+from coordinator.machine.model import SECOND_CARRIAGE
 from coordinator.motion.specs import StepKinematics
 from nodes.errors import CanductorError
 from nodes.records import record
@@ -42,6 +44,8 @@ class PlantSettings:
     """Whether a motor whose enable pin is off stands still."""
     hysteresis_mm: float = 0.1
     """Travel of an endstop from where it closes to where it opens."""
+    skew_mm: Mapping[str, float] = field(default_factory=dict)
+    """How far beside the head a side of an axis begins that has an endstop of its own, by its first motor."""
     switch_noise_mm: float = 0.0
     """How far beside its place each approach finds an endstop, at most."""
     heat: HeatSettings = HeatSettings()
@@ -64,9 +68,15 @@ def machine_plants(
     ]
     plants = [_mechanics(description, node.name, endstops, settings) for node in description.nodes]
     heat = machine_heat(description, settings.heat)
+    drivers = machine_drivers(description)
     return {
         plant.node: replace(
-            plant, seed=settings.seed + number, ambient=settings.heat.ambient_c, **heat[plant.node].parts()
+            plant,
+            seed=settings.seed + number,
+            ambient=settings.heat.ambient_c,
+            tmcs=tuple(drivers[plant.node].tmcs),
+            diags=tuple(drivers[plant.node].diags),
+            **heat[plant.node].parts(),
         )
         for number, plant in enumerate(plants)
     }
@@ -82,22 +92,26 @@ def start_point(description: MachineDescription, away_mm: float = START_MM) -> P
 
 
 def _rails(description: MachineDescription) -> Iterator[RailDescription]:
-    yield from description.rails
-    if description.dual_carriage is not None:
-        known = [rail.steppers for rail in description.rails]
-        yield from (rail for rail in description.dual_carriage.rails if rail.steppers not in known)
+    for rail in description.rails:
+        yield from rail.pieces
+    if description.second_carriage is not None:
+        yield description.second_carriage
 
 
 def _mechanics(
     description: MachineDescription,
     node: str,
-    endstops: Sequence[tuple[str, Switch, Axis]],
+    endstops: Sequence[tuple[str, Switch | None, Axis]],
     settings: PlantSettings,
 ) -> NodePlant:
-    own = [(switch, axis) for at, switch, axis in endstops if at == node]
+    own = [(switch, axis) for at, switch, axis in endstops if at == node and switch is not None]
     # An axis with stops is also known where its steppers are.
-    moved = [axis for _, _, axis in endstops if any(term.node == node for term in axis.terms)]
-    axes = {axis.name: axis for axis in (moved if settings.stops else [])}
+    moved = [
+        axis
+        for _, switch, axis in endstops
+        if any(term.node == node for term in axis.terms) and (settings.stops or switch is None)
+    ]
+    axes = {axis.name: axis for axis in moved}
     axes |= {axis.name: axis for _, axis in own}
     return NodePlant(
         node=node,
@@ -132,20 +146,23 @@ def _endstop(
     start: Point,
     rails: Sequence[float],
     settings: PlantSettings,
-) -> tuple[str, Switch, Axis]:
-    """Return the node, the switch and the axis of RAIL's endstop."""
+) -> tuple[str, Switch | None, Axis]:
+    """Return the node, the switch and the axis of RAIL's endstop; one that is felt is the stop itself."""
     pin, name = rail.homing.endstop_pin, rail.steppers[0].name
     assert pin is not None
-    is_axis = rail.axis in AXES and rail in description.rails
-    if is_axis and (terms := _axis_terms(description, rail)):
+    if rail in description.rails and rail.axis in AXES and (terms := _axis_terms(description, rail)):
         origin, at = start[AXES.index(rail.axis)], rail.homing.position_endstop
         name = rail.axis
     else:
         terms = tuple(Term(s.node, s.name, s.step_distance / len(rail.steppers)) for s in rail.steppers)
-        origin, at = _own_places(description, rail, rails)
+        origin, at = _own_places(description, rail, start, rails)
+        origin += settings.skew_mm.get(name, 0.0)
     assert at is not None
     direction = 1 if rail.homing.positive_dir else -1
     unit = RAD_PER_MM if rail.steppers[0].function.turns else 1.0
+    if rail.homing.virtual_endstop:
+        low, high = _stops(rail, at, 0.0)
+        return pin.node, None, Axis(name=name, terms=terms, origin=origin, min=low, max=high)
     low, high = _stops(rail, at, BEYOND_MM * unit) if settings.stops else (-np.inf, np.inf)
     switch = Switch(
         name=name,
@@ -161,13 +178,16 @@ def _endstop(
 
 
 def _own_places(
-    description: MachineDescription, rail: RailDescription, rails: Sequence[float]
+    description: MachineDescription, rail: RailDescription, start: Point, rails: Sequence[float]
 ) -> tuple[float, float | None]:
-    """Return where a rail that is no axis, or one of two of an axis, is at the begin and at its endstop."""
+    """Return where a rail that is no axis, or a part of one, is at the begin and at its endstop."""
     at = rail.homing.position_endstop
-    if rail not in description.rails:  # the second carriage: parked at its endstop, nearly
+    if rail.axis == SECOND_CARRIAGE:  # parked at its endstop, nearly
         assert at is not None
         return (at - START_MM if rail.homing.positive_dir else at + START_MM), at
+    if rail not in description.rails:  # one side of an axis
+        axis = next(whole.axis for whole in description.rails if rail in whole.pieces)
+        return start[AXES.index(axis)], at
     index = description.kinematics.rails.index(rail.axis)
     return rails[index], description.kinematics.inverse(description.home)[index]
 

@@ -158,7 +158,7 @@ class _Maker:
 
     def add(self, section: RawSection) -> None:
         """Take SECTION, if it is one of heat or fans."""
-        name = _word(section.name)
+        name = plant_word(section.name)
         if heater_pin := self._pin(section, "heater_pin"):
             self._add_heated(section, name, heater_pin)
         elif "sensor_pin" in section.options:
@@ -287,6 +287,6 @@ def _number(section: RawSection, option: str, otherwise: float) -> float:
     return value if math.isfinite(value) else otherwise
 
 
-def _word(name: str) -> str:
+def plant_word(name: str) -> str:
     """Return a section's name as a word of a plant."""
     return "".join(c if c.isascii() and c.isalnum() else "_" for c in name)[:WORD_MAX]

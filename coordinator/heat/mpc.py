@@ -88,7 +88,7 @@ class Mpc:
         self._steady_k_per_s = steady_k_per_s
         self._slope = Slope(1.0)
         self._fan_speed = 0.0
-        self._filament_mm_per_s = 0.0
+        self._filament_mm_per_s = self._coming_mm_per_s = 0.0
         self._ambient_c: float | None = None
         self._estimate: _Estimate | None = None
         self._power_w = 0.0
@@ -105,9 +105,14 @@ class Mpc:
         """Take note that the fan that cools the block runs at SPEED, 0..1."""
         self._fan_speed = speed
 
-    def set_filament(self, mm_per_s: float) -> None:
-        """Take note that so much filament passes; what is pulled back takes no heat."""
+    def set_filament(self, mm_per_s: float, coming_mm_per_s: float | None = None) -> None:
+        """Take note how much filament has passed since the last measurement, and how much is going to.
+
+        None: as much. What is pulled back takes no heat.
+        """
         self._filament_mm_per_s = max(mm_per_s, 0.0)
+        coming = mm_per_s if coming_mm_per_s is None else coming_mm_per_s
+        self._coming_mm_per_s = max(coming, 0.0)
 
     def set_ambient(self, celsius: float) -> None:
         """Take note of the temperature around, where a sensor tells it."""
@@ -127,7 +132,7 @@ class Mpc:
         if target_c <= 0:
             self._power_w = 0.0
         else:
-            flow = self._flow_w(self._estimate)
+            flow = self._flow_w(self._estimate, self._coming_mm_per_s)
             rise_w = self.model.capacity_j_per_k * (target_c - self._estimate.block_c) / self._reach_s
             full_w = self._max_power * self.model.power_w
             self._power_w = min(max(rise_w - flow, 0.0), full_w)
@@ -137,11 +142,14 @@ class Mpc:
         """Tell whether the target is reached and held."""
         return abs(target_c - measured_c) <= NEAR_K and abs(self._slope.k_per_s) <= SLOW_K_PER_S
 
-    def _flow_w(self, estimate: _Estimate) -> float:
-        """Return the heat that comes to the block besides the heater's (negative: it loses)."""
+    def _flow_w(self, estimate: _Estimate, mm_per_s: float) -> float:
+        """Return the heat that comes to the block besides the heater's (negative: it loses).
+
+        MM_PER_S of filament pass.
+        """
         ambient = DEFAULT_AMBIENT_C if self._ambient_c is None else self._ambient_c
         transfer = self.model.transfer_at(self._fan_speed)
-        transfer += self._filament_mm_per_s * self.model.filament_j_per_mm_k
+        transfer += mm_per_s * self.model.filament_j_per_mm_k
         return estimate.unexplained_w - transfer * (estimate.block_c - ambient)
 
     def _observe(self, estimate: _Estimate, elapsed_s: float, measured_c: float) -> None:
@@ -151,7 +159,9 @@ class Mpc:
         step_s = elapsed_s / steps
         follow = 1 - math.exp(-self.model.responsiveness_per_s * step_s)
         for _ in range(steps):
-            rate = (self._power_w + self._flow_w(estimate)) / self.model.capacity_j_per_k
+            rate = (
+                self._power_w + self._flow_w(estimate, self._filament_mm_per_s)
+            ) / self.model.capacity_j_per_k
             estimate.sensor_c += follow * (estimate.block_c - estimate.sensor_c)
             estimate.block_c += rate * step_s
         surprise = measured_c - estimate.sensor_c
@@ -165,6 +175,11 @@ class Mpc:
             estimate.unexplained_w = min(max(learned, -most_w), most_w)
 
     # ------------------------------------------------------------------------------------------------ status
+
+    @property
+    def filament_mm_per_s(self) -> float:
+        """What is going to pass."""
+        return self._coming_mm_per_s
 
     @property
     def block_c(self) -> float | None:

@@ -50,6 +50,15 @@ class Pid:
             self._integral_power = min(max(grown, 0.0), self._max_power)
         return min(max(fast + self._integral_power, 0.0), self._max_power)
 
+    @property
+    def held(self) -> tuple[Slope, float]:
+        """What it has gathered: the slope of the temperature, and the power that holds it."""
+        return self._slope, self._integral_power
+
+    def go_on_from(self, before: "Pid") -> None:
+        """Take over from another one, with other gains, without a jump of what is held."""
+        self._slope, self._integral_power = before.held
+
     def settled(self, measured_c: float, target_c: float) -> bool:
         """Tell whether the target is reached and held."""
         return abs(target_c - measured_c) <= NEAR_K and abs(self._slope.k_per_s) <= SLOW_K_PER_S

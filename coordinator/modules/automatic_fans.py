@@ -8,6 +8,7 @@ from coordinator.modules.base import Build, Modules
 from coordinator.modules.fan_unit import FanModule, FanUnit, fan_options, shutdown_speed
 from coordinator.modules.heater import HeaterUnit
 from coordinator.modules.heaters import Heaters
+from coordinator.modules.motor_power import MotorPower
 
 if TYPE_CHECKING:
     from coordinator.modules.live import Live
@@ -38,7 +39,9 @@ IDLE_TIMEOUT: Final = IntOption(
 IDLE_SPEED: Final = FloatOption(
     name="idle_speed", help="how fast it runs then; by default fan_speed", minimum=0, maximum=1
 )
-STEPPER: Final = ListOption(name="stepper", help="the steppers it cools; by default all (while a job runs)")
+STEPPER: Final = ListOption(
+    name="stepper", help="the steppers it cools: it runs while one of them is on; by default all"
+)
 CONTROLLER_HEATER: Final = ListOption(
     name="heater", help="the heaters whose drivers it cools", default=("extruder",)
 )
@@ -109,7 +112,8 @@ class ControllerFan(FanModule):
 
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
-        help="A fan that runs while a job moves the machine or a heater has a target, and some time after",
+        help="A fan that runs while steppers are on or a heater has a target, and some time after; steppers"
+        " without enable_pin are on while a job runs",
         options=(
             *fan_options(OFF),
             CONTROLLER_HEATER,
@@ -124,7 +128,8 @@ class ControllerFan(FanModule):
         super().__init__(build)
         self.unit = FanUnit(build, OFF)
         self._names = _HeaterNames(build, CONTROLLER_HEATER)
-        build.find(STEPPER)
+        self._power = build.shared(MotorPower)
+        self._steppers = self._read_steppers(build)
         self._speed = build.get(FAN_SPEED)
         idle = build.find(IDLE_SPEED)
         self._idle_speed = self._speed if idle is None else idle
@@ -132,6 +137,19 @@ class ControllerFan(FanModule):
         self._heaters: list[HeaterUnit] = []
         self._live: Live | None = None
         self._worked_s: float | None = None
+
+    @staticmethod
+    def _read_steppers(build: Build) -> tuple[str, ...]:
+        known = [stepper.name for stepper in build.machine.steppers]
+        given = build.find(STEPPER)
+        for name in given or ():
+            if name not in known:
+                hint = nearest(name, known) or f"; there is {', '.join(known)}"
+                raise ConfigError(
+                    build.reader.place_of(STEPPER),
+                    f"'stepper' of [{build.name}] names {shown(name)}, which does not exist{hint}",
+                )
+        return given or tuple(known)
 
     def link(self, modules: Modules) -> None:
         """Find its heaters."""
@@ -147,10 +165,14 @@ class ControllerFan(FanModule):
     def _look(self) -> None:
         assert self._live is not None
         now_s = self._live.now_s()
-        if self._live.machine.busy or any(unit.target_c > 0 for unit in self._heaters):
+        if self._moves(self._live) or any(unit.target_c > 0 for unit in self._heaters):
             self._worked_s = now_s
             self.unit.set_speed(self._speed)
         elif self._worked_s is not None and now_s - self._worked_s < self._idle_s:
             self.unit.set_speed(self._idle_speed)
         else:
             self.unit.set_speed(0.0)
+
+    def _moves(self, live: "Live") -> bool:
+        on = self._power.are_on()
+        return any(on.get(name, live.machine.busy) for name in self._steppers)

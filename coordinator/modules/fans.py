@@ -7,7 +7,7 @@ from coordinator.gcode.words import WordError
 from coordinator.machine.options import SectionSpec
 from coordinator.modules.base import Build, Module
 from coordinator.modules.fan_unit import FanModule, FanUnit, fan_options, shutdown_speed
-from coordinator.modules.words_of import numbers, one, parameters, value
+from coordinator.modules.words import numbers, one, parameters, value
 
 OFF: Final = shutdown_speed(0.0)
 FULL: Final = 255.0
@@ -22,8 +22,8 @@ class Fan(FanModule):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.unit = FanUnit(build, OFF)
-        build.add_command(GCodeCommand("M106", "set the part's fan: S, 0 to 255", self._set))
-        build.add_command(GCodeCommand("M107", "stop the part's fan", self._stop))
+        build.add_command(GCodeCommand("M106", "Set the part's fan: S, 0 to 255", self._set, beside=True))
+        build.add_command(GCodeCommand("M107", "Stop the part's fan", self._stop, beside=True))
 
     def _set(self, call: Call) -> Reading:
         words = numbers(call.command, "SP")
@@ -49,7 +49,9 @@ class GenericFans(Module):
         super().__init__(build)
         self.units: dict[str, FanUnit] = {}
         build.add_command(
-            GCodeCommand("SET_FAN_SPEED", "set the speed of a fan_generic: FAN= SPEED=, 0 to 1", self._set)
+            GCodeCommand(
+                "SET_FAN_SPEED", "Set the speed of a fan_generic: FAN= SPEED=, 0 to 1", self._set, beside=True
+            )
         )
 
     def _set(self, call: Call) -> Reading:

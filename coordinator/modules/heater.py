@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from coordinator.gcode.words import WordError
 from coordinator.heat.controller import Controller
+from coordinator.heat.holding import Held, Holding
 from coordinator.heat.mpc import Mpc
 from coordinator.heat.verify import HeaterCheck
 from coordinator.modules.base import Build, Modules, Value
@@ -38,6 +39,8 @@ LOOK_S: Final = 1.0
 SILENT_LOOKS: Final = 2
 """So many looks in a row may find none; looks and not seconds, as the host itself may have stood still."""
 
+COMING_S: Final = 1.0
+"""Of filament that is going to pass, this long from when a power acts is provided for."""
 BAD_MEASUREMENTS: Final = RANGE_CHECKS + 2
 """So many out of range, and the node should have stopped by itself."""
 
@@ -64,14 +67,15 @@ class HeaterUnit:
         self.target_c = 0.0
         self.power = 0.0
         """What is applied now, 0..1."""
-        self._controller: Controller | None = self.settings.controller()
+        self.controller: Controller | None = self.settings.controller()
         self.node = pin.node
         self._output = PwmOut(
             f"the heater of [{build.name}]",
             pin=pin.name,
             cycle_s=build.get(CYCLE_TIME),
             invert=pin.invert,
-            max_duration_s=build.get(MAX_DURATION),
+            # Counted from when a value takes effect, which is so long after it was sent.
+            max_duration_s=build.get(MAX_DURATION) - AHEAD_S,
         )
         add_pinned(build, self._output, pin)
         self._find_fan = build.needed(COOLING_FAN, FanModule) if build.find(COOLING_FAN) else None
@@ -83,11 +87,15 @@ class HeaterUnit:
         self.calibrated: dict[str, str] = {}
         """Options of the section and their values, as calibration found them."""
         self._check = HeaterCheck(usual(key))
+        self._holding = Holding()
+        self.on_held: Callable[[Held], None] | None = None
+        """Called at the end of each steady state."""
         self._tuning: Tuning | None = None
         self._tuning_failure: CanductorError | None = None
         self._live: Live | None = None
         self._on = False
         self._bad = 0
+        self._told_s = 0.0
 
     # ---------------------------------------------------------------------------------------------- life
 
@@ -105,6 +113,8 @@ class HeaterUnit:
     async def connect(self, live: "Live") -> None:
         """Begin to act."""
         self._live = live
+        if self.settings.kind == "mpc":
+            live.machine.filament.want(self.name)
         await self.input.connect(live)
         live.every(LOOK_S, self._look)
 
@@ -119,6 +129,7 @@ class HeaterUnit:
         """Act no more: the nodes have their outputs off."""
         self._live = None
         self.target_c = self.power = 0.0
+        self._tell_held(self._holding.end())
         self.input.end(cause)
 
     def status(self) -> Mapping[str, Value]:
@@ -127,12 +138,14 @@ class HeaterUnit:
             "temperature": _rounded(self.input.celsius),
             "target": self.target_c,
             "power": round(self.power, 4),
+            **_band(self._holding.held),
         }
-        if isinstance(self._controller, Mpc):
+        if isinstance(self.controller, Mpc):
             status["control_stats"] = {
-                "temp_block": _rounded(self._controller.block_c),
-                "temp_sensor": _rounded(self._controller.sensor_c),
-                "temp_ambient": _rounded(self._controller.ambient_c),
+                "temp_block": _rounded(self.controller.block_c),
+                "temp_sensor": _rounded(self.controller.sensor_c),
+                "temp_ambient": _rounded(self.controller.ambient_c),
+                "filament_mm_per_s": round(self.controller.filament_mm_per_s, 2),
             }
         return status
 
@@ -145,7 +158,7 @@ class HeaterUnit:
                 f"{celsius:g} °C is outside what [{self.name}] allows, {self.input.min_c:g} to"
                 f" {self.input.max_c:g} °C; correct the program, or min_temp and max_temp"
             )
-        if celsius and self._controller is None:
+        if celsius and self.controller is None:
             raise WordError(
                 f"[{self.name}] has to be calibrated before it heats: MPC_CALIBRATE HEATER={self.key}"
             )
@@ -159,9 +172,9 @@ class HeaterUnit:
     @property
     def settled(self) -> bool:
         """Whether who waits for the target may go on."""
-        if self.target_c <= 0 or self._controller is None or self.input.celsius is None:
+        if self.target_c <= 0 or self.controller is None or self.input.celsius is None:
             return True
-        return self._controller.settled(self.input.celsius, self.target_c)
+        return self.controller.settled(self.input.celsius, self.target_c)
 
     async def reach(self) -> None:
         """Wait until the target is reached; raises CanductorError when the heater ends before."""
@@ -186,7 +199,7 @@ class HeaterUnit:
 
     def use(self, controller: Controller) -> None:
         """Be controlled by another controller from now on."""
-        self._controller = controller
+        self.controller = controller
 
     # ------------------------------------------------------------------------------------------- control
 
@@ -204,6 +217,12 @@ class HeaterUnit:
             live.stop(f"heater {self.key} {fault}")
             return
         self._apply(self._wanted(at_s, celsius))
+        ended = self._holding.measured(at_s, celsius, self.target_c, self.power, settled=self.settled)
+        self._tell_held(ended)
+
+    def _tell_held(self, held: Held | None) -> None:
+        if held is not None and self.on_held is not None:
+            self.on_held(held)
 
     def _out_of_range(self, live: "Live", celsius: float) -> None:
         """Heat no more while what is measured cannot be; its node stops by itself a moment later."""
@@ -222,17 +241,25 @@ class HeaterUnit:
             except CanductorError as error:
                 self._tuning_failure = error
                 return 0.0
-        if self._controller is None:
+        if self.controller is None:
             return 0.0
-        if isinstance(self._controller, Mpc):
-            self._tell_model(self._controller)
-        return self._controller.power(at_s, celsius, self.target_c)
+        if isinstance(self.controller, Mpc):
+            self._tell_model(self.controller, at_s)
+        return self.controller.power(at_s, celsius, self.target_c)
 
-    def _tell_model(self, model: Mpc) -> None:
+    def _tell_model(self, model: Mpc, at_s: float) -> None:
         if self.fan is not None:
             model.set_fan(self.fan.unit.speed)
         if self._ambient is not None and self._ambient.input.celsius is not None:
             model.set_ambient(self._ambient.input.celsius)
+        if self._live is not None and model.model.filament_j_per_mm_k > 0:
+            forecast = self._live.machine.filament
+            acts_s = at_s + AHEAD_S
+            model.set_filament(
+                forecast.mm_per_s(self.name, self._told_s, at_s),
+                forecast.mm_per_s(self.name, acts_s, acts_s + COMING_S),
+            )
+            self._told_s = at_s
 
     def _apply(self, power: float) -> None:
         """Have POWER on the node; off needs no renewal."""
@@ -272,6 +299,14 @@ class HeaterUnit:
             self._tuning_failure = CanductorError(f"heater {self.key} went off: {why}")
         if was > 0 and live is not None:
             live.say(f"heater {self.key} is off, its target of {was:g} °C is forgotten: {why}")
+
+
+def _band(held: Held | None) -> dict[str, Value]:
+    return {
+        "held_s": None if held is None else round(held.seconds, 1),
+        "held_low": None if held is None else round(held.low_c, 2),
+        "held_high": None if held is None else round(held.high_c, 2),
+    }
 
 
 def _rounded(celsius: float | None) -> Value:

@@ -1,7 +1,9 @@
 """Which controller a heater's section asks for."""
 
+from dataclasses import replace
+
 from coordinator.heat.controller import Controller
-from coordinator.heat.mpc import HeaterModel, Mpc
+from coordinator.heat.mpc import HeaterModel, Mpc, filament_heat
 from coordinator.heat.pid import Pid, PidGains
 from coordinator.heat.watermark import Watermark
 from coordinator.machine.problem import ConfigError
@@ -11,6 +13,8 @@ from coordinator.modules.heater_options import (
     BLOCK_HEAT_CAPACITY,
     CONTROL,
     FAN_TRANSFER,
+    FILAMENT_DENSITY,
+    FILAMENT_HEAT_CAPACITY,
     HEATER_POWER,
     MAX_DELTA,
     MAX_POWER,
@@ -35,14 +39,15 @@ class ControlSettings:
         self.max_power = build.get(MAX_POWER)
         self.heater_w = build.find(HEATER_POWER)
         self._smooth_s = build.get(SMOOTH_TIME)
-        self._max_delta_k = build.get(MAX_DELTA)
+        self.max_delta_k = build.get(MAX_DELTA)
         self._reach_s, self._steady = build.get(TARGET_REACH_TIME), build.get(STEADY_STATE_RATE)
         for option in (*PID_OPTIONS, *MPC_OPTIONS):
             build.find(option)
         losses = build.find(FAN_TRANSFER)
         self.fan_transfers = tuple(map(float, losses.split(","))) if losses else ()
         self._build = build
-        self._gains = self._read_gains() if self.kind == "pid" else None
+        self._filament_j_per_mm_k = _filament(build)
+        self.gains = self._read_gains() if self.kind == "pid" else None
         self._model = self._read_model() if self.kind == "mpc" else None
 
     def _read_gains(self) -> PidGains:
@@ -71,11 +76,11 @@ class ControlSettings:
 
     def controller(self) -> Controller | None:
         """Return the controller; None for MPC that has yet to be calibrated."""
-        if self._gains is not None:
-            return self.by_pid(self._gains)
+        if self.gains is not None:
+            return self.by_pid(self.gains)
         if self.kind == "mpc":
             return None if self._model is None else self.by_model(self._model)
-        return Watermark(max_power=self.max_power, max_delta_k=self._max_delta_k)
+        return Watermark(max_power=self.max_power, max_delta_k=self.max_delta_k)
 
     def by_pid(self, gains: PidGains) -> Pid:
         """Return the heater's controller with other gains."""
@@ -83,4 +88,14 @@ class ControlSettings:
 
     def by_model(self, model: HeaterModel) -> Mpc:
         """Return the heater's controller with another model."""
+        model = replace(model, filament_j_per_mm_k=self._filament_j_per_mm_k)
         return Mpc(model, max_power=self.max_power, reach_s=self._reach_s, steady_k_per_s=self._steady)
+
+
+def _filament(build: Build) -> float:
+    """Return what a mm of the filament that passes the heater takes, J/(mm·K); 0: none passes."""
+    extruder = next((e for e in build.machine.extruders if e.name == build.name), None)
+    if extruder is None:
+        return 0.0
+    density, capacity = build.get(FILAMENT_DENSITY), build.get(FILAMENT_HEAT_CAPACITY)
+    return filament_heat(extruder.filament_diameter, density, capacity)

@@ -152,8 +152,6 @@ LATER_HEATER_OPTIONS: Final = (
     *LATER_SENSOR_OPTIONS,
     "pid_version",
     "pid_tolerance",
-    "filament_density",
-    "filament_heat_capacity",
     "min_ambient_change",
 )
 MIN_EXTRUDE_TEMP: Final = FloatOption(
@@ -164,4 +162,25 @@ MIN_EXTRUDE_TEMP: Final = FloatOption(
     minimum=-273.15,
     maximum=1500,
 )
-EXTRUDER_HEATER_OPTIONS: Final[tuple[Option[Any], ...]] = (*HEATER_OPTIONS, MIN_EXTRUDE_TEMP)
+FILAMENT_DENSITY: Final = FloatOption(
+    name="filament_density",
+    help="MPC: of the filament, whose heat is provided for before it passes; 0: it is not",
+    default=1.2,
+    unit="g/cm³",
+    minimum=0,
+    maximum=25,
+)
+FILAMENT_HEAT_CAPACITY: Final = FloatOption(
+    name="filament_heat_capacity",
+    help="MPC: of the filament",
+    default=1.8,
+    unit="J/(g·K)",
+    minimum=0,
+    maximum=10,
+)
+EXTRUDER_HEATER_OPTIONS: Final[tuple[Option[Any], ...]] = (
+    *HEATER_OPTIONS,
+    MIN_EXTRUDE_TEMP,
+    FILAMENT_DENSITY,
+    FILAMENT_HEAT_CAPACITY,
+)

@@ -16,8 +16,9 @@ from coordinator.modules.heater_options import (
     MIN_EXTRUDE_TEMP,
 )
 from coordinator.modules.heaters import Heaters
+from coordinator.modules.pid_profile import PidProfiles
 from coordinator.modules.sensor_module import GCODE_ID
-from coordinator.modules.words_of import numbers
+from coordinator.modules.words import numbers
 
 if TYPE_CHECKING:
     from coordinator.modules.live import Live
@@ -30,6 +31,7 @@ class HeaterModule(Module):
         super().__init__(build)
         self.unit = HeaterUnit(build, key)
         self.heaters = build.shared(Heaters)
+        build.shared(PidProfiles)
         self.heaters.add(self.unit, tag)
 
     def link(self, modules: Modules) -> None:
@@ -60,8 +62,8 @@ class HeaterBed(HeaterModule):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build, "heater_bed", "B")
-        build.add_command(GCodeCommand("M140", "set the bed's target: S", self._set))
-        build.add_command(GCodeCommand("M190", "set the bed's target and wait for it: S or R", self._wait))
+        build.add_command(GCodeCommand("M140", "Set the bed's target: S", self._set, beside=True))
+        build.add_command(GCodeCommand("M190", "Set the bed's target and wait for it: S or R", self._wait))
 
     def _set(self, call: Call) -> Reading:
         return self.heaters.set_in_time(self.unit, _target(call, "S"))
@@ -91,11 +93,13 @@ class ExtruderHeaters(Module):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
+        build.shared(PidProfiles)
         self.by_extruder: dict[str, ExtruderHeater] = {}
+        self._extruders = [extruder.name for extruder in build.machine.extruders]
         self.heaters = build.shared(Heaters)
-        build.add_command(GCodeCommand("M104", "set an extruder's target: S, T", self._set))
+        build.add_command(GCodeCommand("M104", "Set an extruder's target: S, T", self._set, beside=True))
         build.add_command(
-            GCodeCommand("M109", "set an extruder's target and wait for it: S or R, T", self._wait)
+            GCodeCommand("M109", "Set an extruder's target and wait for it: S or R, T", self._wait)
         )
 
     def _set(self, call: Call) -> Reading:
@@ -110,6 +114,12 @@ class ExtruderHeaters(Module):
         if "T" in words:
             index = round(words["T"])
             name = "extruder" if index == 0 else f"extruder{index}"
+            if name not in self._extruders:
+                last = len(self._extruders) - 1
+                has = f"T0 to T{last}" if last else "only T0"
+                raise WordError(
+                    f"{call.command.name} names the extruder T{index}, which there is not; there is {has}"
+                )
         found = self.by_extruder.get(name)
         if found is None or found.unit is None:
             raise WordError(f"{call.command.name}: [{name}] has no heater; give it a heater_pin")

@@ -8,8 +8,8 @@ from coordinator.gcode.words import WordError
 from coordinator.machine.options import SectionSpec
 from coordinator.modules.base import Build, Module, Value
 from coordinator.modules.heater import HeaterUnit
-from coordinator.modules.temperature_input import TemperatureInput
-from coordinator.modules.words_of import numbers, one, parameters, value
+from coordinator.modules.temperature_source import TemperatureSource
+from coordinator.modules.words import numbers, one, parameters, value
 
 FAN_STEPS_MAX: Final = 12
 
@@ -23,22 +23,26 @@ class Heaters(Module):
         super().__init__(build)
         self.units: dict[str, HeaterUnit] = {}
         """By what programs call them: extruder, heater_bed, NAME of heater_generic."""
-        self.sensors: dict[str, TemperatureInput] = {}
+        self.sensors: dict[str, TemperatureSource] = {}
         """By what programs call them: heaters and the sections of sensors."""
-        self._tags: dict[str, HeaterUnit | TemperatureInput] = {}
+        self._tags: dict[str, HeaterUnit | TemperatureSource] = {}
         for name, help_, read in (
-            ("M105", "tell all temperatures", self._tell),
-            ("TURN_OFF_HEATERS", "let all heaters cool down", self._turn_off),
-            ("SET_HEATER_TEMPERATURE", "set a heater's target: HEATER= TARGET=", self._set),
+            ("M105", "Tell all temperatures", self._tell),
+            ("TURN_OFF_HEATERS", "Let all heaters cool down", self._turn_off),
+            ("SET_HEATER_TEMPERATURE", "Set a heater's target: HEATER= TARGET=", self._set),
+        ):
+            build.add_command(GCodeCommand(name, help_, read, beside=True))
+        for name, help_, read in (
             (
                 "TEMPERATURE_WAIT",
-                "wait until a temperature is in a range: SENSOR= MINIMUM= MAXIMUM=",
+                "Wait until a temperature is in a range: SENSOR= MINIMUM= MAXIMUM=",
                 self._wait,
             ),
-            ("PID_CALIBRATE", "find a heater's PID constants: HEATER= TARGET=", self._pid),
+            ("QUERY_ADC", "Tell what a sensor's converter reads: NAME= PULLUP=", self._query),
+            ("PID_CALIBRATE", "Find a heater's PID constants: HEATER= TARGET=", self._pid),
             (
                 "MPC_CALIBRATE",
-                "find a heater's model: HEATER= TARGET= FAN_BREAKPOINTS=",
+                "Find a heater's model: HEATER= TARGET= FAN_BREAKPOINTS=",
                 self._mpc,
             ),
         ):
@@ -52,7 +56,7 @@ class Heaters(Module):
             self.sensors[unit.name] = unit.input
         self._tags[tag or unit.key] = unit
 
-    def add_sensor(self, source: TemperatureInput, tag: str = "") -> None:
+    def add_sensor(self, source: TemperatureSource, tag: str = "") -> None:
         """Take a sensor on that belongs to no heater."""
         self.sensors[source.name] = source
         if tag:
@@ -137,6 +141,20 @@ class Heaters(Module):
                 await source.next()
 
         return AtRest(perform)
+
+    def _query(self, call: Call) -> Reading:
+        given = parameters(call.command, ("NAME", "PULLUP"))
+        names = [name for name, source in self.sensors.items() if source.ratio is not None]
+        if "NAME" not in given:
+            return AtOnce((f"sensors with a converter: {', '.join(names) or 'none has read anything yet'}",))
+        name = one(call.command, given, "NAME", names)
+        ratio = self.sensors[name].ratio or 0.0
+        told = f"{name}: {ratio:.6f} of full scale"
+        if "PULLUP" in given:
+            ohms = value(call.command, given, "PULLUP")
+            below = f"{ohms * ratio / (1 - ratio):.1f} Ω" if ratio < 1 else "no resistor"
+            told += f", with {ohms:g} Ω above it {below}"
+        return AtOnce((told,))
 
     def _pid(self, call: Call) -> Reading:
         given = parameters(call.command, ("HEATER", "TARGET", "WRITE_FILE", "TOLERANCE"))

@@ -11,12 +11,12 @@ from coordinator.heat.watermark import Watermark
 from coordinator.machine.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.modules.base import Build, Module, Modules, Value
 from coordinator.modules.fan_unit import FanModule, FanUnit, fan_options, shutdown_speed
+from coordinator.modules.free_temperatures import find_source
 from coordinator.modules.heater_options import MAX_DELTA, PID_KD, PID_KI, PID_KP, SMOOTH_TIME
 from coordinator.modules.heaters import Heaters
 from coordinator.modules.sensor_module import GCODE_ID
-from coordinator.modules.sensor_options import LATER_SENSOR_OPTIONS, SENSOR_OPTIONS
-from coordinator.modules.temperature_input import TemperatureInput
-from coordinator.modules.words_of import one, parameters, value
+from coordinator.modules.sensor_options import FREE_SENSOR_OPTIONS, LATER_SENSOR_OPTIONS, SENSOR_OPTIONS
+from coordinator.modules.words import one, parameters, value
 
 if TYPE_CHECKING:
     from coordinator.modules.live import Live
@@ -55,8 +55,9 @@ class TemperatureFans(Module):
         build.add_command(
             GCodeCommand(
                 "SET_TEMPERATURE_FAN_TARGET",
-                "set what a temperature_fan holds: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
+                "Set what a temperature_fan holds: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
                 self._set,
+                beside=True,
             )
         )
 
@@ -90,6 +91,7 @@ class TemperatureFan(FanModule):
         options=(
             *fan_options(FULL),
             *SENSOR_OPTIONS,
+            *FREE_SENSOR_OPTIONS,
             TARGET_TEMP,
             MIN_SPEED,
             MAX_SPEED,
@@ -107,7 +109,7 @@ class TemperatureFan(FanModule):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.unit = FanUnit(build, FULL)
-        self.input = TemperatureInput(build)
+        self.input = find_source(build, limits_needed=True)
         self.input.on_measured = self._measured
         self.usual_target_c = self.target_c = build.get(TARGET_TEMP)
         self.min_speed, self.max_speed = build.get(MIN_SPEED), build.get(MAX_SPEED)

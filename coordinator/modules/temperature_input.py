@@ -1,6 +1,5 @@
 """A temperature on an analog input, for whatever module has one."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 from coordinator.heat.known_sensors import (
@@ -19,6 +18,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.sensor_options import (
     ADC_VOLTAGE,
+    FREE_SENSORS,
     INLINE,
     LATER_SENSORS,
     MAX_TEMP,
@@ -28,32 +28,19 @@ from coordinator.modules.sensor_options import (
     SENSOR_TYPE,
     VOLTAGE_OFFSET,
 )
+from coordinator.modules.temperature_source import TemperatureSource
 from coordinator.modules.thermistor import KINDS, Circuit, CustomSensor
 from nodes.devices.analog_in import AnalogIn, AnalogValue
-from nodes.errors import CanductorError
 from nodes.node_states import NodeState
 
 if TYPE_CHECKING:
-    import asyncio  # planning waits for nothing
-
     from coordinator.modules.live import Live
 
 PT100_BOARD: Final = "PT100 INA826"
 KNOWN_SENSORS: Final = (*THERMISTORS, "PT1000", PT100_BOARD, *AMPLIFIERS)
-SILENT_S: Final = 10.0
-"""Who waits for a measurement that should come three times a second gives up after so long; a host may stand
-still for a while."""
-MAX_WAITERS: Final = 64
-
-OnMeasured = Callable[[float, float], None]
-"""Print time in s, °C."""
 
 
-def _ignore(_at_s: float, _celsius: float) -> None:
-    pass
-
-
-class TemperatureInput:
+class TemperatureInput(TemperatureSource):
     """The sensor of section BUILD; ``on_measured`` is called with every measurement once it is connected."""
 
     def __init__(self, build: Build, *, min_c: float | None = None, max_c: float | None = None) -> None:
@@ -61,14 +48,13 @@ class TemperatureInput:
 
         A sensor that is not limited does not stop its node when its wire breaks.
         """
-        self.name = build.name
+        super().__init__(
+            build.name,
+            build.get(MIN_TEMP) if min_c is None else _or(build.find(MIN_TEMP), min_c),
+            build.get(MAX_TEMP) if max_c is None else _or(build.find(MAX_TEMP), max_c),
+        )
         self._pin = build.pin(SENSOR_PIN)
-        self.min_c = build.get(MIN_TEMP) if min_c is None else _or(build.find(MIN_TEMP), min_c)
-        self.max_c = build.get(MAX_TEMP) if max_c is None else _or(build.find(MAX_TEMP), max_c)
         self._guarded = min_c is None or build.reader.has(MIN_TEMP) or build.reader.has(MAX_TEMP)
-        self.celsius: float | None = None
-        """The last measurement; None before the first."""
-        self.on_measured: OnMeasured = _ignore
         self._reader = build.reader
         self._type = build.get(SENSOR_TYPE)
         self._circuit = Circuit(
@@ -78,10 +64,6 @@ class TemperatureInput:
         self._analog = AnalogIn(build.name, pin=self._pin.name)
         self._analog.on_value = self._came
         add_pinned(build, self._analog, self._pin)
-        self._live: Live | None = None
-        self._looks = 0
-        self._waiting: list[asyncio.Future[None]] = []
-        self._over: str | None = None
 
     def link(self, modules: Modules) -> None:
         """Find out what the sensor is, and what its converter may read; raises ConfigError."""
@@ -112,6 +94,11 @@ class TemperatureInput:
         raise self._unknown(modules)
 
     def _unknown(self, modules: Modules) -> ConfigError:
+        if self._type in FREE_SENSORS:
+            return self._reader.bad(
+                SENSOR_TYPE,
+                "which no node can watch: a heater needs a sensor on a pin, with a net of its own",
+            )
         if self._type in LATER_SENSORS:
             return self._reader.bad(SENSOR_TYPE, "a sensor that is recognised but not built yet")
         own = [name.partition(" ")[2] for kind in KINDS.values() for name in modules.names(kind)]
@@ -123,67 +110,26 @@ class TemperatureInput:
 
     async def connect(self, live: "Live") -> None:
         """Begin to tell what is measured; waits for the first time, unless its node is away."""
-        self._live = live
+        await super().connect(live)
         if self.celsius is None and live.node(self._pin.node).state is NodeState.READY:
             await self.next()
-
-    def end(self, cause: str) -> None:
-        """End all waiting for it, because of CAUSE."""
-        self._over = cause
-        self._live = None
-        self._wake()
 
     @property
     def node(self) -> str:
         """The node it is on."""
         return self._pin.node
 
-    def missed(self) -> int:
-        """Return how often this was called since the last measurement."""
-        self._looks += 1
-        return self._looks - 1
-
-    async def next(self) -> None:
-        """Wait for the next measurement; raises CanductorError when there will be none."""
-        import asyncio  # noqa: PLC0415
-
-        if self._over is not None:
-            raise CanductorError(self._over)
-        if len(self._waiting) >= MAX_WAITERS:
-            raise CanductorError(f"more than {MAX_WAITERS} wait for the temperature of {self.name}; end some")
-        waiter = asyncio.get_running_loop().create_future()
-        self._waiting.append(waiter)
-        try:
-            async with asyncio.timeout(SILENT_S):
-                await waiter
-        except TimeoutError:
-            raise CanductorError(
-                f"the sensor of [{self.name}] says nothing any more; is its node {self.node} there?"
-            ) from None
-        finally:
-            if waiter in self._waiting:
-                self._waiting.remove(waiter)
-        if self._over is not None:
-            raise CanductorError(self._over)
-
     def _came(self, value: AnalogValue) -> None:
         assert self._sensor is not None
-        self.celsius = self._sensor.celsius(value.ratio)
-        self._looks = 0
-        if self._live is not None:
-            self.on_measured(self._live.print_time_of(self._pin.node, value.clock32), self.celsius)
-        self._wake()
-
-    def _wake(self) -> None:
-        for waiter in self._waiting:
-            if not waiter.done():
-                waiter.set_result(None)
+        celsius = self._sensor.celsius(value.ratio)
+        self.ratio = value.ratio
+        self._take(celsius, lambda live: live.print_time_of(self._pin.node, value.clock32))
 
 
 class SensorModule(Module):
     """A section that measures a temperature."""
 
-    input: TemperatureInput
+    input: TemperatureSource
 
 
 def _or(value: float | None, default: float) -> float:

@@ -75,6 +75,33 @@ class Switch:
 
 
 @record(kw_only=True)
+class Tmc:
+    """The driver of a stepper of the same node, CHIP (tmc2208, tmc2209), on a UART.
+
+    The axes of its stepper count MICROSTEPS to a full step, whatever it is set to.
+    """
+
+    name: str
+    chip: str
+    stepper: str
+    tx_pin: str
+    rx_pin: str
+    microsteps: int
+    address: int = 0
+    free_load: float = 300.0
+    """SG_RESULT while nothing holds the motor."""
+
+
+@record(kw_only=True)
+class Diag:
+    """A pin that DIAG of a driver of any node is wired to."""
+
+    pin: str
+    node: str
+    tmc: str
+
+
+@record(kw_only=True)
 class Body:
     """Something that gets warm."""
 
@@ -196,6 +223,8 @@ _FIELD_NAMES: Final = {
     "dir_pin": "dir",
     "enable_pin": "enable",
     "tach_pin": "tach",
+    "tx_pin": "tx",
+    "rx_pin": "rx",
 }
 """Where a field is named otherwise in the text."""
 
@@ -210,6 +239,8 @@ class NodePlant:
     steppers: tuple[Stepper, ...] = ()
     axes: tuple[Axis, ...] = ()
     switches: tuple[Switch, ...] = ()
+    tmcs: tuple[Tmc, ...] = ()
+    diags: tuple[Diag, ...] = ()
     bodies: tuple[Body, ...] = ()
     couples: tuple[Couple, ...] = ()
     heaters: tuple[Heater, ...] = ()
@@ -233,6 +264,7 @@ class NodePlant:
         named = [term.node for axis in self.axes for term in axis.terms]
         named += [cooling.node for cooling in self.coolings]
         named += [sensor.node for sensor in self.sensors]
+        named += [diag.node for diag in self.diags]
         return tuple(dict.fromkeys(name for name in named if name != self.node))
 
     def _lines(self) -> Iterator[str]:
@@ -244,6 +276,8 @@ class NodePlant:
                 fields = {"axis": axis.name, "node": self._short(term.node), "stepper": term.stepper}
                 yield _line("term", fields | {"mm": term.mm_per_step})
         yield from self._parts("switch", self.switches)
+        yield from self._parts("tmc", self.tmcs)
+        yield from self._parts("diag", self.diags)
         yield from self._parts("body", self.bodies)
         yield from self._parts("couple", self.couples)
         yield from self._parts("fan", self.fans)

@@ -16,7 +16,7 @@ from nodes.records import record
 
 _MAGIC: Final = 0x31544E4C50444E43
 _NAME: Final = 64
-_ITEMS: Final = 64
+_ITEMS: Final = 80
 _STEPPERS: Final = 16
 _HISTORY: Final = 4096
 _HEADER: Final = np.dtype(
@@ -45,6 +45,8 @@ class Kind(IntEnum):
     FAN = 3
     SENSOR = 4
     SWITCH = 5
+    TMC = 6
+    """A stepper's driver."""
 
 
 class Fault(IntEnum):
@@ -52,19 +54,25 @@ class Fault(IntEnum):
 
     SOUND = 0
     OPEN = 1
-    """A sensor's wire is broken."""
+    """A sensor's wire is broken, or that of a driver's UART."""
     SHORTED = 2
-    """A sensor's wires touch."""
+    """A sensor's wires touch, or those of a motor: its driver switched off."""
     FALLEN = 3
     """A sensor fell out of its body: it gets as warm as the surroundings, as fast as its lag lets it."""
     STUCK_ON = 4
     """A heater that is on whatever its pin says."""
     DEAD = 5
-    """A heater or a fan that does nothing."""
+    """A heater or a fan that does nothing, a driver without supply: with that back it has forgotten all."""
     NEVER = 6
     """A switch that never closes."""
     ALWAYS = 7
     """A switch that is always closed."""
+    GARBLED = 8
+    """A driver whose answers are damaged on the way."""
+    WARM = 9
+    """A driver that gives warning."""
+    OVERHEATED = 10
+    """A driver that switched off."""
 
 
 _FAULTS: Final[Mapping[Kind, tuple[Fault, ...]]] = {
@@ -73,6 +81,7 @@ _FAULTS: Final[Mapping[Kind, tuple[Fault, ...]]] = {
     Kind.FAN: (Fault.DEAD,),
     Kind.SENSOR: (Fault.OPEN, Fault.SHORTED, Fault.FALLEN),
     Kind.SWITCH: (Fault.NEVER, Fault.ALWAYS),
+    Kind.TMC: (Fault.OPEN, Fault.SHORTED, Fault.DEAD, Fault.GARBLED, Fault.WARM, Fault.OVERHEATED),
 }
 
 
@@ -94,9 +103,11 @@ class Item:
     kind: Kind
     fault: Fault
     value: float
-    """Of a body °C; of a heater or fan its duty, 0 to 1; of a sensor its own °C; of a switch 1: pressed."""
+    """Of a body °C; of a heater or fan its duty, 0 to 1; of a sensor its own °C; of a switch 1: pressed; of
+    a driver the true time (ns) until which its DIAG is high if no step follows."""
     extra: float
-    """Of a heater J given in all; of a fan turns; of a sensor its last sample; of a switch its changes."""
+    """Of a heater J given in all; of a fan turns; of a sensor its last sample; of a switch its changes;
+    of a driver its SG_RESULT."""
 
 
 class PlantPage:

@@ -77,6 +77,12 @@ static void drive_pin(struct plant *plant, uint64_t ns, uint32_t pin, double dut
         }
 }
 
+static void set_lines(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
+    for (int i = 0; i < plant->tmc_count; i++)
+        if (plant->tmcs[i].tx_pin == (int)pin)
+            plant_tmc_line(plant, &plant->tmcs[i], ns, level);
+}
+
 void plant_output(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
     uint8_t value = level != 0;
     if (plant->level[pin] == value && !plant->floating[pin])
@@ -86,9 +92,15 @@ void plant_output(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
     plant->floating[pin] = 0;
     if (!plant->writes[pin])
         return;
+    set_lines(plant, ns, pin, value);
     if (stepped)
         plant_motion_edge(plant, ns, pin, value);
     drive_pin(plant, ns, pin, value);
+}
+
+void plant_float(struct plant *plant, uint64_t ns, uint32_t pin) {
+    plant->floating[pin] = 1;
+    set_lines(plant, ns, pin, 1); // pulled up
 }
 
 void plant_pwm(struct plant *plant, uint64_t ns, uint32_t pin, uint32_t value) {
@@ -98,6 +110,8 @@ void plant_pwm(struct plant *plant, uint64_t ns, uint32_t pin, uint32_t value) {
 void plant_reset(struct plant *plant, uint64_t ns) {
     memset(plant->level, 0, sizeof(plant->level));
     memset(plant->floating, 1, sizeof(plant->floating));
+    for (int i = 0; i < plant->tmc_count; i++)
+        plant_tmc_line(plant, &plant->tmcs[i], ns, 1);
     for (int i = 0; i < plant->heater_count; i++) {
         plant->heaters[i].wanted = 0;
         drive_heater(plant, ns, &plant->heaters[i]);
@@ -192,10 +206,21 @@ void plant_update(struct plant *plant, uint64_t ns) {
     if (plant->refreshing)
         return;
     refresh(plant, ns);
+    for (int i = 0; i < plant->tmc_count; i++)
+        plant_tmc_look(plant, &plant->tmcs[i], ns);
     show(plant, ns);
 }
 
 // ------------------------------------------------------------------------------------------ what is read
+
+// The drivers' line is low when any of them, or the node, has it low. -1: there is none at this pin.
+static int line_level(struct plant *plant, uint64_t ns, uint32_t pin) {
+    int level = -1;
+    for (int i = 0; i < plant->tmc_count; i++)
+        if (plant->tmcs[i].rx_pin == (int)pin)
+            level = plant_tmc_answer(plant, &plant->tmcs[i], ns) && level;
+    return level < 0 ? level : level != 0;
+}
 
 int plant_input(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
     int any_pressed = 0, inverted = -1;
@@ -206,6 +231,12 @@ int plant_input(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
         }
     if (inverted >= 0)
         return any_pressed != inverted;
+    for (int i = 0; i < plant->diag_count; i++)
+        if (plant->diags[i].pin == (int)pin)
+            return plant_diag_level(plant, &plant->diags[i], ns);
+    int line = line_level(plant, ns, pin);
+    if (line >= 0)
+        return line;
     for (int i = 0; i < plant->fan_count; i++)
         if (plant->fans[i].tach_pin == (int)pin)
             return plant_fan_tach(&plant->fans[i], ns);
@@ -265,6 +296,9 @@ static void make_page(struct plant *plant, struct plant_page *page) {
     plant->first_switch = (int)page->item_count;
     for (int i = 0; i < plant->switch_count; i++)
         add_item(page, PLANT_SWITCH, plant->switches[i].name);
+    plant->first_tmc = (int)page->item_count;
+    for (int i = 0; i < plant->tmc_count; i++)
+        add_item(page, PLANT_TMC, plant->tmcs[i].name);
     atomic_store(&page->horizon_ns, 0);
 }
 
@@ -286,6 +320,10 @@ static void note_pins(struct plant *plant) {
         plant->reads[plant->switches[i].pin] = 1;
     for (int i = 0; i < plant->sensor_count; i++)
         plant->reads[plant->sensors[i].pin] = 1;
+    for (int i = 0; i < plant->tmc_count; i++)
+        plant->writes[plant->tmcs[i].tx_pin] = plant->reads[plant->tmcs[i].rx_pin] = 1;
+    for (int i = 0; i < plant->diag_count; i++)
+        plant->reads[plant->diags[i].pin] = 1;
     for (int pin = 0; pin < PLANT_PINS; pin++)
         plant->cares[pin] |= plant->writes[pin];
 }
@@ -313,6 +351,8 @@ void plant_start(struct plant *plant, struct plant_page *page, uint64_t ns) {
     for (int i = 0; i < plant->fan_count; i++)
         plant->fans[i].at_ns = ns;
     make_page(plant, page);
+    for (int i = 0; i < plant->tmc_count; i++)
+        plant_tmc_start(plant, &plant->tmcs[i], ns);
     show(plant, ns);
     atomic_store_explicit(&page->magic, PLANT_MAGIC, memory_order_release);
 }

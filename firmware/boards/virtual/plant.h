@@ -23,6 +23,9 @@ enum {
     PLANT_AXES = 16,
     PLANT_TERMS = 8,
     PLANT_SWITCHES = 16,
+    PLANT_TMCS = 16,
+    PLANT_TMC_EDGES = 96, // more than a datagram has
+    PLANT_DIAGS = 16,
     PLANT_BODIES = 12,
     PLANT_HEATERS = 12,
     PLANT_FANS = 12,
@@ -33,7 +36,8 @@ enum {
     PLANT_ZONE_STATES = 12, // bodies and sensors that heat flows between
     PLANT_ERROR = 200,
 };
-_Static_assert(PLANT_BODIES + PLANT_HEATERS + PLANT_FANS + PLANT_SENSORS + PLANT_SWITCHES <= PLANT_ITEMS,
+_Static_assert(PLANT_BODIES + PLANT_HEATERS + PLANT_FANS + PLANT_SENSORS + PLANT_SWITCHES + PLANT_TMCS <=
+                   PLANT_ITEMS,
                "all items have a place in the page");
 
 // Something of this node (peer -1) or of another's page. FOUND: its number there, once it is known.
@@ -53,6 +57,7 @@ struct plant_stepper {
     int step_pin, dir_pin, enable_pin;
     int step_inverted, dir_inverted, enable_inverted;
     int both_edges; // each change of the step pin is a step
+    int tmc;        // its driver, which knows better; -1: any
 };
 
 // A place along a line: origin + the sum of each term's mm per step times its stepper's count.
@@ -76,6 +81,32 @@ struct plant_switch {
     int pressed;
     double shift; // of this approach
     uint64_t switched;
+};
+
+// A driver TMC2209, or without StallGuard a TMC2208, of a stepper whose axes count MICROSTEPS to a full step.
+// tx and rx are the node's pins. SG_RESULT is free_load while nothing holds the motor.
+struct plant_tmc {
+    char name[PLANT_NAME];
+    int stepper, tx_pin, rx_pin, address, microsteps, has_stallguard;
+    double free_load;
+    uint32_t registers[128];
+    uint8_t written; // datagrams, rolls over
+    uint32_t fault;
+    int line, edge_count; // of the datagram that is being heard
+    uint64_t edge_ns[PLANT_TMC_EDGES];
+    uint8_t reply[8];
+    uint64_t reply_ns; // when it begins; 0: there is none
+    double reply_bit_ns;
+    int64_t field;    // of the motor, in 1/256 of a full step
+    uint64_t step_ns; // of the last step
+    int step_size;    // in 1/256 of a full step
+    double tstep, sg_result;
+    int stalled;
+};
+// A pin that a driver's DIAG is wired to.
+struct plant_diag {
+    int pin;
+    struct plant_reference tmc;
 };
 
 struct plant_body {
@@ -164,12 +195,14 @@ struct plant {
     // Whether its level matters, whether more than that happens when it changes, whether the plant drives it.
     uint8_t cares[PLANT_PINS], writes[PLANT_PINS], reads[PLANT_PINS];
     int peer_count, stepper_count, axis_count, switch_count, body_count, couple_count, cooling_count;
-    int heater_count, fan_count, sensor_count, zone_count;
-    int first_heater, first_fan, first_sensor, first_switch; // their first items in the page
+    int heater_count, fan_count, sensor_count, zone_count, tmc_count, diag_count;
+    int first_heater, first_fan, first_sensor, first_switch, first_tmc; // their first items in the page
     struct plant_peer peers[PLANT_PEERS];
     struct plant_stepper steppers[PLANT_STEPPERS];
     struct plant_axis axes[PLANT_AXES];
     struct plant_switch switches[PLANT_SWITCHES];
+    struct plant_tmc tmcs[PLANT_TMCS];
+    struct plant_diag diags[PLANT_DIAGS];
     struct plant_body bodies[PLANT_BODIES];
     struct plant_couple couples[PLANT_COUPLES];
     struct plant_cooling coolings[PLANT_COOLINGS];
@@ -190,6 +223,8 @@ void plant_start(struct plant *plant, struct plant_page *page, uint64_t ns);
 // An output of the board has changed, its hardware PWM is set to VALUE.
 void plant_output(struct plant *plant, uint64_t ns, uint32_t pin, int level);
 void plant_pwm(struct plant *plant, uint64_t ns, uint32_t pin, uint32_t value);
+// A pin is no output any more.
+void plant_float(struct plant *plant, uint64_t ns, uint32_t pin);
 // The board restarts: its outputs float, nothing is driven until they are set again.
 void plant_reset(struct plant *plant, uint64_t ns);
 // What an input reads, or a converter gives; LEVEL and VALUE when the plant has nothing there.
@@ -206,6 +241,16 @@ int plant_parse(struct plant *plant, const char *text, size_t size, char *error)
 void plant_motion_edge(struct plant *plant, uint64_t ns, uint32_t pin, int level);
 double plant_axis_position(struct plant *plant, struct plant_axis *axis, uint64_t ns);
 int plant_switch_pressed(struct plant *plant, struct plant_switch *it, uint64_t ns);
+int64_t plant_term_count(struct plant *plant, struct plant_term *term, uint64_t ns);
+void plant_steps_lost(struct plant *plant, uint64_t ns, int stepper, uint64_t steps);
+// plant_tmc.c
+void plant_tmc_start(struct plant *plant, struct plant_tmc *tmc, uint64_t ns);
+void plant_tmc_look(struct plant *plant, struct plant_tmc *tmc, uint64_t ns); // takes what has come since
+void plant_tmc_line(struct plant *plant, struct plant_tmc *tmc, uint64_t ns, int level);
+int plant_tmc_answer(struct plant *plant, struct plant_tmc *tmc, uint64_t ns);
+void plant_tmc_step(struct plant *plant, struct plant_tmc *tmc, uint64_t ns, int direction);
+int plant_tmc_both_edges(const struct plant_tmc *tmc);
+int plant_diag_level(struct plant *plant, struct plant_diag *diag, uint64_t ns);
 // plant_heat.c
 int plant_heat_make(struct plant *plant, char *error);
 void plant_heat_advance(struct plant *plant, uint64_t ns);

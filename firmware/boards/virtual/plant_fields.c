@@ -87,8 +87,16 @@ int plant_text_fan(const struct plant *plant, const char *name) {
     return -1;
 }
 
+int plant_text_tmc(const struct plant *plant, const char *name) {
+    for (int i = 0; i < plant->tmc_count; i++)
+        if (strcmp(plant->tmcs[i].name, name) == 0)
+            return i;
+    return -1;
+}
+
 static int read_value(const struct plant *plant, const struct plant_field *field, void *target,
                       const char *text) {
+    static const char *const chips[] = {"tmc2208", "tmc2209"};
     static const char *const curves[] = {"beta", "steinhart", "rtd", "linear", "table"};
     char *out = (char *)target + field->offset;
     switch (field->type) {
@@ -110,6 +118,10 @@ static int read_value(const struct plant *plant, const struct plant_field *field
         return (*(int *)out = find_axis(plant, text)) < 0 ? -1 : 0;
     case BODY:
         return (*(int *)out = plant_text_body(plant, text)) < 0 ? -1 : 0;
+    case STEPPER:
+        return (*(int *)out = plant_text_stepper(plant, text)) < 0 ? -1 : 0;
+    case CHIP:
+        return read_word((int *)out, text, chips, 2);
     }
     return -1;
 }
@@ -121,7 +133,9 @@ static void describe(const struct plant_field *field, char *out) {
                                         [SIGN] = "1 or -1",
                                         [CURVE] = "beta, steinhart, rtd, linear or table",
                                         [AXIS] = "an axis described above",
-                                        [BODY] = "a body described above"};
+                                        [BODY] = "a body described above",
+                                        [STEPPER] = "a stepper described above",
+                                        [CHIP] = "tmc2208 or tmc2209"};
     if (field->type == NUMBER || field->type == WHOLE)
         snprintf(out, WANT, "expected a number of %g to %g", field->min, field->max);
     else

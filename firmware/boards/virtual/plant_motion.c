@@ -7,7 +7,7 @@
 // Threshold and place are sums of products: steps that meet exactly on paper may miss by their rounding.
 static const double ROUNDING = 1e-9;
 
-static int64_t count_of(struct plant *plant, struct plant_term *term, uint64_t ns) {
+int64_t plant_term_count(struct plant *plant, struct plant_term *term, uint64_t ns) {
     struct plant_reference *stepper = &term->stepper;
     if (stepper->peer < 0)
         return atomic_load_explicit(&plant->page->steppers[stepper->found].count, memory_order_relaxed);
@@ -20,7 +20,7 @@ static int64_t count_of(struct plant *plant, struct plant_term *term, uint64_t n
 double plant_axis_position(struct plant *plant, struct plant_axis *axis, uint64_t ns) {
     double position = axis->origin;
     for (int i = 0; i < axis->term_count; i++)
-        position += axis->terms[i].mm * (double)count_of(plant, &axis->terms[i], ns);
+        position += axis->terms[i].mm * (double)plant_term_count(plant, &axis->terms[i], ns);
     return position;
 }
 
@@ -55,18 +55,24 @@ static int is_enabled(const struct plant *plant, const struct plant_stepper *ste
     return stepper->enable_pin < 0 || plant->level[stepper->enable_pin] != (stepper->enable_inverted != 0);
 }
 
+void plant_steps_lost(struct plant *plant, uint64_t ns, int stepper, uint64_t steps) {
+    struct plant_page_stepper *shown = &plant->page->steppers[stepper];
+    uint64_t before = atomic_load_explicit(&shown->lost, memory_order_relaxed);
+    atomic_store_explicit(&shown->lost, before + steps, memory_order_relaxed);
+    if (!before) // the page goes on counting; a line for each would fill the disk
+        plant_note(plant, ns, "lost", plant->steppers[stepper].name, (double)steps);
+}
+
 static void step(struct plant *plant, uint64_t ns, int number) {
     const struct plant_stepper *stepper = &plant->steppers[number];
     struct plant_page_stepper *shown = &plant->page->steppers[number];
     int direction = plant->level[stepper->dir_pin] != (stepper->dir_inverted != 0) ? 1 : -1;
-    if (!is_enabled(plant, stepper) || is_blocked(plant, number, direction, ns)) {
-        uint64_t lost = atomic_load_explicit(&shown->lost, memory_order_relaxed) + 1;
-        atomic_store_explicit(&shown->lost, lost, memory_order_relaxed);
-        if (lost == 1) // the page goes on counting; a line for each would fill the disk
-            plant_note(plant, ns, "lost", stepper->name, 1);
-        return;
-    }
-    plant_page_step(shown, ns, atomic_load_explicit(&shown->count, memory_order_relaxed) + direction);
+    if (is_enabled(plant, stepper) && stepper->tmc >= 0)
+        plant_tmc_step(plant, &plant->tmcs[stepper->tmc], ns, direction);
+    else if (!is_enabled(plant, stepper) || is_blocked(plant, number, direction, ns))
+        plant_steps_lost(plant, ns, number, 1);
+    else
+        plant_page_step(shown, ns, atomic_load_explicit(&shown->count, memory_order_relaxed) + direction);
 }
 
 void plant_motion_edge(struct plant *plant, uint64_t ns, uint32_t pin, int level) {
@@ -74,7 +80,12 @@ void plant_motion_edge(struct plant *plant, uint64_t ns, uint32_t pin, int level
         const struct plant_stepper *stepper = &plant->steppers[i];
         if (stepper->step_pin != (int)pin)
             continue;
-        if (stepper->both_edges || level != (stepper->step_inverted != 0))
+        int both_edges = stepper->both_edges;
+        if (stepper->tmc >= 0) {
+            plant_tmc_look(plant, &plant->tmcs[stepper->tmc], ns);
+            both_edges = plant_tmc_both_edges(&plant->tmcs[stepper->tmc]);
+        }
+        if (both_edges || level != (stepper->step_inverted != 0))
             step(plant, ns, i);
     }
 }

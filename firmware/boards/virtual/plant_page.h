@@ -12,14 +12,22 @@
 
 enum {
     PLANT_STEPPERS = 16,
-    PLANT_ITEMS = 64,
+    PLANT_ITEMS = 80,
     PLANT_NAME = 64,      // with the zero at its end
     PLANT_HISTORY = 4096, // steps of each stepper that can be looked up; a power of two
 };
 
 #define PLANT_MAGIC 0x31544E4C50444E43u // "CNDPLNT1"
 
-enum plant_kind { PLANT_NOTHING, PLANT_BODY, PLANT_HEATER, PLANT_FAN, PLANT_SENSOR, PLANT_SWITCH };
+enum plant_kind {
+    PLANT_NOTHING,
+    PLANT_BODY,
+    PLANT_HEATER,
+    PLANT_FAN,
+    PLANT_SENSOR,
+    PLANT_SWITCH,
+    PLANT_TMC,
+};
 
 // What can be wrong with an item, by its kind.
 enum plant_fault {
@@ -35,6 +43,11 @@ enum plant_fault {
     // A switch never closes, or is closed for ever.
     PLANT_NEVER,
     PLANT_ALWAYS,
+    // A driver's answers are damaged on the way; it is warm, or so hot that it switched off. OPEN: its UART
+    // hangs on nothing. SHORTED: a coil is, it switched off. DEAD: the motors' supply is missing.
+    PLANT_GARBLED,
+    PLANT_WARM,
+    PLANT_OVERHEATED,
 };
 
 struct plant_step {
@@ -53,7 +66,8 @@ struct plant_page_stepper {
 
 // value and extra are doubles, as bits: of a body °C; of a heater its duty (0..1) and the heat it gave (J);
 // of a fan its duty and the turns it made; of a sensor the °C it has and what its converter last gave; of a
-// switch whether it is pressed and how often it has switched.
+// switch whether it is pressed and how often it has switched; of a driver the time (ns) until which its DIAG
+// is high when no step follows, and its SG_RESULT.
 struct plant_page_item {
     char name[PLANT_NAME];
     uint32_t kind;

@@ -61,7 +61,7 @@ static int read_stepper(const struct plant_reader *reader, char *rest) {
     if (plant->stepper_count == PLANT_STEPPERS)
         return plant_text_fail(reader, "stepper", "too many");
     struct plant_stepper *stepper = &plant->steppers[plant->stepper_count++];
-    stepper->enable_pin = -1;
+    stepper->enable_pin = stepper->tmc = -1;
     return plant_text_fields(reader, FIELDS(fields), rest, stepper);
 }
 
@@ -120,6 +120,44 @@ static int read_switch(const struct plant_reader *reader, char *rest) {
     if (plant->switch_count == PLANT_SWITCHES)
         return plant_text_fail(reader, "switch", "too many");
     return plant_text_fields(reader, FIELDS(fields), rest, &plant->switches[plant->switch_count++]);
+}
+
+static int read_tmc(const struct plant_reader *reader, char *rest) {
+    static const struct plant_field fields[] = {
+        {"name", NAME, AT(plant_tmc, name), 0, 0, 0},
+        {"chip", CHIP, AT(plant_tmc, has_stallguard), 0, 0, 0},
+        {"stepper", STEPPER, AT(plant_tmc, stepper), 0, 0, 0},
+        {"tx", PIN, AT(plant_tmc, tx_pin), 0, 0, 0},
+        {"rx", PIN, AT(plant_tmc, rx_pin), 0, 0, 0},
+        {"address", WHOLE, AT(plant_tmc, address), 0, 3, 1},
+        {"microsteps", WHOLE, AT(plant_tmc, microsteps), 1, 256, 0},
+        {"free_load", NUMBER, AT(plant_tmc, free_load), 0, 510, 1},
+    };
+    struct plant *plant = reader->plant;
+    if (plant->tmc_count == PLANT_TMCS)
+        return plant_text_fail(reader, "tmc", "too many");
+    struct plant_tmc *tmc = &plant->tmcs[plant->tmc_count];
+    tmc->free_load = 300;
+    if (plant_text_fields(reader, FIELDS(fields), rest, tmc))
+        return -1;
+    if (plant->steppers[tmc->stepper].tmc >= 0)
+        return plant_text_fail(reader, tmc->name, "its stepper has a driver already");
+    plant->steppers[tmc->stepper].tmc = plant->tmc_count++;
+    return 0;
+}
+
+static int read_diag(const struct plant_reader *reader, char *rest) {
+    static const struct plant_field fields[] = {
+        {"pin", PIN, AT(plant_diag, pin), 0, 0, 0},
+        {"node", NAME, AT(plant_diag, tmc.node), 0, 0, 0},
+        {"tmc", NAME, AT(plant_diag, tmc.name), 0, 0, 0},
+    };
+    struct plant *plant = reader->plant;
+    if (plant->diag_count == PLANT_DIAGS)
+        return plant_text_fail(reader, "diag", "too many");
+    struct plant_diag *diag = &plant->diags[plant->diag_count++];
+    return plant_text_fields(reader, FIELDS(fields), rest, diag) ||
+           resolve(reader, &diag->tmc, plant_text_tmc);
 }
 
 static int read_body(const struct plant_reader *reader, char *rest) {
@@ -293,6 +331,7 @@ static int read_line(const struct plant_reader *reader, char *line) {
         {"term", read_term},     {"switch", read_switch},   {"body", read_body},
         {"fan", read_fan},       {"couple", read_couple},   {"cooling", read_cooling},
         {"heater", read_heater}, {"sensor", read_sensor},   {"point", read_point},
+        {"tmc", read_tmc},       {"diag", read_diag},
     };
     line += strspn(line, " \t\r");
     if (!*line || *line == '#')

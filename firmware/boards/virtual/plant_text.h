@@ -5,7 +5,7 @@
 
 #include "boards/virtual/plant.h"
 
-enum plant_type { NAME, PIN, FLAG, SIGN, WHOLE, NUMBER, CURVE, AXIS, BODY };
+enum plant_type { NAME, PIN, FLAG, SIGN, WHOLE, NUMBER, CURVE, AXIS, BODY, STEPPER, CHIP };
 
 struct plant_field {
     const char *name;
@@ -29,6 +29,7 @@ int plant_text_fields(const struct plant_reader *reader, const struct plant_fiel
 // The numbers of what has been described so far; -1: nothing of that name.
 int plant_text_stepper(const struct plant *plant, const char *name);
 int plant_text_body(const struct plant *plant, const char *name);
+int plant_text_tmc(const struct plant *plant, const char *name);
 int plant_text_fan(const struct plant *plant, const char *name);
 
 #endif

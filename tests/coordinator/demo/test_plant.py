@@ -1,6 +1,7 @@
 """The plant of configured machines: where endstops stand, whichever the kinematics, and what gets warm."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from coordinator.demo.plant_heat import HeatSettings, steinhart, table_of
 from coordinator.demo.stage import Stage
 from coordinator.kinematics.base import Point
 from coordinator.machine.description import MachineDescription, load_machine
-from nodes.virtual.plant import Beta, NodePlant, Rtd, Steinhart
+from nodes.virtual.plant import Axis, Beta, NodePlant, Rtd, Steinhart
 from nodes.virtual.plant_page import Fault, Kind
 from nodes.virtual.sim import SimNode
 from nodes.virtual.sim_plant import SimPlant, connect_plants
@@ -36,19 +37,28 @@ class Truth:
                 self._motors[stepper.name] = (index, stepper.step_distance)
 
     def pressed(self, point: Point) -> dict[str, bool]:
-        """Return which switches are pressed, leaving out how steps round."""
+        """Return which switches are pressed, and which stops that motors feel, without rounding to steps."""
         there = self.description.kinematics.inverse(point)
+        felt = {rail.axis: rail.homing for rail in self.description.rails if rail.homing.virtual_endstop}
         found = {}
         for plant in self.plants.values():
             axes = {axis.name: axis for axis in plant.axes}
             for switch in plant.switches:
-                axis = axes[switch.axis]
-                place = axis.origin
-                for term in axis.terms:
-                    index, distance = self._motors[term.stepper]
-                    place += term.mm_per_step * (there[index] - self._begin[index]) / distance
+                place = self._place(axes[switch.axis], there)
                 found[switch.name] = switch.direction * (place - switch.at) >= -1e-6
+            for name in felt.keys() & axes.keys():
+                axis, place = axes[name], self._place(axes[name], there)
+                found[name] = (
+                    place >= axis.max - 1e-6 if felt[name].positive_dir else place <= axis.min + 1e-6
+                )
         return found
+
+    def _place(self, axis: Axis, there: Sequence[float]) -> float:
+        place = axis.origin
+        for term in axis.terms:
+            index, distance = self._motors[term.stepper]
+            place += term.mm_per_step * (there[index] - self._begin[index]) / distance
+        return place
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)

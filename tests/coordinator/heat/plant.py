@@ -22,12 +22,15 @@ class Plant:
     seed: int = 1
     fan_loss: float = 0.0
     """More loss, W/K, by a fan at full speed."""
+    filament_j_per_mm_k: float = 0.0
+    """Heat that a mm of filament takes per K."""
     other_w: float = 0.0
     """Heat that comes from elsewhere."""
     block_c: float = field(init=False)
     sensor_c: float = field(init=False)
     now_s: float = field(default=100.0, init=False)
     fan: float = field(default=0.0, init=False)
+    filament_mm_per_s: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
         self.block_c = self.sensor_c = self.ambient_c
@@ -42,7 +45,8 @@ class Plant:
         for _ in range(round(seconds / STEP_S)):
             self.pipe.append(power * self.power_w)
             heat = self.pipe.popleft() + self.other_w
-            heat -= (self.loss + self.fan * self.fan_loss) * (self.block_c - self.ambient_c)
+            loss = self.loss + self.fan * self.fan_loss + self.filament_mm_per_s * self.filament_j_per_mm_k
+            heat -= loss * (self.block_c - self.ambient_c)
             self.block_c += heat / self.capacity * STEP_S
             self.sensor_c += (self.block_c - self.sensor_c) / self.sensor_tau_s * STEP_S
             self.now_s += STEP_S

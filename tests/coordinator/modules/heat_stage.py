@@ -8,8 +8,10 @@ from coordinator.app import Machine, MachineStopped
 from coordinator.demo.plant import PlantSettings, machine_plants
 from coordinator.demo.plant_heat import HeatSettings
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, InTime, Reading
+from coordinator.gcode.program import Program
 from coordinator.gcode.words import parse
 from coordinator.modules.base import Value
+from coordinator.session import run_job
 from coordinator.simulate.scenario import BusSetting, Scenario
 from coordinator.simulate.stage import Stage
 from coordinator.simulate.values import Range
@@ -78,13 +80,20 @@ FAN = "\n[fan]\npin: toolhead:PB5\ntachometer_pin: toolhead:PB6\n"
 
 
 class HeatMachine:
-    """The machine of TEXT (what follows BASE). HURRY: how many times faster all gets hot and cold."""
+    """The machine of TEXT, which follows BASE. HURRY: how many times faster all gets hot and cold."""
 
     def __init__(
-        self, folder: Path, text: str, *, seed: int = 1, hurry: float = 1.0, loss: float = 0.0
+        self,
+        folder: Path,
+        text: str,
+        *,
+        base: str = BASE,
+        seed: int = 1,
+        hurry: float = 1.0,
+        loss: float = 0.0,
     ) -> None:
         path = folder / "printer.cfg"
-        path.write_text(BASE + text)
+        path.write_text(base + text)
         scenario = Scenario(
             name=f"heat of {folder.name}",
             given="heat",
@@ -110,6 +119,22 @@ class HeatMachine:
                 await main()
             finally:
                 await self.machine.close()
+
+        with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
+            runner.run(whole())
+
+    def print(self, *lines: str, ready: Callable[[Machine], None] | None = None) -> None:
+        """Run a program to its end, as a job; READY gets the machine when it begins."""
+
+        async def whole() -> None:
+            await run_job(
+                self.stage.description,
+                Program.from_lines(lines, "part.gcode"),
+                lambda _: None,
+                on_told=lambda told: self.notices.append(str(told)),
+                on_ready=ready,
+                host=self.stage.host,
+            )
 
         with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
             runner.run(whole())

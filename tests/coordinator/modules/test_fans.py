@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.gcode.words import WordError
 from nodes.virtual.plant_page import Fault, Kind
-from tests.coordinator.modules.heat_stage import BED, FAN, HeatMachine
+from tests.coordinator.modules.heat_stage import BASE, BED, FAN, HeatMachine
 
 PID = "control: pid\npid_kp: 10\npid_ki: 1\npid_kd: 15\n"
 
@@ -135,6 +135,34 @@ def test_a_controller_fan_runs_while_there_is_work_and_a_time_after(tmp_path: Pa
         assert on_part(stage, "PC5", 1, "mcu") == pytest.approx(0.25, abs=0.02)
         await asyncio.sleep(5)
         assert on_part(stage, "PC5", 1, "mcu") == 0
+
+    stage.run(main)
+
+
+def test_a_controller_fan_runs_while_its_steppers_are_on(tmp_path: Path) -> None:
+    base = BASE.replace("step_pin: PA1\n", "step_pin: PA1\nenable_pin: !PD1\n").replace(
+        "step_pin: PA3\n", "step_pin: PA3\nenable_pin: !PD2\n"
+    )
+    common = "idle_timeout: 2\nidle_speed: 0\nkick_start_time: 0\n"
+    fans = "".join(
+        f"\n[controller_fan {axis}]\npin: {pin}\nstepper: stepper_{axis}\n{common}"
+        for axis, pin in (("x", "PC5"), ("z", "PC6"))
+    )
+    stage = HeatMachine(tmp_path, PID + fans + f"\n[controller_fan all]\npin: PC7\n{common}", base=base)
+
+    def running() -> list[float]:
+        return [on_part(stage, pin, 1, "mcu") for pin in ("PC5", "PC6", "PC7")]
+
+    async def main() -> None:
+        await stage.do("SET_STEPPER_ENABLE STEPPER=stepper_y ENABLE=1")
+        await asyncio.sleep(3)
+        assert running() == [0, 0, 1], "Y is none of theirs, and Z without enable_pin is on while a job runs"
+        await stage.do("SET_STEPPER_ENABLE STEPPER=stepper_x ENABLE=1")
+        await asyncio.sleep(3)
+        assert running() == [1, 0, 1]
+        await stage.do("M84")
+        await asyncio.sleep(5)
+        assert running() == [0, 0, 0]
 
     stage.run(main)
 

@@ -5,12 +5,13 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.commands import Call, InTime
-from coordinator.gcode.words import parse
+from coordinator.gcode.words import WordError, parse
 from coordinator.heat.known_sensors import PT1000, THERMISTORS
 from coordinator.machine.description import ConfigError, load_machine
 from coordinator.modules.heater_sections import ExtruderHeater, HeaterBed
 from coordinator.modules.module_set import ModuleSet
 from coordinator.modules.sensor_module import TemperatureSensor
+from coordinator.modules.temperature_input import TemperatureInput
 from nodes.node_config import NodeConfig
 from nodes.virtual.firmware import firmware_dictionary
 from tests.coordinator.modules.heat_stage import BASE, BED, HOTEND_PID
@@ -46,7 +47,9 @@ def test_every_heater_has_the_nodes_own_net(tmp_path: Path) -> None:
         build(tmp_path, HOTEND_PID + BED.replace("[heater_bed]", "[heater_bed]\nmax_duration: 3")), "mcu"
     )
     outs = [command for command in commands if command.startswith("config_digital_out")]
-    assert [out.split()[-1] for out in outs] == [f"max_duration={n * 168_000_000 // 2}" for n in (3, 6)]
+    # It counts on the node from when a value takes effect, 0.4 s after the host was heard.
+    ticks = [round((limit_s - 0.4) * 168_000_000) for limit_s in (1.5, 3.0)]
+    assert [out.split()[-1] for out in outs] == [f"max_duration={n}" for n in ticks]
     assert all("value=0 default_value=0" in out for out in outs)
 
 
@@ -54,6 +57,7 @@ def test_only_a_sensor_with_limits_stops_its_node(tmp_path: Path) -> None:
     sensor = "\n[temperature_sensor air]\nsensor_type: PT1000\nsensor_pin: PC3\n"
     for text, low, high in ((sensor, 0.0, 1.0), (sensor + "min_temp: 0\nmax_temp: 100\n", 0.1754, 0.2276)):
         (air,) = build(tmp_path, HOTEND_PID + text).of(TemperatureSensor)
+        assert isinstance(air.input, TemperatureInput)
         limits = air.input._analog._low, air.input._analog._high
         assert limits == pytest.approx((low, high), abs=1e-4)
 
@@ -79,6 +83,20 @@ def test_targets_are_for_the_extruder_that_is_meant(tmp_path: Path) -> None:
         unit = heaters[name].unit
         assert unit is not None
         assert unit.target_c == float(line.split()[1][1:])
+
+
+def test_extruders_that_there_are_not_and_those_without_heater(tmp_path: Path) -> None:
+    cold = BASE[BASE.index("[extruder]") : BASE.index("heater_pin")]
+    cold = cold.replace("[extruder]", "[extruder1]").replace("PB", "PD")
+    read = build(tmp_path, HOTEND_PID + cold).vocabulary.commands["M109"].read
+    for line, told in (
+        ("M109 S200 T7", "M109 names the extruder T7, which there is not; there is T0 to T1"),
+        ("M109 S200 T1", r"M109: \[extruder1\] has no heater; give it a heater_pin"),
+    ):
+        command = parse(line.encode())
+        assert command is not None
+        with pytest.raises(WordError, match=told):
+            read(Call(command, 1, (0, 0, 0, 0), ""))
 
 
 @pytest.mark.parametrize("name", THERMISTORS)

@@ -12,6 +12,8 @@ from tests.coordinator.modules.heat_stage import BED, HeatMachine
 PID = "control: pid\npid_kp: 10\npid_ki: 1\npid_kd: 15\n"
 LIMIT_S = 1.5
 """max_duration, as it is without the option."""
+NOTICE_S = 2.0
+"""Within this the host has given up on a node that is silent."""
 
 
 def heating(tmp_path: Path, text: str = "", **options: float) -> HeatMachine:
@@ -120,7 +122,7 @@ def test_more_cooling_than_the_heater_can_give(tmp_path: Path) -> None:
 
 
 def test_the_wires_to_a_node_are_cut(tmp_path: Path) -> None:
-    """Its last command was up to 0.3 s before that; from then on the node counts by itself."""
+    """The node on the wires counts by itself; the other one is stopped by the host, who has to notice."""
     stage = heating(tmp_path, BED, hurry=5)
 
     async def main() -> None:
@@ -133,8 +135,8 @@ def test_the_wires_to_a_node_are_cut(tmp_path: Path) -> None:
         text = await stage.stopped()
         assert "toolhead" in text
         await asyncio.sleep(LIMIT_S + 2)
-        assert stage.heater_off_after(cut_s) <= LIMIT_S + 0.6
-        assert stage.heater_off_after(cut_s, "PC1", "mcu") <= LIMIT_S + 0.6
+        assert stage.heater_off_after(cut_s) <= LIMIT_S
+        assert stage.heater_off_after(cut_s, "PC1", "mcu") <= NOTICE_S
 
     stage.run(main)
 
@@ -151,8 +153,7 @@ def test_the_host_stands_still_for_two_seconds(tmp_path: Path, frozen: str) -> N
         assert "node toolhead shut down" in text
         await asyncio.sleep(1)
         off_s = stage.heater_off_after(stalled_s)
-        assert 0 < off_s <= LIMIT_S + 0.6
-        assert off_s < 2.0 + 0.3
+        assert 0 < off_s <= LIMIT_S
 
     stage.run(main)
 
@@ -182,7 +183,7 @@ def test_the_host_is_gone(tmp_path: Path) -> None:
     stage.run(main)
     gone_s = stage.now_s()
     stage.world.run_for(10)
-    assert 0 < stage.heater_off_after(gone_s) <= LIMIT_S + 0.6
+    assert 0 < stage.heater_off_after(gone_s) <= LIMIT_S
 
 
 def test_an_emergency_stop(tmp_path: Path) -> None:
@@ -235,7 +236,7 @@ def test_a_node_that_may_be_away_takes_its_heater_along(tmp_path: Path) -> None:
         assert stage.machine.stopped is None
         assert stage.status("heater_generic chamber")["target"] == 0
         assert any("heater chamber is off, its target of 60 °C is forgotten" in n for n in stage.notices)
-        assert 0 < stage.heater_off_after(cut_s, "PA1", "box") <= LIMIT_S + 0.6
+        assert 0 < stage.heater_off_after(cut_s, "PA1", "box") <= LIMIT_S
         board.controller.cut(0)
         async with asyncio.timeout(60):
             while stage.machine.nodes["box"].state is not NodeState.READY:  # noqa: ASYNC110  virtual time

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.demo.heat_proof import HeatWatch
 from coordinator.gcode.words import WordError
+from coordinator.heat.mpc import Mpc
 from coordinator.machine.check import check_config
 from nodes.errors import CanductorError
 from tests.coordinator.modules.heat_stage import BED, FAN, HOTEND_PID, HeatMachine
@@ -117,6 +119,9 @@ def test_a_wait_can_be_cancelled_and_the_heater_goes_on(tmp_path: Path) -> None:
             "temperature": 0,
             "target": 0.0,
             "power": 0.0,
+            "held_s": None,
+            "held_low": None,
+            "held_high": None,
             "can_extrude": False,
         }
 
@@ -169,7 +174,7 @@ def test_temperature_wait_in_both_directions(tmp_path: Path) -> None:
     [
         ("M104 S301", "outside what .extruder. allows, 0 to 300"),
         ("M109 S-5", "outside"),
-        ("M104 S200 T1", "extruder1. has no heater"),
+        ("M104 S200 T1", "M104 names the extruder T1, which there is not; there is only T0"),
         ("M104 X3", "has the word X; it takes S R T"),
         ("SET_HEATER_TEMPERATURE HEATER=extrudr TARGET=1", "there is no 'extrudr'.*extruder"),
         ("SET_HEATER_TEMPERATURE TARGET=1", "needs HEATER="),
@@ -196,3 +201,47 @@ def calm(tmp_path_factory: pytest.TempPathFactory) -> HeatMachine:
 
     stage.run(main)
     return stage
+
+
+def test_a_target_behind_a_dwell_waits_for_its_time(tmp_path: Path) -> None:
+    stage = HeatMachine(tmp_path, BED)
+    stage.print("M140 S100", "G4 P20000", "M140 S0", "G4 P5000")
+    on_s = next(at_s for at_s, level in stage.edges("PC1", "mcu") if level)
+    assert 18 < stage.heater_off_after(on_s, "PC1", "mcu") < 21
+
+
+def test_the_band_that_was_kept_is_told_while_it_lasts_and_at_its_end(tmp_path: Path) -> None:
+    stage, watch = HeatMachine(tmp_path, MPC + FAN + BED), HeatWatch()
+    stage.print("M140 S30", "M109 S80", "G4 P20000", "M104 S0", "G4 P8000", ready=watch.attach)
+    assert sorted({state.heater for state in watch.states}) == ["extruder", "heater_bed"]
+    hotend = next(state for state in watch.states if state.heater == "extruder")
+    assert (hotend.control, hotend.held.target_c, hotend.node) == ("mpc", 80.0, "toolhead")
+    assert 5 < hotend.held.seconds < 20
+    assert hotend.held.deviation_k < 1
+    bed = next(state for state in watch.states if state.heater == "heater_bed")
+    assert (bed.control, bed.max_delta_k, bed.body) == ("watermark", 2.0, "heater_bed")
+    assert bed.span_ns[1] - bed.span_ns[0] == pytest.approx(bed.held.seconds * 1e9, rel=1e-3)
+    assert bed.held.seconds > hotend.held.seconds + 8, "it lasted to the end of the machine"
+
+
+def test_a_model_is_told_of_filament_before_it_passes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage, told = HeatMachine(tmp_path, MPC + FAN), list[tuple[float, float | None]]()
+    tell = Mpc.set_filament
+
+    def note(model: Mpc, passed: float, coming: float | None = None) -> None:
+        assert model.model.filament_j_per_mm_k == pytest.approx(0.0052, abs=1e-4)
+        told.append((passed, coming))
+        tell(model, passed, coming)
+
+    monkeypatch.setattr(Mpc, "set_filament", note)
+    stage.print("M109 S180", "G28", "M83", "G1 X100 E20 F1200", "G4 P2000", "M104 S0")
+    passed = [speed for speed, _ in told]
+    coming = [speed or 0.0 for _, speed in told]
+    assert max(passed) == pytest.approx(4, abs=0.05), "100 mm in 5 s with 20 mm of filament"
+    assert max(coming) == pytest.approx(4, abs=0.05)
+    begins = [next(n for n, speed in enumerate(speeds) if speed > 1) for speeds in (coming, passed)]
+    ends = [next(n for n, speed in enumerate(speeds[-1::-1]) if speed > 1) for speeds in (coming, passed)]
+    assert begins[0] <= begins[1] - 1, "a measurement earlier at least"
+    assert ends[0] >= ends[1] + 1

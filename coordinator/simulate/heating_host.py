@@ -1,4 +1,4 @@
-"""A host that heats and does nothing else, as a process that a test may kill: python heating_host.py CFG."""
+"""A host that heats and does nothing else, as a process that may be killed; arguments: CONFIG CELSIUS."""
 
 import asyncio
 import sys
@@ -10,11 +10,12 @@ from coordinator.host import LinuxHost
 from coordinator.machine.description import load_machine
 
 
-async def main(path: str) -> None:
+async def main(path: str, celsius: float) -> None:
+    """Heat the hotend of the machine in PATH until the machine stops; raises why it did."""
     machine = Machine(load_machine(path), LinuxHost())
     await machine.start()
     try:
-        command = parse(b"M104 S250")
+        command = parse(f"M104 S{celsius:g}".encode())
         assert command is not None
         call = Call(command, 1, (0.0, 0.0, 0.0, 0.0), "")
         reading = machine.modules.vocabulary.commands["M104"].read(call)
@@ -28,4 +29,4 @@ async def main(path: str) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(main(sys.argv[1]))
+    asyncio.run(main(sys.argv[1], float(sys.argv[2])))
