@@ -11,7 +11,7 @@ plan says where it was at the moment at which the endstop was seen to switch.
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,7 +19,7 @@ import numpy as np
 
 from coordinator.app import Machine
 from coordinator.machine.description import CanConnection, RailDescription, StepperDescription
-from coordinator.single_move import Ramp, SingleMove, ratio_of
+from coordinator.single_move import START_LEAD_S, WAY, Ramp, SingleMove, ratio_of
 from nodes.clock import Ticks, extend32
 from nodes.devices.endstop import Endstop
 from nodes.devices.trsync import NO_GROUP, TriggerReason, Trsync, TrsyncState
@@ -36,12 +36,23 @@ REPORTS: Final = 10
 """Reports of a stop group within a time-out: several may get lost."""
 LATE_S: Final = 0.25
 """After the end of the move, before the endstop counts as not found."""
+OPEN_LOOKS: Final = 4
+OPEN_LOOK_S: Final = 0.05
+"""An endstop that so many looks, so far apart, see pressed is pressed."""
 LOOK_S: Final = 50e-6
 """Between two looks at the endstop: at 50 mm/s less than 3 µm."""
 
 
+LEADS_S: Final = (START_LEAD_S, 0.8, 1.6)
+"""To when the move begins: a busy host, or a bus that repeats much, may need longer to arm all nodes."""
+
+
 class HomingError(CanductorError):
     """An axis could not be homed; the sentence says why and what to do."""
+
+
+class _LateError(HomingError):
+    """The nodes were not armed in time; all are stopped again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,11 +121,12 @@ class _Leg:
 
 
 class HomingMove:
-    """One move of the head along AXIS (x, y, z) in DIRECTION (1 or -1), at most WAY_MM far.
+    """One move of the head along AXIS (x, y, z) in DIRECTION (1 or -1), or of motors, at most WAY_MM far.
 
-    Of one of RAILS it stops all that moves when its endstop switches; of several (towers) each stops its own
-    steppers, and the move goes on until all have. SPEED in mm/s, ACCEL in mm/s². The machine stands still and
-    each of RAILS has an endstop on a pin.
+    WAYS: which motors move, and how far per mm of way (see SingleMove). Of one of RAILS it stops all that
+    moves when its endstop switches; of several (towers, sides of an axis) each stops its own steppers, and
+    the move goes on until all have. SPEED in mm/s, ACCEL in mm/s². The machine stands still and each of RAILS
+    has an endstop on a pin.
     """
 
     def __init__(
@@ -122,33 +134,44 @@ class HomingMove:
         machine: Machine,
         rails: Sequence[RailDescription],
         *,
-        axis: str,
-        direction: int,
+        axis: str = "",
+        direction: int = 1,
+        ways: Mapping[str, float] | None = None,
         way_mm: float,
         speed: float,
         accel: float,
     ) -> None:
         self._machine = machine
         self._rails = rails
-        self._ratio = ratio_of(axis, direction)
+        self._ratio = ratio_of(axis, direction) if ways is None else WAY
+        self._ways = ways
         self._ramp = Ramp(way_mm, speed, accel)
         self._heard_s: dict[tuple[int, str], float] = {}
         self._changed = asyncio.Event()
 
     async def run(self) -> tuple[HomingResult, ...]:
         """Move until every endstop switched; raises HomingError with everything stopped."""
+        first = await self._machine.stepper_positions()
+        for lead_s in LEADS_S[:-1]:
+            with contextlib.suppress(_LateError):
+                return await self._run(lead_s, first)
+        return await self._run(LEADS_S[-1], first)
+
+    async def _run(self, lead_s: float, first: dict[str, int]) -> tuple[HomingResult, ...]:
+        """Try once, with the steppers having begun at FIRST: results count from there."""
         devices = self._machine.devices
         for rail in self._rails:
             node = self._machine.nodes[devices.endstop_node(rail)]
-            if (await devices.endstops[rail.axis].state(node)).pressed:
+            if await self._is_pressed(rail, node):
                 raise HomingError(
                     f"the endstop of axis {rail.axis} is pressed before the move towards it; move the axis "
                     "away by hand, or check the endstop's wiring and whether its pin has to be inverted"
                 )
         began_at = await self._machine.stepper_positions()
-        move = SingleMove(self._machine, self._ramp, self._ratio)
+        move = SingleMove(self._machine, self._ramp, self._ratio, ways=self._ways, lead_s=lead_s)
         legs = [self._leg(slot, rail, move) for slot, rail in enumerate(self._rails)]
         ends: list[Callable[[], None]] = []
+        late: _LateError | None = None
         try:
             ends = [
                 sync.listen(node, self._hear(leg, node, sync, move))
@@ -157,15 +180,30 @@ class HomingMove:
             ]
             await self._arm(move, legs)
             await self._until_triggered(move, legs)
+        except _LateError as error:
+            late = error
         finally:
             for end in ends:
                 end()
             states = [await self._end(leg) for leg in legs]
+        # Late for all this host knew: where the endstops switched it was in time, and they are pressed now.
+        if late is not None and not all(map(_switched, legs, states)):
+            raise late
         for leg, found in zip(legs, states, strict=True):
             self._check(leg, found)
         ended_at = await self._machine.stepper_positions()
-        moved = {s.name: ended_at[s.name] - began_at[s.name] for s in move.steppers}
-        return tuple([await self._result(leg, move, moved) for leg in legs])
+        before = {s.name: began_at[s.name] - first[s.name] for s in move.steppers}
+        moved = {s.name: ended_at[s.name] - first[s.name] for s in move.steppers}
+        return tuple([await self._result(leg, move, before, moved) for leg in legs])
+
+    async def _is_pressed(self, rail: RailDescription, node: Node) -> bool:
+        """Look more than once: behind a move away from it, a switch may be seen to open late."""
+        endstop = self._machine.devices.endstops[rail.axis]
+        for _ in range(OPEN_LOOKS):
+            if not (await endstop.state(node)).pressed:
+                return False
+            await asyncio.sleep(OPEN_LOOK_S)
+        return True
 
     # ------------------------------------------------------------------------------------------ set up
 
@@ -194,7 +232,7 @@ class HomingMove:
         for node in {node for leg in legs for node, _ in leg.syncs}:
             await node.link.drained()
         if move.print_time_now() > move.begin_s:
-            raise HomingError(
+            raise _LateError(
                 f"axis {_names(legs)} was not homed: arming its nodes took too long; check the bus for "
                 "errors and load"
             )
@@ -286,7 +324,7 @@ class HomingMove:
                     f"axis {leg.name} was not homed: node {node.name} did not hear from the host for "
                     f"{leg.timeout_s:g} s and stopped by itself; check the bus for errors and load"
                 )
-        if states[leg.endstop_node.name].reason is not TriggerReason.ENDSTOP:
+        if not _switched(leg, states):
             raise HomingError(
                 f"axis {leg.name} moved {self._ramp.way_mm:g} mm and its endstop did not switch; "
                 "check the endstop's wiring, the direction of the axis, and homing_positive_dir"
@@ -294,14 +332,16 @@ class HomingMove:
 
     # ------------------------------------------------------------------------------------------ afterwards
 
-    async def _result(self, leg: _Leg, move: SingleMove, moved: dict[str, int]) -> HomingResult:
+    async def _result(
+        self, leg: _Leg, move: SingleMove, before: dict[str, int], moved: dict[str, int]
+    ) -> HomingResult:
         triggered_at_s = await self._trigger_time(leg, move)
-        to_trigger = self._ramp.way_at(triggered_at_s - move.begin_s)
+        to_trigger = _way(leg, move, before) + self._ramp.way_at(triggered_at_s - move.begin_s)
         own = {stepper.name: moved[stepper.name] for stepper in leg.steppers}
         return HomingResult(
             rail=leg.name,
             way_to_trigger_mm=to_trigger,
-            way_mm=float(np.mean([own[s.name] * s.step_distance / move.along(s) for s in leg.steppers])),
+            way_mm=_way(leg, move, own),
             triggered_at_s=triggered_at_s,
             through_group=leg.by_group,
             moved=own,
@@ -315,6 +355,17 @@ class HomingMove:
         name = leg.endstop_node.name
         near = Ticks(move.ticks_at(name, move.print_time_now()))
         return move.print_time_of(name, extend32(state.next_clock32, near) - leg.rest_ticks)
+
+
+def _way(leg: _Leg, move: SingleMove, steps: dict[str, int]) -> float:
+    """Return how far a rail has gone, mm, by the STEPS of its steppers."""
+    return float(np.mean([steps[s.name] * s.step_distance / move.along(s) for s in leg.steppers]))
+
+
+def _switched(leg: _Leg, states: Mapping[str, TrsyncState]) -> bool:
+    """Tell whether the endstop ended the round."""
+    state = states.get(leg.endstop_node.name)
+    return state is not None and state.reason is TriggerReason.ENDSTOP
 
 
 def _overshoot(move: SingleMove, stepper: StepperDescription, moved: int, to_trigger: float) -> Overshoot:

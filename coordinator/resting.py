@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable
 
 from coordinator.app import MachineStopped
 from coordinator.gcode.commands import Done
@@ -15,8 +14,8 @@ class RestTask:
 
     def __init__(self, event: Resting) -> None:
         self._event = event
-        self._is_ending = False
-        self._task = asyncio.ensure_future(_performed(event.perform()))
+        self._has_begun = self._is_ending = False
+        self._task = asyncio.ensure_future(self._perform())
 
     def look(self) -> bool:
         """End it if nobody wants it any more; return whether it is over, with EVENT telling how.
@@ -32,7 +31,7 @@ class RestTask:
         event = self._event
         event.done, event.over = None, True
         if self._task.cancelled():
-            event.moved = True
+            event.moved = self._has_begun
         elif (error := self._task.exception()) is not None:
             if isinstance(error, MachineStopped) or not isinstance(error, CanductorError):
                 raise error
@@ -48,6 +47,6 @@ class RestTask:
         with contextlib.suppress(asyncio.CancelledError, CanductorError):
             await self._task
 
-
-async def _performed(awaitable: Awaitable[Done | None]) -> Done:
-    return await awaitable or Done()
+    async def _perform(self) -> Done:
+        self._has_begun = True  # never, where it was ended before its turn
+        return await self._event.perform() or Done()

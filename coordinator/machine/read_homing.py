@@ -5,6 +5,7 @@ from coordinator.machine.options import BoolOption, FloatOption, SectionReader
 from coordinator.machine.pins import PinDescription, PinOption, PinRegistry
 from coordinator.machine.read_printer import MAX_ACCEL, MAX_SPEED
 from coordinator.machine.read_steppers import MAX_POSITION
+from coordinator.machine.virtual_endstops import find_diag_pin
 
 ENDSTOP_PIN = PinOption(name="endstop_pin", help="the endstop's input", pullable=True, share="endstop")
 POSITION_ENDSTOP = FloatOption(
@@ -62,12 +63,17 @@ WAITING = tuple(option.name for option in (ENDSTOP_PIN, *APPROACH))
 
 
 def read_endstop(reader: SectionReader, pins: PinRegistry) -> tuple[PinDescription | None, str]:
-    """Return the endstop's pin, or the name of a virtual endstop that a later module offers."""
+    """Return the endstop's pin, and the name of the virtual endstop that it is of.
+
+    That may be one that a later module offers: then there is no pin.
+    """
     pin = reader.find(ENDSTOP_PIN)
     if pin is None:
         return None, ""
     if pin.name.endswith("virtual_endstop") and pin.node not in pins.nodes:
-        return None, f"{pin.node}:{pin.name}"
+        virtual = f"{pin.node}:{pin.name}"
+        diag = find_diag_pin(reader, ENDSTOP_PIN, pin, pins)
+        return (None if diag is None else pins.claim(diag, ENDSTOP_PIN, reader.section)), virtual
     return pins.claim(pin, ENDSTOP_PIN, reader.section), ""
 
 

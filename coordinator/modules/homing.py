@@ -2,31 +2,34 @@
 
 Each rail goes to its endstop at homing_speed, back by homing_retract_dist, and there again at
 second_homing_speed. Where it stands then follows from where the endstop is and from the steps made since it
-switched, so how far it overshot does not matter. A rail without an endstop on a pin is taken as home.
+switched, so how far it overshot does not matter; sides of an axis that have endstops of their own are brought
+level. A rail without an endstop on a pin is taken as home. What moves when is in homing_plan.py.
 """
 
-from collections.abc import Callable, Sequence
+import contextlib
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.machine.options import SectionSpec
 from coordinator.machine.problem import ConfigError
-from coordinator.modules.base import Build, Module
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.homing_plan import AXES, Approach, approaches, landed, second_landed
+from coordinator.modules.virtual_endstop import StallEndstop, section_of
 from nodes.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.app import Machine
-    from coordinator.homing import HomingMove
+    from coordinator.homing import HomingResult
     from coordinator.machine.model import RailDescription
     from coordinator.modules.live import Live
 
-WAY_SHARE: Final = 1.5
-"""An endstop has to switch within so many lengths of its axis."""
 AWAY_MM: Final = 5.0
 """How far a rail that stands on its endstop goes away first, where homing_retract_dist is 0."""
-_AXES: Final = ("x", "y", "z")
-_TOWERS: Final = ("delta", "deltesian")
-"""Kinematics whose rails go up together, with the head."""
+
+
+ReadHome = Callable[[Call, str], Reading]
 
 
 class Homing(Module):
@@ -36,17 +39,28 @@ class Homing(Module):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
+        self.name = "query_endstops"
         self._described = build.machine
+        self._last_query: dict[str, bool] = {}
+        self._approaches = approaches(build.machine)
         self._live: Live | None = None
+        self._feelers: dict[str, StallEndstop] = {}
+        """By virtual endstop."""
         self.instead: Callable[[Call, str], Reading] | None = None
         """Reads G28 in its place; a G28 among the lines that it stands for is homing again."""
+        self.corrected: Callable[[ReadHome], ReadHome] | None = None
+        """What homing finds, for programs whose X Y Z are not those of the axes."""
         build.add_command(GCodeCommand("M119", "Tell which endstops are pressed", self._read_query))
         build.add_command(GCodeCommand("QUERY_ENDSTOPS", "Tell which endstops are pressed", self._read_query))
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell which endstops were pressed when somebody asked last."""
+        return {"last_query": dict(self._last_query)}
 
     @property
     def acts(self) -> bool:
         """Whether there is any endstop that it can look for."""
-        return self.instead is not None or any(self._can_home(rails) for rails, _ in self._groups())
+        return self.instead is not None or any(approach.possible for approach in self._approaches)
 
     def replace_by(self, read: Callable[[Call, str], Reading], build: Build) -> None:
         """Have READ read G28, for the section that BUILD is of; raises ConfigError when another does."""
@@ -58,6 +72,14 @@ class Homing(Module):
             )
         self.instead = read
 
+    def link(self, modules: Modules) -> None:
+        """Find the drivers that are to feel the end of an axis."""
+        for rail in (rail for approach in self._approaches for rail in approach.rails):
+            virtual = rail.homing.virtual_endstop
+            found = modules.find(section_of(virtual), StallEndstop) if virtual else None
+            if found is not None:
+                self._feelers[virtual] = found
+
     async def connect(self, live: "Live") -> None:
         """Take over the machine."""
         self._live = live
@@ -68,101 +90,92 @@ class Homing(Module):
             return self.instead(call, axes)
         return AtRest(lambda: self.home(call, axes))
 
-    # ----------------------------------------------------------------------------------------- which rails
-
-    def _groups(self) -> list[tuple[list["RailDescription"], str]]:
-        """Return the rails that are homed one after the other, each with the axis it moves the head along."""
-        described = self._described
-        rails = {rail.axis: rail for rail in described.rails}
-        groups = []
-        for names in described.kinematics.homing_order:
-            found = [rails[name] for name in names if name in rails]
-            towers = described.kinematics.name in _TOWERS and len(names) > 1
-            axis = "z" if towers else names[0]
-            if found and axis in _AXES:
-                groups.append((found, axis))
-        return groups
-
-    def _can_home(self, rails: Sequence["RailDescription"]) -> bool:
-        return all(rail.homing.endstop_pin is not None for rail in rails)
-
     # ---------------------------------------------------------------------------------------------- homing
 
     async def home(self, call: Call, axes: str) -> Done:
         """Home AXES (letters) from where CALL says that the machine stands; raises CanductorError."""
         described = self._described
-        home = dict(zip(_AXES, described.home, strict=True))
-        place = dict(zip(_AXES, call.position[:3], strict=True))
-        homed: set[str] = set()
-        for rails, axis in self._groups():
-            wanted = set(_AXES) if len(rails) > 1 else {axis}
-            if not wanted & set(axes.lower()):
+        home = dict(zip("XYZ", described.home, strict=True))
+        x, y, z, e = call.position
+        place = (x, y, z)
+        homed, second_mm = set(axes.upper()), None
+        for approach in self._approaches:
+            if not set(approach.letters) & set(axes.upper()):
                 continue
-            if not self._can_home(rails):
-                place.update({name: home[name] for name in wanted})
-            elif len(rails) > 1:
-                y = place["y"] if "Y" in call.homed else home["y"]
-                place.update(zip(_AXES, await self._home_towers(rails, y), strict=True))
+            homed |= set(approach.letters)
+            if not approach.possible:
+                x, y, z = (
+                    home[letter] if letter in approach.letters else at
+                    for letter, at in zip("XYZ", place, strict=True)
+                )
+                place = (x, y, z)
+                continue
+            beyond_mm = await self._approach(approach)
+            y = place[1] if "Y" in call.homed else home["Y"]  # of a Y that towers do not move
+            found = landed(described, approach, beyond_mm, place, y)
+            if approach.is_second_carriage:
+                second_mm = second_landed(approach, beyond_mm)
             else:
-                place[axis] = await self._home_axis(rails[0], axis)
-            homed |= wanted
-        homed |= set(axes.lower()) - homed
-        position = (place["x"], place["y"], place["z"], call.position[3])
-        letters = "".join(axis.upper() for axis in _AXES if axis in homed)
-        return Done(position=position, homed=letters, moved=True)
+                place = found
+        letters = "".join(letter for letter in "XYZ" if letter in homed)
+        return Done(position=(*place, e), homed=letters, moved=True, second_carriage_mm=second_mm)
 
-    async def _home_axis(self, rail: "RailDescription", axis: str) -> float:
-        """Return where the axis stands."""
-        direction = 1 if rail.homing.positive_dir else -1
-        (beyond_mm,) = await self._approach([rail], axis, direction)
-        assert rail.homing.position_endstop is not None
-        return rail.homing.position_endstop + direction * beyond_mm
-
-    async def _home_towers(self, rails: Sequence["RailDescription"], y: float) -> tuple[float, float, float]:
-        """Return where the head stands, Y being Y if it has a rail of its own."""
-        beyond_mm = await self._approach(rails, "z", 1)
-        kinematics = self._described.kinematics
-        ends: tuple[float, ...] = kinematics.endstop_positions  # type: ignore[attr-defined]
-        heights = [end + beyond for end, beyond in zip(ends, beyond_mm, strict=True)]
-        return kinematics.forward((*heights, *(() if len(heights) == len(kinematics.rails) else (y,))))
-
-    async def _approach(self, rails: Sequence["RailDescription"], axis: str, direction: int) -> list[float]:
+    async def _approach(self, approach: Approach) -> list[float]:
         """Go to the endstops, twice if so configured; return how far beyond each trigger the rails stand."""
-        homing = rails[0].homing
-        space = self._described.kinematics.work_space
-        at = _AXES.index(axis)
-        if await self._any_pressed(rails):
-            await self._go_back(rails, axis, -direction)
-        way_mm = WAY_SHARE * (space.high[at] - space.low[at])
-        results = await self._move(rails, axis, direction, way_mm, homing.speed).run()
+        rail = approach.rails[0]
+        homing = rail.homing
+        if await self._any_pressed([rail for rail in approach.rails if not self._feels(rail)]):
+            await self._go_back(approach)
+        results = await self._move(approach, approach.most_mm, homing.speed)
         if homing.retract_distance:
-            await self._go_back(rails, axis, -direction)
-            way_mm = 2 * homing.retract_distance + AWAY_MM
-            results = await self._move(rails, axis, direction, way_mm, homing.second_speed).run()
-        return [result.beyond_trigger_mm for result in results]
+            await self._go_back(approach)
+            most_mm = 2 * homing.retract_distance + AWAY_MM
+            results = await self._move(approach, most_mm, homing.second_speed)
+        beyond_mm = [result.beyond_trigger_mm for result in results]
+        if rail.axis in AXES:
+            await self._align(approach, beyond_mm)
+        return beyond_mm
 
-    def _move(
-        self, rails: Sequence["RailDescription"], axis: str, direction: int, way_mm: float, speed: float
-    ) -> "HomingMove":
+    async def _align(self, approach: Approach, beyond_mm: Sequence[float]) -> None:
+        """Bring the sides of an axis as far beyond their endstops as its first one is."""
+        for rail, beyond in zip(approach.rails[1:], beyond_mm[1:], strict=True):
+            way_mm = beyond_mm[0] - beyond
+            ways = {
+                stepper.name: math.copysign(approach.ways[stepper.name], way_mm * approach.ways[stepper.name])
+                for stepper in rail.steppers
+            }
+            if abs(way_mm) >= rail.steppers[0].step_distance / 2:
+                await self._go(approach, ways, abs(way_mm))
+
+    async def _move(self, approach: Approach, way_mm: float, speed: float) -> "Sequence[HomingResult]":
         from coordinator.homing import HomingMove  # noqa: PLC0415 (planning needs no asyncio)
 
-        return HomingMove(
-            self._machine,
-            rails,
-            axis=axis,
-            direction=direction,
-            way_mm=way_mm,
-            speed=speed,
-            accel=self._accel(axis, rails[0]),
-        )
+        async with contextlib.AsyncExitStack() as stack:
+            for rail in approach.rails:
+                if (feeler := self._feels(rail)) is not None:
+                    await stack.enter_async_context(feeler.feeling(speed))
+            return await HomingMove(
+                self._machine,
+                approach.rails,
+                ways=approach.ways,
+                way_mm=way_mm,
+                speed=speed,
+                accel=self._accel(approach.axis, approach.rails[0]),
+            ).run()
 
-    async def _go_back(self, rails: Sequence["RailDescription"], axis: str, direction: int) -> None:
-        from coordinator.single_move import Ramp, SingleMove, ratio_of  # noqa: PLC0415 (as above)
+    def _feels(self, rail: "RailDescription") -> StallEndstop | None:
+        return self._feelers.get(rail.homing.virtual_endstop)
 
-        homing = rails[0].homing
-        way_mm = homing.retract_distance or AWAY_MM
-        ramp = Ramp(way_mm, homing.retract_speed, self._accel(axis, rails[0]))
-        await SingleMove(self._machine, ramp, ratio_of(axis, direction)).run()
+    async def _go_back(self, approach: Approach) -> None:
+        ways = {name: -way for name, way in approach.ways.items()}
+        await self._go(approach, ways, approach.rails[0].homing.retract_distance or AWAY_MM)
+
+    async def _go(self, approach: Approach, ways: Mapping[str, float], way_mm: float) -> None:
+        from coordinator.single_move import Ramp, SingleMove  # noqa: PLC0415 (as above)
+
+        rail = approach.rails[0]
+        ramp = Ramp(way_mm, rail.homing.retract_speed, self._accel(approach.axis, rail))
+        await SingleMove(self._machine, ramp, ways=ways).run()
 
     def _accel(self, axis: str, rail: "RailDescription") -> float:
         limits = self._described.limits
@@ -175,8 +188,9 @@ class Homing(Module):
         return AtRest(self._query)
 
     async def _query(self) -> Done:
-        rails = [rail for rail in self._described.rails if rail.homing.endstop_pin is not None]
-        told = [f"{rail.axis}:{'pressed' if await self._pressed(rail) else 'open'}" for rail in rails]
+        rails = self._described.stops
+        self._last_query = {rail.axis: await self._pressed(rail) for rail in rails}
+        told = [f"{axis}:{'pressed' if pressed else 'open'}" for axis, pressed in self._last_query.items()]
         return Done((" ".join(told) or "this machine has no endstops on pins",))
 
     async def _any_pressed(self, rails: Sequence["RailDescription"]) -> bool:

@@ -1,19 +1,16 @@
-"""[homing_override]: lines of g-code in the place of G28. A G28 among them is the machine's own."""
+"""[homing_override]: a template of g-code in the place of G28. A G28 in it is the machine's own."""
 
 from dataclasses import replace
 from typing import Final
 
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Lines, Reading
-from coordinator.machine.options import FloatOption, SectionSpec, TextOption
+from coordinator.gcode.words import Command
+from coordinator.machine.options import FloatOption, GCodeOption, SectionSpec, TextOption
 from coordinator.modules.base import Build, Module
+from coordinator.modules.gcode_macro import GCodeTemplate, parameters
 from coordinator.modules.homing import Homing
 
-GCODE: Final = TextOption(
-    name="gcode",
-    help="what is done instead of G28; a G28 in it homes",
-    pattern=r"(?s).+",
-    pattern_rule="lines of g-code, indented",
-)
+GCODE: Final = GCodeOption(name="gcode", help="what is done instead of G28, a template; a G28 in it homes")
 AXES: Final = TextOption(
     name="axes",
     help="letters of the axes for which it is done; G28 of others homes",
@@ -32,6 +29,7 @@ SET: Final = tuple(
     for axis in "xyz"
 )
 _SET_POSITION: Final = "_HOMING_OVERRIDE_SET_POSITION"
+_LINES: Final = "_HOMING_OVERRIDE_LINES"
 
 
 class HomingOverride(Module):
@@ -41,23 +39,29 @@ class HomingOverride(Module):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self._lines = build.get(GCODE)
+        self._template = GCodeTemplate(build, GCODE)
         self._axes = set(build.get(AXES).upper())
         self._set = [build.find(option) for option in SET]
-        if any(value is not None for value in self._set):
-            self._lines = f"{_SET_POSITION}\n{self._lines}"
+        self._sets = any(value is not None for value in self._set)
+        if self._sets:
             build.add_command(
                 GCodeCommand(_SET_POSITION, "Begin what stands in for G28", self._read_set_position)
             )
-        if "{" in self._lines:
-            raise build.reader.bad(GCODE, "which has a template; write plain lines of g-code")
+            build.add_command(GCodeCommand(_LINES, "Go on with it", self._read_lines))
         self._homing = build.shared(Homing)
         self._homing.replace_by(self._read, build)
 
     def _read(self, call: Call, axes: str) -> Reading:
         if not self._axes & set(axes):
             return self._homing.read(replace(call, callers=(*call.callers, "G28")), axes)
-        return Lines(self._lines)
+        if self._sets:  # the template is to see the position that is set
+            return Lines(f"{_SET_POSITION}\n{_LINES} {call.command.text.strip()}")
+        return self._read_lines(call)
+
+    def _read_lines(self, call: Call) -> Reading:
+        homes = Command("G28", call.command.text)
+        values = {"params": parameters(homes), "rawparams": homes.text.strip()}
+        return self._template.lines(call, values)
 
     def _read_set_position(self, call: Call) -> Reading:
         x, y, z = (

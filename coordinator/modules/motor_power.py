@@ -1,7 +1,6 @@
-"""Enable pins: the drivers are switched on before anything moves, and off by M84.
+"""Enable pins: a driver is switched on before its motor moves, and all are switched off by M84.
 
-All are switched together: a motor that is off while others move could be pushed about by them.
-SET_STEPPER_ENABLE is for trying out.
+SET_STEPPER_ENABLE is for trying out: it switches one, and those that share its pin.
 """
 
 from typing import TYPE_CHECKING, Final
@@ -13,7 +12,7 @@ from coordinator.modules.base import Build, Module, Value
 from nodes.devices.digital_out import DigitalOut
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection, Iterable, Mapping
 
     from coordinator.machine.pins import PinDescription
     from coordinator.modules.live import Live
@@ -45,6 +44,7 @@ class MotorPower(Module):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
+        self.name = "stepper_enable"
         lines: dict[tuple[str, str], EnableLine] = {}
         for stepper in build.machine.steppers:
             pin = stepper.enable_pin
@@ -52,6 +52,7 @@ class MotorPower(Module):
                 line = lines.setdefault((pin.node, pin.name), EnableLine(pin))
                 line.steppers.append(stepper.name)
         self._lines = tuple(lines.values())
+        self._motors = build.machine.motors
         self._live: Live | None = None
         for line in self._lines:
             build.add_device(line.node, line)
@@ -78,12 +79,16 @@ class MotorPower(Module):
 
     def status(self) -> dict[str, Value]:
         """Tell which motors are on."""
-        return {"steppers": {name: line.on for line in self._lines for name in line.steppers}}
+        return {"steppers": dict(self.are_on())}
 
-    def on(self) -> None:
-        """Switch all on that are not, as soon as possible; steps may follow WAKE_S later."""
+    def are_on(self) -> "Mapping[str, bool]":
+        """Tell which motors are on, of those with an enable pin."""
+        return {name: line.on for line in self._lines for name in line.steppers}
+
+    def on(self, steppers: "Collection[str]") -> None:
+        """Switch those of STEPPERS on that are off, as soon as possible; steps may follow WAKE_S later."""
         for line in self._lines:
-            if not line.on:
+            if not line.on and any(name in steppers for name in line.steppers):
                 self._switch(line, on=True)
 
     def _switch(self, line: EnableLine, *, on: bool) -> None:
@@ -116,17 +121,26 @@ class MotorPower(Module):
         if enable not in ("0", "1"):
             raise WordError(f"ENABLE of SET_STEPPER_ENABLE is {quoted(enable)}; it must be 0 or 1")
         lines = [line for line in self._lines if name in line.steppers]
-        return AtRest(
-            lambda: self._some(lines, on=enable == "1"), Done() if enable == "1" else Done(unhomed="XYZ")
-        )
+        done = Done(unhomed="" if enable == "1" else self._moved_by(lines))
+        return AtRest(lambda: self._some(lines, enable == "1", done), done)
+
+    def _moved_by(self, lines: "Iterable[EnableLine]") -> str:
+        """Return the letters of the axes whose place is not sure when the motors of LINES are off."""
+        names = {name for line in lines for name in line.steppers}
+        letters = set()
+        for motor in self._motors:
+            if motor.name in names:
+                own = {axis for axis, weight in zip("XYZ", motor.weights, strict=False) if weight}
+                letters |= own or set("XYZ")
+        return "".join(sorted(letters))
 
     async def _all(self, *, on: bool) -> Done:
-        return await self._some(self._lines, on=on)
+        return await self._some(self._lines, on, Done(unhomed="" if on else "XYZ"))
 
-    async def _some(self, lines: "Iterable[EnableLine]", *, on: bool) -> Done:
+    async def _some(self, lines: "Iterable[EnableLine]", on: bool, done: Done) -> Done:
         import asyncio  # noqa: PLC0415 (planning needs none)
 
         for line in lines:
             self._switch(line, on=on)
         await asyncio.sleep(2 * WAKE_S)
-        return Done() if on else Done(unhomed="XYZ")
+        return done

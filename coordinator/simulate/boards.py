@@ -32,7 +32,7 @@ EXTENSIONS: Final = frozenset(
             "table_read",
             "table_pair",
         ),
-        *("table_activate", "table_query_active", "table_active"),
+        *("table_activate", "table_query_active", "table_active", "table_find", "table_found"),
         *("config_table_register", "table_register_poll", "table_register_write"),
     )
 )

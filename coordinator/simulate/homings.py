@@ -1,6 +1,7 @@
 """How well homing repeats: homes again and again on a lossy bus, each seed with clocks of its own.
 
-``python -m coordinator.simulate.homings --seeds 0:50`` prints what the homings found and the spread of all.
+``python -m coordinator.simulate.homings --seeds 0:50`` prints what the homings found and the spread of all;
+with ``--real`` in real time, on virtual nodes that are processes.
 The machine is a corexy with its motors on two boards and the endstop of one axis on each; where the endstops
 are, and when they switch, is the plant's, which knows nothing of the host.
 """
@@ -8,7 +9,8 @@ are, and when they switch, is the plant's, which knows nothing of the host.
 import argparse
 import asyncio
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -17,12 +19,16 @@ import numpy as np
 from coordinator.app import Machine
 from coordinator.demo.plant import AXES, PlantSettings, machine_plants
 from coordinator.homing import CYCLE_S, HomingMove
-from coordinator.machine.description import RailDescription
+from coordinator.host import Host, LinuxHost
+from coordinator.machine.description import MachineDescription, RailDescription, load_machine
+from coordinator.simulate.real_nodes import CONFIG, real_nodes
 from coordinator.simulate.scenario import BusSetting, Scenario
 from coordinator.simulate.stage import Stage
-from coordinator.simulate.values import Range
+from coordinator.simulate.values import Dice, Range
 from coordinator.single_move import Ramp, SingleMove, ratio_of
+from nodes.errors import CanductorError
 from nodes.records import record
+from nodes.virtual.plant_page import PlantPage
 
 MACHINE: Final = Path(__file__).parent / "machines" / "homing.cfg"
 START: Final = (9.0, 238.0, 30.0)
@@ -60,28 +66,47 @@ def home_repeatedly(seed: int, *, times: int, loss: float = LOSS) -> list[Homing
         weight=0.0,
         buses={"can0": BusSetting(loss=Range(loss, loss))},
     )
-    performance = _Performance(Stage(scenario, seed))
-    with asyncio.Runner(loop_factory=performance.stage.make_loop) as runner:
+    stage = Stage(scenario, seed)
+    described = machine_plants(stage.description, PlantSettings(seed=seed + 1, start=START))
+    plants = stage.start_plants(described.values())
+    performance = _Performance(stage.description, stage.host, lambda node: plants[node].page, seed)
+    with asyncio.Runner(loop_factory=stage.make_loop) as runner:
         return runner.run(performance.run(times))
+
+
+def home_for_real(seed: int, *, times: int, loss: float = LOSS) -> list[Homing]:
+    """Do the same in real time, on processes."""
+    settings = PlantSettings(seed=seed + 1, start=START)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with real_nodes(MACHINE, folder, settings, loss=loss, seed=seed) as pages:
+            described = load_machine(str(folder / CONFIG))
+            performance = _Performance(described, LinuxHost(), pages.__getitem__, seed)
+            return asyncio.run(performance.run(times))
 
 
 class _Performance:
     """One seed."""
 
-    def __init__(self, stage: Stage) -> None:
-        self.stage = stage
-        described = machine_plants(stage.description, PlantSettings(seed=stage.seed + 1, start=START))
-        self._plants = stage.start_plants(described.values())
-        self._axes = {axis.name: axis for plant in described.values() for axis in plant.axes}
-        self._dice = stage.dice.stream("homings")
+    def __init__(
+        self, described: MachineDescription, host: Host, page: Callable[[str], PlantPage], seed: int
+    ) -> None:
+        self._described = described
+        self._host = host
+        self._page = page
+        plants = machine_plants(described, PlantSettings(start=START)).values()
+        self._axes = {axis.name: axis for plant in plants for axis in plant.axes}
+        self._seed = seed
+        self._dice = Dice("homings", seed).stream("homings")
 
     async def run(self, times: int) -> list[Homing]:
         """Home X and Y in turn."""
-        machine = Machine(self.stage.description, self.stage.host, on_notice=lambda _: None)
+        machine = Machine(self._described, self._host, on_notice=lambda _: None)
         await machine.start()
         try:
-            rails = [rail for rail in self.stage.description.rails if rail.homing.endstop_pin is not None]
-            return [await self._home(machine, rail) for _ in range(times) for rail in rails]
+            return [await self._home(machine, rail) for _ in range(times) for rail in self._described.stops]
+        except CanductorError as error:
+            raise machine.stopped or error from None  # the cause before what came of it
         finally:
             await machine.close()
 
@@ -102,7 +127,7 @@ class _Performance:
         found_mm = begun_mm + direction * result.way_to_trigger_mm
         await self._go_back(machine, rail, -direction)
         return Homing(
-            self.stage.seed,
+            self._seed,
             rail.axis,
             direction * (found_mm - rail.homing.position_endstop),
             result.beyond_trigger_mm,
@@ -118,7 +143,7 @@ class _Performance:
     def _place(self, rail: RailDescription) -> float:
         """Return where the axis truly is, by the steps that its drivers were given."""
         axis = self._axes[rail.axis]
-        counts = {node: plant.page.motors for node, plant in self._plants.items()}
+        counts = {node.name: self._page(node.name).motors for node in self._described.nodes}
         return START[AXES.index(rail.axis)] + sum(
             term.mm_per_step * counts[term.node][term.stepper].count for term in axis.terms
         )
@@ -152,15 +177,20 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--seeds", default="0:50", help="FIRST:BEHIND; each has clocks of its own")
     parser.add_argument("--times", type=int, default=1, help="homings of each axis with each seed")
     parser.add_argument("--loss", type=float, default=LOSS, help="share of frames that get lost")
+    parser.add_argument("--real", action="store_true", help="in real time, on processes")
     given = parser.parse_args(arguments)
+    home = home_for_real if given.real else home_repeatedly
     first, _, behind = given.seeds.partition(":")
-    homings = [
-        homing
-        for seed in range(int(first), int(behind or int(first) + 1))
-        for homing in home_repeatedly(seed, times=given.times, loss=given.loss)
-    ]
+    homings: list[Homing] = []
+    failed = False
+    for seed in range(int(first), int(behind or int(first) + 1)):
+        try:
+            homings += home(seed, times=given.times, loss=given.loss)
+        except CanductorError as error:
+            sys.stderr.write(f"seed {seed}: {error}\n")
+            failed = True
     sys.stdout.write(f"{report(homings)}\n")
-    return int(any(spread_mm(homings, axis) > MICROSTEP_MM for axis in {h.axis for h in homings}))
+    return int(failed or any(spread_mm(homings, axis) > MICROSTEP_MM for axis in {h.axis for h in homings}))
 
 
 MICROSTEP_MM: Final = 40 / 200 / 16

@@ -203,6 +203,17 @@ class Stage:
         """Return a loop in the world's time."""
         return VirtualLoop(self._world, limit_s=LIMIT_S)
 
+    def cut(self, node: str) -> None:
+        """Cut the wires between NODE and its bus, for good."""
+        controller = self._boards[node].node.controller
+        if controller is None:
+            raise ScenarioError(f"{self.scenario.name}: the node '{node}' is on no bus")
+        controller.cut(1)
+
+    def stall(self, seconds: float, *, io: bool = True) -> None:
+        """Let the host's Python stand still from now on; IO: also the threads of its links."""
+        self._world.stall(seconds, io=io)
+
     def now_ns(self) -> int:
         """Return true time, which is also the host's."""
         return self._world.now_ns

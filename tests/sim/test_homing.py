@@ -13,6 +13,7 @@ from coordinator.homing import TIMEOUT_S, HomingError, HomingMove, HomingResult
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
 from nodes.errors import CanductorError
+from nodes.link import Link
 
 MACHINE = """
 [mcu]
@@ -108,7 +109,13 @@ class Home:
         try:
             rail = self.stage.description.rails[0]
             move = HomingMove(
-                machine, [rail], axis="x", direction=-1, way_mm=self.way_mm, speed=self.speed, accel=3000.0
+                machine,
+                [rail],
+                axis="x",
+                direction=-1,
+                way_mm=self.way_mm,
+                speed=self.speed,
+                accel=3000.0,
             )
             if self.during is not None:
                 asyncio.get_running_loop().call_later(0.5, self.during, self.stage)
@@ -209,6 +216,45 @@ def test_a_switch_that_is_pressed_already_is_told_before_anything_moves(tmp_path
     with pytest.raises(HomingError, match="the endstop of axis x is pressed before the move"):
         home.run()
     assert len(home.steps()) == 0
+
+
+def acknowledge_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the first move's nodes armed half a second late, for all the host knows."""
+    drained = Link.drained
+    waited: list[Link] = []
+
+    async def late(self: Link) -> None:
+        if not waited:
+            waited.append(self)
+            await asyncio.sleep(0.5)
+        await drained(self)
+
+    monkeypatch.setattr(Link, "drained", late)
+
+
+def test_a_move_whose_nodes_were_armed_too_late_is_begun_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The acknowledgements come half a second late: the first steps are made, stopped, and counted."""
+    acknowledge_late(monkeypatch)
+    home = Home(tmp_path)
+    result = home.run()
+    check_position(home, result)
+    gaps = np.diff(home.steps())
+    assert gaps[:-1].max() > 0.5e6, "it stood still in between"
+
+
+@pytest.mark.parametrize("endstop", ["^PC5", "^toolhead:PC5"])
+def test_an_endstop_that_switched_before_its_move_counted_as_late_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, endstop: str
+) -> None:
+    """As at a second approach: it is pressed when the move would be begun again."""
+    acknowledge_late(monkeypatch)
+    home = Home(tmp_path, endstop=endstop, switch_at=-160, speed=25.0)
+    result = home.run()
+    assert result.moved["stepper_x"] == home.position()
+    assert result.way_to_trigger_mm == pytest.approx(2.0, abs=1.5 / STEPS_PER_MM)
+    assert np.diff(home.steps()).max() < 0.5e6, "it went there at once"
 
 
 def cut(stage: Stage) -> None:

@@ -91,6 +91,35 @@ def test_lines_stand_in_for_g28_and_g28_among_them_homes(tmp_path: Path) -> None
     assert max(place for at, place in z if at < x[0][0]) == pytest.approx(z[0][1] + 5, abs=0.01)
 
 
+def test_the_lines_are_a_template_that_sees_what_is_asked_and_where_the_head_is_taken_to_be(
+    tmp_path: Path,
+) -> None:
+    text = (
+        "{% if 'Z' in params or not params %}",
+        "G1 Z{printer.toolhead.position.z + 5} F600",
+        "{% endif %}",
+        "{% for axis in 'XY' if axis in params %}",
+        "G28 {axis}",
+        "{% endfor %}",
+    )
+    lines = "".join(f"  {line}\n" for line in text)
+    found = printer(tmp_path, f"\n[homing_override]\nset_position_z: 2\naxes: xyz\ngcode:\n{lines}")
+    found.run("G28 X0 Z", "M114")
+    assert found.told[0].split()[2] == "Z:7.000"
+    z = track(found, "z")
+    assert z[-1][1] == pytest.approx(z[0][1] + 5, abs=0.01)
+    assert track(found, "x")
+    assert not track(found, "y")
+
+
+def test_a_bad_template_is_told_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "printer.cfg"
+    path.write_text(MACHINE + "[homing_override]\ngcode:\n  G28\n  {% if %}\n")
+    (problem,) = check_config(str(path))
+    line = path.read_text().splitlines().index("  {% if %}") + 1
+    assert str(problem).startswith(f"{path}:{line}: the template of [homing_override]: ")
+
+
 def test_g28_of_other_axes_is_not_overridden(tmp_path: Path) -> None:
     found = printer(tmp_path, "\n[homing_override]\naxes: z\ngcode:\n  G28 X\n")
     found.run("G28 Y", "G1 Y200 F6000", "M114")
