@@ -72,10 +72,16 @@ PEER = {
 
 
 def plan_once(config: Path, gcode: Path) -> Cost:
-    """Run ``canductor plan`` and take the kernel's word for what it cost."""
+    """Run ``canductor plan`` and take the kernel's word for what it cost.
+
+    Python may keep what it compiled, as where it is installed; else a third of a second is its compiler's.
+    """
     with tempfile.TemporaryFile() as out:
         process = subprocess.Popen(
-            [str(CANDUCTOR), "plan", str(config), str(gcode), "--json"], stdout=out, stderr=subprocess.STDOUT
+            [str(CANDUCTOR), "plan", str(config), str(gcode), "--json"],
+            stdout=out,
+            stderr=subprocess.STDOUT,
+            env={name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"},
         )
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)

@@ -21,8 +21,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from coordinator.motion_worker import SEND_AHEAD_S
 from coordinator.simulate.boards import dictionary_blob
-from coordinator.streamer import CYCLE_S, SEND_AHEAD_S
+from coordinator.streamer import CYCLE_S
 from coordinator.timebase import ClockMap, TimeBase
 from nodes.assign import Uuid
 from nodes.can_bus import CanBus

@@ -30,10 +30,8 @@ class MachineDevices:
         self.description = description
         self.modules = modules
         self.steppers: dict[str, Stepper] = {s.name: _stepper(s) for s in description.steppers}
-        self.endstops: dict[str, Endstop] = {
-            rail.axis: _endstop(rail) for rail in description.rails if rail.homing.endstop_pin is not None
-        }
-        """By axis, of the rails whose endstop is on a pin."""
+        self.endstops: dict[str, Endstop] = {rail.axis: _endstop(rail) for rail in description.stops}
+        """By the name of the rail, or of the piece of one, that it stops."""
         self.trsyncs: dict[tuple[int, str], Trsync] = {
             (slot, node): Trsync(f"homing on node {node}") for slot, node in self._homing_nodes()
         }
@@ -63,13 +61,14 @@ class MachineDevices:
         """Return slots and nodes, each once, in order."""
         if not self.endstops:
             return {}
-        together = max(len(group) for group in self.description.kinematics.homing_order)
-        pins = (rail.homing.endstop_pin for rail in self.description.rails)
-        nodes = [*self.moving_nodes, *(pin.node for pin in pins if pin is not None)]
+        pieces = {rail.axis: len(rail.pieces) for rail in self.description.rails}
+        groups = self.description.kinematics.homing_order
+        together = max((sum(pieces.get(name, 0) for name in group) for group in groups), default=1)
+        nodes = [*self.moving_nodes, *(self.endstop_node(rail) for rail in self.description.stops)]
         return dict.fromkeys((slot, node) for node in nodes for slot in range(together))
 
     def _add_homing(self, config: NodeConfig, pins: Mapping[str, int]) -> None:
-        for rail in self.description.rails:
+        for rail in self.description.stops:
             pin = rail.homing.endstop_pin
             if pin is not None and pin.node == config.name:
                 pin.number(pins)

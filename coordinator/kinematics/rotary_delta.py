@@ -110,6 +110,11 @@ class RotaryDelta:
         )
 
     @property
+    def endstop_positions(self) -> tuple[float, ...]:
+        """The same, by the name that towers have for it."""
+        return self.endstop_angles
+
+    @property
     def widest_radius(self) -> float:
         """How far from the middle the head may be; 0 where the arms do not reach the bed."""
         low, high = 0.0, self.shoulder_height

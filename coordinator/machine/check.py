@@ -8,7 +8,7 @@ from typing import Final
 
 from coordinator.machine.config_file import ConfigFile, RawSection, parse_config
 from coordinator.machine.description import describe
-from coordinator.machine.problem import ConfigError
+from coordinator.machine.problem import ConfigError, MissingSection
 from nodes.errors import CanductorError
 
 PROBLEMS_MAX: Final = 100
@@ -19,12 +19,18 @@ def check_config(path: str) -> list[CanductorError]:
     """Return all mistakes in the configuration file PATH and what it includes, by file and line."""
     collected: list[ConfigError] = []
     raised: list[CanductorError] = []
+    stood_in: set[str] = set()
     try:
         config = parse_config(path, collected)
         while len(raised) < PROBLEMS_MAX:
             try:
                 describe(config)
                 break
+            except MissingSection as error:
+                raised.append(error)
+                if error.name in stood_in or not _stand_in(config, error):
+                    break
+                stood_in.add(error.name)
             except ConfigError as error:
                 section = _section_of(config, error)
                 # What is raised after a value stood in may well come from that value.
@@ -44,15 +50,28 @@ def _order(error: CanductorError) -> tuple[str, int]:
 
 def _section_of(config: ConfigFile, error: ConfigError) -> RawSection | None:
     for section in config.sections.values():
-        if error.place in (section.place, *(option.place for option in section.options.values())):
+        if error.place == section.place or any(o.is_at(error.place) for o in section.options.values()):
             return section
     return None
+
+
+def _stand_in(config: ConfigFile, error: MissingSection) -> bool:
+    """Put a section in the place of the one that ERROR is about; return whether that makes sense.
+
+    Without [printer] nobody knows what the others are to be, but for a machine with the steppers of axes.
+    """
+    if error.name == "printer" and not config.sections.keys() >= {"stepper_x", "stepper_y"}:
+        return False
+    config.sections[error.name] = RawSection(
+        error.name, error.place, problems=config.problems, is_set_aside=True, stands_in=True
+    )
+    return True
 
 
 def _take_out(config: ConfigFile, section: RawSection, error: ConfigError) -> bool:
     """Take out of SECTION what ERROR is about; return whether anything is left to be read."""
     for name, option in section.options.items():
-        if option.place == error.place:
+        if option.is_at(error.place):
             del section.options[name]
             section.set_aside.add(name)
             return True

@@ -19,7 +19,7 @@ from coordinator.machine.problem import ConfigError, Place, shown
 SAVED_PREFIX = "#*#"
 SAVED_HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
 _SAVED_HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>\s*")
-_COMMENT = re.compile(r"(?:^|\s)[#;].*")
+_COMMENT = re.compile(r"(?:^|\s)(?:#(?!\})|;).*")  # "#}" ends a comment of a template
 _SECTION = re.compile(r"\[(include .*|[^\[\]]*)\]")  # wildcards of a path may hold brackets
 _SEPARATOR = re.compile(r"[:=]")
 _MAX_NAME_CHARS = 200
@@ -33,6 +33,12 @@ class RawOption:
     """In lower case: names are read without regard to case."""
     value: str
     place: Place
+    numbers: tuple[int, ...] = ()
+    """Where each line of the value stands in the file: comments leave gaps."""
+
+    def is_at(self, place: Place) -> bool:
+        """Tell whether its name or any line of its value stands at PLACE."""
+        return place.path == self.place.path and place.line in (self.place.line, *self.numbers)
 
 
 @dataclass(slots=True)
@@ -50,8 +56,12 @@ class RawSection:
     """Options that are known to be wrong and were taken out: nobody is to miss them."""
     is_set_aside: bool = False
     """Whether all of them were."""
+    misspelt: bool = False
+    """Whether it has an option that looks like another: then others may only seem to be too much."""
     stands_in: bool = False
     """Whether anything of it was read as a value that nobody gave."""
+    used: dict[str, object] = field(default_factory=dict)
+    """What its readers made of it so far: values and defaults, by option."""
 
     def report(self, error: ConfigError) -> None:
         """Raise ERROR, or collect it."""
@@ -159,7 +169,7 @@ class _Parser:
         self._here: dict[str, RawOption] = {}  # under the last header, where a repeat is a mistake
         self._option: RawOption | None = None
         self._option_indent = 0
-        self._value: list[str] = []
+        self._value: list[tuple[int, str]] = []
 
     def parse(self, path: str, lines: Iterable[tuple[int, str]]) -> None:
         """Read all lines of a file; raises ConfigError."""
@@ -169,9 +179,9 @@ class _Parser:
             if not text:
                 # A blank line may stand inside a value, a comment leaves no trace in it.
                 if not line.strip():
-                    self._value.append("")
+                    self._value.append((number, ""))
             elif self._option is not None and indent > self._option_indent:
-                self._value.append(text.strip())
+                self._value.append((number, text.strip()))
             else:
                 self._end_option()
                 self._begin_or_report(text.strip(), indent, Place(path, number))
@@ -189,7 +199,7 @@ class _Parser:
         """Take a line that is not a value's continuation."""
         if not text.startswith("["):
             self._option, first = _option(text, place)
-            self._value, self._option_indent = [first], indent
+            self._value, self._option_indent = [(place.line, first)], indent
             _add(self._section, self._here, self._option)
             return
         name = _section_name(text, place)
@@ -204,7 +214,10 @@ class _Parser:
 
     def _end_option(self) -> None:
         if self._option is not None:
-            self._option.value = "\n".join(self._value).strip()
+            while self._value and not self._value[0][1]:
+                del self._value[0]
+            self._option.value = "\n".join(text for _, text in self._value).rstrip()
+            self._option.numbers = tuple(number for number, _ in self._value)
         self._option = None
         self._value = []
 

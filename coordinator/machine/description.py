@@ -22,7 +22,7 @@ from coordinator.machine.model import (
 )
 from coordinator.machine.pins import PinDescription
 from coordinator.machine.printer_options import PRINTER_SPECS
-from coordinator.machine.problem import ConfigError, Place, nearest
+from coordinator.machine.problem import ConfigError, MissingSection, Place, nearest
 from coordinator.machine.read_extruder import limits_without_extruder, read_extruder_steppers, read_extruders
 from coordinator.machine.read_kinematics import read_frame
 from coordinator.machine.read_nodes import check_policies, make_pin_registry, read_nodes
@@ -32,6 +32,7 @@ from coordinator.machine.read_steppers import is_extra_stepper
 from coordinator.machine.read_tables import read_axis_tables
 from coordinator.machine.reading import Reading
 from coordinator.machine.saved_config import ConfigSource
+from coordinator.machine.second_endstops import with_second_endstops
 from coordinator.machine.well_known import LATER_SECTIONS
 from coordinator.modules.module_set import ModuleSource, ModuleSources
 from coordinator.modules.registry import known_kinds, module_for, modules_beside, own_kinds
@@ -89,7 +90,7 @@ def describe(config: ConfigFile) -> MachineDescription:
     reading = Reading(config, make_pin_registry(config, nodes), later)
     kinematics, reader = open_printer(_required(config, "printer"), PRINTER_SPECS)
     printer = read_printer(reader)
-    frame = read_frame(reading, kinematics, reader)
+    frame = with_second_endstops(reading, read_frame(reading, kinematics, reader))
     reading.finish(reader)
     space = frame.kinematics.work_space
     extruders = tuple(
@@ -129,9 +130,17 @@ def _module_sources(reading: Reading) -> ModuleSources:
     for section in reading.config.sections.values():
         sources += [ModuleSource(section, kind, whole=False) for kind in modules_beside(section.name)]
         if not _is_acting(section) and (kind := module_for(section.kind, section.place)) is not None:
+            if kind.NAMED and not (kind.NAMELESS or section.instance):
+                error = f"[{section.kind}] needs a name; write [{section.kind} NAME]"
+                section.report(ConfigError(section.place, error))
             sources.append(ModuleSource(section, kind, whole=True))
             reading.used.add(section.name)
-    return ModuleSources(tuple(sources), reading.pins)
+    config = {
+        section.name: {option.name: option.value for option in section.options.values()}
+        for section in reading.config.sections.values()
+    }
+    used = {section.name: section.used for section in reading.config.sections.values()}
+    return ModuleSources(tuple(sources), reading.pins, config, used)
 
 
 def _named(limits: MotionLimits, frame: Frame) -> MotionLimits:
@@ -153,7 +162,7 @@ def _check_names(description: MachineDescription) -> None:
 def _required(config: ConfigFile, name: str) -> RawSection:
     section = config.sections.get(name)
     if section is None:
-        raise ConfigError(Place(config.path, 0), f"there is no section [{name}]; add it")
+        raise MissingSection(config.path, name)
     return section
 
 

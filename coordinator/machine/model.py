@@ -1,5 +1,6 @@
 """The machine as the configuration describes it: frozen, checked, ready to be built."""
 
+from dataclasses import replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
@@ -98,11 +99,12 @@ class StepperDescription:
 
 @record
 class HomingDescription:
-    """How a rail finds its origin; kept for the homing module: until then G28 takes the axis as home."""
+    """How a rail finds its origin. Without an endstop on a pin G28 takes it as home."""
 
     endstop_pin: PinDescription | None = None
     virtual_endstop: str = ""
-    """Such as ``probe:z_virtual_endstop``; empty when there is a pin or nothing."""
+    """Such as ``tmc2209_stepper_x:virtual_endstop``, whose pin is ``endstop_pin``, or one that no module
+    offers yet (``probe:z_virtual_endstop``), without pin; empty where the endstop is a switch."""
     position_endstop: float | None = None
     """mm; None with a virtual endstop that knows its own position, or without endstop. Of a tower or an arm:
     Z of the head, in the middle, when the endstop switches."""
@@ -118,8 +120,16 @@ class HomingDescription:
     accel: float | None = None
     """mm/s² of all that; None: as fast as the axis may."""
 
+    @property
+    def waits(self) -> bool:
+        """Whether its endstop is one that no module offers yet."""
+        return self.endstop_pin is None and bool(self.virtual_endstop)
+
 
 NO_ENDSTOP = HomingDescription()
+
+
+SECOND_CARRIAGE = "dual_carriage"
 
 
 @record
@@ -134,6 +144,31 @@ class RailDescription:
     position_max: float | None
     homing: HomingDescription
     place: Place
+    second_endstops: tuple[tuple[str, PinDescription, str], ...] = ()
+    """Further steppers with an endstop of their own: name, pin, and the virtual endstop that it is of."""
+
+    @property
+    def pieces(self) -> "tuple[RailDescription, ...]":
+        """What stops by itself: this rail, or what of it has an endstop of its own, as rails."""
+        own = {name: (pin, virtual) for name, pin, virtual in self.second_endstops}
+        first = replace(
+            self, steppers=tuple(s for s in self.steppers if s.name not in own), second_endstops=()
+        )
+        others = (
+            replace(
+                self,
+                axis=stepper.name.removeprefix("stepper_"),
+                steppers=(stepper,),
+                homing=replace(
+                    self.homing, endstop_pin=own[stepper.name][0], virtual_endstop=own[stepper.name][1]
+                ),
+                place=stepper.place,
+                second_endstops=(),
+            )
+            for stepper in self.steppers
+            if stepper.name in own
+        )
+        return (first, *others) if own else (self,)
 
 
 @record
@@ -240,6 +275,21 @@ class MachineDescription:
     """None: axes have no tables."""
     source: ConfigSource | None = None
     """The file, for what is saved into it; None: there is none."""
+
+    @property
+    def second_carriage(self) -> RailDescription | None:
+        """The rail of the second carriage, by a name that no axis has."""
+        if self.dual_carriage is None:
+            return None
+        return replace(self.dual_carriage.rails[1], axis=SECOND_CARRIAGE)
+
+    @property
+    def stops(self) -> tuple[RailDescription, ...]:
+        """All that has an endstop of its own on a pin: rails, pieces of rails, the second carriage."""
+        second = self.second_carriage
+        pieces = (piece for rail in self.rails for piece in rail.pieces)
+        found = (*pieces, *(() if second is None else (second,)))
+        return tuple(rail for rail in found if rail.homing.endstop_pin is not None)
 
     @property
     def homed_position(self) -> dict[str, float]:

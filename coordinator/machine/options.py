@@ -207,6 +207,23 @@ class TextOption(Option[str]):
 
 
 @record(kw_only=True)
+class GCodeOption(Option[str]):
+    """Lines of g-code, or a template that makes them; also none."""
+
+    def parse(self, text: str) -> str:
+        """Return the text."""
+        return text
+
+    def rule(self) -> str:
+        """Return the values allowed."""
+        return "lines of g-code, indented"
+
+    def stand_in(self) -> str:
+        """Return none."""
+        return ""
+
+
+@record(kw_only=True)
 class ListOption(Option[tuple[str, ...]]):
     """Words separated by commas or line ends."""
 
@@ -269,6 +286,8 @@ class SectionSpec:
     """Options of modules that are not built yet: recognised, recorded, not acting."""
     elsewhere: tuple[str, ...] = ()
     """Options that another specification of the same section has."""
+    family: Option[Any] | None = None
+    """Stands for all options whose names begin with its own, which ends in ``_``."""
 
 
 @dataclass(slots=True)
@@ -290,8 +309,10 @@ class SectionReader:
         spec = self.spec
         valid = (*(option.name for option in spec.options), *spec.later, *spec.elsewhere)
         for raw in self.section.options.values():
-            if raw.name not in valid:
-                hint = nearest(raw.name, valid, pattern="'{}'") or "; remove it or correct its name"
+            if raw.name not in valid and not self._of_family(raw.name):
+                hint = nearest(raw.name, valid, pattern="'{}'")
+                self.section.misspelt |= bool(hint)
+                hint = hint or "; remove it or correct its name"
                 error = ConfigError(raw.place, f"[{self.name}] has no option {shown(raw.name)}{hint}")
                 self.section.report(error)
                 self._read.add(raw.name)
@@ -306,6 +327,18 @@ class SectionReader:
         """The line of the section's header."""
         return self.section.place
 
+    def _of_family(self, name: str) -> bool:
+        family = self.spec.family
+        return family is not None and name.startswith(family.name) and name != family.name
+
+    def family(self) -> dict[str, RawOption]:
+        """Return the options of the specification's family, by what follows its name."""
+        family = self.spec.family
+        assert family is not None
+        found = {name: raw for name, raw in self.section.options.items() if self._of_family(name)}
+        self._read.update(found)
+        return {name.removeprefix(family.name): raw for name, raw in found.items()}
+
     def has(self, option: Option[T]) -> bool:
         """Tell whether the user gave the option; does not count as reading it."""
         return option.name in self.section.options
@@ -316,15 +349,18 @@ class SectionReader:
 
     def find(self, option: Option[T]) -> T | None:
         """Return the value, or None when the option is absent; raises ConfigError for a bad value."""
-        assert option in self.spec.options, option.name
+        own = self.spec.options
+        assert any(known is option for known in own) or option in own, option.name
         self._read.add(option.name)
         raw = self.section.options.get(option.name)
         if raw is None:
             return None
         try:
-            return option.parse(raw.value)
+            value = self.section.used[option.name] = option.parse(raw.value)
         except BadValue as error:
             problem = self.bad(option, str(error) if error.args else f"must be {option.rule()}")
+        else:
+            return value
         self.section.report(problem)
         self.section.stands_in = True
         return option.default if option.default is not None else option.stand_in()
@@ -332,8 +368,8 @@ class SectionReader:
     def get(self, option: Option[T]) -> T:
         """Return the value or the default; raises ConfigError when a required option is absent."""
         value = self.find(option)
-        if value is None:
-            value = option.default
+        if value is None and option.default is not None:
+            value = self.section.used[option.name] = option.default
         if value is not None:
             return value
         if not (self.section.is_set_aside or option.name in self.section.set_aside):
@@ -359,7 +395,7 @@ class SectionReader:
             if name not in self._read and name not in self.spec.elsewhere and (self.whole or name in own)
         ]
         for option in unread:
-            if option.name not in self.spec.later:
+            if option.name not in self.spec.later and not self.section.misspelt:
                 self.section.report(
                     ConfigError(
                         option.place,

@@ -105,6 +105,9 @@ class PinRegistry:
     _aliases: dict[tuple[str, str], str] = field(default_factory=dict)
     _shareable: set[tuple[str, str]] = field(default_factory=set)
     _users: dict[tuple[str, str], tuple[PinDescription, str]] = field(default_factory=dict)
+    diag_pins: dict[str, PinName | None] = field(default_factory=dict)
+    """Of the sections whose virtual endstop an endstop_pin may name, such as ``tmc2209_stepper_x``; None: it
+    has no diag_pin."""
 
     def add_alias(self, node: str, alias: str, name: str, option: RawOption) -> None:
         """Give a pin a second name ([board_pins]); a name in angle brackets reserves the alias instead."""

@@ -1,6 +1,5 @@
 """How a mistake in a configuration is told: the place first, then what is wrong, then what to do."""
 
-import difflib
 from collections.abc import Iterable
 
 from nodes.errors import CanductorError
@@ -32,6 +31,14 @@ class ConfigError(CanductorError):
         """Where the mistake stands, for front ends that mark the line."""
 
 
+class MissingSection(ConfigError):  # noqa: N818 (what is wrong, as the others)
+    """There is no section NAME, without which nothing that follows can be read."""
+
+    def __init__(self, path: str, name: str, why: str = "") -> None:
+        super().__init__(Place(path, 0), f"there is no section [{name}]; add it{why and ': '}{why}")
+        self.name = name
+
+
 def shown(text: str) -> str:
     """Quote what the user wrote so that it fits into a sentence: one line, printable, not long."""
     line = " ".join(text.split())
@@ -50,6 +57,8 @@ def nearest(word: str, valid: Iterable[str], *, pattern: str = "{}") -> str:
     """Return "; did you mean …?" when one of the valid names looks like the word, else nothing."""
     if len(word) > _SHOWN_CHARS:
         return ""
+    import difflib  # noqa: PLC0415 (start-up time)
+
     lower = {name.lower(): name for name in valid}
     found = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
     return f"; did you mean {pattern.format(lower[found[0]])}?" if found else ""

@@ -54,7 +54,7 @@ def read_dual_carriage(reading: Reading, frame: Frame) -> Frame:
     first = frame.rails[axis]
     second = read_axis(reading, reader, letter, _second_function(frame.kinematics.name, axis))
     dual = describe_dual(reader, axis, (first, first.steppers), (second, second.steppers))
-    reading.finish(reader, waiting=WAITING)
+    reading.finish(reader, waiting=WAITING if second.homing.waits else ())
     return park(frame, dual, second.steppers, reader.name)
 
 

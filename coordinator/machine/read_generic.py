@@ -34,7 +34,7 @@ PRIMARY_CARRIAGE = TextOption(
     pattern_rule="the name of a carriage",
 )
 EXTRA_CARRIAGE = SectionSpec(
-    help="A second endstop of a carriage, such as the other side of a gantry; waits for homing",
+    help="A second endstop of a carriage, such as the other side of a gantry; does not act yet",
     options=(PRIMARY_CARRIAGE, ENDSTOP_PIN),
 )
 DUAL_CARRIAGE = SectionSpec(
@@ -209,7 +209,7 @@ def _frame(
                 rail.place, f"no [stepper NAME] moves carriage '{name}'; name it in 'carriages' of one"
             )
         dual = describe_dual(reader, axis, (frame.rails[axis], frame.rails[axis].steppers), (rail, theirs))
-        reading.finish(reader, waiting=WAITING)
+        reading.finish(reader, waiting=WAITING if rail.homing.waits else ())
         frame = park(frame, dual, theirs, reader.name)
     return frame
 

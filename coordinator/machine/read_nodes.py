@@ -23,6 +23,7 @@ from coordinator.machine.options import (
 )
 from coordinator.machine.pins import PRIMARY_NODE, PinOption, PinRegistry
 from coordinator.machine.problem import ConfigError, Place, nearest, shown
+from coordinator.machine.virtual_endstops import note_diag_pins
 from coordinator.machine.well_known import LATER_MCU_OPTIONS
 
 SERIAL = TextOption(
@@ -176,6 +177,7 @@ def make_pin_registry(config: ConfigFile, nodes: tuple[NodeDescription, ...]) ->
     for section in config.sections.values():
         if section.kind == "duplicate_pin_override":
             _read_shared(section, registry)
+    note_diag_pins(config, registry)
     return registry
 
 

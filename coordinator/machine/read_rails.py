@@ -7,6 +7,17 @@ from coordinator.machine.read_homing import ENDSTOP_PIN, HOMING, WAITING, read_e
 from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, TURNING_MOTOR, extra_sections, read_stepper
 from coordinator.machine.reading import Reading
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
+from nodes.records import record
+
+
+@record(kw_only=True)
+class _UpperEnd(FloatOption):
+    """The end of a range."""
+
+    def stand_in(self) -> float:
+        """Return the furthest: no place is told to lie outside of a range that nobody gave."""
+        return MAX_POSITION
+
 
 POSITION_MIN = FloatOption(
     name="position_min",
@@ -16,7 +27,7 @@ POSITION_MIN = FloatOption(
     minimum=-MAX_POSITION,
     maximum=MAX_POSITION,
 )
-POSITION_MAX = FloatOption(
+POSITION_MAX = _UpperEnd(
     name="position_max",
     help="highest position of the axis",
     unit="mm",
@@ -30,7 +41,8 @@ RAIL = SectionSpec(
     later=LATER_STEPPER_OPTIONS,
 )
 EXTRA_STEPPER = SectionSpec(
-    help="A further stepper of an axis, tower or arm: stepper_z1, …; its endstop waits for homing",
+    help="A further stepper of an axis, tower or arm: stepper_z1, …; one of an axis that no other rail moves"
+    " may have an endstop of its own",
     options=(*MOTOR, ENDSTOP_PIN),
 )
 EXTRA_TURNING_STEPPER = SectionSpec(help=EXTRA_STEPPER.help, options=(*TURNING_MOTOR, ENDSTOP_PIN))
@@ -42,7 +54,7 @@ def read_rail(reading: Reading, axis: str, function: StepFunction) -> RailDescri
     """Return the rail of [stepper_AXIS] with all its steppers; raises ConfigError."""
     reader = SectionReader(reading.get(f"stepper_{axis}", EVERY_AXIS), RAIL)
     rail = read_axis(reading, reader, axis, function)
-    reading.finish(reader, waiting=WAITING if rail.homing.virtual_endstop else ())
+    reading.finish(reader, waiting=WAITING if rail.homing.waits else ())
     return rail
 
 
@@ -71,7 +83,11 @@ def read_extra_steppers(
     for section in extra_sections(reading, name):
         reader = SectionReader(section, EXTRA_TURNING_STEPPER if function.turns else EXTRA_STEPPER)
         further.append(read_stepper(reader, function, reading.pins))
+        virtual = ""
         if reader.has(ENDSTOP_PIN):
-            read_endstop(reader, reading.pins)
-        reading.finish(reader, waiting=WAITING)
+            pin, virtual = read_endstop(reader, reading.pins)
+            if pin is not None:
+                reading.second_endstops[reader.name] = (reader.place, pin, virtual)
+                virtual = ""  # it acts
+        reading.finish(reader, waiting=WAITING if virtual else ())
     return tuple(further)

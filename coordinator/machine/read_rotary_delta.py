@@ -71,7 +71,7 @@ def read_rotary_delta(reading: Reading, printer: SectionReader) -> Frame:
         homing = read_tower_homing(reader, end, reading.pins)
         first = read_stepper(reader, function, reading.pins)
         steppers = (first, *read_extra_steppers(reading, reader.name, function))
-        reading.finish(reader, waiting=WAITING)
+        reading.finish(reader, waiting=WAITING if homing.waits else ())
         rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
     home = tidy(machine.forward(machine.endstop_angles))
     return Frame(machine, tuple(rails), home, range_options=ROUND_RANGE_OPTIONS)

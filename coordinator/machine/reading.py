@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from coordinator.machine.config_file import ConfigFile, RawSection
 from coordinator.machine.model import NotYetActing
 from coordinator.machine.options import SectionReader
-from coordinator.machine.pins import PinRegistry
-from coordinator.machine.problem import ConfigError, Place
+from coordinator.machine.pins import PinDescription, PinRegistry
+from coordinator.machine.problem import MissingSection, Place
 
 
 @dataclass(slots=True)
@@ -18,6 +18,8 @@ class Reading:
     later: list[NotYetActing] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
     """Names of sections that have a place in this machine."""
+    second_endstops: dict[str, tuple[Place, PinDescription, str]] = field(default_factory=dict)
+    """Of further steppers of rails, by the stepper: where, its pin, and the virtual endstop that it is of."""
 
     def find(self, name: str) -> RawSection | None:
         """Return a section, which then counts as used, or None."""
@@ -28,7 +30,7 @@ class Reading:
         """Return a section; raises ConfigError with the reason WHY it is needed."""
         section = self.find(name)
         if section is None:
-            raise ConfigError(Place(self.config.path, 0), f"there is no section [{name}]; add it: {why}")
+            raise MissingSection(self.config.path, name, why)
         return section
 
     def named(self, kind: str) -> list[RawSection]:

@@ -4,6 +4,7 @@
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -100,6 +101,8 @@ def section_table(title: str) -> str:
         "|---|---|---|---|",
     ]
     lines += [_row(option) for option in spec.options if not _is_one_of_many(option)]
+    if spec.family is not None:
+        lines.append(_row(replace(spec.family, name=f"{spec.family.name}NAME")))
     if spec.later:
         names = ", ".join(f"`{name}`" for name in spec.later)
         lines += ["", f"Recognised, not yet acting: {names}."]

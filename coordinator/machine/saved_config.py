@@ -4,11 +4,9 @@ The file is replaced in one step or not at all, and what the user wrote stays as
 """
 
 import codecs
-import contextlib
 import os
 import re
 import stat
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
@@ -16,6 +14,7 @@ from typing import Final
 from coordinator.machine.config_file import SAVED_HEADER, SAVED_PREFIX, parse_saved, saved_header
 from coordinator.machine.config_text import split_lines
 from coordinator.machine.problem import ConfigError, shown, shown_path
+from coordinator.whole_file import write_whole
 from nodes.errors import CanductorError
 from nodes.records import record
 
@@ -145,34 +144,11 @@ def replace_file(path: str, before: bytes, after: bytes) -> None:
                 f"{shown_path(path)} has changed since it was read, so nothing was saved; RESTART reads it"
                 " anew, then calibrate again"
             )
-        _put(real, after, status)
+        if not os.access(real, os.W_OK):
+            raise PermissionError(13, "it is write-protected")
+        write_whole(real, after, like=status)
     except OSError as error:
         raise SaveError(
             f"cannot write {shown_path(path)}: {error.strerror or error}; make the file and its folder"
             " writable"
         ) from None
-
-
-def _put(path: Path, data: bytes, like: os.stat_result) -> None:
-    """Replace PATH by a new file with mode and, where allowed, owner of the old one; raises OSError."""
-    if not os.access(path, os.W_OK):
-        raise PermissionError(13, "it is write-protected")
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            if (like.st_uid, like.st_gid) != (os.geteuid(), os.getegid()):
-                with contextlib.suppress(PermissionError):
-                    os.fchown(handle, like.st_uid, like.st_gid)
-            os.fchmod(handle, stat.S_IMODE(like.st_mode))
-            file.flush()
-            os.fsync(handle)
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

@@ -12,23 +12,19 @@ def _words(text: str) -> tuple[str, ...]:
 LATER_SECTIONS = frozenset(
     (
         *_words("manual_stepper delta_calibrate"),
-        *_words("homing_heaters pid_profile temperature_probe adc_scaled ads1x1x ads1118"),
+        *_words("homing_heaters temperature_probe adc_scaled ads1x1x ads1118"),
         *_words("probe bltouch smart_effector probe_eddy_current axis_twist_compensation load_cell"),
         *_words("load_cell_probe"),
         *_words("dockable_probe z_calibration tools_calibrate"),
         *_words("bed_mesh bed_tilt bed_screws screws_tilt_adjust z_tilt z_tilt_ng quad_gantry_level"),
-        *_words("skew_correction z_thermal_adjust endstop_phase"),
-        *_words("gcode_macro delayed_gcode gcode_arcs gcode_button gcode_shell_command save_variables"),
-        *_words("idle_timeout"),
-        *_words("virtual_sdcard sdcard_loop pause_resume firmware_retraction respond exclude_object"),
+        *_words("z_thermal_adjust endstop_phase"),
+        *_words("gcode_shell_command sdcard_loop"),
         *_words("resonance_tester shaketune adxl345 icm20948 lis2dw lis3dh bmi160 mpu9250 angle"),
-        *_words(
-            "tmc2130 tmc2208 tmc2209 tmc2240 tmc2660 tmc5160 autotune_tmc ad5206 mcp4451 mcp4728 mcp4018"
-        ),
-        *_words("led neopixel dotstar pca9533 pca9632 led_effect servo output_pin pwm_tool pwm_cycle_time"),
-        *_words("static_digital_output static_pwm_clock multi_pin sx1509 samd_sercom replicape"),
-        *_words("display display_data display_template display_glyph display_status menu palette2"),
-        *_words("filament_switch_sensor filament_motion_sensor"),
+        *_words("tmc2130 tmc2240 tmc2660 tmc5160 autotune_tmc ad5206 mcp4451 mcp4728 mcp4018"),
+        *_words("led neopixel dotstar pca9533 pca9632 led_effect servo pwm_tool pwm_cycle_time"),
+        *_words("static_pwm_clock multi_pin sx1509 samd_sercom replicape"),
+        *_words("display display_data display_template display_glyph menu palette2"),
+        *_words("filament_motion_sensor"),
         *_words("tsl1401cl_filament_width_sensor hall_filament_width_sensor"),
         *_words("canbus_stats statistics danger_options constants trad_rack belay"),
     )

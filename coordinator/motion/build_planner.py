@@ -18,5 +18,6 @@ ffibuilder = builder(
         "coordinator/motion/planner_queue.c",
         "coordinator/motion/planner_move.c",
         "coordinator/motion/gcode_lines.c",
+        "coordinator/motion/gcode_arcs.c",
     ],
 )

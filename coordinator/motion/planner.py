@@ -10,12 +10,15 @@ from dataclasses import fields
 from typing import Any
 
 from coordinator.motion._planner import ffi, lib
+from coordinator.motion.dynamics import Dynamics
+from coordinator.motion.language import Language, Plane, gcode_words
 from coordinator.motion.planner_values import (
     SPEED_LIMITS,
     Fault,
     FaultKind,
     Feed,
     FeedStatus,
+    Position,
     Slowed,
     Trapezoids,
     check_limits,
@@ -38,28 +41,16 @@ __all__ = [
     "Trapezoids",
 ]
 
-Position = tuple[float, float, float, float]
-
 AXIS_LETTERS = "XYZE"
-WORD_LETTERS = "XYZEFSPT"
-"""In the order of struct gcode_words."""
 MOVE_LETTERS = "XYZEF"
 _STATUS = tuple(FeedStatus)
 DEFAULT_SPEED_MM_S = 25.0
 """Speed of moves before the first F word."""
-MAX_ADVANCE_S = 10.0
-EXTRUDER_LIMITS = (
-    "max_extrude_only_velocity",
-    "max_extrude_only_accel",
-    "max_extrude_only_distance",
-    "max_extrude_ratio",
-    "instantaneous_corner_velocity",
-)
 RING_TRAPEZOIDS = int(lib.PLANNER_RING)
 """Most trapezoids that can wait for ``take``."""
 
 
-class Planner:
+class Planner(Language, Dynamics):
     """Plans moves with look-ahead; begins at standstill at POSITION, print time 0, nothing homed.
 
     Not thread-safe; ``feed`` releases the interpreter lock while C works. Raises ValueError when a limit is
@@ -68,8 +59,6 @@ class Planner:
 
     def __init__(self, limits: MotionLimits, *, position: Position = (0.0, 0.0, 0.0, 0.0)) -> None:
         check_limits(limits)
-        self.limits = limits
-        """What was configured; ``max_accel`` and the like below never exceed it."""
         self._limits: Any = ffi.new(
             "struct planner_limits *",
             {f.name: getattr(limits, f.name) for f in fields(limits) if f.name != "range_options"},
@@ -90,7 +79,8 @@ class Planner:
         )
         self._offset: Any = ffi.new("size_t *")
         self._count: Any = ffi.new("uint32_t *")
-        self._words: Any = ffi.new("struct gcode_words *")
+        Language.__init__(self, self._state, self._core)
+        Dynamics.__init__(self, limits, self._core)
 
     # ---- Text in ----
 
@@ -114,7 +104,7 @@ class Planner:
         """Act on a G1 with these WORDS (letters of MOVE_LETTERS); NEED_DATA says that it was done."""
         if not lib.planner_ready(self._core):
             return FeedStatus.FULL
-        refused = lib.gcode_move(self._state, self._core, self._given(words))
+        refused = lib.gcode_move(self._state, self._core, gcode_words(words))
         return FeedStatus.LIMIT if refused else FeedStatus.NEED_DATA
 
     def move_to(self, target: Sequence[float], speed_mm_s: float) -> FeedStatus:
@@ -129,15 +119,6 @@ class Planner:
         self._state.position = self.toolhead_position
         return FeedStatus.NEED_DATA
 
-    def _given(self, words: Mapping[str, float]) -> Any:
-        """Fill struct gcode_words."""
-        self._words.given = 0
-        for letter, value in words.items():
-            index = WORD_LETTERS.index(letter)
-            self._words.value[index] = value
-            self._words.given |= 1 << index
-        return self._words
-
     @property
     def fault(self) -> Fault:
         """Why the last refused move was refused."""
@@ -145,6 +126,23 @@ class Planner:
         options = (*self.limits.range_options, "")[fault.axis]
         kind, axis = FaultKind(fault.kind), AXIS_LETTERS[fault.axis]
         return Fault(kind, axis, fault.value, fault.low, fault.high, options)
+
+    def end_exclusion(self, retracted_mm: float, speed_mm_s: float) -> FeedStatus:
+        """Make moves again, after some were left out: the program goes on from where the filament is.
+
+        RETRACTED_MM: by how much it was drawn back when they began to be; it gets drawn back by as much as
+        the program has it now. Answers as ``move``.
+        """
+        if not lib.planner_ready(self._core):
+            return FeedStatus.FULL
+        change = retracted_mm - self.retracted_mm
+        if abs(change) > 1e-9:
+            x, y, z, e = self.toolhead_position
+            if lib.planner_add(self._core, (x, y, z, e + change), speed_mm_s):
+                return FeedStatus.LIMIT
+        self.match_filament()
+        self.excluded = False
+        return FeedStatus.NEED_DATA
 
     # ---- Trapezoids out ----
 
@@ -242,11 +240,6 @@ class Planner:
             scale = s.unit * (s.extrude_factor if letter == "E" else 1)
             s.base[axis] = s.position[axis] - value * scale
 
-    def clear_gcode_base(self, axes: str) -> None:
-        """Put the G-code origin of AXES (letters) back to the machine's."""
-        for letter in axes:
-            self._state.base[AXIS_LETTERS.index(letter)] = 0.0
-
     @property
     def homed(self) -> str:
         """Letters of the homed axes; only these may move. E needs no homing."""
@@ -290,6 +283,10 @@ class Planner:
         """The last F, before the speed factor."""
         return float(self._state.speed)
 
+    @speed_mm_s.setter
+    def speed_mm_s(self, speed_mm_s: float) -> None:
+        self._state.speed = check_number("the speed", speed_mm_s, 0)
+
     @property
     def speed_factor(self) -> float:
         """M220 / 100."""
@@ -311,61 +308,7 @@ class Planner:
         self._state.extrude_factor = factor
         self.set_gcode_position({"E": reads})
 
-    # ---- Dynamics of the moves to come; never beyond what was configured ----
-
-    @property
-    def accel(self) -> float:
-        """mm/s² (M204)."""
-        return float(self._core.accel)
-
-    @accel.setter
-    def accel(self, accel: float) -> None:
-        self.set_accel_words({"S": accel})
-
-    def set_accel_words(self, words: Mapping[str, float]) -> None:
-        """M204: S holds for all; P (print) and T (travel), until the next S, as the lower of the two."""
-        most = self.limits.max_accel
-        capped = {key: min(check_number("the acceleration", a, 1e-3), most) for key, a in words.items()}
-        if lib.gcode_accel(self._state, self._core, self._given(capped)):
-            raise ValueError("M204 names no acceleration; give S, or P and T (mm/s²)")
-
-    @property
-    def max_velocity(self) -> float:
-        """mm/s along the path."""
-        return float(self._core.limits.max_velocity)
-
-    @max_velocity.setter
-    def max_velocity(self, velocity: float) -> None:
-        velocity = check_number("the velocity", velocity, 1e-3)
-        self._core.limits.max_velocity = min(velocity, self.limits.max_velocity)
-
-    @property
-    def square_corner_velocity(self) -> float:
-        """mm/s."""
-        return float(self._core.limits.square_corner_velocity)
-
-    @square_corner_velocity.setter
-    def square_corner_velocity(self, velocity: float) -> None:
-        velocity = check_number("the square corner velocity", velocity, 0)
-        self._core.limits.square_corner_velocity = min(velocity, self.limits.square_corner_velocity)
-
-    @property
-    def minimum_cruise_ratio(self) -> float:
-        """0 <= ratio < 1."""
-        return float(self._core.limits.minimum_cruise_ratio)
-
-    @minimum_cruise_ratio.setter
-    def minimum_cruise_ratio(self, ratio: float) -> None:
-        self._core.limits.minimum_cruise_ratio = check_number("the minimum cruise ratio", ratio, 0, 0.999)
-
-    @property
-    def pressure_advance(self) -> float:
-        """Seconds, of the printing moves to come."""
-        return float(self._core.pressure_advance)
-
-    @pressure_advance.setter
-    def pressure_advance(self, advance_s: float) -> None:
-        self._core.pressure_advance = check_number("the pressure advance", advance_s, 0, MAX_ADVANCE_S)
+    # ---- Modes ----
 
     def reset_modes(self) -> None:
         """Take units, modes, speed and dynamics back to where a program begins.
@@ -374,33 +317,13 @@ class Planner:
         """
         self.unit_mm = 1.0
         self.relative = self.relative_extrusion = False
+        self.drop_exclusion()
+        self.plane = Plane.XY
         self._state.speed = DEFAULT_SPEED_MM_S
         self.accel = self.limits.max_accel
         self.max_velocity = self.limits.max_velocity
         self.square_corner_velocity = self.limits.square_corner_velocity
         self.minimum_cruise_ratio = self.limits.minimum_cruise_ratio
-
-    # ---- Where and how the moves to come may go when the machine changes ----
-
-    def set_range(self, axis: int, low: float, high: float) -> None:
-        """AXIS (0 to 2) may go from LOW to HIGH, mm; nowhere when LOW is above HIGH."""
-        self._core.limits.position_min[axis] = check_number("position_min", low, -1e6, 1e6)
-        self._core.limits.position_max[axis] = check_number("position_max", high, -1e6, 1e6)
-
-    @property
-    def cold(self) -> bool:
-        """Whether moves of filament are refused."""
-        return bool(self._core.cold)
-
-    @cold.setter
-    def cold(self, cold: bool) -> None:
-        self._core.cold = cold
-
-    def set_extruder_limits(self, limits: MotionLimits) -> None:
-        """Take over what LIMITS say of filament: another extruder is active."""
-        check_limits(limits)
-        for name in EXTRUDER_LIMITS:
-            setattr(self._core.limits, name, getattr(limits, name))
 
     # ---- Counters ----
 

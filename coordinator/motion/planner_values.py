@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
 
+Position = tuple[float, float, float, float]
+
+
 class FeedStatus(IntEnum):
     """Why ``feed`` stopped."""
 

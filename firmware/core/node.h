@@ -45,6 +45,9 @@ struct timer {
 // Queues TIMER (not queued yet). A waketime in the past shuts the node down with "Timer too close"; while the
 // node is shut down nothing is queued. Interrupts must be off.
 void sched_add_timer(struct node *node, struct timer *timer);
+// Queues TIMER (not queued yet) for TICKS from now. Never too close: with interrupts off nothing comes
+// between on a chip, and on a board that may be kept waiting it is late. Interrupts must be off.
+void sched_add_timer_in(struct node *node, struct timer *timer, uint32_t ticks);
 // Removes TIMER; nothing happens when it is not queued. Interrupts must be off.
 void sched_delete_timer(struct node *node, struct timer *timer);
 // Runs the first timer, which must exist and be due. A waketime set further back than the config's slack

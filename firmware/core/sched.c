@@ -30,6 +30,13 @@ void sched_add_timer(struct node *node, struct timer *timer) {
     insert(node, timer);
 }
 
+void sched_add_timer_in(struct node *node, struct timer *timer, uint32_t ticks) {
+    if (node->shutdown.active)
+        return;
+    timer->waketime = board_clock(node) + ticks;
+    insert(node, timer);
+}
+
 void sched_delete_timer(struct node *node, struct timer *timer) {
     for (struct timer **at = &node->sched.first; *at; at = &(*at)->next)
         if (*at == timer) {

@@ -3,8 +3,11 @@
 // tells which edges an input takes, inputs that take new ones are kept and mutated further.
 //
 // Usage, as libFuzzer's: fuzz_motion [-max_total_time=S] [-runs=N] [-seed=N] FILE|FOLDER...
-// What fails is written to ./crash-input before it runs, and stays there when the process ends by it.
+// What fails, or is at work when SIGTERM ends it, is written to ./crash-input.
 #include <dirent.h>
+#include <fcntl.h>
+#include <sanitizer/common_interface_defs.h>
+#include <signal.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -58,12 +61,25 @@ static void keep(const uint8_t *data, size_t size) {
     corpus[place].size = size;
 }
 
+static const uint8_t *at_work;
+static size_t at_work_size;
+
+// The sanitizers call it, and what ends by a signal; nothing here may allocate.
+static void write_crash(void) {
+    int file = open("crash-input", O_WRONLY | O_CREAT | O_TRUNC, 0644);
+    if (file >= 0 && write(file, at_work, at_work_size) == (ssize_t)at_work_size)
+        close(file);
+}
+
+static void ended(int number) {
+    write_crash();
+    signal(number, SIG_DFL);
+    raise(number);
+}
+
 static void try_input(const uint8_t *data, size_t size, int remember) {
-    FILE *crash = fopen("crash-input", "wb");
-    if (crash) {
-        fwrite(data, 1, size, crash);
-        fclose(crash);
-    }
+    at_work = data;
+    at_work_size = size;
     memset(taken, 0, sizeof taken);
     last_place = 0;
     LLVMFuzzerTestOneInput(data, size);
@@ -140,6 +156,10 @@ static void mutate(uint8_t *data, size_t *size) {
 
 int main(int argc, char **argv) {
     double seconds = 0, began = (double)time(NULL);
+    unlink("crash-input");
+    __sanitizer_set_death_callback(write_crash);
+    signal(SIGABRT, ended);
+    signal(SIGTERM, ended);
     uint64_t runs = 0, most = 0;
     for (int i = 1; i < argc; i++) {
         if (sscanf(argv[i], "-max_total_time=%lf", &seconds) == 1 ||
@@ -162,7 +182,6 @@ int main(int argc, char **argv) {
     size_t edges = 0;
     for (int i = 0; i < MAP; i++)
         edges += known[i] != 0;
-    unlink("crash-input");
     printf("%lu runs in %.0f s, %zu edges, corpus of %zu, nothing failed\n", runs, (double)time(NULL) - began,
            edges, corpus_count);
     return 0;

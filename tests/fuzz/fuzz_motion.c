@@ -129,6 +129,9 @@ static void begin(const uint8_t *options) {
     run.gcode = (struct gcode_state){.unit = options[0] & 32 ? 25.4 : 1, .speed = 25};
     memcpy(run.gcode.position, run.position, sizeof run.position);
     run.gcode.speed_factor = run.gcode.extrude_factor = 1;
+    run.gcode.arc_piece = options[0] & 1 ? 10 : 1;
+    run.gcode.arc_deviation = options[0] & 2 ? 0.5 : 0.005;
+    run.gcode.plane = options[0] >> 3 & 1 ? GCODE_XY : options[0] & 16 ? GCODE_ZX : GCODE_YZ;
     if (options[0] & 64)
         shape();
 }

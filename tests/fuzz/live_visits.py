@@ -52,6 +52,7 @@ WILD: Final[tuple[Any, ...]] = (
         "ü\0\x1b[2J",
     ),
     *("%s%n{0}", "../../etc/passwd", "*", [], [[[[]]]], {}, {"a": {"b": [None]}}, ["*"] * 70, "9" * 400),
+    *(["*a*b*c"], ["*a" * 60] * 64),
 )
 
 
@@ -279,7 +280,7 @@ class Visit:
         parser, last, raw = WireReader(Limits(message_bytes=2**24 - 1), checked=False), {}, 0
         while data := await self._receive(reader):
             if parser.encoding is None:
-                parser.encoding = Encoding.MSGPACK if self._sent_first == 0 else Encoding.JSON
+                parser.encoding = self._encoding_of(data)
             raw += len(data)
             parser.feed(data, 0.0)
             while (message := parser.next_message()) is not None:
@@ -294,6 +295,14 @@ class Visit:
             self._tally.counts[f"ended: {code}"] += 1
             if code not in ENDS:
                 self._problem(f"it was cut off without a reason; last came {str(last)[:100]}")
+
+    def _encoding_of(self, data: bytes) -> Encoding:
+        """Return the encoding of what came first. JSON is also for whom it did not hear in time."""
+        sent = Encoding.MSGPACK if self._sent_first == 0 else Encoding.JSON
+        came = Encoding.MSGPACK if data[0] == 0 else Encoding.JSON
+        if came is not sent and b'"timeout"' not in data:
+            self._problem(f"it spoke {came.name} to one who spoke {sent.name}: {data[:200]!r}")
+        return came
 
     async def _receive(self, reader: asyncio.StreamReader) -> bytes:
         try:

@@ -15,6 +15,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from coordinator.commands import DEMO_MACHINE, DemoOptions
 from coordinator.demo.run import Prover, report_of
 from coordinator.demo.stage import Stage
@@ -25,6 +28,7 @@ from coordinator.ipc.settings import IpcSettings, Limits, TcpSettings
 from coordinator.ipc.state import StateTree
 from coordinator.ipc.uploads import upload_method
 from coordinator.machine.description import load_machine
+from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.pipeline import PlanRecord
 from coordinator.service.log_ring import Entry
 from coordinator.service.machine_service import MachineService, ServiceSettings
@@ -37,11 +41,33 @@ LOOK_S = 0.02
 NODES_PRIORITY, SERVICE_PRIORITY = 10, 5
 
 
+class FiledRecord(PlanRecord):
+    """Keeps trapezoids in a file: the memory that is watched is to be the service's own."""
+
+    __slots__ = ("_file",)
+
+    def __init__(self, path: Path) -> None:
+        super().__init__((0.0, 0.0, 0.0, 0.0))
+        self._file = path.open("ab")
+
+    def restart(self) -> None:
+        super().restart()
+        self._file.truncate(0)
+
+    def add(self, trapezoids: NDArray[np.void]) -> None:
+        self._file.write(trapezoids.tobytes())
+        self.count += len(trapezoids)
+
+    def every(self) -> NDArray[np.void]:
+        self._file.flush()
+        return np.fromfile(self._file.name, TRAPEZOID)
+
+
 class Proved:
     """The service, its server, and what was noted of them."""
 
     def __init__(self, stage: Stage, folder: Path, jobs: Path) -> None:
-        self.record = PlanRecord((0.0, 0.0, 0.0, 0.0))
+        self.record = FiledRecord(folder / "trapezoids")
         self.leads: list[float | None] = []
         self.both_edges: dict[str, bool] = {}
         self.claimed: dict[str, list[str]] = {}
@@ -108,7 +134,7 @@ class Proved:
         pins = self.service.machine.modules.pins
         self.claimed |= {name: pins.claimed(name) for name in self.service.machine.nodes}
         self.both_edges |= {name: stepper.steps_on_both_edges for name, stepper in steppers.items()}
-        self.service.motion.streamer.began_at = await self.service.machine.stepper_positions()
+        self.service.motion.streamer.worker.began_at = await self.service.machine.stepper_positions()
 
     async def _note_leads(self) -> None:
         """Note the smallest lead of each job when the next one begins."""

@@ -12,6 +12,10 @@ DECL_ENUMERATION_RANGE("pin", "PF0", 80, 16);
 DECL_ENUMERATION_RANGE("pin", "PG0", 96, 16);
 DECL_ENUMERATION_RANGE("pin", "PH0", 112, 16);
 DECL_ENUMERATION_RANGE("pin", "PI0", 128, 16);
+DECL_ENUMERATION("pin", "ADC_TEMPERATURE", 254);
+
+// The chip's own sensor: always 35 degrees by the line of RP2040, (0.706 - 8 * 0.001721) / 3.3 of full scale.
+enum { CHIP_PIN = 254, CHIP_SAMPLE = 859 };
 
 DECL_CONSTANT("ADC_MAX", 4095);
 DECL_CONSTANT("PWM_MAX", 32768);
@@ -71,8 +75,10 @@ void board_gpio_write(struct node *node, uint32_t pin, int level) {
 }
 
 int board_gpio_in(struct node *node, uint32_t pin, int pull) {
-    (void)node;
-    (void)pull; // nothing floats here
+    struct virtual_board *board = board_of(node);
+    (void)pull; // what is not driven has its own level here
+    if (!check(pin) && board->plant && board->plant->cares[pin])
+        plant_float(board->plant, virtual_true_ns(board), pin);
     return check(pin);
 }
 
@@ -85,11 +91,15 @@ int board_gpio_read(struct node *node, uint32_t pin) {
 
 int board_adc_setup(struct node *node, uint32_t pin) {
     (void)node;
-    return check(pin);
+    return pin == CHIP_PIN ? 0 : check(pin);
 }
 
 uint32_t board_adc_sample(struct node *node, uint32_t pin, uint16_t *value) {
     struct virtual_board *board = board_of(node);
+    if (pin == CHIP_PIN) {
+        *value = CHIP_SAMPLE;
+        return 0;
+    }
     *value = board->adc[pin];
     if (board->plant && board->plant->reads[pin])
         *value = plant_sample(board->plant, virtual_true_ns(board), pin, *value);

@@ -112,6 +112,50 @@ def test_a_section_that_is_missing_is_all_that_is_told(tmp_path: Path, section: 
     assert f"[{section}]" in told
 
 
+MODULES = """\
+[fan]
+pin: PA1
+max_power: 2
+[tmc2209 stepper_z]
+uart_pin: PD1
+run_current: 0.8
+[safe_z_home]
+home_xy_position: 100, 100
+[gcode_macro G28]
+gcode:
+    G28
+"""
+
+
+@pytest.mark.parametrize(
+    "missing",
+    [("printer",), ("stepper_x",), ("stepper_z",), ("stepper_x", "stepper_z"), ("printer", "stepper_z")],
+)
+def test_modules_are_checked_where_sections_are_missing(tmp_path: Path, missing: tuple[str, ...]) -> None:
+    parts = [part for part in GOOD.split("[") if not part.startswith(missing)]
+    told = mistakes(tmp_path, text="[".join(parts) + MODULES)
+    begin = "[".join(parts).count("\n")
+    named = [f": there is no section [{name}]; add it" for name in missing]
+    assert [line.partition(" of ")[0] for line in told if "no section" not in line] == [
+        f":{begin + 3}: option 'max_power'",
+        f":{begin + 9}: [gcode_macro G28] takes the name",
+    ]
+    assert [line[: len(start)] for line, start in zip(told, named, strict=False)] == named
+
+
+@pytest.mark.parametrize("value", ["", "position_max: far\n"])
+def test_a_range_that_nobody_gave_makes_no_place_lie_outside(tmp_path: Path, value: str) -> None:
+    text = GOOD.replace("position_max: 250\n[stepper_y]", f"{value}[stepper_y]")
+    (told,) = mistakes(tmp_path, text=text + "[safe_z_home]\nhome_xy_position: 100, 100\n")
+    assert "'position_max'" in told
+
+
+def test_without_printer_nobody_knows_what_towers_are(tmp_path: Path) -> None:
+    text = GOOD[: GOOD.index("[printer]")] + "[stepper_a]\n[stepper_b]\n[stepper_c]\n[fan]\nmax_power: 2\n"
+    (told,) = mistakes(tmp_path, text=text)
+    assert told == ": there is no section [printer]; add it"
+
+
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     (told,) = check_config(str(tmp_path / "none.cfg"))
     assert "none.cfg" in str(told)
@@ -123,3 +167,80 @@ def test_what_is_no_configuration_at_all_ends(tmp_path: Path) -> None:
     path = tmp_path / "noise.cfg"
     path.write_text("\n".join(f"line {n}" for n in range(10_000)))
     assert len(check_config(str(path))) == check_module.PROBLEMS_MAX
+
+
+def test_mistakes_within_templates_end_no_check(tmp_path: Path) -> None:
+    (tmp_path / "more.cfg").write_text("[gcode_macro C]\ngcode:\n    {% endfor %}\n")
+    sections = """\
+[gcode_macro A]
+gcode:
+    G28
+    {% if %}
+[gcode_macro B]
+gcode:
+    {% for %}
+[gcode_macro C]
+[delayed_gcode D]
+gcode:
+    {{ }
+[fan_generic x]
+pin: PA1
+max_power: 2
+[include more.cfg]
+"""
+    told = mistakes(tmp_path, text=GOOD + sections)
+    start = len(GOOD.splitlines())
+    assert [line.partition(": ")[0] for line in told if "more.cfg" not in line] == [
+        f":{start + line}" for line in (4, 7, 11, 14)
+    ]
+    (included,) = (line for line in told if "more.cfg" in line)
+    assert included.startswith(f"{tmp_path}/more.cfg:3: the template of [gcode_macro C]")
+
+
+NAMED = (
+    *("gcode_macro", "fan_generic", "delayed_gcode", "output_pin", "heater_fan", "temperature_sensor"),
+    *("heater_generic", "controller_fan", "tmc2209", "gcode_button", "filament_switch_sensor"),
+    *("verify_heater", "temperature_fan", "thermistor", "pid_profile", "static_digital_output"),
+)
+
+
+@pytest.mark.parametrize("kind", NAMED)
+def test_sections_that_need_a_name(tmp_path: Path, kind: str) -> None:
+    told = mistakes(tmp_path, text=f"{GOOD}[{kind}]\n")
+    line = len(GOOD.splitlines()) + 1
+    assert f":{line}: [{kind}] needs a name; write [{kind} NAME]" in told
+
+
+def test_the_plain_section_of_a_kind_that_has_profiles(tmp_path: Path) -> None:
+    assert mistakes(tmp_path, text=GOOD + "[skew_correction]\n[skew_correction mine]\n") == []
+
+
+EXTRUDER = """\
+[extruder]
+step_pin: PC0
+dir_pin: PC1
+microsteps: 16
+rotation_distance: 22.5
+nozzle_diameter: 0.4
+filament_diameter: 1.75
+heater_pinn: PC2
+sensor_type: Generic 3950
+sensor_pin: PC3
+control: watermark
+min_temp: 0
+max_temp: 250
+"""
+
+
+def test_an_option_that_is_misspelt_makes_no_others_useless(tmp_path: Path) -> None:
+    (told,) = mistakes(tmp_path, text=GOOD + EXTRUDER)
+    assert told.endswith(": [extruder] has no option 'heater_pinn'; did you mean 'heater_pin'?")
+    useless = mistakes(tmp_path, text=GOOD + EXTRUDER.replace("heater_pinn", "colour"))
+    assert sum("has no effect beside the others" in line for line in useless) == 5
+
+
+@pytest.mark.parametrize("rename", ["rename_existin: G28.1", "rename_existing: G-28"])
+def test_a_name_for_a_command_that_is_wrong_is_not_asked_for_again(tmp_path: Path, rename: str) -> None:
+    (told,) = mistakes(tmp_path, text=f"{GOOD}[gcode_macro G28]\n{rename}\ngcode:\n    G28.1\n")
+    assert "rename_existing" in told
+    assert "takes the name" not in told

@@ -163,7 +163,7 @@ def test_moves_without_length_are_dropped_and_nothing_is_lost() -> None:
 
 def test_the_commands_between_moves_that_are_read_with_them() -> None:
     planner = homed_planner()
-    text = b"""M204 P2000
+    text = b"""M204 P3000 T2000
 G92 X5 E-1.5 ; X 0 reads as 5
 G1 X15 F12000
 m204 T1000 (travel)
@@ -178,11 +178,13 @@ G1 X10
     feed = planner.feed(text, feed.offset, len(text), final=True)
     assert feed == (FeedStatus.NEED_DATA, len(text), 9)
     t = joined(flushed(planner))
-    assert t["accel"].tolist() == [2000, 1000, 5000]
+    assert t["accel"].tolist() == [2000, 2000, 5000], "T alone has no effect"
     assert t["start"][:, 0].tolist() == [0, 10, 20]
     assert planner.gcode_base == (20, 0, 0, 0)
     planner.set_accel_words({"P": 3000})
-    assert planner.accel == 3000, "S forgot P and T"
+    assert planner.accel == 5000
+    planner.set_accel_words({"P": 3000, "T": 4000})
+    assert planner.accel == 3000
 
 
 @pytest.mark.parametrize(

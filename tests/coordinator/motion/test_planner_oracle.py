@@ -122,7 +122,8 @@ def test_random_programs(lines: list[str], limits: MotionLimits) -> None:
 
 @pytest.mark.parametrize("name", ["text_cube.gcode", "vase.gcode", "circles01.gcode"])
 def test_real_files(name: str) -> None:
-    lines = real_file(name).decode().splitlines()[:3000]
+    # Sliced for a host that heeds P alone: with S the acceleration changes as it was meant to.
+    lines = real_file(name).decode().replace("M204 P", "M204 S").splitlines()[:3000]
     planner = homed_planner()
     language = Language(LIMITS, (0, 0, 0, 0))
     pieces = []
@@ -131,7 +132,7 @@ def test_real_files(name: str) -> None:
         if planner.feed(text, 0, len(text), final=False).offset == len(text):
             language.line(line)
         elif line.split(" ")[0] in {"G92", "M82", "M83", "M204"}:
-            language.line(line.replace("P", "S"))
+            language.line(line)
             planner.accel = language.accel
             planner.relative_extrusion = language.relative_e
             if line.startswith("G92"):

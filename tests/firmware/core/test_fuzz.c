@@ -13,7 +13,7 @@
 
 #include <string.h>
 
-enum { ROUNDS = 40, BLOCKS = 600, OIDS = 10, NODE_ID = 4, TO_NODE = 0x108, FROM_NODE = 0x109 };
+enum { ROUNDS = 40, BLOCKS = 600, OIDS = 11, NODE_ID = 4, TO_NODE = 0x108, FROM_NODE = 0x109 };
 enum { DAMAGED = 1, ON_CAN = 2, TABLE_ROOM = 4 };
 
 static const uint8_t uuid[NODE_UUID_SIZE] = {1, 2, 3, 4, 5, 6};
@@ -28,6 +28,7 @@ DECL_COMMAND(command_config_digital_out, "", 0);
 DECL_COMMAND(command_config_pwm_out, "", 0);
 DECL_COMMAND(command_config_analog_in, "", 0);
 DECL_COMMAND(command_config_buttons, "", 0);
+DECL_COMMAND(command_config_tmcuart, "", 0);
 DECL_COMMAND(command_config_table, "", 0);
 DECL_COMMAND(command_config_table_register, "", 0);
 
@@ -50,7 +51,9 @@ DECL_COMMAND(command_queue_pwm_out, "", 0);
 DECL_COMMAND(command_query_analog_in, "", 0);
 DECL_COMMAND(command_buttons_query, "", 0);
 DECL_COMMAND(command_buttons_ack, "", 0);
+DECL_COMMAND(command_tmcuart_send, "", 0);
 DECL_COMMAND(command_table_activate, "", 0);
+DECL_COMMAND(command_table_find, "", 0);
 DECL_COMMAND(command_table_query, "", 0);
 DECL_COMMAND(command_table_read, "", 0);
 DECL_COMMAND(command_table_register_poll, "", 0);
@@ -79,6 +82,7 @@ static const struct {
     {command_query_analog_in, 6, 1},
     {command_buttons_query, 7, 1},
     {command_buttons_ack, 7, 1},
+    {command_tmcuart_send, 10, 0},
     {command_table_activate, 8, 1},
     {command_table_query, 8, 0},
     {command_table_read, 8, 0},
@@ -267,6 +271,8 @@ static void configure(struct fuzz *fuzz) {
         {command_config_buttons, {INT(7), INT(8)}},
         {command_config_table, {INT(8), INT(1), INT(TABLE_ROOM), INT(below(fuzz, 2))}},
         {command_config_table_register, {INT(9)}},
+        {command_config_tmcuart,
+         {INT(10), INT(9), INT(1), INT(9 + below(fuzz, 2)), INT(8 + below(fuzz, 99))}},
         {command_trsync_set_group, {INT(2), INT(below(fuzz, 3))}},
         {command_set_bus_stop, {INT(1)}},
         {command_finalize_config, {INT(1)}},
@@ -296,6 +302,9 @@ static size_t sensible_command(struct fuzz *fuzz, uint8_t *out) {
     } else if (uses[use].handler == command_endstop_home ||
                uses[use].handler == command_stepper_stop_on_trigger) {
         args[uses[use].oid ? 6 : 1] = INT(2);
+    } else if (uses[use].handler == command_tmcuart_send) {
+        args[1] = BYTES(uuid, below(fuzz, sizeof(uuid) + 1));
+        args[2] = INT(below(fuzz, 11));
     } else if (uses[use].handler == command_trsync_set_group) {
         args[1] = INT(below(fuzz, 3));
     }
