@@ -2,9 +2,12 @@
 
 import asyncio
 import contextlib
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+from coordinator.filament_forecast import FilamentForecast
 from coordinator.host import Host
 from coordinator.load_watch import LoadWatch
 from coordinator.machine.description import (
@@ -19,6 +22,7 @@ from coordinator.machine_devices import MachineDevices, stream_specs
 from coordinator.modules.live import Live
 from coordinator.motion.specs import NodeStreamSpec
 from coordinator.node_care import JobGate, NodeCare
+from coordinator.rail_places import RailPlaces
 from coordinator.timebase import ClockMap, TimeBase
 from coordinator.wire import Wire
 from nodes.assign import Uuid
@@ -31,6 +35,9 @@ from nodes.link import IOStats, Link
 from nodes.node import Node
 from nodes.node_config import NodeConfig
 from nodes.node_states import NodeState
+
+if TYPE_CHECKING:
+    from coordinator.modules.runner import Runner
 
 
 class MachineStopped(CanductorError):  # noqa: N818
@@ -77,8 +84,13 @@ class Machine:
         self.policies = {node.name: node.policy for node in description.nodes}
         self.modules = description.modules.build(description)
         self.devices = MachineDevices(description, self.modules)
+        self.rails = RailPlaces(description)
         self.nodes: dict[str, Node] = {}
         self.stopped: MachineStopped | None = None
+        self.runner: Runner | None = None
+        """The service that runs it; None: a program is all there is."""
+        self.filament = FilamentForecast()
+        """What moves that are planned are going to push; heaters ask."""
         self.unsaved = PendingConfig(description.source)
         self.prepare_restart = prepare_restart
         self._reset_nodes = reset_nodes
@@ -263,7 +275,13 @@ class Machine:
         """Raise BusOverload when a bus will not carry the motion queued on it in time."""
         for opened in self._open:
             if opened.bus.closed_because is None:
-                opened.watch.look(opened.bus.io.forecast(), self.host.now(), _repeated(opened.bus))
+                opened.watch.look(
+                    opened.bus.io.forecast(), self.host.now(), functools.partial(_repeated, opened.bus)
+                )
+
+    def is_busy(self, load: float) -> bool:
+        """Tell whether a bus has carried more than LOAD lately, a share of its time."""
+        return any(o.bus.closed_because is None and o.bus.io.load().total > load for o in self._open)
 
     async def stepper_positions(self) -> dict[str, int]:
         """Ask every node where its steppers stand: steps from where they began, positive as motion counts."""

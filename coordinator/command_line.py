@@ -78,7 +78,7 @@ def read_words(words: Sequence[str]) -> Job:
         return _front_end(words)
     if words[0] in OTHER_COMMANDS:
         return _other(words)
-    arguments = _parser().parse_args(list(words))
+    arguments = _parser(only=words[0]).parse_args(list(words))
     if arguments.version:
         sys.stdout.write(f"canductor {version()}\n")
         raise Answered
@@ -138,7 +138,15 @@ def _front_end(words: Sequence[str]) -> Job:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     _declare_front_end(commands, words[0], FRONT_END_COMMANDS[words[0]])
     arguments = parser.parse_args(list(words))
+    arguments.on_device = _on_device
     return cast("Job", arguments.make_job(arguments))
+
+
+def _on_device(job: Any) -> Report:
+    """Send tables to drives and nodes without a coordinator: a tool's work."""
+    from canbus_tools.table_device import carry_out  # noqa: PLC0415 (start-up time)
+
+    return carry_out(job)
 
 
 def _declare_front_end(commands: Any, name: str, summary: str) -> None:
@@ -164,8 +172,8 @@ def _declare_other(commands: Any, name: str) -> None:
     importlib.import_module(_WORDS_OF[name]).declare(command)
 
 
-def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
-    """Return the parser; WHOLE: without the commands that others declare."""
+def _parser(*, whole: bool = False, only: str = "") -> argparse.ArgumentParser:
+    """Return the parser; WHOLE: without the commands that others declare; ONLY: of this command of ours."""
     parser = _Parser(
         prog="canductor",
         description="One coordinator conducts many micro-controllers on CAN buses and UARTs as one machine.",
@@ -174,9 +182,7 @@ def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="print the version")
     parser.set_defaults(make_job=None)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
-    for name, summary in () if whole else (TOOL_COMMANDS | FRONT_END_COMMANDS | OTHER_COMMANDS).items():
-        commands.add_parser(name, help=_in_list(summary))
-    for name, summary, declare, make_job in (
+    own = (
         ("demo", "print on virtual nodes and compare every stepper with the plan", _declare_demo, _demo),
         ("run", "bring up the machine of a configuration file", _declare_run, _run),
         ("plan", "plan a file without hardware: time, steps, bus load, warnings", _declare_plan, _plan),
@@ -186,7 +192,14 @@ def _parser(*, whole: bool = False) -> argparse.ArgumentParser:
             _declare_simulate,
             _simulate,
         ),
-    ):
+    )
+    known = only in [name for name, *_ in own]
+    others = {} if whole or known else TOOL_COMMANDS | FRONT_END_COMMANDS | OTHER_COMMANDS
+    for name, summary in others.items():
+        commands.add_parser(name, help=_in_list(summary))
+    for name, summary, declare, make_job in own:
+        if known and name != only:
+            continue
         command = commands.add_parser(name, help=summary, description=f"{summary}.", allow_abbrev=False)
         declare(command)
         command.add_argument("--json", action="store_true", help="print one JSON object as the last line")
@@ -325,7 +338,8 @@ def _plan(given: argparse.Namespace) -> Job:
     if given.plot is not None and given.plot.suffix.lower() != ".svg":
         raise UsageError(f"--plot is '{given.plot}', must be a file that ends in .svg")
     dictionaries = assignments("--dictionary", given.dictionary, Path)
-    tables = assignments("--table", given.table, Path)
+    by_axis = [pair.partition("=") for pair in given.table or ()]
+    tables = assignments("--table", [f"{axis.lower()}{equals}{file}" for axis, equals, file in by_axis], Path)
     for path in (*dictionaries.values(), *tables.values()):
         existing_file(path)
     options = PlanOptions(

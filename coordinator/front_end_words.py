@@ -12,6 +12,7 @@ from coordinator.table.words import declare_table
 from nodes.errors import CanductorError
 from nodes.option_values import UsageError, existing_file, number, whole
 from nodes.records import record
+from nodes.secret_file import read_secret
 
 SHELLS: Final = ("bash", "zsh", "fish")
 
@@ -32,7 +33,7 @@ def declare(command: argparse.ArgumentParser, name: str) -> None:
     """Add the options of the command NAME."""
     add = command.add_argument
     if name == "table":
-        declare_table(command, _add_target, _target)
+        declare_table(command, add_target, read_target)
         return
     if name == "call":
         add("method", help="its name; api.methods lists all")
@@ -51,12 +52,13 @@ def declare(command: argparse.ArgumentParser, name: str) -> None:
     elif name == "discover":
         add("--timeout", default="3", metavar="S", help="for machines to answer; 3 if not given")
     if name not in ("completion", "discover"):
-        _add_target(command)
+        add_target(command)
     add("--json", action="store_true", help="print one JSON object as the last line")
     command.set_defaults(make_job=_MAKERS[name])
 
 
-def _add_target(command: argparse.ArgumentParser) -> None:
+def add_target(command: argparse.ArgumentParser) -> None:
+    """Add the options that say which machine."""
     add = command.add_argument
     add("--at", metavar="ADDRESS", help="socket, tcp://HOST:PORT or tls://HOST:PORT")
     add("--token-file", type=Path, metavar="FILE", help="file that holds the token, for TCP")
@@ -64,20 +66,24 @@ def _add_target(command: argparse.ArgumentParser) -> None:
     add("--timeout", default="5", metavar="S", help="for the machine to answer; 5 if not given")
 
 
-def _target(given: argparse.Namespace) -> Target:
-    token = None
-    if given.token_file is not None:
-        existing_file(given.token_file)
-        try:
-            token = given.token_file.read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise CanductorError(f"the token's file {given.token_file} cannot be read: {error}") from None
+def read_target(given: argparse.Namespace) -> Target:
+    """Read them; raises CanductorError, UsageError."""
     return Target(
         address=given.at,
-        token=token,
+        token=None if given.token_file is None else _read_token(given.token_file),
         certificate=existing_file(given.certificate),
         timeout_s=number("--timeout", given.timeout, 0.1, 3600, "s"),
     )
+
+
+def _read_token(path: Path) -> str:
+    existing_file(path)
+    words = read_secret(path, "the token's file")[0].split()
+    if not words:
+        raise CanductorError(f"the token's file {path} is empty; write the token into it")
+    if len(words) > 1:
+        raise CanductorError(f"the token's file {path} must hold one token, and nothing else")
+    return words[0]
 
 
 def _run(name: str, *arguments: object, **options: object) -> Report:
@@ -102,23 +108,23 @@ def read_params(pairs: list[str]) -> dict[str, Any]:
 
 
 def _call(given: argparse.Namespace) -> Callable[[], Report]:
-    target, params = _target(given), read_params(given.params)
+    target, params = read_target(given), read_params(given.params)
     return lambda: _run("call", target, given.method, params)
 
 
 def _watch(given: argparse.Namespace) -> Callable[[], Report]:
-    target, rate_hz = _target(given), number("--rate", given.rate, 0.01, 50, "Hz")
+    target, rate_hz = read_target(given), number("--rate", given.rate, 0.01, 50, "Hz")
     count = None if given.count is None else whole("--count", given.count, 1)
     return lambda: _run("watch", target, given.fields or ["*"], rate_hz, count, as_json=given.json)
 
 
 def _status(given: argparse.Namespace) -> Callable[[], Report]:
-    target = _target(given)
+    target = read_target(given)
     return lambda: _run("status", target)
 
 
 def _send(given: argparse.Namespace) -> Callable[[], Report]:
-    target = _target(given)
+    target = read_target(given)
     existing_file(given.file)
     name = given.name or given.file.name
     return lambda: _run(
@@ -127,7 +133,7 @@ def _send(given: argparse.Namespace) -> Callable[[], Report]:
 
 
 def _estop(given: argparse.Namespace) -> Callable[[], Report]:
-    target = _target(given)
+    target = read_target(given)
     return lambda: _run("estop", target)
 
 

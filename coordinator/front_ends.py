@@ -35,14 +35,19 @@ class Answer:
         return self.text
 
 
+def tls_of(target: Target) -> ssl.SSLContext | None:
+    """Return how TARGET's certificate is checked; None: as usual. Raises CanductorError."""
+    if target.certificate is None:
+        return None
+    try:
+        return ssl.create_default_context(cafile=target.certificate)
+    except (OSError, ssl.SSLError) as error:
+        raise CanductorError(f"{target.certificate} is no certificate: {error}") from None
+
+
 def _with_client(target: Target, body: Callable[[Client], Awaitable[T]]) -> T:
     async def main() -> T:
-        tls = None
-        if target.certificate is not None:
-            try:
-                tls = ssl.create_default_context(cafile=target.certificate)
-            except (OSError, ssl.SSLError) as error:
-                raise CanductorError(f"{target.certificate} is no certificate: {error}") from None
+        tls = tls_of(target)
         client = Client.connect(
             target.address, token=target.token, name="canductor", tls=tls, timeout_s=target.timeout_s
         )
@@ -71,6 +76,8 @@ def watch(target: Target, fields: list[str], rate_hz: float, count: int | None, 
         updates = client.watch(fields, rate_hz)
         try:
             async for update in updates:
+                if update.snapshot and not update.values:
+                    _say_that_none_matches(fields, waiting=shown + 1 != count)
                 _show_update(update, as_json=as_json)
                 shown += 1
                 if shown == count:
@@ -85,6 +92,12 @@ def watch(target: Target, fields: list[str], rate_hz: float, count: int | None, 
     except KeyboardInterrupt:
         pass  # how one ends a watch
     return Answer({"updates": shown}, "")
+
+
+def _say_that_none_matches(fields: list[str], *, waiting: bool) -> None:
+    addition = "; waiting for one that does" if waiting else ""
+    sys.stderr.write(f"canductor: no field matches {' '.join(fields)} now{addition}\n")
+    sys.stderr.flush()
 
 
 def _show_update(update: Update, *, as_json: bool) -> None:
@@ -135,6 +148,8 @@ def estop(target: Target) -> Answer:
 
 def send(target: Target, file: Path, name: str, *, replace: bool, start: bool, quiet: bool) -> Answer:
     """Send FILE as NAME into the job folder, and begin to print it; raises CanductorError."""
+    if file.exists() and not file.is_file():
+        raise CanductorError(f"{file} is no regular file; save what it holds in one, and send that")
     size = file.stat().st_size
 
     async def body(client: Client) -> Any:

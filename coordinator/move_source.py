@@ -40,6 +40,13 @@ class MoveSource(Protocol):
         """Work until there is something to tell; raises GCodeError."""
         ...
 
+    def attend_others(self) -> Event | None:
+        """Do what may be done while ``step`` must not be called, as the machine rests; nothing is planned.
+
+        Returns what there is to tell, None when that was all.
+        """
+        ...
+
 
 class Witness(Protocol):
     """Sees what is planned and what is sent."""
@@ -69,6 +76,8 @@ class Planned:
     """Print time from which nothing moves any more; None: there is more to plan."""
     steps_sent: tuple[int, ...] = ()
     """By stepper: steps from the start that its commands add up to."""
+    offset: Position = (0.0, 0.0, 0.0, 0.0)
+    """SET_GCODE_OFFSET."""
 
 
 @record

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from coordinator.compensation import Compensation
+    from coordinator.filament_forecast import FilamentForecast
 
 BatchSink = Callable[[int, bytes], None]
 """Takes a node's index and a piece of its stream (nodes/link/batch.h)."""
@@ -88,13 +89,17 @@ class PlanRecord:
         self.pieces.append(trapezoids.copy())
         self.count += len(trapezoids)
 
-    def epochs(self) -> "list[tuple[Position, NDArray[np.void]]]":
-        """Return the stretches between declarations: where each begins, and its trapezoids."""
+    def every(self) -> "NDArray[np.void]":
+        """Return all trapezoids."""
         import numpy as np  # noqa: PLC0415 (start-up time: only proofs keep a record)
 
         from coordinator.motion.trapezoid_array import TRAPEZOID  # noqa: PLC0415
 
-        every = np.concatenate(self.pieces) if self.pieces else np.empty(0, TRAPEZOID)
+        return np.concatenate(self.pieces) if self.pieces else np.empty(0, TRAPEZOID)
+
+    def epochs(self) -> "list[tuple[Position, NDArray[np.void]]]":
+        """Return the stretches between declarations: where each begins, and its trapezoids."""
+        every = self.every()
         cuts = [(0, self.start), *self.declared]
         ends = [at for at, _ in cuts[1:]] + [len(every)]
         return [(position, every[at:end]) for (at, position), end in zip(cuts, ends, strict=True)]
@@ -134,6 +139,7 @@ class Pipeline:
         record: PlanRecord | None = None,
         watch: MoveWatch | None = None,
         compensation: "Compensation | None" = None,
+        filament: "FilamentForecast | None" = None,
     ) -> None:
         self.job = job
         self.steps = steps
@@ -142,6 +148,7 @@ class Pipeline:
         self._record = record
         self._watch = watch
         self._compensation = compensation
+        self._filament = filament
         self._appended_until = 0.0
         self._shapers: dict[str, Shaper] = {}
         self._weights: dict[str, Position] = {}
@@ -152,7 +159,8 @@ class Pipeline:
         """Print time at which the last of them ends, in s."""
         self.due: list[tuple[float, Timed]] = []
         """Events with the print time at which they take effect, for the owner to take out."""
-        self._timed: deque[Timed] = deque()
+        self._timed: deque[tuple[float | None, Timed]] = deque()
+        """With the print time where they stand, if the machine stands there: a dwell may follow."""
         self._moves_before = job.planner.moves
         self._begin()
 
@@ -191,6 +199,7 @@ class Pipeline:
             self._follow(machine.filament.weights())
         if machine.carriages is not None and machine.carriage_state is not None:
             self._follow(machine.carriages.weights(machine.carriage_state))
+        self._follow(machine.follows)
         self._smooth()
         self._note_acting()
         self.planner.begin_at(self.steps.next_move_s)
@@ -211,6 +220,8 @@ class Pipeline:
         self.steps.set_shaper(SHAPER_AXES.index(axis), impulses)
 
     def _follow(self, weights: Mapping[str, Position]) -> None:
+        if self._filament is not None:
+            self._filament.follow(weights)
         for name, axes in weights.items():
             self.steps.set_weights(self.steps.index(name), axes)
             self._weights[name] = axes
@@ -248,14 +259,17 @@ class Pipeline:
         if event.after_moves == AS_SOON_AS_POSSIBLE:
             self.due.append((0.0, event))
         else:
-            self._timed.append(event)
+            at_s = self.planner.print_time_end_s if self.planner.at_standstill else None
+            self._timed.append((at_s, event))
 
     def _find_due(self, moves: Any, count: int) -> None:
         """Look for the begin of waiting events among MOVES, the next COUNT."""
         first = self._moves_before + self.moves
-        while self._timed and self._timed[0].after_moves < first + count:
-            event = self._timed.popleft()
-            self.due.append((float(moves[max(0, event.after_moves - first)].print_time), event))
+        while self._timed and self._timed[0][1].after_moves < first + count:
+            at_s, event = self._timed.popleft()
+            if at_s is None:
+                at_s = float(moves[max(0, event.after_moves - first)].print_time)
+            self.due.append((at_s, event))
 
     def transfer(self) -> bool:
         """Hand planned moves to step generation while it has room; return whether all were handed over."""
@@ -270,6 +284,8 @@ class Pipeline:
                 self.moves += taken
                 if self._watch is not None:
                     self._watch(waiting.pointer, taken)
+                if self._filament is not None:
+                    self._filament.see_moves(waiting.pointer, taken)
                 if self._record is not None:
                     self._record.add(waiting.array()[:taken])
                 self.planner.release(taken)
@@ -277,7 +293,8 @@ class Pipeline:
                 return False
         self._appended_until = max(self._appended_until, self.planner.print_time_end_s)
         if self._timed and self.planner.at_standstill:  # no move comes behind them for now
-            self.due += [(self._appended_until, event) for event in self._timed]
+            end_s = self._appended_until
+            self.due += [(end_s if at_s is None else at_s, event) for at_s, event in self._timed]
             self._timed.clear()
         return True
 

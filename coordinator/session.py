@@ -140,7 +140,7 @@ async def _print(
     streamer = Streamer(
         machine, job, record=record, compensation=compensation, on_told=on_told, on_state=show
     )
-    streamer.began_at = await machine.stepper_positions()
+    streamer.worker.began_at = await machine.stepper_positions()
     await streamer.run()
     return await outcome_of(machine, streamer)
 
@@ -148,16 +148,16 @@ async def _print(
 async def outcome_of(machine: Machine, streamer: Streamer) -> Outcome:
     """Return what became of STREAMER's job, which has ended."""
     ended_at = await machine.stepper_positions()
-    stats = streamer.steps.stats()
+    stats = streamer.worker.steps.stats()
     return Outcome(
-        moves=streamer.pipeline.moves,
+        moves=streamer.worker.pipeline.moves,
         print_time_s=streamer.ended_s - streamer.began_s,
         span=(streamer.began_s, streamer.ended_s),
         steps=sum(s.steps for s in stats.steppers),
         queue_steps=sum(s.queue_steps for s in stats.steppers),
-        positions={name: ended_at[name] - began for name, began in streamer.began_at.items()},
+        positions={name: ended_at[name] - began for name, began in streamer.worker.began_at.items()},
         issued={s.name: s.issued for s in stats.steppers},
-        maps={node.name: m for node, m in zip(machine.moving, streamer.maps, strict=True)},
+        maps={node.name: m for node, m in zip(machine.moving, streamer.worker.maps, strict=True)},
         nodes=tuple(
             NodeOutcome(node.name, link_of(node).stats(), node.clock_error_s or 0.0)
             for node in machine.nodes.values()

@@ -17,7 +17,7 @@ from coordinator.motion.steps import StepGenerator
 from coordinator.motion.trapezoid_array import TRAPEZOID
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 START_LEAD_S: Final = 0.4
 """From now to the first step: time to arm what has to stop it, and for the steps to reach the nodes."""
@@ -28,11 +28,11 @@ SETTLE_S: Final = 0.05
 """After the last step is due, before it is believed to be done."""
 BATCH_ROOM: Final = 1 << 16
 AXES: Final = ("x", "y", "z")
-_UPRIGHT: Final = (StepKinematics.DELTA, StepKinematics.DELTESIAN)
-"""Steppers of towers: they go up and down with the head."""
 
 Ratio = tuple[float, float, float, float]
 """What each of X Y Z E moves per mm of way."""
+WAY: Final = (1.0, 0.0, 0.0, 0.0)
+"""Where motors have ways of their own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,28 +90,38 @@ def ratio_of(axis: str, direction: int) -> Ratio:
 
 
 class SingleMove:
-    """RAMP along RATIO on MACHINE, beginning START_LEAD_S from its making.
+    """RAMP on MACHINE, beginning LEAD_S from its making: of the axes along RATIO, or of motors.
 
-    ALONE: the name of the one stepper that moves, by RATIO's X, whatever it moves otherwise.
+    WAYS: by stepper how far it goes per mm of way (mm, or rad where it turns something), whatever moves it
+    otherwise; those that are not named stand still.
     """
 
-    def __init__(self, machine: Machine, ramp: Ramp, ratio: Ratio, *, alone: str | None = None) -> None:
+    def __init__(
+        self,
+        machine: Machine,
+        ramp: Ramp,
+        ratio: Ratio = WAY,
+        *,
+        ways: "Mapping[str, float] | None" = None,
+        lead_s: float = START_LEAD_S,
+    ) -> None:
         self._machine = machine
+        self._ways = ways
         self._time_base = machine.time_base()
         self.ramp = ramp
-        self.ratio = ratio
+        self._ratio = ratio
         self.steppers: Sequence[StepperDescription] = [
             s for s in machine.description.steppers if self.along(s) != 0
         ]
         """Those it moves."""
-        machine.modules.before_motion()
+        machine.modules.before_motion([stepper.name for stepper in self.steppers])
         now = self.print_time_now()
-        self.begin_s = now + START_LEAD_S
+        self.begin_s = now + lead_s
         self.end_s = self.begin_s + ramp.duration_s
         self._nodes = machine.moving
         specs = machine.devices.stepper_specs()
-        if alone is not None:
-            specs = [_by_itself(spec, moves=spec.name == alone) for spec in specs]
+        if ways is not None:
+            specs = [_by_itself(spec, ways.get(spec.name, 0.0)) for spec in specs]
         self._steps = StepGenerator(specs, machine.stream_specs())
         self._maps = [machine.clock_map(self._time_base, node, now) for node in self._nodes]
         for index, clock_map in enumerate(self._maps):
@@ -161,15 +171,14 @@ class SingleMove:
 
     def along(self, stepper: StepperDescription) -> float:
         """Return how many mm a stepper moves per mm of way; 0 where that is not the same all the way."""
-        if stepper.function.kinematics in _UPRIGHT and not any(self.ratio[:2]):
-            return self.ratio[2]
-        return float(np.dot(stepper.weights, self.ratio))
+        if self._ways is not None:
+            return self._ways.get(stepper.name, 0.0)
+        return float(np.dot(stepper.weights, self._ratio))
 
     def planned_steps(self, stepper: StepperDescription, way_mm: float) -> float:
         """Return where a stepper is after WAY_MM, in steps from the begin; a step is due at every half."""
         return self.along(stepper) * way_mm / stepper.step_distance
 
 
-def _by_itself(spec: StepperSpec, *, moves: bool) -> StepperSpec:
-    weights = (1.0 if moves else 0.0, 0.0, 0.0, 0.0)
-    return replace(spec, weights=weights, kinematics=StepKinematics.LINEAR, params=())
+def _by_itself(spec: StepperSpec, way: float) -> StepperSpec:
+    return replace(spec, weights=(way, 0.0, 0.0, 0.0), kinematics=StepKinematics.LINEAR, params=())

@@ -5,6 +5,7 @@ it by a constant factor; those of a secondary node are steered: its map is made 
 without a jump, each aimed at where the two clock estimators say the node's clock will be a moment later.
 """
 
+from array import array
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,12 +49,10 @@ class ClockMap:
 
     def __init__(self, clock_freq: float, first: ClockPiece) -> None:
         self.clock_freq = clock_freq
-        self._pieces = [first]
-
-    @property
-    def last(self) -> ClockPiece:
+        self.last = first
         """The piece in force."""
-        return self._pieces[-1]
+        self._ended = array("d")
+        """The pieces before it, three numbers each: a proof of a long run keeps them all."""
 
     def bend(self, print_time: float, ticks_per_s: float) -> ClockPiece:
         """Go on from PRINT_TIME (not before the last piece) at another rate; return the new piece."""
@@ -61,21 +60,20 @@ class ClockMap:
         assert print_time >= last.print_time
         ticks = last.ticks + (print_time - last.print_time) * last.ticks_per_s
         piece = ClockPiece(print_time, ticks, ticks_per_s)
-        if print_time == last.print_time:
-            self._pieces[-1] = piece
-        else:
-            self._pieces.append(piece)
+        if print_time > last.print_time:
+            self._ended.extend((last.print_time, last.ticks, last.ticks_per_s))
+        self.last = piece
         return piece
 
     def forget(self) -> None:
         """Forget every piece but the one in force: a map that is only steered by stays small."""
-        del self._pieces[:-1]
+        del self._ended[:]
 
     def ticks(self, print_time: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the node's ticks at these print times, none before the first piece."""
-        begins = np.array([p.print_time for p in self._pieces])
-        ticks = np.array([p.ticks for p in self._pieces])
-        rates = np.array([p.ticks_per_s for p in self._pieces])
+        last = self.last
+        pieces = np.array([*self._ended, last.print_time, last.ticks, last.ticks_per_s])
+        begins, ticks, rates = pieces.reshape(-1, 3).T
         which = np.clip(np.searchsorted(begins, print_time, side="right") - 1, 0, None)
         mapped: NDArray[np.float64] = ticks[which] + (print_time - begins[which]) * rates[which]
         return mapped

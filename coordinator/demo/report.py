@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from coordinator.demo.heat_proof import HeatProof
 from coordinator.demo.proof import ClockProof, StepperProof
 from coordinator.demo.truth import PlaceProof
 
@@ -30,6 +31,8 @@ class DemoReport:
     steppers: tuple[StepperProof, ...]
     places: tuple[PlaceProof, ...]
     """Of what was homed."""
+    heat: tuple[HeatProof, ...]
+    """Of every steady state of a heater."""
     clocks: tuple[ClockProof, ...]
     stray_edges: int
     """Level changes of pins that are nobody's."""
@@ -40,9 +43,9 @@ class DemoReport:
 
     @property
     def ok(self) -> bool:
-        """Whether every stepper did exactly what was planned, and nothing else moved."""
-        proved = all(s.holds for s in self.steppers) and all(p.holds for p in self.places)
-        return proved and self.stray_edges == 0
+        """Whether every stepper did exactly what was planned, nothing else moved, and heat was held."""
+        moved = all(s.holds for s in self.steppers) and all(p.holds for p in self.places)
+        return moved and all(heat.holds for heat in self.heat) and self.stray_edges == 0
 
     def to_json(self) -> Mapping[str, object]:
         """Return the figures by name."""
@@ -59,6 +62,7 @@ class DemoReport:
             "worst_step_error_us": _us(max((s.worst_error_s for s in self.steppers), default=0.0)),
             "worst_band_error_us": _us(max((s.worst_band_error_s for s in self.steppers), default=0.0)),
             "place_error_um": {place.axis: round(place.error_mm * 1e3, 2) for place in self.places},
+            "heat": [heat.to_json() for heat in self.heat],
             "clock_rms_us": {clock.node: _us(clock.rms_s) for clock in self.clocks},
             "clock_worst_us": {clock.node: _us(clock.worst_s) for clock in self.clocks},
             "retransmitted_bytes": sum(node.retransmitted_bytes for node in self.nodes),
@@ -98,6 +102,7 @@ class DemoReport:
             f"(a step is {p.step_mm * 1e3:.1f} µm)"
             for p in self.places
         ]
+        lines += [heat.to_text() for heat in self.heat]
         lines += [
             f"clock of {c.node}: {_us(c.rms_s)} µs rms from print time, {_us(c.worst_s)} µs at worst"
             for c in self.clocks
@@ -121,6 +126,9 @@ class DemoReport:
         lost = [p.axis for p in self.places if not p.holds]
         if lost:
             return f"{', '.join(lost)} is not where the machine believes it to be"
+        cold = [heat.heater for heat in self.heat if not heat.holds]
+        if cold:
+            return f"{', '.join(dict.fromkeys(cold))} left its target in steady state"
         return f"{self.stray_edges} changes of pins that are nobody's"
 
 

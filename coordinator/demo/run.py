@@ -13,6 +13,7 @@ from coordinator.commands import DEMO_GCODE, DemoOptions
 from coordinator.demo.exact_program import program_legs
 from coordinator.demo.expected import ExpectedSteps, expected_steps
 from coordinator.demo.expected_curved import expected_curved
+from coordinator.demo.heat_proof import HeatProof, HeatWatch, not_steady, prove_heat
 from coordinator.demo.proof import ClockProof, PrimaryClock, StepperProof, prove_clock, prove_stepper
 from coordinator.demo.report import DemoReport, NodeReport
 from coordinator.demo.stage import Stage
@@ -40,10 +41,12 @@ def run_demo(options: DemoOptions) -> DemoReport:
     both_edges: dict[str, bool] = {}
 
     claimed: dict[str, list[str]] = {}
+    warmth = HeatWatch()
 
     def ready(machine: Machine) -> None:
         claimed.update({name: machine.modules.pins.claimed(name) for name in machine.nodes})
         both_edges.update({name: s.steps_on_both_edges for name, s in machine.devices.steppers.items()})
+        warmth.attach(machine)
 
     with ExitStack() as stack:
         folder = stack.enter_context(_folder(options.keep))
@@ -62,8 +65,15 @@ def run_demo(options: DemoOptions) -> DemoReport:
         )
         figures = stage.stop_nodes()
         prover = Prover(description, stage.edge_log, outcome, record, both_edges=both_edges, claimed=claimed)
+        heat = [p for node in description.nodes for p in _heat_of(warmth, stage, node.name)]
         notices = [*map(str, description.not_yet_acting), *description.notes, *told]
-        return report_of(prover, stage, figures, outcome, notices)
+        if (sentence := not_steady(warmth.heaters, heat)) is not None:
+            notices.append(sentence)
+        return report_of(prover, stage, figures, outcome, notices, heat=heat)
+
+
+def _heat_of(warmth: HeatWatch, stage: Stage, node: str) -> list[HeatProof]:
+    return prove_heat(warmth.states, node, stage.plant_log(node))
 
 
 @contextmanager
@@ -194,6 +204,8 @@ def report_of(
     figures: Mapping[str, Mapping[str, Any]],
     outcome: Outcome,
     notices: Sequence[str],
+    *,
+    heat: Sequence[HeatProof] = (),
 ) -> DemoReport:
     """Return the report, with every stepper proved; the nodes have ended, with these FIGURES."""
     frames, frames_lost = stage.frames()
@@ -203,6 +215,7 @@ def report_of(
         queue_steps=outcome.queue_steps,
         steppers=tuple(prover.steppers()),
         places=tuple(prover.places(stage)),
+        heat=tuple(heat),
         clocks=tuple(prover.clocks()),
         stray_edges=prover.stray_edges(),
         nodes=tuple(

@@ -1,12 +1,14 @@
 """``canductor demo --serve``: the virtual machine stays up for front ends to be developed and tried on."""
 
 import dataclasses
+import shutil
 import tempfile
 from pathlib import Path
 
 from coordinator.commands import DEMO_GCODE, DemoOptions
 from coordinator.demo.stage import Stage
 from coordinator.machine.description import load_machine
+from coordinator.modules.virtual_sdcard import VirtualSdcard
 from coordinator.service.serve import ServeReport, serve
 
 
@@ -15,10 +17,19 @@ def serve_demo(options: DemoOptions) -> ServeReport:
     assert options.serve is not None
     description = load_machine(str(options.machine))
     serving = options.serve
-    if serving.jobs is None:
-        serving = dataclasses.replace(serving, jobs=DEMO_GCODE.parent)
+    has_jobs = any(source.kind is VirtualSdcard for source in description.modules.sources)
     with (
         tempfile.TemporaryDirectory(prefix="canductor-demo-") as folder,
         Stage(description, options, Path(folder)) as stage,
     ):
+        if serving.jobs is None and not has_jobs:
+            serving = dataclasses.replace(serving, jobs=_demo_jobs(Path(folder)))
         return serve(lambda: stage.description, serving)
+
+
+def _demo_jobs(folder: Path) -> Path:
+    """Return a job folder with the demo's program, for this run: a service writes its journal there."""
+    jobs = folder / "jobs"
+    jobs.mkdir()
+    shutil.copy(DEMO_GCODE, jobs)
+    return jobs

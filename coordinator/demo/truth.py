@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from nodes.virtual.plant_page import Motor
 
 STEPS_OFF: Final = 2.0
-"""A homed axis may be so many steps beside where it believes to be: one for each of two roundings."""
+"""A homed axis may be so many steps beside where it believes to be: one for each of two roundings. One whose
+motor felt the end may be so many full steps: a motor follows its field no better."""
 
 
 @record
@@ -29,6 +30,8 @@ class PlaceProof:
     believed_mm: float
     true_mm: float
     step_mm: float
+    steps_off: float = STEPS_OFF
+    """So many steps of it are allowed."""
 
     @property
     def error_mm(self) -> float:
@@ -37,8 +40,8 @@ class PlaceProof:
 
     @property
     def holds(self) -> bool:
-        """Whether that is no more than rounding to steps explains."""
-        return abs(self.error_mm) <= STEPS_OFF * self.step_mm
+        """Whether that is no more than rounding explains: to steps, of an end that was felt full ones."""
+        return abs(self.error_mm) <= self.steps_off * self.step_mm
 
 
 def prove_places(
@@ -65,10 +68,19 @@ def prove_places(
             believed_mm=believed[name],
             true_mm=axis.origin + sum(t.mm_per_step * motors[t.node][t.stepper].count for t in axis.terms),
             step_mm=sum(abs(term.mm_per_step) for term in axis.terms),
+            steps_off=_steps_off(description, name),
         )
         for name, axis in axes.items()
         if name in believed
     ]
+
+
+def _steps_off(description: MachineDescription, axis: str) -> float:
+    """Return how many steps an axis may be off."""
+    for rail in description.rails:
+        if rail.axis == axis and rail.homing.virtual_endstop:
+            return STEPS_OFF * rail.steppers[0].microsteps
+    return STEPS_OFF
 
 
 def _end_of(plan: PlanRecord) -> list[float]:

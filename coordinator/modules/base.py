@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, TypeVar
 
 from coordinator.gcode.commands import GCodeCommand
 from coordinator.machine.config_file import RawSection
-from coordinator.machine.options import Option, SectionReader, SectionSpec
+from coordinator.machine.options import BadValue, ListOption, Option, SectionReader, SectionSpec
 from coordinator.machine.pins import PinDescription, PinOption, PinRegistry
 from coordinator.machine.problem import ConfigError, Place, nearest, shown
 from nodes.node_config import NodeConfig
@@ -27,6 +27,7 @@ from nodes.node_config import NodeConfig
 if TYPE_CHECKING:  # planning needs neither, and they draw in asyncio
     from coordinator.machine.model import MachineDescription
     from coordinator.modules.live import Live
+    from coordinator.motion.planner import Planner
     from nodes.node import Node
 
 Value = None | bool | int | float | str | list["Value"] | dict[str, "Value"]
@@ -52,6 +53,24 @@ class Modules(Protocol):
     def names(self, kind: "type[Module]") -> list[str]:
         """Return the section names of all modules of KIND, in the order of the file."""
 
+    def knows(self, command: str) -> bool:
+        """Tell whether programs know COMMAND, by a module or anyway."""
+
+    @property
+    def helps(self) -> "Mapping[str, str]":
+        """What each command of programs does, by its name: a sentence without a full stop."""
+
+    def status(self) -> "Mapping[str, Mapping[str, Value]]":
+        """Tell how each module is, by its name; on the control loop."""
+
+    @property
+    def config(self) -> "Mapping[str, Mapping[str, str]]":
+        """The configuration as text: options by section."""
+
+    @property
+    def settings(self) -> "Mapping[str, Mapping[str, object]]":
+        """What was read of it: values and defaults."""
+
 
 class Module:
     """One section of the configuration."""
@@ -60,6 +79,8 @@ class Module:
     """All its options; the reference page is made from it."""
     NAMED: ClassVar[bool] = False
     """Whether there may be several, ``[kind NAME]``; else there is one, ``[kind]``."""
+    NAMELESS: ClassVar[bool] = False
+    """Whether, where there may be several, one may be without a name."""
     TITLE: ClassVar[str] = ""
     """Which sections it reads a part of: ``[extruder], [extruder1] …``; else it has its own."""
 
@@ -76,6 +97,9 @@ class Module:
 
     def ready(self) -> None:
         """Take note that the machine is ready."""
+
+    def job_begins(self) -> None:
+        """Take note that a service is about to print a file: what was known of the last one is void."""
 
     def stopped(self, cause: str) -> None:
         """Take note that the machine is stopped, and why."""
@@ -112,6 +136,9 @@ class Build:
         self.devices: list[tuple[str, Device]] = []
         """With the node of each."""
         self.commands: list[GCodeCommand] = []
+        self.replacements: list[tuple[GCodeCommand, str]] = []
+        """Commands that may take another's name, and the name that one has then; empty: there is no other."""
+        self.set_ups: list[Callable[[Planner], None]] = []
         self._pins = pins
         self._share = share
 
@@ -141,6 +168,19 @@ class Build:
         """Take the pin that an option names, if it is given; raises ConfigError."""
         return None if self.reader.find(option) is None else self.pin(option)
 
+    def pins(self, option: ListOption) -> list[PinDescription]:
+        """Take the output pins that an option lists; raises ConfigError."""
+        each = PinOption(name=option.name, help=option.help)
+        found = []
+        for word in self.reader.get(option):
+            try:
+                pin = each.parse(word)
+            except BadValue as error:
+                why = str(error) or f"of which each must be {each.rule()}"
+                raise self.reader.bad(option, why) from None
+            found.append(self._pins.claim(pin, each, self.reader.section))
+        return found
+
     def add_device(self, node: str, device: Device) -> None:
         """Have DEVICE on a node."""
         self.devices.append((node, device))
@@ -148,6 +188,14 @@ class Build:
     def add_command(self, command: GCodeCommand) -> None:
         """Have programs know COMMAND."""
         self.commands.append(command)
+
+    def replace_command(self, command: GCodeCommand, rename: str = "") -> None:
+        """Have programs know COMMAND; one that had its name before is called RENAME then."""
+        self.replacements.append((command, rename))
+
+    def set_up_programs(self, call: "Callable[[Planner], None]") -> None:
+        """Have CALL called for every program that begins, in the reader's thread."""
+        self.set_ups.append(call)
 
     def shared(self, kind: type[M]) -> M:
         """Return the one module of KIND without a section, which is made when it is first asked for.

@@ -83,8 +83,8 @@ class ForceMove(Module):
         assert self._live is not None
         if distance_mm:
             ramp = Ramp(abs(distance_mm), speed, accel)
-            ratio = (math.copysign(1.0, distance_mm), 0.0, 0.0, 0.0)
-            await SingleMove(self._live.machine, ramp, ratio, alone=name).run()
+            ways = {name: math.copysign(1.0, distance_mm)}
+            await SingleMove(self._live.machine, ramp, ways=ways).run()
 
     # -------------------------------------------------------------------------------------------- positions
 

@@ -1,6 +1,7 @@
 """The running machine as its modules see it."""
 
 import asyncio
+import contextlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
@@ -23,6 +24,7 @@ class Live:
         self.say = say
         self._time_base = machine.time_base()
         self._timers: set[_Timer] = set()
+        self._loop = asyncio.get_running_loop()
 
     def node(self, name: str) -> Node:
         """Return a node by its name."""
@@ -50,6 +52,11 @@ class Live:
         now_ns = self.machine.host.now()
         ticks = extend32(clock32, Ticks(clock.ticks_at(now_ns)))
         return self._time_base.print_time_at(clock.ns_at(ticks))
+
+    def soon_on_loop(self, call: Callable[[], None]) -> None:
+        """Have CALL called on the control loop; from any thread."""
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(call)
 
     def every(self, seconds: float, call: Callable[[], None]) -> Callable[[], None]:
         """Call CALL every so many seconds; returns what ends it. All end when the machine closes."""

@@ -2,17 +2,24 @@
 
 import contextlib
 import copy
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import field
+from typing import TYPE_CHECKING, Final, TypeVar
 
-from coordinator.gcode.commands import GCodeCommand, Vocabulary
+from coordinator.gcode.basic_commands import BESIDE, HANDLERS
+from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
+from coordinator.gcode.helps import HELPS
 from coordinator.machine.config_file import RawSection
 from coordinator.machine.pins import PinRegistry
 from coordinator.machine.problem import ConfigError, Place
 from coordinator.modules.base import Build, Device, Module, Value
+from coordinator.modules.console import Console
 from coordinator.modules.homing import Homing
+from coordinator.modules.manual_probe import ManualProbe
 from coordinator.modules.motor_power import MotorPower
+from coordinator.modules.positions import Positions
 from coordinator.modules.save_config import SaveConfig
+from coordinator.modules.stepper_buzz import StepperBuzz
 from nodes.errors import CanductorError
 from nodes.node_config import NodeConfig
 from nodes.records import record
@@ -20,9 +27,12 @@ from nodes.records import record
 if TYPE_CHECKING:
     from coordinator.machine.model import MachineDescription
     from coordinator.modules.live import Live
+    from coordinator.motion.planner import Planner
     from nodes.node import Node
 
 M = TypeVar("M", bound=Module)
+INTERRUPTING: Final = frozenset(("PAUSE", "CANCEL_PRINT"))
+"""Commands that pause or cancel a job, whatever macros they may be."""
 
 
 @record
@@ -42,10 +52,14 @@ class ModuleSources:
     sources: tuple[ModuleSource, ...]
     pins: PinRegistry
     """As the machine's own sections left it."""
+    config: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    """The configuration as text: options by section."""
+    settings: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    """As it was read: values and defaults."""
 
     def build(self, machine: "MachineDescription") -> "ModuleSet":
         """Make those of MACHINE, linked with each other; raises ConfigError."""
-        built = ModuleSet(machine, copy.deepcopy(self.pins))
+        built = ModuleSet(machine, copy.deepcopy(self.pins), self.config, self.settings)
         for source in self.sources:
             built.build(source)
         built.link()
@@ -74,18 +88,32 @@ def _blamed(kind: type[Module], place: Place) -> Iterator[None]:
 class ModuleSet:
     """The modules, by the names of their sections; also what they are to each other."""
 
-    def __init__(self, machine: "MachineDescription", pins: PinRegistry) -> None:
+    def __init__(
+        self,
+        machine: "MachineDescription",
+        pins: PinRegistry,
+        config: Mapping[str, Mapping[str, str]] | None = None,
+        settings: Mapping[str, Mapping[str, object]] | None = None,
+    ) -> None:
         self.pins = pins
+        self.config = config or {}
+        self.settings = settings or {}
         self._machine = machine
         self._modules: list[Module] = []
         self._places: dict[Module, Place] = {}
         self._devices: dict[str, list[Device]] = {}
         self._commands: dict[str, GCodeCommand] = {}
         self._owners: dict[str, str] = {}
+        self._set_ups: list[Callable[[Planner], None]] = []
+        self._replacements: list[tuple[GCodeCommand, str, Build]] = []
         self._live: Live | None = None
         self._homing = self.shared(Homing)
         self._motors = self.shared(MotorPower)
+        self.shared(ManualProbe)
+        self.shared(Positions)
         self.shared(SaveConfig)
+        self.shared(Console)
+        self.shared(StepperBuzz)
 
     def build(self, source: ModuleSource) -> Module:
         """Make the module of SOURCE; raises ConfigError."""
@@ -121,17 +149,68 @@ class ModuleSet:
             if owner != build.name and command.name in self._commands:
                 raise ConfigError(
                     build.place,
-                    f"[{build.name}] brings the command {command.name}, which [{owner}] has; rename one",
+                    f"[{build.name}] brings the command {command.name}, which is {self._whose(owner)}; rename"
+                    " one",
                 )
             self._commands[command.name] = command
+        self._set_ups += build.set_ups
+        self._replacements += [(command, rename, build) for command, rename in build.replacements]
 
     def link(self) -> None:
         """Let them find each other; raises ConfigError."""
+        for command, rename, build in self._replacements:
+            self._replace(command, rename, build)
         for module in self._modules:
             with _blamed(type(module), self._places[module]):
                 module.link(self)
 
+    def _replace(self, command: GCodeCommand, rename: str, build: Build) -> None:
+        """Let COMMAND have its name, and whoever had it before the name RENAME."""
+        name = command.name
+        before = self._commands.get(name)
+        if not rename and (before is not None or name in HELPS):
+            # What has no help does nothing by itself: M106 without a fan is a name that is free.
+            section = build.reader.section
+            if section.misspelt or "rename_existing" in section.set_aside:
+                return  # it is told already what is wrong with it
+            whose = self._whose(self._owners.get(name, ""))
+            raise ConfigError(
+                build.place,
+                f"[{build.name}] takes the name of the command {name}, which is {whose}; add rename_existing"
+                f" with another name for that one, such as {name}{'.1' if name[1:].isdigit() else '_BASE'}",
+            )
+        if rename:
+            if not self.knows(name):
+                raise ConfigError(
+                    build.place,
+                    f"[{build.name}] has rename_existing, but there is no command {name}; remove that option",
+                )
+            if self.knows(rename):
+                raise ConfigError(
+                    build.place,
+                    f"rename_existing of [{build.name}] is {rename}, which is a command already; choose a"
+                    " name that none has",
+                )
+            self._commands[rename] = renamed(before, name, rename, beside=name in BESIDE)
+            self._owners[rename] = self._owners.get(name, build.name)
+        self._commands[name] = command
+        self._owners[name] = build.name
+
+    def _whose(self, owner: str) -> str:
+        """Say whose a command is, of which OWNER is the module; what several sections share has none."""
+        of_a_section = any(module.name == owner and self._places[module].path for module in self._modules)
+        return f"that of [{owner}]" if of_a_section else "canductor's own"
+
     # ---------------------------------------------------------------------------------------- looking up
+
+    def knows(self, command: str) -> bool:
+        """Tell whether programs know COMMAND, by a module or anyway."""
+        return command in self._commands or command in HANDLERS
+
+    @property
+    def helps(self) -> Mapping[str, str]:
+        """What each command of programs does, by its name."""
+        return {**HELPS, **{name: command.help for name, command in self._commands.items()}}
 
     def find(self, name: str, kind: type[M]) -> M | None:
         """Return the module of section NAME, or None when there is none of KIND."""
@@ -150,8 +229,24 @@ class ModuleSet:
     @property
     def vocabulary(self) -> Vocabulary:
         """What programs know through them."""
-        home = self._homing.read if self._homing.acts else None
-        return Vocabulary(self._commands, home, self._too_cold)
+        homing = self._homing
+        home = homing.read if homing.corrected is None else homing.corrected(homing.read)
+        return Vocabulary(
+            self._commands,
+            home if homing.acts else None,
+            self._too_cold,
+            self._interrupting(),
+            set_ups=tuple(self._set_ups),
+        )
+
+    def _interrupting(self) -> frozenset[str]:
+        from coordinator.modules.gcode_macro import GCodeMacro, words_in  # noqa: PLC0415 (start-up time)
+
+        words = {macro.command: words_in(macro.text) for macro in self.of(GCodeMacro)}
+        found = set(INTERRUPTING & self._commands.keys())
+        while more := {name for name, inner in words.items() if inner & found} - found:
+            found |= more
+        return frozenset(found)
 
     def _too_cold(self, extruder: str) -> bool:
         from coordinator.modules.heater_sections import ExtruderHeater  # noqa: PLC0415 (start-up time)
@@ -185,9 +280,14 @@ class ModuleSet:
         for module in self._modules:
             module.ready()
 
-    def before_motion(self) -> None:
-        """Get ready for steps, which follow no sooner than a start from standstill takes."""
-        self._motors.on()
+    def job_begins(self) -> None:
+        """Tell all that a file is going to be printed."""
+        for module in self._modules:
+            module.job_begins()
+
+    def before_motion(self, steppers: Collection[str]) -> None:
+        """Get ready for steps of STEPPERS, which follow no sooner than a start from standstill takes."""
+        self._motors.on(steppers)
 
     def stopped(self, cause: str) -> None:
         """Tell all that the machine is stopped."""

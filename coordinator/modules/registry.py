@@ -3,13 +3,13 @@
 import re
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Final
 
 from coordinator.machine.problem import ConfigError, Place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from importlib.metadata import EntryPoint
 
     from coordinator.modules.base import Module
 
@@ -18,18 +18,37 @@ ENTRY_POINTS: Final = "canductor.modules"
 _OURS: Final[dict[str, str]] = {
     "adc_temperature": "coordinator.modules.thermistor:AdcTemperature",
     "controller_fan": "coordinator.modules.automatic_fans:ControllerFan",
+    "delayed_gcode": "coordinator.modules.delayed_gcode:DelayedGCode",
+    "display_status": "coordinator.modules.display_status:DisplayStatus",
+    "exclude_object": "coordinator.modules.exclude_object:ExcludeObject",
     "fan": "coordinator.modules.fans:Fan",
     "fan_generic": "coordinator.modules.fans:FanGeneric",
+    "filament_switch_sensor": "coordinator.modules.filament_switch_sensor:FilamentSwitchSensor",
+    "firmware_retraction": "coordinator.modules.firmware_retraction:FirmwareRetraction",
     "force_move": "coordinator.modules.force_move:ForceMove",
+    "gcode_arcs": "coordinator.modules.gcode_arcs:GCodeArcs",
+    "gcode_button": "coordinator.modules.gcode_button:GCodeButton",
+    "gcode_macro": "coordinator.modules.gcode_macro:GCodeMacro",
     "heater_bed": "coordinator.modules.heater_sections:HeaterBed",
     "heater_fan": "coordinator.modules.automatic_fans:HeaterFan",
     "heater_generic": "coordinator.modules.heater_sections:HeaterGeneric",
     "homing_override": "coordinator.modules.homing_override:HomingOverride",
+    "idle_timeout": "coordinator.modules.idle_timeout:IdleTimeout",
+    "output_pin": "coordinator.modules.output_pin:OutputPin",
+    "pause_resume": "coordinator.modules.pause_resume:PauseResume",
+    "pid_profile": "coordinator.modules.pid_profile:PidProfile",
+    "respond": "coordinator.modules.respond:Respond",
     "safe_z_home": "coordinator.modules.safe_z_home:SafeZHome",
+    "save_variables": "coordinator.modules.save_variables:SaveVariables",
+    "skew_correction": "coordinator.modules.skew_correction:SkewCorrection",
+    "static_digital_output": "coordinator.modules.output_pin:StaticDigitalOutput",
     "temperature_fan": "coordinator.modules.temperature_fan:TemperatureFan",
     "temperature_sensor": "coordinator.modules.sensor_module:TemperatureSensor",
+    "tmc2208": "coordinator.modules.tmc_driver:Tmc2208",
+    "tmc2209": "coordinator.modules.tmc_driver:Tmc2209",
     "thermistor": "coordinator.modules.thermistor:Thermistor",
     "verify_heater": "coordinator.modules.verify_heater:VerifyHeater",
+    "virtual_sdcard": "coordinator.modules.virtual_sdcard:VirtualSdcard",
 }
 """By the section's first word: module and class."""
 _BESIDE: Final[dict[str, str]] = {
@@ -103,9 +122,11 @@ def _load(path: str) -> "type[Module]":
 
 
 @cache
-def _others() -> dict[str, EntryPoint]:
+def _others() -> "dict[str, EntryPoint]":
+    from importlib.metadata import entry_points  # noqa: PLC0415 (start-up time: it draws in the mail parser)
+
     return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
 
 
-def _package(point: EntryPoint) -> str:
+def _package(point: "EntryPoint") -> str:
     return point.dist.name if point.dist is not None else "?"

@@ -118,7 +118,7 @@ class SafeZHome(Module):
             call = await self._lift(call)
             if self._back:
                 call = await self._go(call, known[0], known[1])
-        return Done(done.replies, position=call.position, homed=axes, moved=True)
+        return replace(done, position=call.position, homed=axes, moved=True)
 
     async def _lift(self, call: Call) -> Call:
         """Lift the head to the height of the hop, or by as much where its height is not known."""

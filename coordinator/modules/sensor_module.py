@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 from coordinator.machine.options import SectionSpec, TextOption
 from coordinator.modules.base import Build, Modules, Value
+from coordinator.modules.free_temperatures import find_source
 from coordinator.modules.heaters import Heaters
-from coordinator.modules.sensor_options import LATER_SENSOR_OPTIONS, SENSOR_OPTIONS
-from coordinator.modules.temperature_input import SensorModule, TemperatureInput
+from coordinator.modules.sensor_options import FREE_SENSOR_OPTIONS, LATER_SENSOR_OPTIONS, SENSOR_OPTIONS
+from coordinator.modules.temperature_input import SensorModule
 
 if TYPE_CHECKING:
     from coordinator.modules.live import Live
@@ -18,8 +19,6 @@ GCODE_ID: Final = TextOption(
     pattern=r"[A-Za-z][A-Za-z0-9_]*",
     pattern_rule="a letter, and letters and digits",
 )
-LOWEST_C: Final = -273.15
-HIGHEST_C: Final = 1500.0
 
 
 class TemperatureSensor(SensorModule):
@@ -28,13 +27,13 @@ class TemperatureSensor(SensorModule):
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A temperature that is watched; with min_temp or max_temp its node stops all outside them",
-        options=(*SENSOR_OPTIONS, GCODE_ID),
+        options=(*SENSOR_OPTIONS, *FREE_SENSOR_OPTIONS, GCODE_ID),
         later=LATER_SENSOR_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self.input = TemperatureInput(build, min_c=LOWEST_C, max_c=HIGHEST_C)
+        self.input = find_source(build, limits_needed=False)
         self.input.on_measured = self._measured
         self._extremes: tuple[float, float] | None = None
         build.shared(Heaters).add_sensor(self.input, build.find(GCODE_ID) or "")

@@ -25,8 +25,11 @@ from typing import Any, Literal, Self
 from nodes.errors import CanductorError
 
 BIN_DIR = Path(__file__).parent / "bin"
-READY_TIMEOUT_S = 10.0
-STOP_TIMEOUT_S = 5.0
+READY_TIMEOUT_S = 30.0
+STOP_TIMEOUT_S = 20.0
+"""Patience for a busy computer; both take some hundredths of a second."""
+ENDING_S = 2.0
+"""From the end of a process's output to its own, on a busy computer."""
 LINE_MAX = 65_536
 """Bytes a line of a child may have."""
 _STDERR_TAIL = 500
@@ -152,7 +155,7 @@ class ChildProcess:
             return CanductorError(f"{self.name} {what}: it had been killed before")
         # Its output may end a moment before the process itself does.
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(0.1)
+            self._process.wait(min(timeout_s, ENDING_S))
         status = self._process.poll()
         if status is None:
             reason = f"no answer in {timeout_s:g} s; it was killed"

@@ -4,16 +4,18 @@ import asyncio
 import json
 import os
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from coordinator.ipc.methods import Caller, Kind, Method, Param, Scope
 from coordinator.ipc.uploads import PART_MAX, upload_method
-from tests.coordinator.ipc.served import Served, serving
+from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, serving
 
 CANDUCTOR = Path(sys.executable).parent / "canductor"
 
@@ -31,10 +33,10 @@ async def canductor(*words: str, folder: Path) -> tuple[int, str, str]:
     return process.returncode, out.decode(), err.decode()
 
 
-def run(folder: Path, body: Callable[[Served], Awaitable[None]]) -> None:
+def run(folder: Path, body: Callable[[Served], Awaitable[None]], **settings: Any) -> None:
     async def main() -> None:
-        (folder / "canductor").mkdir()
-        async with asyncio.timeout(60), serving(folder / "canductor") as served:
+        (folder / "canductor").mkdir(exist_ok=True)
+        async with asyncio.timeout(60), serving(folder / "canductor", **settings) as served:
             registry = served.server._common.registry
             jobs = folder / "jobs"
             jobs.mkdir()
@@ -67,6 +69,87 @@ def test_call_status_estop(tmp_path: Path) -> None:
     run(tmp_path, body)
 
 
+def leave_socket(path: Path) -> str:
+    """Leave a socket at PATH as a coordinator does that was killed."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as left:
+        left.bind(str(path))
+    return str(path)
+
+
+def test_sockets_that_were_left_behind_stop_nobody(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        live = served.at
+        old = leave_socket(served.path.with_name("old.sock"))
+        leave_socket(served.path.with_name("a.sock"))
+        status, _, err = await canductor("estop", folder=tmp_path)
+        assert (status, len(served.stops), err) == (0, 1, "")
+        async with serving(served.path.parent / "b") as second:  # two that live: the dead are not offered
+            second.path.rename(second_path := served.path.with_name("second.sock"))
+            status, _, err = await canductor("estop", folder=tmp_path)
+            assert (status, len(second.stops)) == (1, 0)
+            assert err == (
+                f"canductor: several machines run here; name one with --at: {live}, {second_path}\n"
+            )
+            second_path.unlink()
+        status, _, err = await canductor("estop", "--at", old, folder=tmp_path)
+        assert (status, len(served.stops)) == (1, 1)
+        left = "does not answer: a coordinator that ended left this socket; start one with canductor run\n"
+        assert err == f"canductor: {old} {left}"
+
+    (tmp_path / "canductor" / "b").mkdir(parents=True)
+    run(tmp_path, body)
+
+    async def alone() -> None:
+        _, _, err = await canductor("status", folder=tmp_path)  # two, and both are dead
+        assert "a.sock does not answer: a coordinator that ended left this socket" in err
+        folder = tmp_path / "canductor"
+        (folder / "a.sock").unlink()
+        (folder / "plain").touch()
+        for at, sentence in (
+            ((), "old.sock does not answer: a coordinator that ended left this socket; start one with"),
+            (("--at", str(folder)), f"{folder} is a folder, not a socket; canductor discover lists"),
+            (("--at", str(folder / "plain")), "plain is a file, not a socket"),
+            (("--at", str(folder / "none")), "none does not answer: No such file or directory"),
+        ):
+            status, _, err = await canductor("estop", *at, folder=tmp_path)
+            assert status == 1
+            assert sentence in err
+
+    asyncio.run(alone())
+
+
+def test_a_token_that_others_can_read_is_not_used(tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text(TOKENS[Scope.OPERATE] + "\n")
+
+    async def body(served: Served) -> None:
+        words = ("estop", "--at", f"tcp://127.0.0.1:{served.server.tcp_port}", "--token-file", str(token))
+        for mode in (0o644, 0o640, 0o606):
+            token.chmod(mode)
+            status, _, err = await canductor(*words, folder=tmp_path)
+            assert (status, len(served.stops)) == (1, 0)
+            assert err == (
+                f"canductor: the token's file {token} must be yours alone; chmod 600 it, and own it\n"
+            )
+        token.chmod(0o600)
+        status, _, err = await canductor(*words, folder=tmp_path)
+        assert (status, len(served.stops), err) == (0, 1, "")
+        for text, sentence in (
+            ("", "is empty; write the token into it"),
+            ("\n \n", "is empty; write the token into it"),
+            (f"operate me {TOKENS[Scope.OPERATE]}\n", "must hold one token, and nothing else"),
+        ):
+            token.write_text(text)
+            status, _, err = await canductor(*words, folder=tmp_path)
+            assert (status, err) == (1, f"canductor: the token's file {token} {sentence}\n")
+        status, _, err = await canductor(*words[:3], folder=tmp_path)
+        assert (status, len(served.stops)) == (1, 1)
+        assert f"{words[2]} wants a token; name the file that holds it with --token-file" in err
+        assert not served.server._brake._failures  # nothing that is no token was sent as one
+
+    run(tmp_path, body, tcp=plain_tcp(tmp_path))
+
+
 def test_watch(tmp_path: Path) -> None:
     async def body(served: Served) -> None:
         served.state.update("a", {"x": 1.5, "y": "text", "z": None})
@@ -76,6 +159,27 @@ def test_watch(tmp_path: Path) -> None:
         first, last = map(json.loads, out.splitlines())
         assert first["values"] == {"a.x": 1.5}
         assert last == {"ok": True, "result": {"updates": 1}}
+
+    run(tmp_path, body)
+
+
+def test_watch_says_that_nothing_matches_and_goes_on(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        served.state.set("a.x", 1)
+        process = await asyncio.create_subprocess_exec(
+            *(CANDUCTOR, "watch", "nothing.*", "b", "--count", "2"),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
+        )
+        assert process.stderr is not None
+        told = await process.stderr.readline()
+        assert told == b"canductor: no field matches nothing.* b now; waiting for one that does\n"
+        served.state.set("b", 2)
+        out, err = await process.communicate()
+        assert (process.returncode, out, err) == (0, b"b = 2\n", b"")
+        ended = await canductor("watch", "nothing", "--count", "1", folder=tmp_path)
+        assert ended == (0, "", "canductor: no field matches nothing now\n")
 
     run(tmp_path, body)
 
@@ -111,11 +215,11 @@ def test_an_upload_follows_no_link_and_keeps_its_order(tmp_path: Path) -> None:
     (jobs / "b.gcode").symlink_to(outside)
 
     async def body() -> None:
-        method = upload_method(jobs)
+        method, caller = upload_method(jobs), Caller("test", Scope.OPERATE)
 
         async def upload(**params: object) -> str:
             try:
-                result = method.call(Caller("test", Scope.OPERATE), method.check(params))
+                result = method.call(caller, method.check(params))
                 assert isinstance(result, Awaitable)
                 return str(await result)
             except Exception as error:  # noqa: BLE001 (each is looked at)
@@ -134,6 +238,18 @@ def test_an_upload_follows_no_link_and_keeps_its_order(tmp_path: Path) -> None:
 
     asyncio.run(body())
     assert outside.read_text() == "precious"
+
+
+def test_what_is_no_regular_file_is_not_sent(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        del served
+        os.mkfifo(tmp_path / "pipe.gcode")
+        for path in ("/dev/zero", str(tmp_path / "pipe.gcode")):
+            status, _, err = await canductor("send", path, "--name", "z.gcode", folder=tmp_path)
+            assert (status, f"{path} is no regular file" in err) == (1, True), err
+        assert list((tmp_path / "jobs").iterdir()) == []
+
+    run(tmp_path, body)
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

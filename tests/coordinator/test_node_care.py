@@ -140,7 +140,7 @@ def test_an_optional_node_goes_and_comes_and_the_machine_does_not_mind(stage: St
             assert asyncio.get_running_loop().time() - began_s < LAST_TRY_S + 5
             await asyncio.sleep(0.1)
         assert len(stage.said) == 2
-        assert stage.said[1].startswith("node light is back after 30")
+        assert stage.said[1].startswith("node light is back after 3")
         assert (stage.host.light.nodeid, stage.host.light.configured) == (6, True)
         assert stage.machine.stopped is None
         assert stage.job.told == ["release"]

@@ -6,6 +6,7 @@ from itertools import pairwise
 import pytest
 
 from nodes.devices.analog_in import AnalogIn, AnalogValue
+from nodes.devices.button import Button
 from nodes.devices.counter import Counter
 from nodes.devices.pwm_out import PwmOut
 from nodes.message_format import Message
@@ -147,3 +148,83 @@ def test_changes_faster_than_the_polls_are_not_made_up() -> None:
 
     machine.run(main)
     assert 0 < max(seen) <= 50
+
+
+def button(*, invert: bool = False) -> tuple[Button, list[bool]]:
+    switch = Button("a door", pin="PC3", pull=1, invert=invert)
+    seen: list[bool] = []
+    switch.on_change = seen.append
+    return switch, seen
+
+
+@pytest.mark.parametrize("invert", [False, True])
+def test_a_switch_tells_each_change_once_also_from_the_start_and_behind_a_restart(*, invert: bool) -> None:
+    switch, seen = button(invert=invert)
+    machine = DeviceMachine(switch)
+
+    async def main() -> None:
+        pin = machine.pins["PC3"]
+        machine.board.set_input(pin, int(not invert))
+        await asyncio.sleep(1)
+        assert seen == [True]
+        for pressed in (False, True, False, True):
+            machine.board.set_input(pin, int(pressed != invert))
+            await asyncio.sleep(0.3)
+        assert seen == [True, False, True, False, True]
+        assert switch.pressed
+        machine.board.set_input(pin, int(invert))
+        await machine.node.restart()
+        await asyncio.sleep(1)
+        assert seen == [True, False, True, False, True, False]
+
+    machine.run(main)
+
+
+def test_a_switch_that_bounces_is_not_told_of_and_many_changes_are_told_in_order() -> None:
+    switch, seen = button()
+    machine = DeviceMachine(switch)
+
+    async def main() -> None:
+        pin = machine.pins["PC3"]
+        await asyncio.sleep(1)
+        now = machine.world.now_ns
+        for n in range(400):  # faster than two looks
+            machine.board.set_input(pin, n % 2, now + 1_000_000 + n * 500_000)
+        await asyncio.sleep(0.3)
+        machine.board.set_input(pin, 0)
+        await asyncio.sleep(0.3)
+        seen.clear()
+        now = machine.world.now_ns
+        for n in range(300):  # more than a counter of acknowledgements holds
+            machine.board.set_input(pin, (n + 1) % 2, now + n * 20_000_000)
+        await asyncio.sleep(7)
+        assert seen == [n % 2 == 0 for n in range(300)]
+
+    machine.run(main)
+
+
+def test_reports_that_come_again_and_those_of_before_are_passed_over() -> None:
+    switch, seen = button()
+    machine = DeviceMachine(switch)
+
+    async def main() -> None:
+        await asyncio.sleep(1)
+        oid = switch.oid
+        assert oid is not None
+
+        def told(ack_count: int, *states: int) -> None:
+            parameters: dict[str, int | bytes] = {
+                "oid": oid,
+                "ack_count": ack_count,
+                "state": bytes(states),
+            }
+            switch._came(machine.node, oid, Message("buttons_state", parameters))
+
+        told(0, 1, 0)
+        told(0, 1, 0)
+        told(0, 1, 0, 1)
+        told(2, 1)
+        told(7, 0)
+        assert seen == [True, False, True]
+
+    machine.run(main)

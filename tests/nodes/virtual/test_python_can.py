@@ -10,7 +10,7 @@ import pytest
 from nodes.virtual.hub import VirtualBus
 from nodes.virtual.python_can import CanductorBus
 
-WAIT_S = 10.0
+WAIT_S = 30.0
 
 
 @pytest.fixture

@@ -1,9 +1,12 @@
-"""Reads the parameters of modules' commands; mistakes are WordErrors."""
+"""Reads the parameters of modules' commands; every mistake is a WordError that says what to write."""
 
 from collections.abc import Iterable, Mapping
+from typing import TypeVar
 
 from coordinator.gcode.words import Command, WordError, number, quoted
 from coordinator.machine.problem import nearest
+
+T = TypeVar("T", float, None)
 
 
 def numbers(command: Command, allowed: str) -> dict[str, float]:
@@ -21,7 +24,7 @@ def parameters(command: Command, allowed: Iterable[str]) -> dict[str, str]:
     found = command.parameters()
     for name in found:
         if name not in allowed:
-            hint = nearest(name, allowed) or f"; it takes {', '.join(allowed)}"
+            hint = nearest(name, allowed) or f"; it takes {', '.join(allowed) or 'none'}"
             raise WordError(f"{command.name} has no parameter {quoted(name)}{hint}")
     return found
 
@@ -46,3 +49,30 @@ def one(command: Command, given: Mapping[str, str], name: str, known: Iterable[s
             return name_
     hint = nearest(text, known) or f"; there is {', '.join(known)}"
     raise WordError(f"{command.name}: there is no {quoted(text)}{hint}")
+
+
+def needed(command: Command, values: Mapping[str, str], key: str) -> str:
+    """Return VALUES[KEY]."""
+    if key not in values:
+        raise WordError(f"{command.name} has no {key}; add {key}=...")
+    return values[key]
+
+
+def bounded(
+    command: Command, values: Mapping[str, str], key: str, default: T, *, low: float, high: float
+) -> float | T:
+    """Read the number VALUES[KEY], from LOW to HIGH; without it, DEFAULT."""
+    if key not in values:
+        return default
+    value = number(command.name, values, key)
+    if not low <= value <= high:
+        raise WordError(f"{key} of {command.name} is {value:g}; {low:g} to {high:g} are possible")
+    return value
+
+
+def flag(command: Command, values: Mapping[str, str], key: str) -> bool:
+    """Read KEY=0 or KEY=1; without it, False."""
+    text = values.get(key, "0")
+    if text not in {"0", "1"}:
+        raise WordError(f"{key} of {command.name} is {quoted(text)}; give 0 or 1")
+    return text == "1"

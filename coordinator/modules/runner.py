@@ -1,0 +1,30 @@
+"""What modules may have a service do. Without one (a file is run, a program is planned) there is none."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+
+class Runner(Protocol):
+    """Has the machine do things on its own account; on the control loop."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything moves, is done or waits; a paused job alone does not count."""
+        ...
+
+    @property
+    def works(self) -> int:
+        """How much was done so far: a number that grows with every end of a job, of lines, of a move."""
+        ...
+
+    def run_lines(self, name: str, lines: Sequence[str], text: str = "") -> None:
+        """Have g-code LINES done as those of a client; NAME is for messages. What goes wrong is logged.
+
+        TEXT is what they stand for: a job is paused first if there are words in it that pause or cancel one.
+        """
+
+    def run_paused(self, name: str, lines: Sequence[str], *, stay: bool) -> None:
+        """Have LINES done with the job paused, if there is one: they may move.
+
+        It goes on behind them, unless they have paused it; with STAY it stays paused.
+        """

@@ -1,0 +1,71 @@
+"""A machine of a few lines with the modules under test, and programs that it reads; no hardware."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coordinator.gcode.commands import Done
+from coordinator.gcode.events import End, Event, Full, Notice, Progress, Reply, Resting
+from coordinator.gcode.interpreter import Job
+from coordinator.gcode.program import Program
+from coordinator.machine.description import load_machine
+from coordinator.motion.planner import Planner
+from coordinator.program_machine import machine_state
+from tests.coordinator.machine.printer_cfg import PRINTER_CFG, write
+
+if TYPE_CHECKING:
+    from coordinator.gcode.machine_state import MachineState
+    from coordinator.modules.module_set import ModuleSet
+
+
+class ProgramStage:
+    """The machine, with sections added to its configuration; programs run one after the other."""
+
+    def __init__(self, folder: Path, sections: str = "") -> None:
+        self.path = write(folder, PRINTER_CFG + "\n" + sections)
+        self.description = load_machine(self.path)
+        self.modules: ModuleSet = self.description.modules.build(self.description)
+        self.planner = Planner(self.description.limits)
+        self.machine: MachineState = machine_state(self.description)
+        self.moves: list[tuple[float, ...]] = []
+        """Starts of all moves (X Y Z E, mm), each with its ratios."""
+
+    def job(self, *lines: str) -> Job:
+        self.planner.lines = 0
+        return Job(
+            Program.from_lines(lines, "part.gcode"),
+            self.planner,
+            self.description.homed_position,
+            self.machine,
+            self.modules.vocabulary,
+        )
+
+    def events(self, *lines: str, perform: Callable[[Resting], None] | None = None) -> list[Event]:
+        """Run a program to its end; what is done at rest succeeds unless PERFORM says what comes of it."""
+        job, found = self.job(*lines), list[Event]()
+        while not (found and isinstance(found[-1], End)):
+            event = job.step()
+            self._drain()
+            if isinstance(event, Resting):
+                assert self.planner.at_standstill
+                if perform is not None:
+                    perform(event)
+                elif event.done is None:
+                    event.done = Done()
+            if not isinstance(event, Progress | Full):
+                found.append(event)
+        return found
+
+    def run(self, *lines: str) -> list[str]:
+        """Run a program to its end; return its replies."""
+        return [event.text for event in self.events(*lines) if isinstance(event, Reply)]
+
+    def notices(self, *lines: str) -> list[str]:
+        return [event.text for event in self.events(*lines) if isinstance(event, Notice)]
+
+    def _drain(self) -> None:
+        while (waiting := self.planner.take()).count:
+            for move in waiting.array():
+                ratio = [round(float(r), 9) for r in move["ratio"]]
+                self.moves.append(tuple(float(v) for v in move["start"]) + tuple(ratio))
+            self.planner.release(waiting.count)
