@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.system.patiently import be_patient
 from tests.system.stage import Hardware, hardware
 
 
@@ -10,6 +11,12 @@ from tests.system.stage import Hardware, hardware
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep what commands cache out of the user's home."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give machines in this process as much time as those in processes of their own have."""
+    be_patient(monkeypatch.setattr)
 
 
 @pytest.fixture

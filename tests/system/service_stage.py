@@ -64,7 +64,7 @@ class Served:
         self._homed: tuple[dict[str, int], Position] = ({}, (0.0,) * 4)
         add_methods(self.service, self._registry)
 
-    async def call(self, name: str, **params: Any) -> dict[str, Any]:
+    async def call(self, name: str, /, **params: Any) -> dict[str, Any]:
         """Call a method as the server does."""
         method = self._registry.methods[name]
         answer = method.call(Caller("a test", Scope.ADMIN), method.check(params))
@@ -78,9 +78,9 @@ class Served:
         (self.jobs / name).write_text(text, encoding="utf-8")
         return name
 
-    async def until(self, true: Callable[[], bool], what: str) -> None:
+    async def until(self, true: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
         """Wait until TRUE, looking as often as the state changes."""
-        async with asyncio.timeout(LIMIT_S):
+        async with asyncio.timeout(limit_s):
             while not true():
                 assert self.service.state != "error" or what == "error", self.service.cause
                 await asyncio.sleep(0.01)
@@ -88,8 +88,8 @@ class Served:
     async def until_state(self, state: str) -> None:
         await self.until(lambda: str(self.service.state) == state, state)
 
-    async def until_job(self, *phases: str) -> None:
-        await self.until(lambda: self.job_state in phases, f"job {phases}")
+    async def until_job(self, *phases: str, limit_s: float = LIMIT_S) -> None:
+        await self.until(lambda: self.job_state in phases, f"job {phases}", limit_s)
 
     @property
     def job_state(self) -> str:

@@ -17,7 +17,7 @@ from nodes.virtual.processes import BusProcess, ChildProcess, NodeProcess
 
 ROOT = Path(__file__).parents[2]
 DEMO_CFG = (ROOT / "config" / "demo" / "machine.cfg").read_text(encoding="utf-8")
-CANDUCTOR = (sys.executable, "-m", "coordinator.cli")
+CANDUCTOR = (sys.executable, "-m", "tests.system.patiently")
 MCU_UUID, TOOLHEAD_UUID = "90a4ae022dfc", "5e1ec7ab1e02"
 END_S = 60.0
 """No command of these tests may take longer; on a busy machine they take a third of it."""

@@ -75,7 +75,11 @@ G1 X3 Y2 Z1 E0.1
 @pytest.mark.parametrize(
     ("machine", "first", "second"),
     [
-        ("delta", "G1 X12 Y-15 Z-60 F6000", "G4 P50"),
+        (
+            "delta",
+            "M104 S188\nM190 S52.5\nTEMPERATURE_WAIT SENSOR=extruder MINIMUM=180\nG1 X12 Y-15 Z-60 F6000",
+            "G4 P50",
+        ),
         ("corexy", "G1 X40 Y40 Z6 F6000", "SET_PRESSURE_ADVANCE ADVANCE=0.1"),
         (
             "corexy",
@@ -100,6 +104,42 @@ def test_non_linear_shaped_smoothed_and_changing_steppers_are_proved(
     assert ended.json["ok"] is True
     assert ended.json["steps"] == ended.json["steps_planned"] > 10_000
     assert ended.json["worst_band_error_us"] <= 12.5 * 1.001
+
+
+HOT = """\
+M140 S52
+M104 S188
+G28
+M190 S52
+M83
+G1 X30 Y20 Z2 F6000
+M106 S64
+G1 X60 E1 F1800
+G1 Y40 E0.5
+G4 P1500
+M104 S0
+M140 S0
+G1 X20 F6000
+"""
+
+
+def test_a_printer_homes_heats_and_holds_its_bed(tmp_path: Path) -> None:
+    """It begins warm, and the bed is to stay as it is: ten seconds of settling are enough to wait for."""
+    ended = canductor(
+        *("demo", "--json", "--no-web", "--machine", str(CONFIG / "cartesian_uart.cfg")),
+        *("--gcode", write_gcode(tmp_path, HOT)),
+    )
+    assert ended.status == 0, ended
+    report = ended.json
+    assert report["ok"] is True
+    assert set(report["place_error_um"]) == set("xyz")
+    assert report["steps"] == report["steps_planned"] > 10_000
+    heat = {state["heater"]: state for state in report["heat"]}
+    bed = heat["heater_bed"]
+    assert (bed["control"], bed["target_c"]) == ("pid", 52)
+    assert bed["deviation_k"] <= 1
+    for low, high in (bed["measured_c"], bed["true_c"]):
+        assert 51 <= low <= high <= 53
 
 
 # ---------------------------------------------------------------------------------------------- it can fail

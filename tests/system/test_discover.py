@@ -39,8 +39,9 @@ def secrets_of(folder: Path) -> tuple[Path, Path]:
     """Return the file of tokens for the server, and that of one for a client."""
     tokens, token = folder / "tokens", folder / "token"
     tokens.write_text(f"operate me {TOKEN}\n", encoding="utf-8")
-    tokens.chmod(0o600)
     token.write_text(TOKEN, encoding="utf-8")
+    tokens.chmod(0o600)
+    token.chmod(0o600)
     return tokens, token
 
 

@@ -35,7 +35,7 @@ MATRIX: dict[str, tuple[str, dict[str, Any], str]] = {
     "state.get": ("watch", {"fields": ["machine.*"]}, "result"),
     "machine.info": ("watch", {}, "result"),
     "machine.state": ("watch", {}, "result"),
-    "machine.emergency_stop": ("operate", {"who": 1}, "bad_params"),  # the last caller really does
+    "machine.emergency_stop": ("operate", {"who": 1}, "result"),  # whoever may does so after all the others
     "machine.restart": ("operate", {"x": 1}, "bad_params"),
     "log.tail": ("watch", {}, "result"),
     "config.get": ("watch", {}, "result"),
@@ -47,7 +47,10 @@ MATRIX: dict[str, tuple[str, dict[str, Any], str]] = {
     "job.list": ("watch", {}, "result"),
     "job.upload": ("operate", {"file": "a.gcode", "offset": 0, "text": "G28\n"}, "result"),
     "job.start": ("operate", {"file": "none.gcode"}, "no_such_file"),
+    "job.stream": ("operate", {"name": "\n"}, "bad_params"),
+    "job.feed": ("operate", {"name": "none", "first_line": 1, "text": ""}, "no_job"),
     "job.pause": ("operate", {}, "no_job"),
+    "job.recover": ("operate", {}, "no_job"),
     "job.resume": ("operate", {}, "no_job"),
     "job.cancel": ("operate", {}, "no_job"),
     "job.status": ("watch", {}, "result"),
@@ -61,6 +64,8 @@ MATRIX: dict[str, tuple[str, dict[str, Any], str]] = {
     "table.remove": ("operate", {"x": 1}, "bad_params"),
 }
 """By method: the scope that it needs, what to call it with, and what it answers to one who may."""
+
+STOP = "machine.emergency_stop"
 
 
 class Line:
@@ -193,24 +198,43 @@ def test_the_scope_matrix_of_the_machine(machine: Hardware) -> None:
             _check_caller(place, name, caller)
         for method, (_, params, _) in MATRIX.items():
             _check_stranger(place, method, params)
-        with Line(place, tcp=True) as admin:
-            admin.ask("api.hello", version=1, token=TOKENS["operate"])
-            assert admin.ask("machine.emergency_stop")["result"]["state"] == "shutdown"
+        for name, caller in CALLERS.items():
+            _check_stop(place, name, caller)
 
 
-def _check_caller(place: Place, name: str, caller: tuple[bool, str | None, str | None, str]) -> None:
+@contextmanager
+def _line_of(place: Place, name: str, caller: tuple[bool, str | None, str | None, str]) -> Iterator[Line]:
+    """Say hello as CALLER."""
     tcp, token, asked, scope = caller
     with Line(place, tcp=tcp, packed="token" in name) as line:
         hello: dict[str, Any] = {"version": 1}
         hello |= {"token": TOKENS[token]} if token is not None else {}
         hello |= {"scope": asked} if asked is not None else {}
         assert line.ask("api.hello", **hello)["result"]["scope"] == scope
-        found = {method: line.outcome(method, params) for method, (_, params, _) in MATRIX.items()}
+        yield line
+
+
+def _check_caller(place: Place, name: str, caller: tuple[bool, str | None, str | None, str]) -> None:
+    scope = caller[3]
+    with _line_of(place, name, caller) as line:
         expected = {
             method: outcome if RANK[needed] <= RANK[scope] else "not_allowed"
             for method, (needed, _, outcome) in MATRIX.items()
+            if method != STOP or scope == "watch"
         }
+        found = {method: line.outcome(method, MATRIX[method][1]) for method in expected}
         assert found == expected, name
+
+
+def _check_stop(place: Place, name: str, caller: tuple[bool, str | None, str | None, str]) -> None:
+    """Who may stops the machine, though a parameter is wrong; who may only watch does not."""
+    with _line_of(place, name, caller) as line:
+        answer = line.ask(STOP, **MATRIX[STOP][1])
+        if caller[3] == "watch":
+            assert answer["error"]["code"] == "not_allowed"
+        else:
+            assert answer["result"]["state"] == "shutdown"
+            assert "who is 1, must be a string" in answer["result"]["ignored"]
 
 
 def _check_stranger(place: Place, method: str, params: dict[str, Any]) -> None:

@@ -11,6 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from coordinator.ipc.client import Client
 from coordinator.metrics.catalog import GROUPS, NOT_SHOWN, Kind, Metric, full_name
+from coordinator.metrics.collect import LABEL_MAX
 from coordinator.service.figures import field_name
 from tests.system.stage import SQUARE, Command, Hardware
 from tests.system.test_discover import free_port, secrets_of
@@ -115,9 +116,9 @@ def compare(state: dict[str, Any], samples: Samples) -> tuple[int, dict[str, Any
                 if (prefix, field) != (group.prefix, metric.field) or not plain(metric, value):
                     continue
                 told = samples[full_name(metric)]
-                (figure,) = (v for labels, v in told.items() if is_of(entity, dict(labels), group.labels))
-                if figure != pytest.approx(value * metric.scale):
-                    wrong[path] = (value, figure)
+                figures = [v for labels, v in told.items() if is_of(entity, dict(labels), group.labels)]
+                if figures != pytest.approx([value * metric.scale]):
+                    wrong[path] = (value, figures)
                 compared += 1
     return compared, wrong
 
@@ -127,7 +128,7 @@ def plain(metric: Metric, value: object) -> bool:
 
 
 def is_of(entity: str, labels: dict[str, str], keys: tuple[str, ...]) -> bool:
-    return not entity or field_name(labels[keys[0]]) == entity
+    return not entity or field_name(labels[keys[0]]) == entity[:LABEL_MAX]
 
 
 def forgotten(state: dict[str, Any]) -> set[str]:

@@ -98,7 +98,7 @@ def test_a_job_that_is_held_reads_no_further_until_it_is_released(machine: Hardw
                 streamer.hold("a node is away")
                 await streamer.run()
                 assert held_cycles == 10
-                assert streamer.pipeline.moves == 2
+                assert streamer.worker.pipeline.moves == 2
             assert real.stopped is None
         finally:
             await real.close()

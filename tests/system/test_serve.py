@@ -15,9 +15,11 @@ import pytest
 
 from coordinator.ipc.client import Client
 from coordinator.ipc.methods import ApiError
+from coordinator.service.journal import NAME
 from tests.system.service_stage import zigzag
 from tests.system.stage import (
     CANDUCTOR,
+    DEMO_CFG,
     MCU_UUID,
     ROOT,
     SQUARE,
@@ -94,10 +96,10 @@ def test_pause_and_a_client_killed_meanwhile(machine: Hardware) -> None:
         seen = await until(client, "job.state", "paused")
         assert seen["machine.state"] == "paused"
         stood = await client.call("position.get", {"ask_nodes": True})
-        with pytest.raises(ApiError) as error:
-            await client.call("move.by", {"x": 1})
-        assert error.value.code == "busy"
         assert (await client.call("position.get", {"ask_nodes": True}))["nodes_steps"] == stood["nodes_steps"]
+        moved = await client.call("move.by", {"x": 1, "z": 1})
+        assert moved["position"]["x"] == pytest.approx(stood["planned"]["x"] + 1)
+        assert (await client.call("job.status"))["state"] == "paused"
         await client.call("job.resume")
         await until(client, "job.state", "printing")
         await client.call("job.cancel")
@@ -156,6 +158,27 @@ def test_the_demo_is_served_without_hardware(tmp_path: Path) -> None:
                 await client.call("gcode.run", {"script": "G28\nG1 X5 F6000"})
                 told = await client.call("position.get", {"ask_nodes": True})
                 assert told["nodes_steps"] == {n: s["steps_sent"] for n, s in told["steppers"].items()}
+                await client.call("job.start", {"file": "part.gcode"})
+                await until(client, "machine.state", "printing")
+
+        asyncio.run(main())
+        command.signal(signal.SIGINT)
+        command.end()
+    assert not list((ROOT / "config").rglob(NAME)), "its journal is where it ran, not beside the program"
+
+
+def test_a_served_demo_prints_from_the_folder_of_its_machine(tmp_path: Path) -> None:
+    path = tmp_path / "demo.sock"
+    (tmp_path / "jobs").mkdir()
+    (tmp_path / "jobs" / "own.gcode").write_text(SQUARE, encoding="utf-8")
+    machine = tmp_path / "machine.cfg"
+    machine.write_text(DEMO_CFG + "\n[virtual_sdcard]\npath: jobs\n", encoding="utf-8")
+    with Command("demo", "--serve", "--machine", machine, "--ipc", path) as command:
+        command.stdout.wait_for("ready")
+
+        async def main() -> None:
+            async with asyncio.timeout(LIMIT_S), Client.connect(str(path)) as client:
+                assert [file["name"] for file in (await client.call("job.list"))["files"]] == ["own.gcode"]
 
         asyncio.run(main())
         command.signal(signal.SIGINT)

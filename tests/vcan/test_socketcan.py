@@ -37,7 +37,7 @@ from tests.vcan.kernel import (
 pytestmark = pytest.mark.skipif(bool(why_no_socketcan()), reason=why_no_socketcan())
 controls_interface = pytest.mark.skipif(bool(why_no_control()), reason=why_no_control())
 
-WAIT_S = 30.0
+WAIT_S = 60.0
 UUIDS = (Uuid.parse("90a4ae022dfc"), Uuid.parse("5e1ec7ab1e02"))
 RECORD = struct.Struct("=IB3x8s")
 
@@ -200,6 +200,7 @@ def test_frames_of_other_protocols_on_the_bus_disturb_nobody(
     others = (socket.CAN_EFF_FLAG | 0x108, socket.CAN_RTR_FLAG | 0x108, 0x7FF)
 
     async def check() -> None:
+        before = [node.link.stats().bytes_invalid for node in bench.nodes]
         with raw_socket() as stranger:
             for _ in range(50):
                 for can_id in others:
@@ -208,7 +209,7 @@ def test_frames_of_other_protocols_on_the_bus_disturb_nobody(
         assert bench.io is not None
         # Those with eleven bits are no node's either, but might be; the other kinds do not even arrive.
         assert bench.io.stats().frames_malformed == 0
-        assert {node.link.stats().bytes_invalid for node in bench.nodes} == {0}
+        assert [node.link.stats().bytes_invalid for node in bench.nodes] == before
 
     bench.run(check)
     assert [process.stop()["lost"] for process in processes] == [0, 0]
