@@ -80,16 +80,27 @@ class Served:
 
     async def until(self, true: Callable[[], bool], what: str, limit_s: float = LIMIT_S) -> None:
         """Wait until TRUE, looking as often as the state changes."""
-        async with asyncio.timeout(limit_s):
-            while not true():
-                assert self.service.state != "error" or what == "error", self.service.cause
-                await asyncio.sleep(0.01)
+        try:
+            async with asyncio.timeout(limit_s):
+                while not true():
+                    assert self.service.state != "error" or what == "error", self.service.cause
+                    await asyncio.sleep(0.01)
+        except TimeoutError:
+            told = (str(self.service.state), self.job_state, self.tree.get("job.line"), self.lines[-5:])
+            raise AssertionError(f"{what} did not come within {limit_s} s: {told}") from None
 
     async def until_state(self, state: str) -> None:
         await self.until(lambda: str(self.service.state) == state, state)
 
     async def until_job(self, *phases: str, limit_s: float = LIMIT_S) -> None:
-        await self.until(lambda: self.job_state in phases, f"job {phases}", limit_s)
+        """Wait until the job is in one of PHASES; fails at once when it has come to another end."""
+
+        def reached() -> bool:
+            job = self.service.job
+            assert job is None or job.active or job.phase in phases, (job.phase, job.message, self.lines[-5:])
+            return self.job_state in phases
+
+        await self.until(reached, f"job {phases}", limit_s)
 
     @property
     def job_state(self) -> str:

@@ -18,8 +18,10 @@ from nodes.virtual.processes import BusProcess, Flavour, NodeProcess
 from tests.system.service_stage import LIMIT_S, served, zigzag
 from tests.system.stage import Command, Hardware
 
-HURRY = 30
-"""How much faster than in truth all gets hot."""
+PLANT = PlantSettings(
+    start=(20.0, 230.0, 5.0), heat=HeatSettings(hurry=4, warm_c={"extruder": 200.0, "heater_bed": 58.0})
+)
+"""Near the endstops; not so quick that a heater that is looked at every 0.3 s leaves its target."""
 NODES = {"mcu": "11aa22bb33cc", "toolhead": "44dd55ee66ff"}
 SECTIONS = """
 [pause_resume]
@@ -44,8 +46,7 @@ def printer(tmp_path: Path) -> Iterator[Hardware]:
     text = text.replace("control: pid", "control: watermark").replace("can0", f"virtual:{tmp_path / 'bus'}")
     config = tmp_path / "printer.cfg"
     config.write_text(text + SECTIONS, encoding="utf-8")
-    settings = PlantSettings(heat=HeatSettings(hurry=HURRY))
-    plants = machine_plants(load_machine(str(config)), settings)
+    plants = machine_plants(load_machine(str(config)), PLANT)
     with ExitStack() as stack:
         bus = BusProcess(tmp_path / "bus")
         stack.callback(bus.kill)
@@ -62,7 +63,7 @@ def printer(tmp_path: Path) -> Iterator[Hardware]:
 
 def true_mm(printer: Hardware) -> list[float]:
     """Return where the head truly is."""
-    plants = machine_plants(load_machine(str(printer.config)))
+    plants = machine_plants(load_machine(str(printer.config)), PLANT)
     motors = {name: PlantPage.at(printer.folder, name).motors for name in NODES}
     axes = {axis.name: axis for plant in plants.values() for axis in plant.axes}
     return [
