@@ -2,14 +2,17 @@
 
 Nodes have commands for about half a second, and a host that hears nothing from them gives them up: machines
 stop, as they should, when all processors of a virtual machine are given to others for as long. A watcher in
-each process of the tests measures how late it gets its turn. A test that failed while that was more than
-STILL_S is begun anew, with new fixtures, TRIES times in all, and told of at the end. Without a standstill it
-has failed.
+each process of the tests measures how late it gets its turn; the processes of nodes and services may have
+waited as long as the kernel says that the host of this virtual machine took its processors away. A test that
+failed while either was more than STILL_S is begun anew, with new fixtures, TRIES times in all, and told of at
+the end. Without a standstill it has failed.
 """
 
+import os
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 import pytest
@@ -22,17 +25,32 @@ OUTCOME: Final = "repeated"
 PROPERTY: Final = "stood still"
 
 
-class Watcher:
-    """Measures for how long this process got no turn, from ``begin`` on."""
+def kernel_stolen_s() -> float:
+    """Return what the host took away of all processors since this kernel began; see proc(5), steal."""
+    try:
+        told = Path("/proc/stat").read_text(encoding="ascii").split("\n", 1)[0].split()
+    except OSError:
+        return 0.0
+    return int(told[8]) / os.sysconf("SC_CLK_TCK") if len(told) > 8 else 0.0
 
-    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+
+class Watcher:
+    """Measures for how long this process got no turn, and what was stolen from all, from ``begin`` on."""
+
+    def __init__(
+        self, now_s: Callable[[], float] = time.monotonic, stolen_s: Callable[[], float] = kernel_stolen_s
+    ) -> None:
         self.longest_s = 0.0
-        self._now_s = now_s
-        self._looked_s = now_s()
+        self._now_s, self._stolen_s = now_s, stolen_s
+        self._looked_s, self._stolen_before_s = now_s(), stolen_s()
 
     def begin(self) -> None:
         """Forget what was."""
-        self.longest_s = 0.0
+        self.longest_s, self._stolen_before_s = 0.0, self._stolen_s()
+
+    def still_s(self) -> float:
+        """Return for how long any process of a test may have got no turn."""
+        return max(self.longest_s, self._stolen_s() - self._stolen_before_s)
 
     def look(self) -> None:
         """Take note of the time; called every LOOK_S."""
@@ -62,11 +80,12 @@ class Repeating:
             self._watcher.begin()
             reports = runtestprotocol(item, nextitem=nextitem, log=False)
             failed = any(report.failed for report in reports)
-            again = failed and tries_left > 0 and self._watcher.longest_s > STILL_S
+            still_s = self._watcher.still_s() if failed else 0.0
+            again = tries_left > 0 and still_s > STILL_S
             for report in reports:
                 if again and report.failed:
                     report.outcome = OUTCOME  # type: ignore[assignment]  # shown by pytest_report_teststatus
-                    report.user_properties.append((PROPERTY, round(self._watcher.longest_s, 2)))
+                    report.user_properties.append((PROPERTY, round(still_s, 2)))
                 if not again or _is_repeated(report):
                     item.ihook.pytest_runtest_logreport(report=report)
             if not again or not _make_new(item):

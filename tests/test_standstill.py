@@ -1,18 +1,20 @@
 """What a standstill of the computer does to tests that fail, in a pytest of its own."""
 
+import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
-from tests.standstill import LOOK_S, STILL_S, TRIES, Watcher
+from tests.standstill import LOOK_S, STILL_S, TRIES, Watcher, kernel_stolen_s
 
 ROOT = Path(__file__).parents[1]
 CONFTEST = """
 import pytest
 from tests.standstill import Repeating, Watcher
-watcher = Watcher()
+watcher = Watcher(stolen_s=lambda: 0.0)
 def pytest_configure(config):
     config.pluginmanager.register(Repeating(watcher))
 @pytest.fixture
@@ -63,10 +65,24 @@ def test_what_failed_in_a_standstill_is_begun_anew(tmp_path: Path, words: list[s
 
 def test_the_longest_standstill_counts() -> None:
     now_s = 0.0
-    watcher = Watcher(lambda: now_s)
+    watcher = Watcher(lambda: now_s, lambda: 0.0)
     for wait_s in (LOOK_S, LOOK_S + 2 * STILL_S, LOOK_S, LOOK_S + STILL_S):
         now_s += wait_s
         watcher.look()
-    assert watcher.longest_s == pytest.approx(2 * STILL_S)
+    assert watcher.still_s() == pytest.approx(2 * STILL_S)
     watcher.begin()
-    assert watcher.longest_s == 0
+    assert watcher.still_s() == 0
+
+
+def test_stolen_time_counts() -> None:
+    stolen_s = 5.0
+    watcher = Watcher(lambda: 0.0, lambda: stolen_s)
+    assert watcher.still_s() == 0
+    stolen_s = 5.5
+    assert watcher.still_s() == 0.5
+    watcher.begin()
+    assert watcher.still_s() == 0
+
+
+def test_the_kernel_tells_what_was_stolen() -> None:
+    assert 0 <= kernel_stolen_s() <= time.clock_gettime(time.CLOCK_BOOTTIME) * (os.cpu_count() or 1)
