@@ -61,7 +61,7 @@ class FrameQueue:
             frames = list(self._waiting)
             self._waiting.clear()
             if not frames and self._cause is not None:
-                raise self._cause
+                raise self._cause.with_traceback(None)
         return frames
 
     def _run(self) -> None:

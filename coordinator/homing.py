@@ -291,7 +291,7 @@ class HomingMove:
                 async with asyncio.timeout(CYCLE_S):
                     await self._changed.wait()
             if self._machine.stopped is not None:
-                raise self._machine.stopped
+                raise self._machine.stopped.with_traceback(None)
 
     def _renew(self, move: SingleMove, leg: _Leg) -> None:
         """Nobody is to go on longer than the host has heard from all."""

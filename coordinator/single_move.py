@@ -151,7 +151,7 @@ class SingleMove:
             self.stream()
             await asyncio.sleep(CYCLE_S)
             if self._machine.stopped is not None:
-                raise self._machine.stopped
+                raise self._machine.stopped.with_traceback(None)
 
     def stream(self) -> None:
         """Make and send what is due by now; CanductorError when a node cannot take it."""

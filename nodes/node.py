@@ -206,7 +206,7 @@ class Node:
 
     def _check_usable(self) -> None:
         if self.failure is not None:
-            raise self.failure
+            raise self.failure.with_traceback(None)
         if self.state not in (NodeState.CONFIGURING, NodeState.READY):
             raise NodeError(f"node {self.name} is {self.state.value} and takes no commands")
 
@@ -342,7 +342,7 @@ class Node:
 
     def _check_configured(self, found: Message, wanted: NodeConfig) -> None:
         if self.failure is not None:
-            raise self.failure
+            raise self.failure.with_traceback(None)
         if found.integer("is_shutdown"):
             raise NodeShutdown(f"node {self.name} shut down while being configured; see its pins and limits")
         if not found.integer("is_config") or found.integer("crc") != wanted.crc:
@@ -396,7 +396,7 @@ class Node:
                 f"node {self.name} answers too seldom to learn its clock; check the bus for errors and load"
             ) from None
         if self.failure is not None:
-            raise self.failure
+            raise self.failure.with_traceback(None)
 
     # ------------------------------------------------------------------------------------------- what comes
 

@@ -150,7 +150,7 @@ class Job:
                 self._breaks = False
                 return self._progress()
             if isinstance(self._over, GCodeError):
-                raise self._over
+                raise self._over.with_traceback(None)
             if self._over is not None:
                 return self._over
             filament = self.machine.filament

@@ -155,7 +155,7 @@ class Client:
         except TimeoutError:
             raise ConnectionLost(f"{self.address} is not there; waited {self._timeout_s:g} s") from None
         if self._refusal is not None:
-            raise self._refusal
+            raise self._refusal.with_traceback(None)
 
     async def _ask(self, method: str, params: Mapping[str, Value], begins: Watch | None = None) -> Any:
         assert self._writer is not None

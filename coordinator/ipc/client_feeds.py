@@ -77,7 +77,7 @@ class Watch:
         """Wait for an update; raises ApiError."""
         await self._news.wait()
         if self._failure is not None:
-            raise self._failure
+            raise self._failure.with_traceback(None)
         self._news.clear()
         update, self._merged = self._merged, None
         assert update is not None
@@ -114,7 +114,7 @@ class Feed:
         """Wait for a notification; raises ApiError."""
         while not self._waiting:
             if self._failure is not None:
-                raise self._failure
+                raise self._failure.with_traceback(None)
             self._news.clear()
             await self._news.wait()
         return self._waiting.popleft()

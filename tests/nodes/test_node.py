@@ -386,6 +386,20 @@ def test_emergency_stop_reaches_the_node() -> None:
     machine.run(machine.bus.start, check)
 
 
+def test_asking_a_node_that_is_gone_again_and_again_keeps_nothing() -> None:
+    machine = Machine(TwinNode())
+
+    async def check() -> None:
+        machine.bus.emergency_stop()
+        await machine.changed_to(NodeState.SHUTDOWN)
+        for _ in range(100):
+            with pytest.raises(NodeShutdown) as told:
+                _ = machine.node.link
+        assert len(told.traceback) < 10
+
+    machine.run(machine.bus.start, check)
+
+
 # --------------------------------------------------------------------------------------------------- states
 
 
