@@ -32,8 +32,11 @@ static int64_t walk_back(struct plant_page_stepper *stepper, uint64_t head, uint
             return count;
         later = count;
     }
-    // All steps known are later than NS. Before the very first one it stood at 0.
-    return oldest ? later : 0;
+    // All steps known are later than NS. Before the very first one it stood at 0; that one may be overwritten
+    // by now.
+    atomic_thread_fence(memory_order_acquire);
+    uint64_t now = atomic_load_explicit(&stepper->head, memory_order_relaxed);
+    return oldest || now > PLANT_HISTORY ? later : 0;
 }
 
 int64_t plant_page_count_at(struct plant_page_stepper *stepper, uint64_t ns) {
