@@ -42,6 +42,7 @@ def builder(module: str, headers: Sequence[str], sources: Iterable[str], *, cdef
             "-Wextra",
             "-Wno-psabi",
             "-fno-math-errno",
+            "-ffp-contract=off",  # the same numbers on every processor
             "-pthread",
         ],
         extra_link_args=["-pthread"],

@@ -41,19 +41,17 @@ bool VARIANT(step_replay)(const struct replay *r, double *worst) {
     static const quad FIRST = {1, 2, 3, 4};
     const double interval = r->interval, add = r->add, bend = QUAD * QUAD * add;
     quad at = (double)r->clock + interval * FIRST + add * (0.5 * FIRST * (FIRST - 1));
-    quad ahead = QUAD * interval + add * (QUAD * FIRST + 6), most = {0};
-    quad_selection bad = {0};
+    quad ahead = QUAD * interval + add * (QUAD * FIRST + 6), most = {0}, beyond = {0};
     size_t i = 0;
     for (; i + QUAD <= r->count; i += QUAD) {
-        const quad_selection error = (quad_selection)(at - load_quad(r->ticks + i)) & INT64_MAX; // no sign
-        bad |= (at < load_quad(r->low + i)) | (at > load_quad(r->high + i));
-        const quad_selection more = (quad)error > most;
-        most = (quad)((error & more) | ((quad_selection)most & ~more));
+        const quad error = at - load_quad(r->ticks + i);
+        most = larger_quad(most, larger_quad(error, -error));
+        beyond = larger_quad(beyond, larger_quad(load_quad(r->low + i) - at, at - load_quad(r->high + i)));
         at += ahead;
         ahead += bend;
     }
     *worst = fmax(fmax(most[0], most[1]), fmax(most[2], most[3]));
-    bool good = !any(bad);
+    bool good = !any_above_0(beyond);
     for (int lane = 0; i < r->count; i++, lane++) {
         good &= (at[lane] >= r->low[i]) & (at[lane] <= r->high[i]);
         *worst = fmax(*worst, fabs(at[lane] - r->ticks[i]));

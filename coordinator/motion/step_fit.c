@@ -72,37 +72,41 @@ static int32_t last_between(const struct fit_problem *p, const struct fit *f, in
     return at;
 }
 
-// Where lines through the first gates end at WIDE places, as far as lines through any two gates tell.
+enum { SEEN = 8 }; // last places that are looked at
+_Static_assert(SEEN % WIDE == 0, "whole vectors");
+
+// Where lines through the first gates end at SEEN places, as far as lines through any two gates tell.
 struct ends {
-    float low[WIDE], high[WIDE];   // of the bands
-    float least[WIDE], most[WIDE]; // slopes
-    float lowest[WIDE], highest[WIDE];
+    float low[SEEN], high[SEEN];   // of the bands
+    float least[SEEN], most[SEEN]; // slopes
+    float lowest[SEEN], highest[SEEN];
 };
 
+// Looks at WIDE places from FIRST on, of those up to LAST; they are the ones of E from PART on.
 static inline void look_at_ends(const struct fit_problem *p, const struct fit *f, int32_t gates,
-                                int32_t first, int32_t last, struct ends *e) {
-    static const vector PLACES_BEHIND = {0, 1, 2, 3, 4, 5, 6, 7};
-    put_gates(p, f, first * f->stride, f->stride, last * f->stride, e->low, e->high);
-    const vector low = load(e->low), high = load(e->high);
+                                int32_t first, int32_t last, struct ends *e, int part) {
+    put_gates(p, f, first * f->stride, f->stride, last * f->stride, e->low + part, e->high + part);
+    const vector low = load(e->low + part), high = load(e->high + part);
     vector least = all(-FAR), most = all(FAR), lowest = low, highest = high;
     int32_t behind = first - f->spacing;
     for (int32_t i = 0; i < gates && behind > -WIDE; i++, behind -= f->spacing) {
         const vector k = load(INVERSE + REACH + behind), none = load(NONE + REACH + behind);
-        const vector away = PLACES_BEHIND + (float)behind;
+        const vector away = COUNTING + (float)(behind - 1);
         least = larger(least, (low - f->high[i]) * k + none);
         most = smaller(most, (high - f->low[i]) * k - none);
         lowest = larger(lowest, away * f->least[i + 1] + f->low[i] + none);
         highest = smaller(highest, away * f->most[i + 1] + f->high[i] - none);
     }
-    store(e->least, &least), store(e->most, &most);
-    store(e->lowest, &lowest), store(e->highest, &highest);
+    store(e->least + part, &least), store(e->most + part, &most);
+    store(e->lowest + part, &lowest), store(e->highest + part, &highest);
 }
 
-// Finds the last place with each end, of the WIDE up to LAST.
+// Finds the last place with each end, of the SEEN up to LAST.
 static void find_ends(const struct fit_problem *p, struct fit *f, int32_t gates, int32_t last) {
-    const int32_t first = last > WIDE ? last - WIDE + 1 : 1;
+    const int32_t first = last > SEEN ? last - SEEN + 1 : 1;
     struct ends e;
-    look_at_ends(p, f, gates, first, last, &e);
+    for (int part = 0; part < SEEN; part += WIDE)
+        look_at_ends(p, f, gates, first + part, last, &e, part);
     int missing = FIT_ENDS;
     int32_t before = gates_before(f, last), gate = before * f->spacing;
     for (int32_t i = last - first; i >= 0 && missing; i--) {
@@ -202,13 +206,14 @@ static uint32_t count_good(const struct fit_problem *p, const struct fit_segment
     const double bend = QUAD * QUAD * s->add;
     uint32_t i = 0;
     for (; i + 2 * QUAD <= count; i += 2 * QUAD) {
-        quad_selection bad = (at < load_quad(p->low + i)) | (at > load_quad(p->high + i));
+        quad beyond = larger_quad(load_quad(p->low + i) - at, at - load_quad(p->high + i));
         at += ahead;
         ahead += bend;
-        bad |= (at < load_quad(p->low + i + QUAD)) | (at > load_quad(p->high + i + QUAD));
+        beyond = larger_quad(beyond, load_quad(p->low + i + QUAD) - at);
+        beyond = larger_quad(beyond, at - load_quad(p->high + i + QUAD));
         at += ahead;
         ahead += bend;
-        if (any(bad)) {
+        if (any_above_0(beyond)) {
             at -= 2 * ahead - 3 * bend;
             ahead -= 2 * bend;
             break;

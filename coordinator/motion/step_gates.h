@@ -17,7 +17,6 @@ enum {
 _Static_assert(GATES *(PLACES + SPREAD / 2) / SPREAD + WIDE < 120, "the tables cover all places");
 
 static const float FAR = 1e30F;
-static const vector COUNTING = {1, 2, 3, 4, 5, 6, 7, 8};
 
 // ------------------------------------------------------------------------------------------------- tables
 
@@ -31,7 +30,7 @@ static const float INVERSE[2 * REACH] = {
 static const float NONE[2 * REACH] = {FORTY(NOTHING, 0), FORTY(NOTHING, 0), FORTY(NOTHING, 0),
                                       EIGHT(NOTHING, 0), NOTHING(0)};
 // [GATES − n + i]: takes gates i ≥ n out.
-static const float BEYOND[2 * GATES + WIDE] = {
+static const float BEYOND[2 * GATES + FIT_LANES] = {
     [GATES] = EIGHT(NOTHING, 0), EIGHT(NOTHING, 0), EIGHT(NOTHING, 0), EIGHT(NOTHING, 0)};
 
 // -------------------------------------------------------------------------------------------------- gates
@@ -40,9 +39,9 @@ static const float BEYOND[2 * GATES + WIDE] = {
 static inline void put_gates_of(const struct fit_problem *p, const struct fit *f, quad n, quad low, quad high,
                                 float *put_low, float *put_high) {
     const quad base = p->clock + n * (f->interval + f->add * 0.5 * (n - 1));
-    const half_vector inverse = 1 / __builtin_convertvector(n, half_vector);
-    const half_vector a = __builtin_convertvector(low - base, half_vector) * inverse,
-                      b = __builtin_convertvector(high - base, half_vector) * inverse;
+    const four inverse = 1 / __builtin_convertvector(n, four);
+    const four a = __builtin_convertvector(low - base, four) * inverse,
+               b = __builtin_convertvector(high - base, four) * inverse;
     memcpy(put_low, &a, sizeof(a));
     memcpy(put_high, &b, sizeof(b));
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Vectors for the loops over steps: one register each with AVX2, more with the baseline of x86-64 and
-// AArch64. The same arithmetic either way, so every machine makes the same segments.
+// Vectors for the loops over steps, of single precision as wide as a register. The same arithmetic lane by
+// lane on every processor, so every machine makes the same segments.
 #ifndef MOTION_STEP_LANES_H
 #define MOTION_STEP_LANES_H
 
@@ -13,12 +13,15 @@
 #define VARIANT(name) name
 #endif
 
-typedef float vector __attribute__((vector_size(32)));
-typedef int32_t selection __attribute__((vector_size(32)));
-typedef double quad __attribute__((vector_size(32)));
-typedef int64_t quad_selection __attribute__((vector_size(32)));
-typedef float half_vector __attribute__((vector_size(16)));
-enum { WIDE = 8, QUAD = 4 };
+#ifdef __AVX2__
+enum { WIDE = 8 };
+#else // x86-64, AArch64
+enum { WIDE = 4 };
+#endif
+enum { QUAD = 4 };
+typedef float vector __attribute__((vector_size(WIDE * sizeof(float))));
+typedef float four __attribute__((vector_size(QUAD * sizeof(float))));
+typedef double quad __attribute__((vector_size(QUAD * sizeof(double))));
 
 static inline vector load(const float *at) {
     vector v;
@@ -36,49 +39,38 @@ static inline quad load_quad(const double *at) {
     return v;
 }
 
-static inline bool any(quad_selection v) {
-#ifdef __AVX2__
-    return __builtin_ia32_movmskpd256((quad)v) != 0;
-#else
-    return (v[0] | v[1] | v[2] | v[3]) != 0;
-#endif
-}
-
 static inline vector all(float x) {
     return x - (vector){0};
-}
-
-// Compilers make one instruction of the scalar form only.
-static inline vector larger(vector a, vector b) {
-#ifdef __AVX2__
-    return __builtin_ia32_maxps256(a, b);
-#else
-    const selection keep = a > b;
-    return (vector)(((selection)a & keep) | ((selection)b & ~keep));
-#endif
-}
-
-static inline vector smaller(vector a, vector b) {
-#ifdef __AVX2__
-    return __builtin_ia32_minps256(a, b);
-#else
-    const selection keep = a < b;
-    return (vector)(((selection)a & keep) | ((selection)b & ~keep));
-#endif
-}
-
-static inline quad smaller_quad(quad a, quad b) {
-#ifdef __AVX2__
-    return __builtin_ia32_minpd256(a, b);
-#else
-    const quad_selection keep = a < b;
-    return (quad)(((quad_selection)a & keep) | ((quad_selection)b & ~keep));
-#endif
 }
 
 struct range {
     float least, most;
 };
+
+// The larger and the smaller of two, lane by lane. Compilers make one instruction of the scalar form only,
+// and look at lane after lane when they compare vectors wider than a register.
+#ifdef __AVX2__
+static const vector COUNTING = {1, 2, 3, 4, 5, 6, 7, 8};
+
+static inline vector larger(vector a, vector b) {
+    return __builtin_ia32_maxps256(a, b);
+}
+
+static inline vector smaller(vector a, vector b) {
+    return __builtin_ia32_minps256(a, b);
+}
+
+static inline quad larger_quad(quad a, quad b) {
+    return __builtin_ia32_maxpd256(a, b);
+}
+
+static inline quad smaller_quad(quad a, quad b) {
+    return __builtin_ia32_minpd256(a, b);
+}
+
+static inline bool any_above_0(quad v) {
+    return __builtin_ia32_movmskpd256((quad)(v > 0)) != 0;
+}
 
 // The largest of LEAST and the smallest of MOST.
 static inline struct range narrowest(vector least, vector most) {
@@ -90,5 +82,69 @@ static inline struct range narrowest(vector least, vector most) {
     a = larger(a, __builtin_shufflevector(a, a, 1, 0, 3, 2, 5, 4, 7, 6));
     return (struct range){a[0], -a[4]};
 }
+
+#else
+
+static const vector COUNTING = {1, 2, 3, 4};
+
+typedef double pair __attribute__((vector_size(16)));
+
+#ifdef __SSE2__
+static inline vector larger(vector a, vector b) {
+    return __builtin_ia32_maxps(a, b);
+}
+
+static inline vector smaller(vector a, vector b) {
+    return __builtin_ia32_minps(a, b);
+}
+
+static inline pair larger_pair(pair a, pair b) {
+    return __builtin_ia32_maxpd(a, b);
+}
+#else
+typedef int32_t selection __attribute__((vector_size(16)));
+typedef int64_t pair_selection __attribute__((vector_size(16)));
+
+static inline vector larger(vector a, vector b) {
+    const selection keep = a > b;
+    return (vector)(((selection)a & keep) | ((selection)b & ~keep));
+}
+
+static inline vector smaller(vector a, vector b) {
+    const selection keep = a < b;
+    return (vector)(((selection)a & keep) | ((selection)b & ~keep));
+}
+
+static inline pair larger_pair(pair a, pair b) {
+    const pair_selection keep = a > b;
+    return (pair)(((pair_selection)a & keep) | ((pair_selection)b & ~keep));
+}
+#endif
+
+static inline quad larger_quad(quad a, quad b) {
+    const pair low = larger_pair(__builtin_shufflevector(a, a, 0, 1), __builtin_shufflevector(b, b, 0, 1)),
+               high = larger_pair(__builtin_shufflevector(a, a, 2, 3), __builtin_shufflevector(b, b, 2, 3));
+    return __builtin_shufflevector(low, high, 0, 1, 2, 3);
+}
+
+static inline quad smaller_quad(quad a, quad b) {
+    return -larger_quad(-a, -b);
+}
+
+static inline bool any_above_0(quad v) {
+    const pair most = larger_pair(__builtin_shufflevector(v, v, 0, 1), __builtin_shufflevector(v, v, 2, 3));
+    return (most[0] > 0) | (most[1] > 0);
+}
+
+// The largest of LEAST and the smallest of MOST.
+static inline struct range narrowest(vector least, vector most) {
+    most = -most;
+    // Two lanes of each side by side, so that both are searched at once.
+    vector a = larger(__builtin_shufflevector(least, most, 0, 1, 4, 5),
+                      __builtin_shufflevector(least, most, 2, 3, 6, 7));
+    a = larger(a, __builtin_shufflevector(a, a, 1, 0, 3, 2));
+    return (struct range){a[0], -a[2]};
+}
+#endif
 
 #endif
