@@ -33,8 +33,9 @@ CAUSE_WAIT_S: Final = 0.1
 
 
 class Streamer:
-    """Runs one JOB on MACHINE, whose nodes are READY. ON_TOLD gets replies and notices, ON_STATE progress.
+    """Runs one JOB on MACHINE, whose nodes are READY.
 
+    ON_TOLD gets replies and notices, ON_STATE how far it is in every cycle; ON_CYCLE is called at its end.
     WITNESS sees the moves and the commands go by, COMPENSATION has the tables of the axes.
     """
 
@@ -48,6 +49,7 @@ class Streamer:
         compensation: "Compensation | None" = None,
         on_told: Callable[[Told], None],
         on_state: Callable[[JobState], None],
+        on_cycle: Callable[[], None] = lambda: None,
     ) -> None:
         self._machine = machine
         self.worker = MotionWorker(machine, job, record=record, witness=witness, compensation=compensation)
@@ -55,6 +57,7 @@ class Streamer:
         self._job = job
         self._on_told = on_told
         self._on_state = on_state
+        self._on_cycle = on_cycle
         self._witness = witness
         self._nodes = machine.moving
         self._due = DueEvents()
@@ -129,12 +132,13 @@ class Streamer:
             while not isinstance(event, End):
                 cycle = await loop.run_in_executor(thread, self.worker.work, event)
                 event = cycle.event
-                self._hand_over(cycle)
                 if isinstance(event, Emergency):
+                    self._hand_over(cycle)
                     self._tell(cycle)
                     self._machine.stop(f"{self._job.name}:{event.line}: M112 stopped the machine")
                     return
                 await self._tell_on(cycle)
+                self._hand_over(cycle)  # last: links and buses begin to work then, and the loop rests
                 if isinstance(event, Resting):
                     await self._attend(event)
                 if event is not None or self.held is not None:
@@ -178,11 +182,13 @@ class Streamer:
         self._act(self._due.take(self.print_time_now(), cycle.due))
 
     async def _tell_on(self, cycle: Cycle) -> None:
-        """Tell of CYCLE in two steps: whoever else uses the loop waits for the one that runs, not for all."""
+        """Tell of CYCLE in steps: whoever else uses the loop waits for the one that runs, not for all."""
         await asyncio.sleep(0)
         self._tell(cycle)
         await asyncio.sleep(0)
         self._report(cycle.planned)
+        await asyncio.sleep(0)
+        self._on_cycle()
 
     def _act(self, due: Sequence[Due]) -> None:
         for print_time_s, timed in due:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from nodes.clock_fit import CURVATURE_SD, LEAST_SPREAD_S, LOOSE, NOISE, RATE_SD, hazard
 
-SWEEPS: Final = 5
+SWEEPS: Final = 2
+"""With each new sample; more change no figure of bench/clock.py that could be told from chance."""
 DAMPING: Final = 0.6
 Array = NDArray[np.float64]
 

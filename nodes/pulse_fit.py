@@ -79,7 +79,8 @@ class PulseLine:
 
 def _noise(off_s: NDArray[np.float64]) -> float:
     """Return the middle of what readings are off by, as the standard deviation of a normal distribution."""
-    return max(JITTER_FLOOR_S, 1.4826 * float(np.median(off_s)))
+    ranked, half = np.sort(off_s), len(off_s) // 2  # np.median takes ten times as long over so few
+    return max(JITTER_FLOOR_S, 1.4826 * float(ranked[half] + ranked[~half]) / 2)
 
 
 class PulseFit:
@@ -89,6 +90,8 @@ class PulseFit:
         self._reference_hz = reference_hz
         self._freq_hz = freq_hz
         self._pairs: deque[tuple[Ticks, Ticks]] = deque(maxlen=PAIRS_MAX)
+        self._off_s = np.zeros(0)
+        """How far the pairs lie off the newest fit."""
         self.line: PulseLine | None = None
         """The newest fit; None before the first pair."""
         self.restarts = 0
@@ -107,7 +110,7 @@ class PulseFit:
             self._pairs.clear()
             self.restarts += 1
         self._pairs.append((reference, ticks))
-        self.line = self._fit()
+        self.line = self._fit(self._off_the_last_line())
 
     def fill(self, pairs: Iterable[tuple[Ticks, Ticks]]) -> None:
         """Begin anew with PAIRS, in order; what lies before a jump of either clock does not count."""
@@ -116,7 +119,7 @@ class PulseFit:
             if self._pairs and self._parted(self._pairs[-1], pair):
                 self._pairs.clear()
             self._pairs.append(pair)
-        self.line = self._fit() if self._pairs else None
+        self.line = self._fit(np.zeros(len(self._pairs))) if self._pairs else None
 
     def _parted(self, earlier: tuple[Ticks, Ticks], later: tuple[Ticks, Ticks]) -> bool:
         passed_s = (later[0] - earlier[0]) / self._reference_hz
@@ -128,14 +131,15 @@ class PulseFit:
         off_s = abs(ticks - line.ticks_at(reference)) / self._freq_hz
         return passed_s <= 0 or off_s > JUMP_S + RATE_PRIOR * passed_s
 
-    def _fit(self) -> PulseLine:
+    def _fit(self, off_s: NDArray[np.float64]) -> PulseLine:
+        """Fit the pairs, which are known to lie OFF_S off."""
         last_reference, last_ticks = self._pairs[-1]
-        t = np.array([(r - last_reference) / self._reference_hz for r, _ in self._pairs])
-        y = np.array([(n - last_ticks) / self._freq_hz for _, n in self._pairs]) - t
+        pairs = np.array(self._pairs, dtype=np.int64)
+        t = (pairs[:, 0] - last_reference) / self._reference_hz
+        y = (pairs[:, 1] - last_ticks) / self._freq_hz - t
         rows = np.stack([np.ones_like(t), t, t * t / 2], axis=1)
         fade = np.exp(t / FADE_S)
         hold = np.diag([0.0, RATE_PRIOR**-2, CURVATURE_PRIOR_PER_S**-2])
-        off_s = self._off_the_last_line(len(t))
         noise_s = _noise(off_s)
         for _ in range(ROUNDS):
             trust = np.minimum(1.0, (ROBUST * noise_s / np.maximum(off_s, JITTER_FLOOR_S)) ** 2)
@@ -144,6 +148,7 @@ class PulseFit:
             fitted = np.linalg.solve(normal, rows.T @ (weight * y))
             off_s = np.abs(y - rows @ fitted)
             noise_s = _noise(off_s)
+        self._off_s = off_s
         offset_s, rate, curvature_per_s = (float(value) for value in fitted)
         ahead = np.array([1.0, REACH_S, REACH_S**2 / 2])
         variance = float(ahead @ np.linalg.solve(normal, ahead))
@@ -158,9 +163,11 @@ class PulseFit:
             CONFIDENCE * math.sqrt(variance) + noise_s,
         )
 
-    def _off_the_last_line(self, count: int) -> NDArray[np.float64]:
+    def _off_the_last_line(self) -> NDArray[np.float64]:
         """Return how far pairs lie off the last fit: a late latch is doubted before it bends the new one."""
-        line = self.line
+        line, count = self.line, len(self._pairs)
         if line is None or count < SETTLE_PAIRS:
             return np.zeros(count)
-        return np.array([abs(n - line.ticks_at(r)) / self._freq_hz for r, n in self._pairs])
+        reference, ticks = self._pairs[-1]
+        newest_s = abs(ticks - line.ticks_at(reference)) / self._freq_hz
+        return np.append(self._off_s, newest_s)[-count:]

@@ -56,8 +56,8 @@ class Motion:
             compensation=compensation,
             on_told=on_told,
             on_state=self._cycle_ended,
+            on_cycle=on_cycle,
         )
-        self._on_cycle = on_cycle
         self.works = 0
         """Done so far."""
         self._ending: list[Ticket] = []
@@ -143,7 +143,6 @@ class Motion:
             while True:
                 self._ending.append(self.feeder.finished.popleft())
         self._ending = [ticket for ticket in self._ending if not self._settle(ticket, now_s)]
-        self._on_cycle()
 
     def _settle(self, ticket: Ticket, now_s: float) -> bool:
         """Tell that TICKET is done once its last move is executed; return whether it is."""

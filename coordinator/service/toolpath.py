@@ -22,15 +22,13 @@ class Toolpath:
 
     def __init__(self, points_max: int = POINTS_MAX) -> None:
         self._points_max = points_max
-        self._put(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=bool))
-        self.generation = next(_GENERATIONS)
+        self.clear()
 
     def __len__(self) -> int:
-        return len(self._at)
+        return self._count
 
     def clear(self) -> None:
         """Begin anew."""
-        self.generation = next(_GENERATIONS)
         self._put(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=bool))
 
     def add(self, moves: Moves) -> None:
@@ -40,18 +38,15 @@ class Toolpath:
         start, ratio = moves["start"][:, :3], moves["ratio"]
         end = start + ratio[:, :3] * _length_mm(moves)[:, None]
         end_s = moves["print_time"] + moves["accel_s"] + moves["cruise_s"] + moves["decel_s"]
-        before = np.vstack((self._at[-1:] if len(self) else start[:1] - 1.0, end[:-1]))
+        last = self._at[self._count - 1 : self._count]
+        before = np.vstack((last if len(self) else start[:1] - 1.0, end[:-1]))
         jumps = np.flatnonzero(np.abs(start - before).max(axis=1) > _SAME_MM)
         at = np.insert(end, jumps, start[jumps], axis=0)
         time_s = np.insert(end_s, jumps, moves["print_time"][jumps])
         extrudes = np.insert(ratio[:, 3] > 0, jumps, False)
-        moved = np.abs(np.diff(np.vstack((self._at[-1:], at)), axis=0)).max(axis=1) > _SAME_MM
+        moved = np.abs(np.diff(np.vstack((last, at)), axis=0)).max(axis=1) > _SAME_MM
         kept = moved if len(self) else np.concatenate(([True], moved))
-        self._put(
-            np.vstack((self._at, at[kept])),
-            np.concatenate((self._time_s, time_s[kept])),
-            np.concatenate((self._extrudes, extrudes[kept])),
-        )
+        self._append(at[kept], time_s[kept], extrudes[kept])
         while len(self) > self._points_max:
             self._thin()
 
@@ -60,28 +55,44 @@ class Toolpath:
 
         Place (mm), print time (s), and whether it extruded on the way there.
         """
-        part = slice(first, first + count)
+        part = slice(first, min(first + count, self._count))
         return self._at[part], self._time_s[part], self._extrudes[part]
 
     def _put(self, at: Floats, time_s: Floats, extrudes: NDArray[np.bool_]) -> None:
+        """Have these points only, by new numbers."""
+        self.generation = next(_GENERATIONS)
+        self._count = len(at)
         self._at, self._time_s, self._extrudes = at, time_s, extrudes
+
+    def _append(self, at: Floats, time_s: Floats, extrudes: NDArray[np.bool_]) -> None:
+        """Add points behind the others, in room made for more: what was given out by ``after`` stays."""
+        begin, self._count = self._count, self._count + len(at)
+        if self._count > len(self._at):
+            room = 2 * self._count - begin
+            self._at, self._time_s, self._extrudes = (
+                np.concatenate((old[:begin], np.empty((room, *old.shape[1:]), old.dtype)))
+                for old in (self._at, self._time_s, self._extrudes)
+            )
+        self._at[begin : self._count] = at
+        self._time_s[begin : self._count] = time_s
+        self._extrudes[begin : self._count] = extrudes
 
     def _thin(self) -> None:
         """Drop every other point at most, those first that lie next to the line between their neighbours."""
-        a, b, c = self._at[:-2:2], self._at[1:-1:2], self._at[2::2]
+        at, extrudes = self._at[: self._count], self._extrudes[: self._count]
+        a, b, c = at[:-2:2], at[1:-1:2], at[2::2]
         a, b = a[: len(c)], b[: len(c)]
         chord = c - a
         along = np.einsum("ij,ij->i", b - a, chord) / np.maximum(np.einsum("ij,ij->i", chord, chord), 1e-12)
         away = np.linalg.norm(b - a - np.clip(along, 0, 1)[:, None] * chord, axis=1)
-        same = self._extrudes[1:-1:2][: len(c)] == self._extrudes[2::2][: len(c)]
+        same = extrudes[1:-1:2][: len(c)] == extrudes[2::2][: len(c)]
         surplus = len(self) - int(KEEP_SHARE * self._points_max)
         order = np.argsort(np.where(same, away, np.inf), kind="stable")[: min(surplus, int(same.sum()))]
         kept = np.ones(len(self), dtype=bool)
         kept[1 + 2 * order] = False
         if kept.sum() > self._points_max:  # all corners matter: the oldest go
             kept[: len(self) - int(KEEP_SHARE * self._points_max)] = False
-        self.generation = next(_GENERATIONS)
-        self._put(self._at[kept], self._time_s[kept], self._extrudes[kept])
+        self._put(at[kept], self._time_s[: self._count][kept], extrudes[kept])
 
 
 def _length_mm(moves: Moves) -> Floats:

@@ -122,14 +122,14 @@ def _end_s(move: Any) -> float:
 
 def _moment(move: Any, print_time: float) -> Moment:
     """Evaluate one move, or its end when it is over."""
-    t = print_time - float(move["print_time"])
-    accel, cruise_v = float(move["accel"]), float(move["cruise_v"])
-    accel_s, cruise_s, decel_s = (float(move[k]) for k in ("accel_s", "cruise_s", "decel_s"))
+    fields = dict(zip(TRAPEZOID.names or (), move.item(), strict=True))  # one by one they cost three times
+    t = print_time - fields["print_time"]
+    accel, start_v, cruise_v = fields["accel"], fields["start_v"], fields["cruise_v"]
+    accel_s, cruise_s, decel_s = fields["accel_s"], fields["cruise_s"], fields["decel_s"]
     moving = t < accel_s + cruise_s + decel_s
     a, c, d = min(t, accel_s), min(max(t - accel_s, 0.0), cruise_s), max(t - accel_s - cruise_s, 0.0)
     d = min(d, decel_s)
-    start_v = float(move["start_v"])
     way = start_v * a + accel * a * a / 2 + cruise_v * c + cruise_v * d - accel * d * d / 2
     speed = start_v + accel * a if t < accel_s else cruise_v - accel * d
-    x, y, z, e = (float(s + r * way) for s, r in zip(move["start"], move["ratio"], strict=True))
-    return Moment((x, y, z, e), speed if moving else 0.0, int(move["line"]), moving)
+    x, y, z, e = (fields["start"] + fields["ratio"] * way).tolist()
+    return Moment((x, y, z, e), speed if moving else 0.0, fields["line"], moving)
