@@ -50,6 +50,7 @@ struct way {
     uint32_t at;
     uint16_t bytes; // of the numbers in its commands
     uint8_t from;   // the way it goes on from, a segment earlier
+    uint8_t end;    // where in its band the last step comes
 };
 
 // How a way could go on.
@@ -82,14 +83,16 @@ static struct fit_problem problem_behind(const struct search *q, const struct wa
     };
 }
 
-// Bytes of a number on the wire, see wire/vlq.c.
-static uint32_t size_of(double value) {
-    return 1U + (value < -32 || value >= 96) + (value < -4096 || value >= 12288) +
-           (value < -524288 || value >= 1572864) + (value < -67108864 || value >= 201326592);
+// Bytes of a number on the wire, see wire/vlq.c: one from −32 to 95, with each more 128 times as many.
+static uint32_t size_of(int64_t value) {
+    uint32_t size = 1;
+    for (uint64_t under = 32; (uint64_t)value + under >= 4 * under && size < 5; under *= 128)
+        size++;
+    return size;
 }
 
-static uint16_t bytes_of(const struct fit_segment *g) {
-    return (uint16_t)(size_of(g->interval) + size_of(g->count) + size_of(g->add));
+static uint32_t bytes_of(const struct fit_segment *g) {
+    return size_of((int64_t)g->interval) + size_of(g->count) + size_of((int64_t)g->add);
 }
 
 static double end_of(const struct fit_segment *g, double clock) {
@@ -115,7 +118,7 @@ static int look_on(struct search *q, int level, struct branch *branches) {
         q->arithmetic->fit_find(&p, fit);
         if (fit->open && !(p.ticks[0] < q->force))
             return -1;
-        const double bytes = way->bytes + size_of(fit->interval) + size_of(fit->add);
+        const double bytes = way->bytes + size_of((int64_t)fit->interval) + size_of((int64_t)fit->add);
         for (int end = 0; end < FIT_ENDS; end++) {
             const uint32_t count = fit->count[end];
             if (!count)
@@ -143,6 +146,14 @@ static bool is_new(const struct search *q, const struct way *ways, int count, co
     return true;
 }
 
+// Whether one of COUNT better ways comes to about the same: to step AT with END.
+static bool is_known(const struct way *ways, int count, uint32_t at, int end) {
+    for (int i = 0; i < count; i++)
+        if (ways[i].at == at && ways[i].end == end)
+            return true;
+    return false;
+}
+
 // Goes on with the best branches. Returns whether a way did all steps; it is the first then.
 static bool go_on(struct search *q, int level, const struct branch *branches, int count) {
     struct way *ways = q->ways[level + 1];
@@ -150,15 +161,17 @@ static bool go_on(struct search *q, int level, const struct branch *branches, in
     for (int i = 0; i < count && (found < WAYS || ways[WAYS - 1].rank < branches[i].rank); i++) {
         const struct way *before = &q->ways[level][branches[i].from];
         const struct fit_problem p = problem_behind(q, before);
-        struct way way = {.from = branches[i].from};
-        if (!q->arithmetic->fit_make(&p, &q->fits[way.from], branches[i].end, &way.segment))
+        struct way way = {.from = branches[i].from, .end = branches[i].end};
+        struct fit *fit = &q->fits[way.from];
+        if (is_known(ways, found, before->at + fit->count[way.end], way.end) ||
+            !q->arithmetic->fit_make(&p, fit, way.end, &way.segment))
             continue;
         way.at = before->at + way.segment.count;
         way.clock = end_of(&way.segment, before->clock);
         if (!is_new(q, ways, found, &way))
             continue;
         way.bytes = (uint16_t)(before->bytes + bytes_of(&way.segment));
-        way.rank = rank_of(q, way.at, way.segment.count, branches[i].end, way.bytes / (level + 1.0));
+        way.rank = rank_of(q, way.at, way.segment.count, way.end, way.bytes / (level + 1.0));
         if (found == WAYS && way.rank <= ways[WAYS - 1].rank)
             continue;
         int place = found < WAYS ? found++ : WAYS - 1;

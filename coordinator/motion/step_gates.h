@@ -83,17 +83,10 @@ static inline void pair_up(struct fit *f, int32_t begin) {
         least = larger(least, (low - f->high[i]) * k + none);
         most = smaller(most, (high - f->low[i]) * k - none);
     }
-    float a[WIDE], b[WIDE];
     const float inverse = INVERSE[REACH + f->spacing];
-    least *= inverse, most *= inverse;
-    store(a, &least), store(b, &most);
-    float so_far_least = f->least[begin], so_far_most = f->most[begin];
-    for (i = 0; i < WIDE; i++) {
-        so_far_least = a[i] > so_far_least ? a[i] : so_far_least;
-        so_far_most = b[i] < so_far_most ? b[i] : so_far_most;
-        f->least[begin + i + 1] = so_far_least;
-        f->most[begin + i + 1] = so_far_most;
-    }
+    least = larger(largest_so_far(least * inverse), all(f->least[begin]));
+    most = smaller(-largest_so_far(-most * inverse), all(f->most[begin]));
+    store(f->least + begin + 1, &least), store(f->most + begin + 1, &most);
 }
 
 // Puts up to COUNT gates until no line passes; returns how many one does.

@@ -83,6 +83,13 @@ static inline struct range narrowest(vector least, vector most) {
     return (struct range){a[0], -a[4]};
 }
 
+// In each lane the largest of it and those before.
+static inline vector largest_so_far(vector v) {
+    v = larger(v, __builtin_shufflevector(v, v, 0, 0, 1, 2, 3, 4, 5, 6));
+    v = larger(v, __builtin_shufflevector(v, v, 0, 1, 0, 1, 2, 3, 4, 5));
+    return larger(v, __builtin_shufflevector(v, v, 0, 1, 2, 3, 0, 1, 2, 3));
+}
+
 #else
 
 static const vector COUNTING = {1, 2, 3, 4};
@@ -144,6 +151,12 @@ static inline struct range narrowest(vector least, vector most) {
                       __builtin_shufflevector(least, most, 2, 3, 6, 7));
     a = larger(a, __builtin_shufflevector(a, a, 1, 0, 3, 2));
     return (struct range){a[0], -a[2]};
+}
+
+// In each lane the largest of it and those before.
+static inline vector largest_so_far(vector v) {
+    v = larger(v, __builtin_shufflevector(v, v, 0, 0, 1, 2));
+    return larger(v, __builtin_shufflevector(v, v, 0, 1, 0, 1));
 }
 #endif
 
