@@ -189,6 +189,7 @@ class Streamer:
         self._report(cycle.planned)
         await asyncio.sleep(0)
         self._on_cycle()
+        await asyncio.sleep(0)
 
     def _act(self, due: Sequence[Due]) -> None:
         for print_time_s, timed in due:
