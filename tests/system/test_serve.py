@@ -55,10 +55,10 @@ def with_client(machine: Hardware, go: Callable[[Client, Command], Coroutine[Any
         return ended.status
 
 
-async def until(client: Client, path: str, *values: str) -> dict[str, Any]:
+async def until(client: Client, path: str, *values: object) -> dict[str, Any]:
     """Watch the state until PATH has one of VALUES; return all that was seen of it."""
     seen: dict[str, Any] = {}
-    async for update in client.watch(["machine.*", "job.*", "nodes.*.state"], rate_hz=20):
+    async for update in client.watch(["machine.*", "job.*", "nodes.*.state", "position.moving"], rate_hz=20):
         seen.update(update.values)
         if seen.get(path) in values:
             return seen
@@ -92,6 +92,7 @@ def test_pause_and_a_client_killed_meanwhile(machine: Hardware) -> None:
         assert await watcher.stdout.readline() == b"seen\n"
         watcher.kill()
         await watcher.wait()
+        await until(client, "position.moving", True)  # before its first move it stands: paused at once
         assert (await client.call("job.pause"))["state"] == "pausing"
         seen = await until(client, "job.state", "paused")
         assert seen["machine.state"] == "paused"
