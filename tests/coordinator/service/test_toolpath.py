@@ -64,6 +64,18 @@ def test_a_jump_is_a_way_without_extrusion() -> None:
     assert path.after(0, 4)[2].tolist() == [False, True, False, True]
 
 
+def test_what_was_given_out_stays_while_the_path_grows() -> None:
+    path = Toolpath()
+    path.add(straight((0, 0, 0), (1, 0, 0)))
+    given = path.after(0, 10)
+    copies = [part.copy() for part in given]
+    for x in range(1, 100):
+        path.add(straight((x, 0, 0), (x + 1, 0, 0), from_s=x))
+    assert all(np.array_equal(part, copy) for part, copy in zip(given, copies, strict=True))
+    assert places(path) == [(x, 0, 0) for x in range(101)]
+    assert list(path.after(0, 200)[1]) == list(range(101))
+
+
 def test_a_new_generation_for_all_that_changes_numbers() -> None:
     path, other = Toolpath(), Toolpath()
     assert path.generation != other.generation
