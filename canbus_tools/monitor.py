@@ -23,6 +23,7 @@ from canbus_tools.open_bus import BusOptions, bus_options, declare_bus, open_bus
 from canbus_tools.protocol import DATA_NODEID_MAX
 from canbus_tools.survey import survey
 from canbus_tools.talk import BusTalk, refuse_if_in_use
+from canbus_tools.until_stopped import StopFlag, stop_flag
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
@@ -157,17 +158,18 @@ class Lines:
         self._told: set[str] = set()
 
     def run(self) -> int:
-        """Write until the duration is over, or Ctrl-C; returns how many lines."""
+        """Write until the duration is over, Ctrl-C or SIGTERM; returns how many lines.
+
+        They end it between two lines: what was written was counted.
+        """
         shown = 0
-        try:
-            for said in self._said():
+        with stop_flag() as flag:
+            for said in self._said(flag):
                 sys.stdout.write(self._form(said) + "\n")
                 sys.stdout.flush()
                 shown += 1
                 if self._queue.dropped > 2 * self._told_dropped:
                     self._tell_dropped()
-        except KeyboardInterrupt:
-            pass  # the end of the tool, not of its report
         if self._queue.dropped > self._told_dropped:
             self._tell_dropped()
         return shown
@@ -185,13 +187,15 @@ class Lines:
             sys.stderr.write(f"canductor: {guess}\n")
         self._told |= guesses
 
-    def _said(self) -> Iterator[Decoded]:
+    def _said(self, flag: StopFlag) -> Iterator[Decoded]:
         passes = self._options.filter_.passes
         duration_s = self._options.duration_s
         end_s = None if duration_s is None else time.monotonic() + duration_s
-        while end_s is None or time.monotonic() < end_s:
+        while not flag.stopped and (end_s is None or time.monotonic() < end_s):
             for frame in self._queue.take(_WAIT_S):
                 for said in self._watch.feed(frame):
+                    if flag.stopped:
+                        return
                     if passes(said):
                         yield said
             self._tell_guesses()

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import io
 import json
 import signal
 import subprocess
@@ -256,6 +257,18 @@ def test_rates_are_of_the_last_seconds() -> None:
     assert len(watch.loads) == 7
 
 
+def shown_of(bus: VirtualBus, queue: FrameQueue, duration_s: float) -> int:
+    options = MonitorOptions(
+        bus=opened(bus),
+        bitrate=1_000_000,
+        bitrate_is_known=False,
+        filter_=Filter(),
+        dictionaries={},
+        duration_s=duration_s,
+    )
+    return Lines(options, BusWatch(BusDecoder(), LoadMeter(1_000_000), time.monotonic()), queue).run()
+
+
 def test_dropped_frames_are_told_now_and_then(tmp_path: Path, capsys: Captured) -> None:
     with (
         VirtualBus(tmp_path / "bus", bitrate=None) as bus,
@@ -265,16 +278,30 @@ def test_dropped_frames_are_told_now_and_then(tmp_path: Path, capsys: Captured) 
         for _ in range(50):
             set_nodeid(host, MAIN, MAIN_ID)
         wait_until(lambda: queue.dropped >= 45)
-        options = MonitorOptions(
-            bus=opened(bus),
-            bitrate=1_000_000,
-            bitrate_is_known=False,
-            filter_=Filter(),
-            dictionaries={},
-            duration_s=0.2,
-        )
-        watch = BusWatch(BusDecoder(), LoadMeter(1_000_000), time.monotonic())
-        assert Lines(options, watch, queue).run() == 5
+        assert shown_of(bus, queue, 0.2) == 5
     said = capsys.readouterr()
     assert said.out.count("set_nodeid") == 5
     assert said.err == "canductor: 45 frames were dropped until now: lines are read too slowly\n"
+
+
+class Interrupted(io.StringIO):
+    """An output whose reader presses Ctrl-C when it sees the second line, before the write has returned."""
+
+    def flush(self) -> None:
+        if self.getvalue().count("\n") == 2:
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_a_line_that_was_written_when_ctrl_c_came_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with (
+        VirtualBus(tmp_path / "bus", bitrate=None) as bus,
+        FrameQueue(open_bus(opened(bus)), "bus") as queue,
+        closing(Place("canductor", str(bus.path)).open()) as host,
+    ):
+        for _ in range(5):
+            set_nodeid(host, MAIN, MAIN_ID)
+        output = Interrupted()
+        monkeypatch.setattr(sys, "stdout", output)
+        assert shown_of(bus, queue, PATIENCE_S) == output.getvalue().count("\n") == 2
