@@ -32,7 +32,7 @@ TO_ROLLOVER_S = 2
 class Process:
     """One node process and a patient host; speaks CAN frames or plain bytes over a file descriptor."""
 
-    def __init__(self, folder: Path, flavour: str, *options: str) -> None:
+    def __init__(self, folder: Path, flavour: str, *options: str, preload: Path | None = None) -> None:
         self.edge_log = folder / "edges"
         self.on_can = flavour != "uart"
         self._listener = socket.socket(socket.AF_UNIX)
@@ -48,7 +48,13 @@ class Process:
             str(self.edge_log),
             *options,
         ]
-        self.process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            arguments,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | ({} if preload is None else {"LD_PRELOAD": str(preload)}),
+        )
         assert self.process.stdout
         self.ready = json.loads(self.process.stdout.readline())
         if self.on_can:
@@ -225,6 +231,46 @@ def test_a_late_command_is_late(process: Process) -> None:
     seen = process.send("get_config")
     assert seen[-1]["is_shutdown"] == 1
     assert process.end()["edges"] == 0
+
+
+def test_input_finds_the_slots_that_are_free_by_then(tmp_path: Path) -> None:
+    """As on a chip, whose timers go on while input comes in: here the process is stopped meanwhile."""
+    held_read, hold = tmp_path / "held_read.so", tmp_path / "hold"
+    source = Path(__file__).with_name("held_read.c")
+    defines = [f'-DHOLD="{hold}"', "-O2", "-shared", "-fPIC"]
+    subprocess.run(["gcc", *defines, source, "-o", held_read], check=True)
+    process = Process(tmp_path, "uart", preload=held_read)
+    process.start()
+    process.send(
+        "allocate_oids count=1",
+        "config_stepper oid=0 step_pin=3 dir_pin=4 invert_step=255 step_pulse_ticks=0",
+    )
+    process.send("finalize_config crc=9")
+    freq, slots = FREQUENCIES["uart"], process.send("get_config")[0]["move_count"]
+    free_at = process.send("get_clock")[0]["clock"] + 2 * freq
+    process.send(f"reset_step_clock oid=0 clock={(free_at - freq) % ROLLOVER}")
+    process.send(f"queue_step oid=0 interval={freq} count=1 add=0")
+    for _ in range(slots - 1):
+        process.send(f"queue_step oid=0 interval={20 * freq} count=1 add=0")
+    hold.touch()
+    process.write(wire_twin.block(process.seq, process.words.encode("get_clock")))
+    state = Path(f"/proc/{process.process.pid}/stat")
+    deadline = time.monotonic() + PATIENCE_S
+    while state.read_text().rpartition(")")[2].split()[0] != "T":
+        assert time.monotonic() < deadline
+    hold.unlink()
+    _, rate, start_ns, start_clock = struct.unpack_from("<ddQQ", process.edge_log.read_bytes(), 8)
+    while (free_s := (free_at - start_clock) / rate + start_ns * 1e-9 - time.monotonic()) > -0.001:
+        time.sleep(max(0.001, free_s))
+    process.seq += 1
+    process.write(
+        wire_twin.block(process.seq & 15, process.words.encode("queue_step oid=0 interval=9 count=1 add=0"))
+    )
+    process.process.send_signal(signal.SIGCONT)
+    assert process.read_answer("clock")["clock"] - free_at > 0, "it was stopped until then"
+    process.seq = (process.seq + 1) & 15
+    assert process.send("get_config")[-1]["is_shutdown"] == 0
+    process.kill()
 
 
 def test_reset_makes_it_forget_but_live(process: Process) -> None:

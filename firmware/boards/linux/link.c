@@ -159,6 +159,9 @@ void link_read(struct linux_board *board) {
         return;
     board->bytes_in += (uint64_t)got;
     board->in_size += (size_t)got;
+}
+
+void link_hand_over(struct linux_board *board) {
     size_t used = board->in_size;
     if (board->options.link == LINK_UART)
         receive_bytes(board, board->in, board->in_size);

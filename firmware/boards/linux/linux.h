@@ -70,8 +70,9 @@ uint64_t ns_of_clock(const struct linux_board *board, uint64_t clock);
 // link.c. link_open returns 0, or -1 after one sentence on stderr.
 int link_open(struct linux_board *board);
 void link_close(struct linux_board *board);
-// Reads what is there and gives it to the node, running its tasks as it goes.
+// Reads what is there; link_hand_over gives it to the node, running its tasks as it goes.
 void link_read(struct linux_board *board);
+void link_hand_over(struct linux_board *board);
 void link_flush(struct linux_board *board);
 
 // plant.c. linux_plant_open returns 0, or -1 after one sentence on stderr.

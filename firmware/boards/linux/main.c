@@ -135,8 +135,11 @@ static void run(struct linux_board *board, int signal_fd) {
             readable = 0;
         }
         if (readable) {
-            dispatch_timers(board); // what was due before the input came
+            // The host may have sent the input while timers ran, relying on those that were due by then,
+            // which free the queue's slots: on a chip they would have come first.
             link_read(board);
+            dispatch_timers(board);
+            link_hand_over(board);
         }
     }
     link_flush(board);
