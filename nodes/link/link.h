@@ -131,7 +131,7 @@ void link_init(struct link *link, const struct link_settings *settings, const st
 // ------------------------------------------------------------------------------------------------ commands
 
 // Queues one encoded command of KIND, LINK_CONTROL or LINK_BULK, at NOW. Order is kept within a class; it
-// does not go before min_clock (0: at once).
+// does not go before min_clock (0: at once) is past for certain, some two milliseconds later.
 enum link_status link_send(struct link *link, enum link_class kind, const uint8_t *content, size_t size,
                            uint64_t min_clock, uint64_t req_clock, uint64_t now);
 

@@ -14,15 +14,24 @@
 #define CONTROL_DUE_NS (5 * NS_PER_MS)
 #define BULK_DUE_NS (1000 * NS_PER_MS)
 #define MARGIN_MAX_NS (100 * NS_PER_MS)
+// Slots become free by timers, which a node may run up to 1 ms late, at a clock that the host only estimates.
+#define GATE_MARGIN_NS (2 * NS_PER_MS)
 
 // ------------------------------------------------------------------------------------------------- packing
 
+// When a node whose queue has room at MIN_CLOCK (0: now) has it for certain.
+static uint64_t free_at(const struct link *link, uint64_t min_clock) {
+    uint64_t free_ns = min_clock ? link_clock_to_ns(link, min_clock) : 0;
+    return free_ns && free_ns < LINK_NEVER - GATE_MARGIN_NS ? free_ns + GATE_MARGIN_NS : free_ns;
+}
+
 static uint64_t gate_of(const struct link *link, const struct link_command *command) {
     uint64_t reach = command->req_clock > CLOCK_REACH ? command->req_clock - CLOCK_REACH : 0;
-    uint64_t ticks = command->min_clock > reach ? command->min_clock : reach;
-    if (link->clock_hz > 0)
-        return ticks ? link_clock_to_ns(link, ticks) : 0;
-    return command->min_clock ? LINK_NEVER : 0;
+    if (!(link->clock_hz > 0))
+        return command->min_clock ? LINK_NEVER : 0;
+    uint64_t free_ns = free_at(link, command->min_clock);
+    uint64_t reach_ns = reach ? link_clock_to_ns(link, reach) : 0;
+    return free_ns > reach_ns ? free_ns : reach_ns;
 }
 
 static struct link_front ready(const struct link *link, const struct link_queue *queue, uint64_t now,

@@ -226,8 +226,9 @@ def test_min_clock_gates_each_queue_also_across_the_rollover(start: int) -> None
         for command in line.node.executed[len(arrivals) :]:
             arrivals[command] = line.now
     for command, gate in gates.items():
-        due_ns = begin_ns + (gate - start) * 1000
-        assert due_ns + MS <= arrivals[command] <= due_ns + 2 * MS, gate
+        # Timers free slots up to a millisecond late, and the clock is an estimate.
+        sure_ns = begin_ns + (gate - start) * 1000 + 2 * MS
+        assert sure_ns + MS <= arrivals[command] <= sure_ns + 2 * MS, gate
     assert line.link.stats.lead_count == 10
     assert 990 * MS < line.link.stats.lead_min_ns < 1000 * MS
 
