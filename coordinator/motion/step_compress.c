@@ -17,8 +17,13 @@ enum {
     DEPTH = 48, // segments it looks ahead at most
 };
 // What an end below, about and above the true time is worth, in shares of the segment's length. Measured on
-// sliced files; from 0/0.1/0.1 to 0/0.15/0.25 the number of segments differs by less than 1 %.
-static const double END_IS_WORTH[FIT_ENDS] = {0, 0.1, 0.15};
+// sliced files; from 0/0.05/0.05 to 0/0.15/0.15 the number of segments differs by less than 1 %.
+static const double END_IS_WORTH[FIT_ENDS] = {0, 0.07, 0.1};
+// Ways whose rank is behind the best by more than this share of a segment are given up where a band has many
+// ticks: a third less time for 1 % more commands. Where it has few, whole ticks decide who comes through, and
+// all are kept.
+static const double MARGIN = 0.02;
+enum { COARSE_TICKS = 256 }; // half a band at 20 MHz
 // What a byte less in every command is worth, in shares of the way. More saves bytes at the price of
 // commands.
 static const double BYTE_IS_WORTH = 0.003;
@@ -61,6 +66,7 @@ struct branch {
 
 struct search {
     const struct stepper *s;
+    double margin; // of ranks, in shares of the best way's last segment
     const struct step_arithmetic *arithmetic;
     size_t begin;   // of the stretch, in the buffer
     uint32_t count; // its steps
@@ -85,10 +91,9 @@ static struct fit_problem problem_behind(const struct search *q, const struct wa
 
 // Bytes of a number on the wire, see wire/vlq.c: one from −32 to 95, with each more 128 times as many.
 static uint32_t size_of(int64_t value) {
-    uint32_t size = 1;
-    for (uint64_t under = 32; (uint64_t)value + under >= 4 * under && size < 5; under *= 128)
-        size++;
-    return size;
+    const uint64_t v = (uint64_t)value;
+    return 1U + (v + 0x20 >= 0x80) + (v + 0x1000 >= 0x4000) + (v + 0x80000 >= 0x200000) +
+           (v + 0x4000000 >= 0x10000000);
 }
 
 static uint32_t bytes_of(const struct fit_segment *g) {
@@ -107,9 +112,10 @@ static double rank_of(const struct search *q, uint32_t at, uint32_t count, int e
     return (at + count * END_IS_WORTH[end]) * (1 - BYTE_IS_WORTH * bytes);
 }
 
-// Finds how each way of a level could go on, best first. Returns how many branches there are, or -1 when
-// steps to come might lead a way further.
+// Finds how each way of a level could go on. Returns how many branches there are, or -1 when steps to come
+// might lead a way further.
 static int look_on(struct search *q, int level, struct branch *branches) {
+    const double share = 1 / (level + 1.0);
     int found = 0;
     for (int i = 0; i < q->found[level]; i++) {
         const struct way *way = &q->ways[level][i];
@@ -121,17 +127,23 @@ static int look_on(struct search *q, int level, struct branch *branches) {
         const double bytes = way->bytes + size_of((int64_t)fit->interval) + size_of((int64_t)fit->add);
         for (int end = 0; end < FIT_ENDS; end++) {
             const uint32_t count = fit->count[end];
-            if (!count)
-                continue;
-            const double rank =
-                rank_of(q, way->at + count, count, end, (bytes + size_of(count)) / (level + 1.0));
-            int place = found++;
-            for (; place > 0 && branches[place - 1].rank < rank; place--)
-                branches[place] = branches[place - 1];
-            branches[place] = (struct branch){rank, (uint8_t)i, (uint8_t)end};
+            if (count)
+                branches[found++] =
+                    (struct branch){rank_of(q, way->at + count, count, end, (bytes + size_of(count)) * share),
+                                    (uint8_t)i, (uint8_t)end};
         }
     }
     return found;
+}
+
+// Takes the best of COUNT branches out.
+static struct branch take_best(struct branch *branches, int count) {
+    int best = 0;
+    for (int i = 1; i < count; i++)
+        best = branches[i].rank > branches[best].rank ? i : best;
+    const struct branch taken = branches[best];
+    branches[best].rank = -HUGE_VAL;
+    return taken;
 }
 
 // Two ways that end at the same step, and within so much of its band, are one.
@@ -154,14 +166,24 @@ static bool is_known(const struct way *ways, int count, uint32_t at, int end) {
     return false;
 }
 
+// What a way must come to, given the best, to be followed.
+static double least_rank(const struct search *q, const struct way *best) {
+    return best->rank - q->margin * best->segment.count;
+}
+
 // Goes on with the best branches. Returns whether a way did all steps; it is the first then.
-static bool go_on(struct search *q, int level, const struct branch *branches, int count) {
+static bool go_on(struct search *q, int level, struct branch *branches, int count) {
+    const double share = 1 / (level + 1.0);
     struct way *ways = q->ways[level + 1];
     int found = 0;
-    for (int i = 0; i < count && (found < WAYS || ways[WAYS - 1].rank < branches[i].rank); i++) {
-        const struct way *before = &q->ways[level][branches[i].from];
+    for (int left = count; left > 0; left--) {
+        const struct branch branch = take_best(branches, count);
+        if ((found && branch.rank < least_rank(q, ways)) ||
+            (found == WAYS && branch.rank <= ways[WAYS - 1].rank))
+            break;
+        const struct way *before = &q->ways[level][branch.from];
         const struct fit_problem p = problem_behind(q, before);
-        struct way way = {.from = branches[i].from, .end = branches[i].end};
+        struct way way = {.from = branch.from, .end = branch.end};
         struct fit *fit = &q->fits[way.from];
         if (is_known(ways, found, before->at + fit->count[way.end], way.end) ||
             !q->arithmetic->fit_make(&p, fit, way.end, &way.segment))
@@ -171,7 +193,7 @@ static bool go_on(struct search *q, int level, const struct branch *branches, in
         if (!is_new(q, ways, found, &way))
             continue;
         way.bytes = (uint16_t)(before->bytes + bytes_of(&way.segment));
-        way.rank = rank_of(q, way.at, way.segment.count, way.end, way.bytes / (level + 1.0));
+        way.rank = rank_of(q, way.at, way.segment.count, way.end, way.bytes * share);
         if (found == WAYS && way.rank <= ways[WAYS - 1].rank)
             continue;
         int place = found < WAYS ? found++ : WAYS - 1;
@@ -179,6 +201,8 @@ static bool go_on(struct search *q, int level, const struct branch *branches, in
             ways[place] = ways[place - 1];
         ways[place] = way;
     }
+    while (found > 1 && ways[found - 1].rank < least_rank(q, ways))
+        found--;
     q->found[level + 1] = found;
     return found && ways[0].at == q->count;
 }
@@ -309,7 +333,7 @@ static int compress_stretch(struct step_gen *gen, struct stepper *s, size_t *fro
         const int64_t clock = begin_segment(s, *from, &first);
         struct search q;
         q.s = s, q.arithmetic = gen->arithmetic, q.begin = *from, q.count = (uint32_t)(end - *from),
-        q.force = force;
+        q.force = force, q.margin = s->max_error_ticks < COARSE_TICKS ? HUGE_VAL : MARGIN;
         const int depth = search(&q, (double)clock, s->expected);
         if (!depth && s->ticks[*from] < force)
             return step_fail(gen, STEP_NO_FIT, s, clock_print_time(s->clock, s->ticks[*from], s->base), 0);

@@ -21,26 +21,36 @@ static inline float shorter(float add, float from, float first, float last) {
     return add;
 }
 
+// Whole adds, measured from F's, of lines to place AT whose last step comes between LOW and HIGH.
+static struct fit_adds adds_to(const struct fit *f, int32_t at, int32_t before, float low, float high) {
+    const float scale = 2.0F / (float)f->stride;
+    struct range r = slopes(f, at, before, low, high);
+    if (f->extra)
+        slopes_of_extra(f, at, before, low, high, &r);
+    return (struct fit_adds){ceilf(r.least * scale), floorf(r.most * scale)};
+}
+
 // The segment in whole ticks to place AT whose last step comes between FROM and TO, as shares of its band.
-static bool end_between(const struct fit_problem *p, const struct fit *f, int32_t at, float from, float to,
-                        struct fit_segment *s) {
+// KNOWN are the adds to there, if they are.
+static inline bool end_between(const struct fit_problem *p, const struct fit *f, int32_t at, float from,
+                               float to, const struct fit_adds *known, struct fit_segment *s) {
     const int32_t before = gates_before(f, at), steps = at * f->stride;
     const double n = steps, base = p->clock + n * (f->interval + f->add * 0.5 * (n - 1));
     const float inverse = 1.0F / (float)steps, below = (float)(p->low[steps - 1] - base) * inverse,
                 above = (float)(p->high[steps - 1] - base) * inverse;
     const float middle = 0.5F * (below + above), wide = 0.5F * (above - below);
-    const float low = middle + from * wide, high = middle + to * wide, scale = 2.0F / (float)f->stride;
-    struct range r = slopes(f, at, before, low, high);
-    if (f->extra)
-        slopes_of_extra(f, at, before, low, high, &r);
+    const float low = middle + from * wide, high = middle + to * wide;
+    const struct fit_adds to_there = known ? *known : adds_to(f, at, before, low, high);
     float first = -FIT_ADD_MAX - 1 - (float)f->add, last = FIT_ADD_MAX - (float)f->add;
-    first = ceilf(r.least * scale) > first ? ceilf(r.least * scale) : first;
-    last = floorf(r.most * scale) < last ? floorf(r.most * scale) : last;
+    first = to_there.least > first ? to_there.least : first;
+    last = to_there.most < last ? to_there.most : last;
+    if (first > last)
+        return false;
     const float middle_add = floorf(0.5F * (first + last)),
                 adds[] = {shorter(middle_add, (float)f->add, first, last), middle_add, first, last};
-    for (int j = 0; j < 4 && first <= last; j++) {
+    for (int j = 0; j < 4; j++) {
         const float bent = adds[j] * 0.5F * (float)(steps - 1);
-        r = begins(f, before, adds[j]);
+        struct range r = begins(f, before, adds[j]);
         if (f->extra)
             begins_of_extra(f, at, adds[j], &r);
         narrow(&r, low - bent, high - bent);
@@ -59,15 +69,16 @@ static bool end_between(const struct fit_problem *p, const struct fit *f, int32_
 // Of the places up to AT, the last one with a segment in whole ticks: on a long cruise lines reach much
 // further. Steps back by ever more, then halves. Returns 0, or the place and its segment.
 static int32_t last_between(const struct fit_problem *p, const struct fit *f, int32_t at, float from,
-                            float to, struct fit_segment *s) {
+                            float to, const struct fit_adds *known, struct fit_segment *s) {
     int32_t beyond = at + 1;
-    for (int32_t back = 1; at > 0 && !end_between(p, f, at, from, to, s); back *= 2) {
+    for (int32_t back = 1; at > 0 && !end_between(p, f, at, from, to, known, s); back *= 2) {
         beyond = at;
         at = at > back ? at - back : 0;
+        known = NULL;
     }
     while (beyond - at > 1) {
         const int32_t middle = (at + beyond) / 2;
-        *(end_between(p, f, middle, from, to, s) ? &at : &beyond) = middle;
+        *(end_between(p, f, middle, from, to, NULL, s) ? &at : &beyond) = middle;
     }
     return at;
 }
@@ -75,54 +86,64 @@ static int32_t last_between(const struct fit_problem *p, const struct fit *f, in
 enum { SEEN = 8 }; // last places that are looked at
 _Static_assert(SEEN % WIDE == 0, "whole vectors");
 
-// Where lines through the first gates end at SEEN places, as far as lines through any two gates tell.
+// Adds with which lines lead to each of SEEN places with each end, through all gates before it.
 struct ends {
-    float low[SEEN], high[SEEN];   // of the bands
-    float least[SEEN], most[SEEN]; // slopes
-    float lowest[SEEN], highest[SEEN];
+    float least[FIT_ENDS][SEEN], most[FIT_ENDS][SEEN]; // none where least > most
+    unsigned passes[FIT_ENDS], whole[FIT_ENDS];        // places with lines, with lines of a whole add
 };
 
 // Looks at WIDE places from FIRST on, of those up to LAST; they are the ones of E from PART on.
 static inline void look_at_ends(const struct fit_problem *p, const struct fit *f, int32_t gates,
                                 int32_t first, int32_t last, struct ends *e, int part) {
-    put_gates(p, f, first * f->stride, f->stride, last * f->stride, e->low + part, e->high + part);
-    const vector low = load(e->low + part), high = load(e->high + part);
-    vector least = all(-FAR), most = all(FAR), lowest = low, highest = high;
-    int32_t behind = first - f->spacing;
-    for (int32_t i = 0; i < gates && behind > -WIDE; i++, behind -= f->spacing) {
-        const vector k = load(INVERSE + REACH + behind), none = load(NONE + REACH + behind);
-        const vector away = COUNTING + (float)(behind - 1);
-        least = larger(least, (low - f->high[i]) * k + none);
-        most = smaller(most, (high - f->low[i]) * k - none);
-        lowest = larger(lowest, away * f->least[i + 1] + f->low[i] + none);
-        highest = smaller(highest, away * f->most[i + 1] + f->high[i] - none);
+    float below[WIDE], above[WIDE];
+    put_gates(p, f, first * f->stride, f->stride, last * f->stride, below, above);
+    const int32_t before = gates_before(f, first);
+    const vector low = load(below), high = load(above), third = (high - low) * (1.0F / 3);
+    const vector edges[FIT_ENDS + 1] = {low, low + third, high - third, high};
+    vector least[FIT_ENDS], most[FIT_ENDS];
+    for (int end = 0; end < FIT_ENDS; end++)
+        least[end] = all(f->least[before]), most[end] = all(f->most[before]);
+    int32_t behind = first - f->spacing, i = 0;
+    for (; i < before; i++, behind -= f->spacing) {
+        const vector k = load(INVERSE + REACH + behind);
+        for (int end = 0; end < FIT_ENDS; end++) {
+            least[end] = larger(least[end], (edges[end] - f->high[i]) * k);
+            most[end] = smaller(most[end], (edges[end + 1] - f->low[i]) * k);
+        }
     }
-    store(e->least + part, &least), store(e->most + part, &most);
-    store(e->lowest + part, &lowest), store(e->highest + part, &highest);
+    for (; i < gates && behind > -WIDE; i++, behind -= f->spacing) { // before some of them only
+        const vector k = load(INVERSE + REACH + behind), none = load(NONE + REACH + behind);
+        const vector through = f->least[i + 1] + none, under = f->most[i + 1] - none;
+        for (int end = 0; end < FIT_ENDS; end++) {
+            least[end] = larger(larger(least[end], through), (edges[end] - f->high[i]) * k + none);
+            most[end] = smaller(smaller(most[end], under), (edges[end + 1] - f->low[i]) * k - none);
+        }
+    }
+    const float scale = 2.0F / (float)f->stride;
+    for (int end = 0; end < FIT_ENDS; end++) {
+        e->passes[end] |= (unsigned)not_above(least[end], most[end]) << part;
+        least[end] = -floors(-least[end] * scale), most[end] = floors(most[end] * scale);
+        e->whole[end] |= (unsigned)not_above(least[end], most[end]) << part;
+        store(e->least[end] + part, &least[end]), store(e->most[end] + part, &most[end]);
+    }
 }
 
 // Finds the last place with each end, of the SEEN up to LAST.
 static void find_ends(const struct fit_problem *p, struct fit *f, int32_t gates, int32_t last) {
     const int32_t first = last > SEEN ? last - SEEN + 1 : 1;
-    struct ends e;
-    for (int part = 0; part < SEEN; part += WIDE)
+    const unsigned seen = (2U << (last - first)) - 1;
+    struct ends e = {.passes = {0}};
+    for (int part = 0; part < SEEN && first + part <= last; part += WIDE)
         look_at_ends(p, f, gates, first + part, last, &e, part);
-    int missing = FIT_ENDS;
-    int32_t before = gates_before(f, last), gate = before * f->spacing;
-    for (int32_t i = last - first; i >= 0 && missing; i--) {
-        if (first + i == gate)
-            before--, gate -= f->spacing;
-        struct range r = {e.least[i], e.most[i]};
-        narrow(&r, f->least[before], f->most[before]);
-        if (r.least > r.most || e.lowest[i] > e.highest[i])
+    // On a long cruise whole adds may be further apart than lines: then only the making tells.
+    const bool any = (e.whole[0] | e.whole[1] | e.whole[2]) & seen;
+    for (int end = 0; end < FIT_ENDS; end++) {
+        const unsigned found = (any ? e.whole[end] : e.passes[end]) & seen;
+        if (!found)
             continue;
-        const float middle = 0.5F * (e.low[i] + e.high[i]), wide = 0.5F * (e.high[i] - e.low[i]);
-        for (int end = 0; end < FIT_ENDS; end++)
-            if (!f->count[end] && e.lowest[i] <= middle + EDGES[end + 1] * wide &&
-                e.highest[i] >= middle + EDGES[end] * wide) {
-                f->count[end] = (uint32_t)((first + i) * f->stride);
-                missing--;
-            }
+        const int place = 31 - __builtin_clz(found);
+        f->count[end] = (uint32_t)((first + place) * f->stride);
+        f->adds[end] = (struct fit_adds){e.least[end][place], e.most[end][place]};
     }
 }
 
@@ -182,7 +203,7 @@ void VARIANT(step_fit_find)(const struct fit_problem *p, struct fit *f) {
     // With an interval a tick longer the last step comes so many ticks later.
     const int32_t ticks = last * f->stride;
     if (last && ticks > p->high[ticks - 1] - p->low[ticks - 1])
-        last = last_between(p, f, last, -1, 1, &s);
+        last = last_between(p, f, last, -1, 1, NULL, &s);
     f->open = p->count <= FIT_COUNT_MAX && (uint32_t)((last + 1) * f->stride) > count;
     if (last)
         find_ends(p, f, gates, last);
@@ -251,7 +272,7 @@ static void look_closer(const struct fit_problem *p, struct fit *f, const struct
 static uint32_t make_good(const struct fit_problem *p, struct fit *f, int end, struct fit_segment *s) {
     int32_t at = f->stride == 1 ? (int32_t)f->count[end] : (int32_t)f->count[end] / f->stride;
     for (;;) {
-        at = last_between(p, f, at, EDGES[end], EDGES[end + 1], s);
+        at = last_between(p, f, at, EDGES[end], EDGES[end + 1], f->extra ? NULL : &f->adds[end], s);
         if (!at)
             return 0;
         // Between places, and up to the last step when that is near, it may reach on.

@@ -42,8 +42,11 @@ struct fit_segment {
 // What was found for a problem. Segments end at places, every STRIDE steps; gates stand at every SPACING-th.
 struct fit {
     uint32_t count[FIT_ENDS]; // about how many steps the longest segment with each end has; 0: there is none
-    bool open;                // a segment might reach beyond the steps there are
-    double interval, add;     // from where lines are measured: whole numbers, near all that pass
+    struct fit_adds {
+        float least, most;
+    } adds[FIT_ENDS];     // of lines to there, whole, measured from ADD
+    bool open;            // a segment might reach beyond the steps there are
+    double interval, add; // from where lines are measured: whole numbers, near all that pass
     int32_t stride, spacing, gates, extra;
     float low[FIT_GATES + FIT_LANES], high[FIT_GATES + FIT_LANES];
     float least[FIT_GATES + FIT_LANES], most[FIT_GATES + FIT_LANES]; // slopes that pass so many gates

@@ -43,6 +43,13 @@ static inline vector all(float x) {
     return x - (vector){0};
 }
 
+// The greatest whole numbers that are not above V, for magnitudes below 2^22.
+static inline vector floors(vector v) {
+    const float whole = 0x1.8p23F; // so large that nothing behind the point is left
+    const vector near = v + whole - whole;
+    return near + __builtin_convertvector(near > v, vector);
+}
+
 struct range {
     float least, most;
 };
@@ -70,6 +77,10 @@ static inline quad smaller_quad(quad a, quad b) {
 
 static inline bool any_above_0(quad v) {
     return __builtin_ia32_movmskpd256((quad)(v > 0)) != 0;
+}
+
+static inline int not_above(vector a, vector b) {
+    return __builtin_ia32_movmskps256((vector)(a <= b));
 }
 
 // The largest of LEAST and the smallest of MOST.
@@ -127,6 +138,13 @@ static inline pair larger_pair(pair a, pair b) {
     return (pair)(((pair_selection)a & keep) | ((pair_selection)b & ~keep));
 }
 #endif
+
+static inline int not_above(vector a, vector b) {
+    int which = 0;
+    for (int lane = 0; lane < WIDE; lane++)
+        which |= (a[lane] <= b[lane]) << lane;
+    return which;
+}
 
 static inline quad larger_quad(quad a, quad b) {
     const pair low = larger_pair(__builtin_shufflevector(a, a, 0, 1), __builtin_shufflevector(b, b, 0, 1)),
