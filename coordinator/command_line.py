@@ -5,6 +5,7 @@ argparse, because the start counts: a library that is nicer to write with cost m
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -26,6 +27,7 @@ Job = Callable[[], Report]
 SEED_MAX = 2**32
 SEEDS_AT_ONCE_MAX = 10_000_000
 JOBS_MAX = 256
+_COLUMNS = 80
 TOOL_COMMANDS = {
     "can": "Find, watch and debug nodes on a CAN bus.",
     "console": "Talk to one node in its own words.",
@@ -54,8 +56,29 @@ class Answered(Exception):  # noqa: N818 (no failure: the words asked for help o
     """There is nothing left to do."""
 
 
+class _Help(argparse.HelpFormatter):
+    """Looks up the terminal's width itself: argparse does for every option declared, by a slow import."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, width=_columns() - 2)
+
+
+def _columns() -> int:
+    """Return what ``shutil.get_terminal_size`` would."""
+    given = os.environ.get("COLUMNS", "")
+    if given.isdecimal() and int(given):
+        return int(given)
+    try:
+        return os.get_terminal_size(sys.stdout.fileno()).columns or _COLUMNS
+    except (AttributeError, ValueError, OSError):  # there is none, it is closed, or no terminal
+        return _COLUMNS
+
+
 class _Parser(argparse.ArgumentParser):
     """Raises where argparse would print and exit."""
+
+    def __init__(self, **words: Any) -> None:
+        super().__init__(formatter_class=_Help, **words)
 
     def error(self, message: str) -> NoReturn:
         """Tell what is wrong."""

@@ -4,7 +4,6 @@ A dictionary comes off a wire and is hostile until parsed: every size is bounded
 in one DictionaryError sentence. Once parsed it does not change; decoding is total (a message or None).
 """
 
-import hashlib
 import json
 import re
 import zlib
@@ -34,9 +33,7 @@ _INTEGER: Final = re.compile(r"[+-]?(?:0x[0-9a-fA-F]{1,16}|[0-9]{1,20})\Z")
 class Dictionary:
     """What one firmware build understands and says. Make it with ``parse`` or ``from_json``."""
 
-    def __init__(self, source: Mapping[str, object], digest: str) -> None:
-        self.digest = digest
-        """SHA-256 of the inflated dictionary, in hex."""
+    def __init__(self, source: Mapping[str, object]) -> None:
         self.version = _text(source, "version")
         self.build_versions = _text(source, "build_versions")
         self.app = _text(source, "app")
@@ -88,7 +85,7 @@ class Dictionary:
             raise DictionaryError(f"dictionary: not usable JSON ({error})") from None
         if not isinstance(source, dict):
             raise DictionaryError("dictionary: not a JSON object")
-        return cls(source, hashlib.sha256(text).hexdigest())
+        return cls(source)
 
     # -------------------------------------------------------------------------------------------- look up
 
@@ -300,5 +297,5 @@ def _constants(source: Mapping[str, object]) -> dict[str, int | float | str]:
     return constants
 
 
-BOOTSTRAP: Final = Dictionary({}, "")
+BOOTSTRAP: Final = Dictionary({})
 """The two messages every node knows before its dictionary is read."""
