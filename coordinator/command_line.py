@@ -4,6 +4,7 @@ argparse, because the start counts: a library that is nicer to write with cost m
 """
 
 import argparse
+import gc
 import importlib
 import os
 import sys
@@ -248,7 +249,13 @@ def _tool(words: Sequence[str]) -> Job:
 
 def _runner(module: str, function: str) -> Callable[[object], Report]:
     """Import a runner when it is needed: motion costs more than the rest of a start."""
-    return cast("Callable[[object], Report]", getattr(importlib.import_module(module), function))
+    gc.disable()  # what is imported stays
+    try:
+        found = importlib.import_module(module)
+    finally:
+        gc.freeze()
+        gc.enable()
+    return cast("Callable[[object], Report]", getattr(found, function))
 
 
 # ------------------------------------------------------------------------------------------------ commands

@@ -6,7 +6,7 @@ program and keeps no clock. Not thread-safe: one thread at a time.
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import TYPE_CHECKING, Any
 
 from coordinator.gcode.events import (
@@ -65,7 +65,7 @@ class Stretch:
     acting: Acting
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class PlanRecord:
     """What was planned, for whoever checks it: trapezoids in order, and where positions were declared."""
 

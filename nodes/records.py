@@ -3,7 +3,8 @@
 ``dataclass(frozen=True, slots=True)`` compiles six methods for every class imported, in some 0.7 ms: for
 the classes of a short plan that was a fifth of all its CPU time. Here five methods are common to all classes
 and the constructor is compiled when the first instance is made. Everything else is the dataclass it replaces:
-fields, defaults, ``field``, ``replace``, ``asdict``, ``match``, ``__post_init__``, pickling.
+fields, defaults, ``field``, ``replace``, ``asdict``, ``match``, ``__post_init__``, pickling. With
+``frozen=False`` it may be changed, and has no hash.
 
 A record may only inherit from records. Comparing, hashing and showing loop over the fields: use a dataclass
 where that is done millions of times.
@@ -19,18 +20,21 @@ T = TypeVar("T")
 @overload
 def record(cls: type[T], /) -> type[T]: ...
 @overload
-def record(*, kw_only: bool = False) -> Callable[[type[T]], type[T]]: ...
+def record(*, kw_only: bool = False, frozen: bool = True) -> Callable[[type[T]], type[T]]: ...
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
-def record(cls: type[T] | None = None, /, *, kw_only: bool = False) -> type[T] | Callable[[type[T]], type[T]]:
-    """Make CLS a record; KW_ONLY: its own fields are given by name."""
+def record(
+    cls: type[T] | None = None, /, *, kw_only: bool = False, frozen: bool = True
+) -> type[T] | Callable[[type[T]], type[T]]:
+    """Make CLS a record; KW_ONLY: its own fields are given by name; not FROZEN: they may be set."""
 
     def make(plain: type[T]) -> type[T]:
+        plain.__doc__ = plain.__doc__ or plain.__name__  # dataclass would import half a parser to make one
         made = dataclass(plain, init=False, repr=False, eq=False, slots=True, kw_only=kw_only)
         own = vars(made)
-        for name, method in _METHODS.items():
+        for name, method in (_METHODS if frozen else _CHANGEABLE).items():
             if name not in own or (name == "__hash__" and own[name] is None):
                 setattr(made, name, method)
-        made.__init__ = _first_init(made)  # type: ignore[method-assign]
+        made.__init__ = _first_init(made, frozen=frozen)  # type: ignore[method-assign]
         return made
 
     return make if cls is None else make(cls)
@@ -39,18 +43,18 @@ def record(cls: type[T] | None = None, /, *, kw_only: bool = False) -> type[T] |
 # --------------------------------------------------------------------------------------------- constructor
 
 
-def _first_init(cls: type) -> Callable[..., None]:
+def _first_init(cls: type, *, frozen: bool) -> Callable[..., None]:
     """Return a constructor that puts the real one into its place."""
 
     def __init__(self: object, *args: Any, **kwargs: Any) -> None:  # noqa: N807 (it is one)
-        init = _compile_init(cls)
+        init = _compile_init(cls, frozen=frozen)
         cls.__init__ = init  # type: ignore[misc]
         init(self, *args, **kwargs)
 
     return __init__
 
 
-def _compile_init(cls: type) -> Callable[..., None]:
+def _compile_init(cls: type, *, frozen: bool) -> Callable[..., None]:
     names: dict[str, Any] = {"_set": object.__setattr__, "_MISSING": MISSING}
     positional: list[str] = []
     by_name: list[str] = []
@@ -69,7 +73,7 @@ def _compile_init(cls: type) -> Callable[..., None]:
             (by_name if entry.kw_only else positional).append(parameter)
         else:
             value = f"_make_{name}()" if entry.default_factory is not MISSING else f"_default_{name}"
-        body.append(f"    _set(self, {name!r}, {value})")
+        body.append(f"    _set(self, {name!r}, {value})" if frozen else f"    self.{name} = {value}")
     if hasattr(cls, "__post_init__"):
         body.append("    self.__post_init__()")
     parameters = ", ".join(["self", *positional, *(["*", *by_name] if by_name else [])])
@@ -121,12 +125,15 @@ def _set_state(self: Any, state: tuple[Any, ...]) -> None:
         object.__setattr__(self, name, value)
 
 
-_METHODS: dict[str, Callable[..., Any]] = {
+_CHANGEABLE: dict[str, Callable[..., Any] | None] = {
     "__eq__": _eq,
-    "__hash__": _hash,
+    "__hash__": None,
     "__repr__": _repr,
-    "__setattr__": _refuse_set,
-    "__delattr__": _refuse_delete,
     "__getstate__": _values,
     "__setstate__": _set_state,
+}
+_METHODS: dict[str, Callable[..., Any] | None] = _CHANGEABLE | {
+    "__hash__": _hash,
+    "__setattr__": _refuse_set,
+    "__delattr__": _refuse_delete,
 }

@@ -6,7 +6,6 @@ real-time streamer drive the same ``step`` and act on its events (events.py).
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 
 from coordinator.gcode import basic_commands, machine_commands
@@ -43,6 +42,7 @@ from coordinator.gcode.program import Program
 from coordinator.gcode.words import Command, WordError, parse, quoted
 from coordinator.motion.language import READ_IN_C
 from coordinator.motion.planner import Feed, FeedStatus, Planner
+from nodes.records import record
 
 MAX_NOTICES = 100
 """Different notices a job gives; a file of garbage must not flood the screen."""
@@ -52,7 +52,7 @@ MAX_PLACES = 4
 """Of such commands that a message names all; of more, it names the outermost and the innermost one."""
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class Recorded:
     """Commands of one name that wait for a module which does not exist yet."""
 
@@ -62,7 +62,7 @@ class Recorded:
     last_text: str
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class _Inner:
     """The lines that take a command's place; read one by one, they count as the line of that command."""
 

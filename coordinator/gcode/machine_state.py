@@ -5,7 +5,7 @@ change to step generation at its print time.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 from coordinator.kinematics.base import Weights
 from coordinator.kinematics.dual_carriage import CarriageState, DualCarriage
@@ -33,7 +33,7 @@ class Shaper:
         return SHAPER_PERIODS / self.frequency_hz if self.frequency_hz else 0.0
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class Extruder:
     """What a program may change of one extruder."""
 
@@ -70,7 +70,7 @@ class SavedState:
     """Letters of the axes that were homed."""
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class MachineState:
     """What the machine is like for the next line."""
 

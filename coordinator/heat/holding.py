@@ -4,7 +4,6 @@ Steady state begins SETTLING_S after the target was reached, as M109 and M190 wa
 target changes. Neither a fan that starts nor filament that passes ends it: to hold against them is the task.
 """
 
-from dataclasses import dataclass
 from typing import Final
 
 from nodes.records import record
@@ -40,7 +39,7 @@ class Held:
         return max(self.high_c - self.target_c, self.target_c - self.low_c)
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class _Steady:
     """A target that is held: running sums, whatever the time."""
 

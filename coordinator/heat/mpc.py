@@ -13,7 +13,6 @@ OBSERVER_SPEED · k: fast against the sensor's lag, yet not so fast that noise i
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 from coordinator.heat.controller import NEAR_K, SLOW_K_PER_S, Slope
@@ -60,7 +59,7 @@ def filament_heat(diameter_mm: float, density_g_per_cm3: float, heat_capacity_j_
     return math.pi * (diameter_mm / 2) ** 2 / 1000 * density_g_per_cm3 * heat_capacity_j_per_g_k
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class _Estimate:
     block_c: float
     sensor_c: float

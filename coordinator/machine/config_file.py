@@ -10,11 +10,12 @@ Nothing here knows what an option means.
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import field
 
 from coordinator.machine import config_text
 from coordinator.machine.config_text import ReadBudget
 from coordinator.machine.problem import ConfigError, Place, shown
+from nodes.records import record
 
 SAVED_PREFIX = "#*#"
 SAVED_HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
@@ -25,7 +26,7 @@ _SEPARATOR = re.compile(r"[:=]")
 _MAX_NAME_CHARS = 200
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class RawOption:
     """One option as written; the value has no comments and no outer white space; lines end in a line feed."""
 
@@ -41,7 +42,7 @@ class RawOption:
         return place.path == self.place.path and place.line in (self.place.line, *self.numbers)
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class RawSection:
     """One section, merged from all places that name it."""
 
@@ -80,7 +81,7 @@ class RawSection:
         return self.name.partition(" ")[2]
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class ConfigFile:
     """A parsed configuration."""
 

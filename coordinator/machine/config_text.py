@@ -3,10 +3,11 @@
 import fnmatch
 import os
 import stat
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 from coordinator.machine.problem import ConfigError, Place, shown_path
+from nodes.records import record
 
 MAX_FILES = 200
 MAX_BYTES = 2_000_000
@@ -15,7 +16,7 @@ MAX_DIRECTORY_ENTRIES = 20_000
 _WILDCARDS = "*?["
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class ReadBudget:
     """What one configuration may still read; shared by a file and all it includes."""
 

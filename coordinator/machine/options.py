@@ -7,7 +7,7 @@ handed back.
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any, Generic, TypeVar
 
 from coordinator.machine.config_file import RawOption, RawSection
@@ -290,7 +290,7 @@ class SectionSpec:
     """Stands for all options whose names begin with its own, which ends in ``_``."""
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class SectionReader:
     """Reads one section by its specification and remembers what was read.
 

@@ -6,7 +6,7 @@ A pin is ``[!][^|~][node:]name``, or with the marks after the node as in ``toolh
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 from coordinator.machine.config_file import RawOption, RawSection
 from coordinator.machine.options import BadValue, Option
@@ -97,7 +97,7 @@ class PinOption(Option[PinName]):
 _ANY_PIN = PinOption(name="pin", help="any pin", pullable=True)
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class PinRegistry:
     """Who uses which pin."""
 
@@ -108,6 +108,16 @@ class PinRegistry:
     diag_pins: dict[str, PinName | None] = field(default_factory=dict)
     """Of the sections whose virtual endstop an endstop_pin may name, such as ``tmc2209_stepper_x``; None: it
     has no diag_pin."""
+
+    def copy(self) -> "PinRegistry":
+        """Return one that goes on from here by itself."""
+        return PinRegistry(
+            self.nodes,
+            dict(self._aliases),
+            set(self._shareable),
+            dict(self._users),
+            dict(self.diag_pins),
+        )
 
     def add_alias(self, node: str, alias: str, name: str, option: RawOption) -> None:
         """Give a pin a second name ([board_pins]); a name in angle brackets reserves the alias instead."""

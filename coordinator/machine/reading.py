@@ -1,15 +1,16 @@
 """What every reader of a machine's sections shares: the file, the pins, and what was read so far."""
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 from coordinator.machine.config_file import ConfigFile, RawSection
 from coordinator.machine.model import NotYetActing
 from coordinator.machine.options import SectionReader
 from coordinator.machine.pins import PinDescription, PinRegistry
 from coordinator.machine.problem import MissingSection, Place
+from nodes.records import record
 
 
-@dataclass(slots=True)
+@record(frozen=False)
 class Reading:
     """One reading of a configuration."""
 

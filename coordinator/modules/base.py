@@ -111,6 +111,10 @@ class Module:
         """Tell how it is: for macros and front ends; cheap, and not changed afterwards."""
         return {}
 
+    def stands_for(self) -> Mapping[str, set[str]]:
+        """Tell which of its commands stand for lines of g-code, each with what may be commands in them."""
+        return {}
+
 
 M = TypeVar("M", bound=Module)
 T = TypeVar("T")

@@ -113,6 +113,10 @@ class GCodeMacro(Module):
         """Tell the variables."""
         return {name: plain(value) for name, value in dict(self.variables).items()}
 
+    def stands_for(self) -> Mapping[str, set[str]]:
+        """Tell which words its lines have."""
+        return {self.command: words_in(self.text)}
+
     @property
     def text(self) -> str:
         """What it stands for, as it is written."""

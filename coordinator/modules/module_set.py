@@ -1,7 +1,6 @@
 """All modules of one machine, from its configuration to its end."""
 
 import contextlib
-import copy
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import field
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -59,7 +58,7 @@ class ModuleSources:
 
     def build(self, machine: "MachineDescription") -> "ModuleSet":
         """Make those of MACHINE, linked with each other; raises ConfigError."""
-        built = ModuleSet(machine, copy.deepcopy(self.pins), self.config, self.settings)
+        built = ModuleSet(machine, self.pins.copy(), self.config, self.settings)
         for source in self.sources:
             built.build(source)
         built.link()
@@ -240,9 +239,7 @@ class ModuleSet:
         )
 
     def _interrupting(self) -> frozenset[str]:
-        from coordinator.modules.gcode_macro import GCodeMacro, words_in  # noqa: PLC0415 (start-up time)
-
-        words = {macro.command: words_in(macro.text) for macro in self.of(GCodeMacro)}
+        words = {name: inner for module in self._modules for name, inner in module.stands_for().items()}
         found = set(INTERRUPTING & self._commands.keys())
         while more := {name for name, inner in words.items() if inner & found} - found:
             found |= more

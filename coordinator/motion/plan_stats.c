@@ -62,9 +62,10 @@ static void halve(struct plan_stats *stats) {
 static size_t bin_at(struct plan_stats *stats, double print_time) {
     if (!(print_time > 0 && isfinite(print_time)))
         print_time = 0;
-    while (print_time / stats->bin_s >= PLAN_BINS)
+    double at;
+    while ((at = print_time / stats->bin_s) >= PLAN_BINS)
         halve(stats);
-    const uint32_t bin = (uint32_t)(print_time / stats->bin_s);
+    const uint32_t bin = (uint32_t)at;
     if (bin >= stats->bins_used)
         stats->bins_used = bin + 1;
     return bin;
@@ -139,8 +140,9 @@ static uint32_t stuff_bits(const struct plan_node *node, uint32_t size, const ui
     return can_frame_bits(node->can_id, size, data) - FRAME_BITS - 8 * size;
 }
 
-// Bits of a finished block on CAN, with the acknowledgement: one frame of WIRE_BLOCK_MIN bytes.
-static uint64_t can_bits_of(struct plan_node *node, uint32_t size) {
+// Bits of the node's block on CAN, with the acknowledgement: one frame of WIRE_BLOCK_MIN bytes.
+static uint64_t can_bits(struct plan_node *node) {
+    const uint32_t size = (uint32_t)wire_block_finish(node->block, node->used, node->sequence++);
     uint64_t bits = FRAME_BITS + 8 * WIRE_BLOCK_MIN;
     node->frames++;
     for (uint32_t at = 0; at < size; at += FRAME_BYTES) {
@@ -159,8 +161,8 @@ static void send_block(struct plan_stats *stats, int index) {
     struct plan_node *node = &stats->nodes[index];
     if (!node->used)
         return;
-    const uint32_t size = (uint32_t)wire_block_finish(node->block, node->used, node->sequence++);
-    const uint64_t bits = node->is_serial ? (uint64_t)PLAN_UART_BITS * size : can_bits_of(node, size);
+    const uint64_t bits =
+        node->is_serial ? (uint64_t)PLAN_UART_BITS * (node->used + WIRE_BLOCK_MIN) : can_bits(node);
     stats->bin_bits[index][bin_at(stats, node->block_time)] += bits;
     node->bits += bits;
     node->blocks++;
@@ -188,10 +190,10 @@ static bool count_steps(struct plan_stats *stats, int index, const struct batch_
         return false;
     stats->bin_steps[index][bin_at(stats, time)] += count;
     const double last = (double)interval + (double)(int32_t)add * (double)(count - 1);
-    const double rate = node->clock_freq / fmin(interval, last);
+    const double least = fmin(interval, last);
     struct plan_peak *peak = &stats->step_rate[index][oid];
-    if (isfinite(rate) && rate > peak->value)
-        *peak = (struct plan_peak){rate, time, 0};
+    if (least > 0 && node->clock_freq > peak->value * least)
+        *peak = (struct plan_peak){node->clock_freq / least, time, 0};
     return true;
 }
 

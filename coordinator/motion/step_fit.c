@@ -95,11 +95,10 @@ struct ends {
 // Looks at WIDE places from FIRST on, of those up to LAST; they are the ones of E from PART on.
 static inline void look_at_ends(const struct fit_problem *p, const struct fit *f, int32_t gates,
                                 int32_t first, int32_t last, struct ends *e, int part) {
-    float below[WIDE], above[WIDE];
-    put_gates(p, f, first * f->stride, f->stride, last * f->stride, below, above);
+    const struct gates ends = gates_from(p, f, first * f->stride, f->stride, last * f->stride);
     const int32_t before = gates_before(f, first);
-    const vector low = load(below), high = load(above), third = (high - low) * (1.0F / 3);
-    const vector edges[FIT_ENDS + 1] = {low, low + third, high - third, high};
+    const vector third = (ends.high - ends.low) * (1.0F / 3);
+    const vector edges[FIT_ENDS + 1] = {ends.low, ends.low + third, ends.high - third, ends.high};
     vector least[FIT_ENDS], most[FIT_ENDS];
     for (int end = 0; end < FIT_ENDS; end++)
         least[end] = all(f->least[before]), most[end] = all(f->most[before]);

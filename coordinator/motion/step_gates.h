@@ -35,75 +35,83 @@ static const float BEYOND[2 * GATES + FIT_LANES] = {
 
 // -------------------------------------------------------------------------------------------------- gates
 
+struct gates {
+    vector low, high;
+};
+
+struct half_gates {
+    four low, high;
+};
+
 // The gates of QUAD steps whose numbers are N and whose bands are LOW to HIGH.
-static inline void put_gates_of(const struct fit_problem *p, const struct fit *f, quad n, quad low, quad high,
-                                float *put_low, float *put_high) {
+static inline struct half_gates gates_of(const struct fit_problem *p, const struct fit *f, quad n, quad low,
+                                         quad high) {
     const quad base = p->clock + n * (f->interval + f->add * 0.5 * (n - 1));
     const four inverse = 1 / __builtin_convertvector(n, four);
-    const four a = __builtin_convertvector(low - base, four) * inverse,
-               b = __builtin_convertvector(high - base, four) * inverse;
-    memcpy(put_low, &a, sizeof(a));
-    memcpy(put_high, &b, sizeof(b));
+    return (struct half_gates){__builtin_convertvector(low - base, four) * inverse,
+                               __builtin_convertvector(high - base, four) * inverse};
 }
 
-// Puts WIDE gates, at every APART-th step from FIRST on; instead of those behind LAST, LAST once more.
-static inline void put_gates(const struct fit_problem *p, const struct fit *f, int32_t first, int32_t apart,
-                             int32_t last, float *low, float *high) {
-    static const quad ZERO_ON = {0, 1, 2, 3};
+// QUAD gates, at every APART-th step from FIRST on; instead of those behind LAST, LAST once more.
+static inline struct half_gates half_gates_from(const struct fit_problem *p, const struct fit *f,
+                                                int32_t first, int32_t apart, int32_t last) {
     const double *l = p->low - 1, *h = p->high - 1;
-    for (int32_t k = 0; k < WIDE; k += QUAD, first += QUAD * apart) {
-        const quad n = first + apart * ZERO_ON;
-        if (first + (QUAD - 1) * apart > last) {
-            const int32_t a = first < last ? first : last, b = a + apart < last ? a + apart : last,
-                          c = b + apart < last ? b + apart : last;
-            put_gates_of(p, f, (quad){a, b, c, last}, (quad){l[a], l[b], l[c], l[last]},
-                         (quad){h[a], h[b], h[c], h[last]}, low + k, high + k);
-        } else if (apart == 1) {
-            put_gates_of(p, f, n, load_quad(l + first), load_quad(h + first), low + k, high + k);
-        } else {
-            const int32_t a = first, b = a + apart, c = b + apart, d = c + apart;
-            put_gates_of(p, f, n, (quad){l[a], l[b], l[c], l[d]}, (quad){h[a], h[b], h[c], h[d]}, low + k,
-                         high + k);
-        }
+    int32_t a = first, b = a + apart, c = b + apart, d = c + apart;
+    if (d > last) {
+        a = a < last ? a : last, b = b < last ? b : last, c = c < last ? c : last, d = last;
+    } else if (apart == 1) {
+        static const quad ZERO_ON = {0, 1, 2, 3};
+        return gates_of(p, f, first + ZERO_ON, load_quad(l + first), load_quad(h + first));
     }
+    return gates_of(p, f, (quad){a, b, c, d}, (quad){l[a], l[b], l[c], l[d]}, (quad){h[a], h[b], h[c], h[d]});
 }
 
-// Narrows the slopes by the pairs of the gates BEGIN.. with those before.
-static inline void pair_up(struct fit *f, int32_t begin) {
-    const vector low = load(f->low + begin), high = load(f->high + begin);
+static inline struct gates gates_from(const struct fit_problem *p, const struct fit *f, int32_t first,
+                                      int32_t apart, int32_t last) {
+    const struct half_gates a = half_gates_from(p, f, first, apart, last);
+#if defined __AVX2__
+    const struct half_gates b = half_gates_from(p, f, first + QUAD * apart, apart, last);
+    return (struct gates){__builtin_shufflevector(a.low, b.low, 0, 1, 2, 3, 4, 5, 6, 7),
+                          __builtin_shufflevector(a.high, b.high, 0, 1, 2, 3, 4, 5, 6, 7)};
+#else
+    return (struct gates){a.low, a.high};
+#endif
+}
+
+// Puts WIDE gates from place BEGIN on, and narrows the slopes by their pairs with those before and with each
+// other. Returns through how many of them lines pass.
+static inline int32_t put_gates(struct fit *f, int32_t begin, struct gates g) {
     vector least = all(-FAR), most = all(FAR);
+    store(f->low + begin, &g.low), store(f->high + begin, &g.high);
     int32_t i = 0;
     for (; i < begin; i++) {
         const vector k = load(INVERSE + REACH + begin - i);
-        least = larger(least, (low - f->high[i]) * k);
-        most = smaller(most, (high - f->low[i]) * k);
+        least = larger(least, (g.low - f->high[i]) * k);
+        most = smaller(most, (g.high - f->low[i]) * k);
     }
     for (; i < begin + WIDE - 1; i++) {
         const vector k = load(INVERSE + REACH + begin - i), none = load(NONE + REACH + begin - i);
-        least = larger(least, (low - f->high[i]) * k + none);
-        most = smaller(most, (high - f->low[i]) * k - none);
+        least = larger(least, (g.low - f->high[i]) * k + none);
+        most = smaller(most, (g.high - f->low[i]) * k - none);
     }
     const float inverse = INVERSE[REACH + f->spacing];
     least = larger(largest_so_far(least * inverse), all(f->least[begin]));
     most = smaller(-largest_so_far(-most * inverse), all(f->most[begin]));
     store(f->least + begin + 1, &least), store(f->most + begin + 1, &most);
+    return __builtin_ctz(~(unsigned)not_above(least, most));
 }
 
 // Puts up to COUNT gates until no line passes; returns how many one does.
 static inline int32_t pass(const struct fit_problem *p, struct fit *f, int32_t count) {
     const int32_t apart = f->stride * f->spacing;
     f->least[0] = -FAR, f->most[0] = FAR;
-    int32_t i = 0;
-    while (i < count) {
-        put_gates(p, f, (i + 1) * apart, apart, count * apart, f->low + i, f->high + i);
-        pair_up(f, i);
-        i = i + WIDE < count ? i + WIDE : count;
-        if (f->least[i] > f->most[i])
-            break;
+    for (int32_t i = 0; i < count; i += WIDE) {
+        const struct gates gates = gates_from(p, f, (i + 1) * apart, apart, count * apart);
+        const int32_t passed = put_gates(f, i, gates);
+        if (passed < WIDE)
+            return i + passed < count ? i + passed : count;
     }
-    while (f->least[i] > f->most[i])
-        i--;
-    return i;
+    return count;
 }
 
 // -------------------------------------------------------------------------------------------------- lines

@@ -43,6 +43,12 @@ class NamedTwin(PointTwin):
         object.__setattr__(self, "derived", self.x + self.hidden)
 
 
+@record(frozen=False)
+class Changeable:
+    x: int
+    y: list[int] = field(default_factory=list)
+
+
 @record
 class Empty:
     pass
@@ -120,3 +126,16 @@ def test_matching() -> None:
     match Point(5, 6):
         case Point(x, y):
             assert (x, y) == (5, 6)
+
+
+def test_one_that_may_be_changed_has_no_hash() -> None:
+    one = Changeable(1)
+    one.x, one.y = 2, [3]
+    assert one == Changeable(2, [3]) != Changeable(1)
+    assert repr(one) == "Changeable(x=2, y=[3])"
+    assert pickle.loads(pickle.dumps(one)) == replace(one) == one  # noqa: S301
+    del one.x
+    with pytest.raises(AttributeError):
+        one.z = 1  # type: ignore[attr-defined]
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(one)
