@@ -92,9 +92,10 @@ struct stepper {
     struct step_stepper_stats stats;
 };
 
-struct heap {
+// Clocks in order, in a ring.
+struct clocks {
     uint64_t *at;
-    uint32_t count;
+    uint32_t first, count, room;
 };
 
 struct timed {
@@ -105,8 +106,8 @@ struct timed {
 struct node {
     struct step_node_config config;
     struct clock_map clock;
-    struct heap slots; // finish clocks of the commands that may still hold a slot
-    struct heap busy;  // those of them that are unfinished at the newest req_clock
+    struct clocks slots; // finish clocks of the commands that may still hold a slot
+    struct clocks busy;  // those of them that are unfinished at the newest req_clock
     struct timed *timed;
     uint32_t timed_count;
     uint64_t last_req;

@@ -13,56 +13,46 @@ void step_make_prefix(struct prefix *prefix, int32_t id, int32_t oid) {
 
 // ------------------------------------------------------------------------------------------------- slots
 
-static void sift_down(struct heap *h) {
-    const uint64_t value = h->at[0];
-    uint32_t i = 0;
-    for (uint32_t child; (child = 2 * i + 1) < h->count; i = child) {
-        child += child + 1 < h->count && h->at[child + 1] < h->at[child];
-        if (h->at[child] >= value)
+static uint64_t least(const struct clocks *c) {
+    return c->at[c->first];
+}
+
+static void drop_least(struct clocks *c) {
+    c->first = c->first + 1 < c->room ? c->first + 1 : 0;
+    c->count--;
+}
+
+// Segments come nearly in the order in which they finish: few have to make way.
+static void put_clock(struct clocks *c, uint64_t clock) {
+    uint32_t at = c->first + c->count++;
+    at = at < c->room ? at : at - c->room;
+    for (uint32_t left = c->count - 1; left; left--) {
+        const uint32_t before = at ? at - 1 : c->room - 1;
+        if (c->at[before] <= clock)
             break;
-        h->at[i] = h->at[child];
+        c->at[at] = c->at[before];
+        at = before;
     }
-    h->at[i] = value;
-}
-
-static void heap_push(struct heap *h, uint64_t value) {
-    uint32_t i = h->count++;
-    for (; i && h->at[(i - 1) / 2] > value; i = (i - 1) / 2)
-        h->at[i] = h->at[(i - 1) / 2];
-    h->at[i] = value;
-}
-
-static void heap_drop(struct heap *h) {
-    h->at[0] = h->at[--h->count];
-    if (h->count)
-        sift_down(h);
-}
-
-static void heap_replace(struct heap *h, uint64_t value) {
-    h->at[0] = value;
-    sift_down(h);
+    c->at[at] = clock;
 }
 
 // Takes a slot until FINISH for a command that needs it at DUE; returns the clock at which one is free.
-// Every earlier command that is not in the heap has finished by an earlier min_clock, and the node receives
-// in order: so when this command arrives at its min_clock, at most move_count − 1 others hold a slot.
+// Every earlier command that no longer counts has finished by an earlier min_clock, and the node receives in
+// order: so when this command arrives at its min_clock, at most move_count − 1 others hold a slot.
 static uint64_t take_slot(struct node *node, uint64_t req, uint64_t due, uint64_t finish) {
-    const uint32_t slots = (uint32_t)node->config.move_count;
+    struct clocks *slots = &node->slots, *busy = &node->busy;
     uint64_t min_clock = 0;
-    if (node->slots.count == slots) {
-        min_clock = node->slots.at[0];
-        heap_replace(&node->slots, finish);
-    } else
-        heap_push(&node->slots, finish);
+    if (slots->count == slots->room) {
+        min_clock = least(slots);
+        drop_least(slots);
+    }
+    put_clock(slots, finish);
     node->stats.late_slots += min_clock > due;
-    while (node->busy.count && node->busy.at[0] <= req)
-        heap_drop(&node->busy);
-    if (node->busy.count == slots)
-        heap_replace(&node->busy, finish);
-    else
-        heap_push(&node->busy, finish);
-    if ((int32_t)node->busy.count > node->stats.max_slots)
-        node->stats.max_slots = (int32_t)node->busy.count;
+    while (busy->count && (least(busy) <= req || busy->count == busy->room))
+        drop_least(busy);
+    put_clock(busy, finish);
+    if ((int32_t)busy->count > node->stats.max_slots)
+        node->stats.max_slots = (int32_t)busy->count;
     return min_clock;
 }
 
