@@ -13,12 +13,12 @@
 #include <string.h>
 
 enum {
-    WAYS = 3,   // that the search keeps
+    WAYS = 4,   // that the search keeps
     DEPTH = 48, // segments it looks ahead at most
 };
 // What an end below, about and above the true time is worth, in shares of the segment's length. Measured on
 // sliced files; from 0/0.05/0.05 to 0/0.15/0.15 the number of segments differs by less than 1 %.
-static const double END_IS_WORTH[FIT_ENDS] = {0, 0.07, 0.1};
+static const double END_IS_WORTH[FIT_ENDS] = {0, 0.08, 0.12};
 // Ways whose rank is behind the best by more than this share of a segment are given up where a band has many
 // ticks: a third less time for 1 % more commands. Where it has few, whole ticks decide who comes through, and
 // all are kept.
@@ -147,7 +147,7 @@ static struct branch take_best(struct branch *branches, int count) {
 }
 
 // Two ways that end at the same step, and within so much of its band, are one.
-static const double SAME = 1.0 / 8;
+static const double SAME = 1.0 / 16;
 
 static bool is_new(const struct search *q, const struct way *ways, int count, const struct way *way) {
     const size_t last = q->begin + way->at - 1;

@@ -56,7 +56,10 @@ static inline bool end_between(const struct fit_problem *p, const struct fit *f,
         narrow(&r, low - bent, high - bent);
         r = (struct range){ceilf(r.least), floorf(r.most)};
         if (r.least <= r.most) {
-            *s = (struct fit_segment){(uint32_t)steps, f->interval + floorf(0.5F * (r.least + r.most)),
+            // Nearer to the edge that is meant, but not at it: there the next segment has the whole band.
+            const float share = 0.5F + 0.25F * (from + to);
+            *s = (struct fit_segment){(uint32_t)steps,
+                                      f->interval + floorf(r.least + share * (r.most - r.least)),
                                       f->add + adds[j]};
             return true;
         }
@@ -246,10 +249,11 @@ static uint32_t count_good(const struct fit_problem *p, const struct fit_segment
     return i;
 }
 
-static bool single(const struct fit_problem *p, struct fit_segment *s) {
+static bool single(const struct fit_problem *p, int end, struct fit_segment *s) {
+    static const double SHARE[FIT_ENDS] = {-0.4, 0, 0.4}; // of the band, from its middle
     double first = ceil(p->low[0] - p->clock), last = floor(p->high[0] - p->clock);
     first = first > p->shortest ? first : p->shortest;
-    const double interval = rint(p->ticks[0] - p->clock);
+    const double interval = rint(p->ticks[0] - p->clock + SHARE[end] * (p->high[0] - p->low[0]));
     *s = (struct fit_segment){1, interval < first ? first : interval > last ? last : interval, 0};
     return first <= last;
 }
@@ -287,10 +291,10 @@ static uint32_t make_good(const struct fit_problem *p, struct fit *f, int end, s
 
 bool VARIANT(step_fit_make)(const struct fit_problem *p, struct fit *f, int end, struct fit_segment *s) {
     if (f->count[end] == 1)
-        return single(p, s);
+        return single(p, end, s);
     uint32_t count = make_good(p, f, end, s);
     if (!count || s->interval < p->shortest)
-        return single(p, s);
+        return single(p, end, s);
     if (s->add < 0) { // the last interval is the shortest
         const double most = floor((s->interval - p->shortest) / -s->add) + 1;
         count = most < count ? (uint32_t)most : count;
