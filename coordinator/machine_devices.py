@@ -1,6 +1,7 @@
 """The configured machine's devices: what each node is configured as, and what motion has to know of it."""
 
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 from coordinator.machine.description import (
     CanConnection,
@@ -11,13 +12,15 @@ from coordinator.machine.description import (
 )
 from coordinator.modules.module_set import ModuleSet
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
-from coordinator.table.axle_map import stepper_tables
 from nodes.devices.endstop import Endstop
 from nodes.devices.stepper import Stepper
 from nodes.devices.trsync import Trsync
 from nodes.dictionary import Dictionary
 from nodes.node_config import NodeConfig
 from nodes.vocabulary import KNOWS_BUS_STOP
+
+if TYPE_CHECKING:
+    from coordinator.table.axle_map import StepperTables
 
 
 class MachineDevices:
@@ -36,8 +39,15 @@ class MachineDevices:
             (slot, node): Trsync(f"homing on node {node}") for slot, node in self._homing_nodes()
         }
         """By slot and node, of all that take part in homing: of rails homed together each has a slot."""
-        self.tables = stepper_tables(description, self.steppers)
+        self.tables = self._tables()
         """Compensation tables, of steppers whose axes may have such."""
+
+    def _tables(self) -> "list[StepperTables]":
+        if self.description.axis_tables is None:
+            return []
+        from coordinator.table.axle_map import stepper_tables  # noqa: PLC0415 (start-up time)
+
+        return stepper_tables(self.description, self.steppers)
 
     def build_config(self, node: str, dictionary: Dictionary) -> NodeConfig:
         """Return what NODE is to be configured as; raises CanductorError when it cannot be that."""

@@ -139,3 +139,23 @@ def test_one_that_may_be_changed_has_no_hash() -> None:
         one.z = 1  # type: ignore[attr-defined]
     with pytest.raises(TypeError, match="unhashable"):
         hash(one)
+
+
+def test_the_first_instances_are_those_that_come_later() -> None:
+    @record
+    class Fresh(Point):
+        z: int = field(default=3, kw_only=True)
+
+    with pytest.raises(TypeError, match=r"Fresh\.__init__\(\)"):
+        Fresh(1, x=2)  # type: ignore[misc]
+
+    @record
+    class Often(Point):
+        z: int = field(default=3, kw_only=True)
+
+    many = [Often(1, tags=["a"], z=n) for n in range(40)]
+    assert [repr(one) for one in many] == [
+        f"{Often.__qualname__}(x=1, y=2, tags=['a'], z={n})" for n in range(40)
+    ]
+    with pytest.raises(TypeError, match=r"Often\.__init__\(\)"):
+        Often(1, 2, [], 4)  # type: ignore[misc]
