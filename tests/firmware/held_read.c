@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A process whose read() stops it, just before it reads, while the file HOLD is there: whoever stopped it knows
-// what it has done by then, and gives it time and input.
+// A process whose read() stops it, just before it reads, while the file HOLD is there: whoever stopped it
+// knows what it has done by then, and gives it time and input.
 #define _GNU_SOURCE
 #include <signal.h>
 #include <sys/syscall.h>

@@ -158,4 +158,4 @@ def test_the_first_instances_are_those_that_come_later() -> None:
         f"{Often.__qualname__}(x=1, y=2, tags=['a'], z={n})" for n in range(40)
     ]
     with pytest.raises(TypeError, match=r"Often\.__init__\(\)"):
-        Often(1, 2, [], 4)  # type: ignore[misc]
+        Often(1, 2, [], 4)  # type: ignore[call-arg]
