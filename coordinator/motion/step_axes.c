@@ -8,9 +8,13 @@ static const struct trapezoid *move_at(const struct step_gen *gen, uint64_t numb
     return &gen->moves[number % STEP_TRAPEZOIDS];
 }
 
+static double length_of(const struct trapezoid *m) {
+    return (m->start_v + 0.5 * m->accel * m->accel_s) * m->accel_s + m->cruise_v * m->cruise_s +
+           (m->cruise_v - 0.5 * m->accel * m->decel_s) * m->decel_s;
+}
+
 void step_move_end_position(const struct trapezoid *m, double *position) {
-    const double way = (m->start_v + 0.5 * m->accel * m->accel_s) * m->accel_s + m->cruise_v * m->cruise_s +
-                       (m->cruise_v - 0.5 * m->accel * m->decel_s) * m->decel_s;
+    const double way = length_of(m);
     for (int i = 0; i < AXES; i++)
         position[i] = m->start[i] + m->ratio[i] * way;
 }
@@ -23,13 +27,14 @@ void step_end_position(const struct step_gen *gen, double *position) {
 }
 
 static void locate_rest(const struct step_gen *gen, uint64_t cursor, struct motion *out) {
-    *out = (struct motion){.border = HUGE_VAL};
-    if (cursor < gen->moves_to)
-        out->border = move_at(gen, cursor)->print_time;
-    if (cursor == gen->kept_from)
-        memcpy(out->p, gen->rest, sizeof(out->p));
-    else
-        step_move_end_position(move_at(gen, cursor - 1), out->p);
+    static const double NO_WAY[AXES] = {0};
+    const double border = cursor < gen->moves_to ? move_at(gen, cursor)->print_time : HUGE_VAL;
+    if (cursor == gen->kept_from) {
+        *out = (struct motion){.from = gen->rest, .ratio = NO_WAY, .border = border};
+        return;
+    }
+    const struct trapezoid *m = move_at(gen, cursor - 1);
+    *out = (struct motion){.from = m->start, .ratio = m->ratio, .way = length_of(m), .border = border};
 }
 
 void step_locate(const struct step_gen *gen, uint64_t *cursor, double time, struct motion *out) {
@@ -53,13 +58,9 @@ void step_locate(const struct step_gen *gen, uint64_t *cursor, double time, stru
         }
         out->border = accel == 0 && !is_over(border, time) ? border : move_end(m);
     }
-    way += (speed + 0.5 * accel * t) * t;
-    speed += accel * t;
-    for (int i = 0; i < AXES; i++) {
-        out->p[i] = m->start[i] + m->ratio[i] * way;
-        out->v[i] = m->ratio[i] * speed;
-        out->a[i] = m->ratio[i] * accel;
-    }
+    out->from = m->start, out->ratio = m->ratio;
+    out->way = way + (speed + 0.5 * accel * t) * t;
+    out->speed = speed + accel * t, out->accel = accel;
     out->pressure_advance = m->pressure_advance;
 }
 

@@ -5,6 +5,8 @@
 // acceleration there: the closed form of step_times.c. The others are solved by safeguarded Newton.
 #include "coordinator/motion/step_internal.h"
 
+#include <string.h>
+
 static const double FURTHEST_STEPS = 1e12;
 static const double JUMP_STEPS = 0.51;
 static const double SPAN_S = 0.002;  // in which a non-linear stepper turns at most once
@@ -50,10 +52,11 @@ static void look(const struct step_gen *gen, struct stepper *s, int index, unsig
         if (!(tap->axes & axes & 1u << j))
             continue;
         const double weight = s->config.weights[j] * tap->amplitude[j] / s->config.step_distance;
-        seen->poly[0] += weight * m.p[j];
-        seen->poly[1] += weight * m.v[j];
-        seen->poly[2] += weight * (m.a[j] / 2);
-        seen->still &= m.v[j] == 0 && m.a[j] == 0;
+        const double v = speed_of(&m, j), a = accel_of(&m, j);
+        seen->poly[0] += weight * place_of(&m, j);
+        seen->poly[1] += weight * v;
+        seen->poly[2] += weight * (a / 2);
+        seen->still &= v == 0 && a == 0;
     }
 }
 
@@ -71,7 +74,7 @@ static double add_taps(const struct step_gen *gen, struct stepper *s, unsigned a
         p->poly[1] += seen->poly[1] + 2 * t * a;
         p->poly[2] += a;
         p->still &= seen->still;
-        end = fmin(end, seen->border);
+        end = seen->border < end ? seen->border : end;
         if (seen->border == HUGE_VAL)
             seen->border = -HUGE_VAL; // a move may be appended at any time
     }
@@ -90,10 +93,11 @@ static double add_axes(const struct step_gen *gen, struct stepper *s, struct pie
         for (int j = 0; j < AXES; j++) {
             if (!(s->uses >> j & 1))
                 continue;
-            p->axis[j][0] += tap->amplitude[j] * m.p[j];
-            p->axis[j][1] += tap->amplitude[j] * m.v[j];
-            p->axis[j][2] += tap->amplitude[j] * m.a[j] / 2;
-            p->still &= m.v[j] == 0 && m.a[j] == 0;
+            const double v = speed_of(&m, j), a = accel_of(&m, j);
+            p->axis[j][0] += tap->amplitude[j] * place_of(&m, j);
+            p->axis[j][1] += tap->amplitude[j] * v;
+            p->axis[j][2] += tap->amplitude[j] * a / 2;
+            p->still &= v == 0 && a == 0;
         }
     }
     return end;
@@ -232,13 +236,14 @@ static void solve_one_by_one(const struct stepper *s, const struct piece *p, dou
 
 static int play_solved(struct step_gen *gen, struct stepper *s, const struct piece *p, double from, double to,
                        int direction, int64_t target) {
-    double t[SOLVED + FILL_BLOCK] = {0}, c[5];
+    double t[SOLVED + FILL_BLOCK], c[5];
     const struct phase flow = {.time = p->begin, .seconds = p->seconds, .solved = t};
     for (int k = 0; k < 5; k++)
         c[k] = p->poly[k] * direction;
     while (s->position != target) {
         const int64_t left = (target - s->position) * direction;
         const int count = left < SOLVED ? (int)left : SOLVED;
+        memset(t + count, 0, FILL_BLOCK * sizeof(*t)); // is read, and does not matter
         for (int i = 0; i < count; i += FILL_BLOCK) {
             const int n = count - i < FILL_BLOCK ? count - i : FILL_BLOCK;
             const int64_t position = s->position + i * direction;

@@ -131,9 +131,22 @@ struct shaper {
 
 // Planned motion around a time: position and derivatives of each axis, constant acceleration up to BORDER.
 struct motion {
-    double p[AXES], v[AXES], a[AXES];
+    const double *from, *ratio; // of the axes: place is from + ratio·way
+    double way, speed, accel;   // along the move
     double pressure_advance, border;
 };
+
+static inline double place_of(const struct motion *m, int axis) {
+    return m->from[axis] + m->ratio[axis] * m->way;
+}
+
+static inline double speed_of(const struct motion *m, int axis) {
+    return m->ratio[axis] * m->speed;
+}
+
+static inline double accel_of(const struct motion *m, int axis) {
+    return m->ratio[axis] * m->accel;
+}
 
 // A stretch of constant acceleration in one direction; lengths in any unit.
 struct phase {

@@ -4,7 +4,7 @@
 // p(t+h))/h², which is quadratic between the borders of phases and these borders ± h: there E_s is quartic.
 #include "coordinator/motion/step_internal.h"
 
-enum { TRUSTED = 16 };
+enum { TRUSTED = 64 };
 
 // ∫ p and ∫ |distance from FROM's outer end|·p over one half of the window.
 struct half {
@@ -19,8 +19,8 @@ static struct half integrate(const struct step_gen *gen, uint64_t cursor, double
         struct motion m;
         step_locate(gen, &cursor, at, &m);
         const double end = fmax(fmin(m.border, to), at + ROUNDING_S / 2), x = fmin(end, to) - at;
-        const double pa = m.pressure_advance, v = m.v[AXIS_E], a = m.a[AXIS_E];
-        const double c0 = m.p[AXIS_E] + pa * v - reference, c1 = v + pa * a, c2 = a / 2;
+        const double pa = m.pressure_advance, v = speed_of(&m, AXIS_E), a = accel_of(&m, AXIS_E);
+        const double c0 = place_of(&m, AXIS_E) + pa * v - reference, c1 = v + pa * a, c2 = a / 2;
         const double sum = x * (c0 + x * (c1 / 2 + x * c2 / 3));
         const double first = x * x * (c0 / 2 + x * (c1 / 3 + x * c2 / 4));
         half.sum += sum;
@@ -37,8 +37,9 @@ static void look(const struct step_gen *gen, struct stepper *s, int which, doubl
     if (seen->border == -HUGE_VAL || is_over(seen->border, time)) {
         struct motion m;
         step_locate(gen, &s->cursor[STEP_TAPS + which], time + shift, &m);
-        const double pa = m.pressure_advance, v = m.v[AXIS_E], a = m.a[AXIS_E];
-        *seen = (struct seen){time, m.border - shift, {m.p[AXIS_E] + pa * v, v + pa * a, a / 2}, false};
+        const double pa = m.pressure_advance, v = speed_of(&m, AXIS_E), a = accel_of(&m, AXIS_E);
+        *seen =
+            (struct seen){time, m.border - shift, {place_of(&m, AXIS_E) + pa * v, v + pa * a, a / 2}, false};
     }
     const double t = time - seen->time;
     poly[0] = seen->poly[0] + t * (seen->poly[1] + t * seen->poly[2]);
