@@ -1,19 +1,11 @@
 """What holds for all tests."""
 
-import threading
+import signal
 
-import pytest
-from hypothesis import settings
+from tests import profiles
 
-from tests.standstill import Repeating, Watcher
+profiles.register()
 
-# How long an example takes says how busy the machine is, and nothing else.
-settings.register_profile("patient", deadline=None)
-settings.load_profile("patient")
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Have tests repeated that failed while the computer stood still."""
-    watcher = Watcher()
-    threading.Thread(target=watcher.run, name="standstill", daemon=True).start()
-    config.pluginmanager.register(Repeating(watcher))
+# A shell that starts a job in the background has it ignore Ctrl-C, and children inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -24,6 +24,7 @@ from tests.canbus_tools.talk_twin import (
     identify_pieces,
     texts,
 )
+from tests.profiles import examples
 
 
 def knowing(*nodeids: int) -> BusDecoder:
@@ -339,7 +340,7 @@ def test_any_frames(frames: list[Frame]) -> None:
         assert node.to_json()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60))
 @given(st.randoms(use_true_random=False))
 def test_a_mutated_session(rng: random.Random) -> None:
     talk = download(Talk(), identify_pieces())

@@ -11,9 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.fuzz.dnc_target import PIECES, run_engine
+from tests.profiles import examples
 
 choices = st.integers(0, 2**31 - 1)
-short = settings(max_examples=150, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
+short = settings(max_examples=examples(150), suppress_health_check=list(HealthCheck))
 
 
 @short

@@ -12,11 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.fuzz.ipc_target import REQUESTS, SEEDS, line, packed, run_session
+from tests.profiles import examples
 
 cuts = st.integers(0, 2**31 - 1)
 plain = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary()
 values = st.recursive(plain, lambda v: st.lists(v, max_size=4) | st.dictionaries(st.text(), v, max_size=4))
-short = settings(max_examples=300, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
+short = settings(max_examples=examples(300), suppress_health_check=list(HealthCheck))
 
 
 @short
@@ -32,7 +33,7 @@ def test_any_requests(requests: list[dict[str, object]], as_json: bool, cut: int
     run_session(b"".join(map(line if as_json else packed, [REQUESTS[1], *requests])), cut)
 
 
-@settings(short, max_examples=80)
+@settings(short, max_examples=examples(80))
 @given(st.dictionaries(st.sampled_from(["id", "method", "params", "x"]), values), cuts)
 def test_any_values(message: dict[str, object], cut: int) -> None:
     run_session(packed(REQUESTS[1]) + packed({"method": "quick"} | message), cut)

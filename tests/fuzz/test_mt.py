@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from nodes.table.mt import to_bytes, transmission
 from tests.fuzz.mt_target import run_receivers
+from tests.profiles import examples
 
-short = settings(max_examples=200, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
+short = settings(max_examples=examples(200), suppress_health_check=list(HealthCheck))
 
 
 @short

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from nodes.clock import ClockEstimator, HostTime
 from tests.nodes import clock_traces as traces
+from tests.profiles import examples
 
 FREQ_HZ = 168_000_000
 RATE = 1 + 50e-6
@@ -80,7 +81,7 @@ def test_wake_ups_late_by_ten_microseconds_leave_the_rate_good() -> None:
     assert sorted(rates)[18] < 20e-6
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40))
 @given(st.lists(st.tuples(st.integers(-5, 1 << 62), st.integers(-5, 1 << 60), st.integers(0, (1 << 32) - 1))))
 def test_odd_input_never_raises_and_never_makes_nonsense(rows: list[tuple[int, int, int]]) -> None:
     estimator = ClockEstimator(FREQ_HZ)

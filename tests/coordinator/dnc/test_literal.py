@@ -14,10 +14,11 @@ from coordinator.dnc.scanner import Scanner
 from coordinator.dnc.signs import Kind
 from tests.coordinator.dnc import literal
 from tests.coordinator.dnc.line import Faults, Line, Owner, Wire
+from tests.profiles import examples
 
 texts = st.binary(max_size=60).map(lambda t: bytes(c for c in t if 0x20 <= c < 0x7F))
 programs = st.lists(texts, max_size=12)
-quick = settings(max_examples=40, deadline=None, derandomize=True)
+quick = settings(max_examples=examples(40))
 
 
 class TextWire(Wire):

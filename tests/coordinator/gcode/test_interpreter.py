@@ -32,6 +32,7 @@ from tests.coordinator.motion.planner_helpers import (
     joined,
     real_file,
 )
+from tests.profiles import examples
 
 HOME = {"X": 0.0, "Y": 0.0, "Z": 0.0}
 
@@ -377,7 +378,7 @@ def test_a_file_cut_within_a_word(tail: bytes, ok: bool, tmp_path: Path) -> None
             run(job)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(
     st.lists(
         st.one_of(

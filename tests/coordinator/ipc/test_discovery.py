@@ -25,6 +25,7 @@ from coordinator.ipc.announcer import Announcer
 from coordinator.ipc.discovery import INSTANCES_MAX, Browser
 from coordinator.ipc.multicast import Place, reached_at, spoken_on
 from tests.coordinator.ipc.served import Served, serving
+from tests.profiles import examples
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 (the word, not a socket)
 LIMIT_S = 60.0
@@ -126,7 +127,7 @@ def test_without_port_or_address_it_is_no_machine() -> None:
     assert len(usable_addresses(f"10.0.0.{n}" for n in range(100))) == ADDRESSES_MAX
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50))
 @given(
     st.dictionaries(st.sampled_from(sorted(machine("m").txt())), st.none() | st.binary(max_size=300)),
     st.none() | st.integers(),

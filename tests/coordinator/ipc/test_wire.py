@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from coordinator.ipc.settings import Limits
 from coordinator.ipc.wire import Encoder, Encoding, Fault, WireReader
+from tests.profiles import examples
 
 LIMITS = Limits(message_timeout_s=5.0)
 plain = (
@@ -20,11 +21,12 @@ values = st.recursive(plain, lambda v: st.lists(v, max_size=5) | st.dictionaries
 messages = st.lists(st.dictionaries(st.text(), values, max_size=4), min_size=1, max_size=5)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=examples(60))
 @given(messages, st.sampled_from(Encoding), st.data())
 def test_messages_come_out_as_they_went_in_however_they_are_cut(
     sent: list[dict[str, Any]], encoding: Encoding, data: st.DataObject
 ) -> None:
+
     encoder, reader = Encoder(), WireReader(LIMITS)
     stream = b"".join(encoder.message(encoding, message) for message in sent)
     got = []
@@ -39,7 +41,7 @@ def test_messages_come_out_as_they_went_in_however_they_are_cut(
     assert reader.next_deadline() is None
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=examples(100))
 @given(st.dictionaries(st.text(), values, min_size=1, max_size=3), st.sampled_from(Encoding))
 def test_joined_pieces_are_one_message(part: dict[str, Any], encoding: Encoding) -> None:
     encoder, reader = Encoder(), WireReader(LIMITS)

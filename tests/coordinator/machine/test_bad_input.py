@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from coordinator.machine.description import ConfigError, load_machine
 from tests.coordinator.machine.printer_cfg import PRINTER_CFG, changed, write
+from tests.profiles import examples
 
 
 def without(section: str) -> str:
@@ -346,7 +347,7 @@ SCRAPS = [
 ]
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=examples(400))
 @given(
     line=st.integers(0, len(LINES) - 1),
     keep_option=st.booleans(),

@@ -8,6 +8,7 @@ from coordinator.machine import config_text
 from coordinator.machine.config_file import ConfigFile, parse_config
 from coordinator.machine.problem import ConfigError, Place
 from tests.coordinator.machine.printer_cfg import write
+from tests.profiles import examples
 
 
 def values(config: ConfigFile) -> dict[str, dict[str, str]]:
@@ -241,7 +242,7 @@ PIECES = st.sampled_from(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300))
 @given(
     data=st.one_of(st.binary(max_size=200), st.lists(PIECES, max_size=40).map(lambda p: "".join(p).encode()))
 )

@@ -26,6 +26,7 @@ from coordinator.metrics.collect import (
 from coordinator.service.jobs import JobPhase
 from coordinator.service.machine_service import ServiceState
 from nodes.node_states import NodeState
+from tests.profiles import examples
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 FIELDS: dict[str, Value] = {
@@ -134,7 +135,7 @@ def test_of_a_machine_that_has_not_started_there_is_little() -> None:
     assert {name for name, _ in read({})} == {"canductor_machine_waiting", "canductor_metrics_left_out"}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=examples(50))
 @given(
     st.dictionaries(
         st.sampled_from(

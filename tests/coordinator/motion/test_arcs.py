@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from coordinator.motion.language import ARC_DEVIATION_MM, ARC_PIECE_MM, ArcFault, Plane
 from coordinator.motion.planner import FeedStatus, Planner
 from tests.coordinator.motion.planner_helpers import drain, flushed, homed_planner, joined
+from tests.profiles import examples
 
 PLANES = {"G17": (Plane.XY, 0, 1, "IJ"), "G18": (Plane.ZX, 2, 0, "KI"), "G19": (Plane.YZ, 1, 2, "JK")}
 START = (100.0, 110.0, 120.0)
@@ -40,7 +41,7 @@ def at_start(plane: Plane = Plane.XY) -> Planner:
     return planner
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150))
 @given(
     code=st.sampled_from(sorted(PLANES)),
     clockwise=st.booleans(),

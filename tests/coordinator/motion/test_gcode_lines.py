@@ -16,6 +16,7 @@ from tests.coordinator.motion.planner_helpers import (
     joined,
     planned,
 )
+from tests.profiles import examples
 
 
 def number(text: bytes) -> tuple[int, float]:
@@ -39,7 +40,7 @@ def test_a_number_of_a_slicer_is_the_nearest_double(value: object) -> None:
     assert number(text) == (len(text), float(text))
 
 
-@settings(max_examples=500)
+@settings(max_examples=examples(500))
 @given(
     st.integers(0, 10**19 - 1),
     st.integers(0, 19),
@@ -131,7 +132,7 @@ def test_a_line_is_read_when_it_is_whole() -> None:
     assert planner.toolhead_position[0] == 6
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(
     st.lists(st.one_of(st.binary(max_size=30), st.text("G1XYEF-.0123 *;()N\r", max_size=20).map(str.encode)))
 )

@@ -20,6 +20,7 @@ from tests.coordinator.motion.planner_helpers import (
     real_file,
 )
 from tests.coordinator.motion.planner_oracle import Language, plan
+from tests.profiles import examples
 
 
 def compare(t: Array, language: Language) -> None:
@@ -107,7 +108,7 @@ def run(planner: Planner, lines: list[str]) -> Array:
     return np.concatenate(pieces)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=examples(100))
 @given(programs(), LIMIT_SETS)
 def test_random_programs(lines: list[str], limits: MotionLimits) -> None:
     planner = homed_planner(limits)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from tests.coordinator.motion.steps_harness import MACHINES, MAX_ERROR_S, ORIGIN, Run, X, node_spec, stepper
 from tests.coordinator.motion.steps_oracle import Move, fewest_segments, make_move, step_times
+from tests.profiles import examples
 
 # -------------------------------------------------------------------------------------------- strategies
 
@@ -47,7 +48,7 @@ cut_shares = st.lists(st.tuples(st.floats(0, 1), st.booleans()), max_size=6)
 
 @pytest.mark.parametrize("machine", MACHINES)
 @given(moves=chains())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=examples(40))
 def test_every_step_is_in_its_band(machine: str, moves: list[Move]) -> None:
     if not moves:
         return
@@ -57,7 +58,7 @@ def test_every_step_is_in_its_band(machine: str, moves: list[Move]) -> None:
 
 
 @given(moves=chains(), shares=cut_shares)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60))
 def test_generating_in_pieces_changes_no_step(moves: list[Move], shares: list[tuple[float, bool]]) -> None:
     if not moves:
         return

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.service.job_folder import JobFolder, NoSuchJob
+from tests.profiles import examples
 
 
 @pytest.fixture
@@ -73,7 +74,7 @@ def test_refuses_in_one_sentence(folder: JobFolder, name: str) -> None:
     assert len(str(error.value)) < 300
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=examples(300))
 @given(
     parts=st.lists(
         st.sampled_from(["..", ".", "", "a", "out", "jobs", "secret.gcode", "/", "~", "\0"]), max_size=6

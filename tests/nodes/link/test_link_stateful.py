@@ -10,6 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from tests.nodes.link.test_link_faults import DAMAGES
 from tests.nodes.link.twin import STOP, NodeTwin, WindowObserver, ask, store
 from tests.nodes.link.virtual import MS, CoreLink, Delivery, Line
+from tests.profiles import examples
 from tests.wire_twin import read_vlq
 
 HZ = 1_000_000
@@ -120,5 +121,5 @@ class LinkMachine(RuleBasedStateMachine):
         self.nothing_twice_nothing_out_of_order()
 
 
-LinkMachine.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
+LinkMachine.TestCase.settings = settings(max_examples=examples(60), stateful_step_count=40)
 TestLink = LinkMachine.TestCase
