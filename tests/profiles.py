@@ -11,16 +11,23 @@ from hypothesis import settings
 
 CI: Final = "ci"
 FULL: Final = "full"
+CI_EXAMPLES: Final = 40
+"""Of a test that does not say how many it needs."""
 FULL_FACTOR: Final = 20
 
 
 def register() -> None:
     """Make both profiles known to Hypothesis and select ``ci``; pytest's option may select the other."""
-    settings.register_profile(CI, deadline=None, derandomize=True, database=None)
-    settings.register_profile(FULL, deadline=None, print_blob=True)
+    settings.register_profile(CI, max_examples=CI_EXAMPLES, deadline=None, derandomize=True, database=None)
+    settings.register_profile(FULL, max_examples=CI_EXAMPLES * FULL_FACTOR, deadline=None, print_blob=True)
     settings.load_profile(CI)
+
+
+def is_full() -> bool:
+    """Return whether the profile is ``full``: tests may then take minutes."""
+    return settings.get_current_profile_name() == FULL
 
 
 def examples(count: int) -> int:
     """Return how many examples a test draws that draws COUNT in profile ``ci``; for ``max_examples``."""
-    return count * FULL_FACTOR if settings.get_current_profile_name() == FULL else count
+    return count * FULL_FACTOR if is_full() else count

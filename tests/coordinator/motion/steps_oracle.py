@@ -16,7 +16,8 @@ LONG = np.longdouble
 Longs = np.ndarray[tuple[int], np.dtype[np.longdouble]]
 SNAP = 65536
 SLACK_TICKS = 2
-BISECTIONS = 90
+BISECTIONS = 70
+"""A move of 1,000 s is then known to 1e-18 s: below the resolution of a long double, which has 64 bits."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,10 @@ class Move:
         """Return s after T seconds, straight from the definition of a trapezoid."""
         ta, tc, td = (LONG(s) for s in self.seconds)
         v0, v, a = LONG(self.start_v), LONG(self.cruise_v), LONG(self.accel)
-        t1 = np.clip(t, 0, ta)
-        t2 = np.clip(t - ta, 0, tc)
-        t3 = np.clip(t - ta - tc, 0, td)
+        zero = LONG(0)
+        t1 = np.minimum(np.maximum(t, zero), ta)
+        t2 = np.minimum(np.maximum(t - ta, zero), tc)
+        t3 = np.minimum(np.maximum(t - ta - tc, zero), td)
         way: Longs = v0 * t1 + a * t1 * t1 / 2 + v * t2 + v * t3 - a * t3 * t3 / 2
         return way
 

@@ -1,7 +1,7 @@
 """Sliced programs on real machines: the emitted commands against the exact motion.
 
-Here the steps of a few short windows and the number of all steps; ``python bench/motion.py --prove``
-compares every single one.
+Here the steps of a few short windows and the number of all steps, of a program's first part in profile
+``ci`` and of the whole in ``full``; ``python bench/motion.py --prove`` compares every single one.
 """
 
 from pathlib import Path
@@ -10,26 +10,33 @@ import pytest
 
 from coordinator.motion.steps import MAX_ERROR_S
 from tests.coordinator.motion.exact_program import Planned, plan_program
+from tests.profiles import is_full
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 MACHINES = ("cartesian_plain", "corexy_is_pa", "corexy_is_pa_toolhead")
 PROGRAMS = ("text_cube", "vase")
 WINDOWS = 24
 WINDOW_S = 0.25
+CI_LINES = 4000
+"""What ``ci`` plans of a program: its first layers."""
 
 
-def planned(program: str, machine: str) -> Planned:
+def planned(folder: Path, program: str, machine: str) -> Planned:
     gcode, config = DATA / "gcode" / f"{program}.gcode", DATA / "config" / f"{machine}.cfg"
     for path in (gcode, config):
         if not path.exists():
             pytest.skip(f"{path} is not there: the sliced programs are no part of the project")
+    if not is_full():
+        lines = gcode.read_text(encoding="utf-8").splitlines(keepends=True)
+        gcode = folder / gcode.name
+        gcode.write_text("".join(lines[:CI_LINES]), encoding="utf-8")
     return plan_program(config, gcode)
 
 
 @pytest.mark.parametrize("machine", MACHINES)
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_the_commands_make_the_exact_motion(program: str, machine: str) -> None:
-    plan = planned(program, machine)
+def test_the_commands_make_the_exact_motion(tmp_path: Path, program: str, machine: str) -> None:
+    plan = planned(tmp_path, program, machine)
     share = plan.print_time_s / WINDOWS
     windows = [(share * (i + 0.5), share * (i + 0.5) + WINDOW_S) for i in range(WINDOWS)]
     verdicts = plan.prove(windows)
