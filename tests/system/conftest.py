@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.stages.processes import Hardware, hardware
 from tests.system.patiently import be_patient
-from tests.system.stage import Hardware, hardware
 
 
 @pytest.fixture(autouse=True)

@@ -4,8 +4,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.garbage_node import GarbageNode
-from tests.system.stage import MCU_UUID, SQUARE, TOOLHEAD_UUID, Hardware, canductor, write_config, write_gcode
+from tests.stages.garbage_node import GarbageNode
+from tests.stages.processes import (
+    MCU_UUID,
+    SQUARE,
+    TOOLHEAD_UUID,
+    Hardware,
+    canductor,
+    write_config,
+    write_gcode,
+)
 
 
 def words_for(command: str, config: Path, gcode: Path) -> list[str | Path]:

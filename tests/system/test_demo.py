@@ -10,7 +10,7 @@ from coordinator.demo.expected import expected_steps
 from coordinator.demo.proof import EDGE_TOLERANCE_S, PrimaryClock, StepperProof, prove_stepper
 from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.timebase import ClockMap, ClockPiece
-from tests.system.stage import SQUARE, canductor, write_gcode
+from tests.stages.processes import SQUARE, canductor, write_gcode
 
 CLOCK_FREQ_UART = 16_000_000
 FIELDS = (

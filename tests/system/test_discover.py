@@ -16,7 +16,7 @@ import pytest
 
 from coordinator.ipc.discovery import Browser
 from tests.coordinator.ipc.test_discovery import need_own_networks
-from tests.system.stage import CANDUCTOR, ROOT, Command, Hardware, canductor
+from tests.stages.processes import CANDUCTOR, ROOT, Command, Hardware, canductor
 
 if TYPE_CHECKING:
     from coordinator.ipc.announcement import Announcement

@@ -6,7 +6,7 @@ from typing import Any
 
 from coordinator.ipc.client import Client
 from tests.coordinator.dnc.cable import Cable
-from tests.system.stage import Command, Hardware
+from tests.stages.processes import Command, Hardware
 
 LIMIT_S = 120.0
 LINES = 20_000

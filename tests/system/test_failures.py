@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from tests.system.stage import LONG, Command, Ended, Hardware, write_config, write_gcode
+from tests.stages.processes import LONG, Command, Ended, Hardware, write_config, write_gcode
 
 MOVING = "taken as already home"
 """Said once the machine is ready and the job has begun."""

@@ -17,8 +17,8 @@ import pytest
 
 from coordinator.ipc.blocking import BlockingClient
 from coordinator.ipc.client import Refused
-from tests.system.service_stage import zigzag
-from tests.system.stage import Command, Hardware
+from tests.stages.processes import Command, Hardware
+from tests.stages.served import zigzag
 
 PATIENCE_S = 60.0
 TOKENS = {scope: f"{scope}-" + "t" * 32 for scope in ("watch", "operate", "admin")}

@@ -13,7 +13,7 @@ from coordinator.ipc.client import Client
 from coordinator.metrics.catalog import GROUPS, NOT_SHOWN, Kind, Metric, full_name
 from coordinator.metrics.collect import LABEL_MAX
 from coordinator.service.figures import field_name
-from tests.system.stage import SQUARE, Command, Hardware
+from tests.stages.processes import SQUARE, Command, Hardware
 from tests.system.test_discover import free_port, secrets_of
 
 LIMIT_S = 60.0

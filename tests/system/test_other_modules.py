@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.stage import ROOT, Command, Hardware, canductor
+from tests.stages.processes import ROOT, Command, Hardware, canductor
 
 EXAMPLE = ROOT / "docs" / "examples" / "chime"
 CHIME = "\n[chime]\npin: toolhead:PC5\n"

@@ -15,7 +15,7 @@ from coordinator.motion.planner import Planner
 from coordinator.move_source import JobState
 from coordinator.streamer import Streamer
 from nodes.virtual.processes import NodeProcess
-from tests.system.stage import Command, Hardware, write_config, write_gcode
+from tests.stages.processes import Command, Hardware, write_config, write_gcode
 
 MOVING = "taken as already home"
 LIGHT_UUID, SCALE_UUID = "0102030405aa", "0102030405bb"

@@ -2,7 +2,16 @@
 
 import pytest
 
-from tests.system.stage import END_S, SQUARE, Command, Ended, Hardware, canductor, write_config, write_gcode
+from tests.stages.processes import (
+    END_S,
+    SQUARE,
+    Command,
+    Ended,
+    Hardware,
+    canductor,
+    write_config,
+    write_gcode,
+)
 
 
 def steps(ended: Ended) -> dict[str, int]:

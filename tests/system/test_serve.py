@@ -16,8 +16,7 @@ import pytest
 from coordinator.ipc.client import Client
 from coordinator.ipc.methods import ApiError
 from coordinator.service.journal import NAME
-from tests.system.service_stage import zigzag
-from tests.system.stage import (
+from tests.stages.processes import (
     CANDUCTOR,
     DEMO_CFG,
     MCU_UUID,
@@ -29,6 +28,7 @@ from tests.system.stage import (
     canductor,
     write_gcode,
 )
+from tests.stages.served import zigzag
 
 LIMIT_S = 60.0
 

@@ -7,8 +7,8 @@ import weakref
 import pytest
 
 from coordinator.ipc.methods import ApiError
-from tests.system.service_stage import served, zigzag
-from tests.system.stage import SQUARE, Hardware
+from tests.stages.processes import SQUARE, Hardware
+from tests.stages.served import served, zigzag
 
 
 def test_lines_and_moves_between_jobs(machine: Hardware) -> None:

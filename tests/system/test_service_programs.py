@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from coordinator.ipc.methods import ApiError
-from tests.system.service_stage import Served, served, zigzag
-from tests.system.stage import Hardware
+from tests.stages.processes import Hardware
+from tests.stages.served import Served, served, zigzag
 
 SECTIONS = """
 [pause_resume]

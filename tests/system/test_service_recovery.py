@@ -15,8 +15,8 @@ from coordinator.ipc.methods import ApiError
 from coordinator.machine.description import load_machine
 from nodes.virtual.plant_page import PlantPage
 from nodes.virtual.processes import BusProcess, Flavour, NodeProcess
-from tests.system.service_stage import LIMIT_S, served, zigzag
-from tests.system.stage import Command, Hardware
+from tests.stages.processes import Command, Hardware
+from tests.stages.served import LIMIT_S, served, zigzag
 
 PLANT = PlantSettings(
     start=(20.0, 230.0, 5.0), heat=HeatSettings(hurry=4, warm_c={"extruder": 200.0, "heater_bed": 58.0})

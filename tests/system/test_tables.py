@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.system.stage import Command, Hardware, canductor
+from tests.stages.processes import Command, Hardware, canductor
 
 TABLE = "0 0 0\n50 50.01 49.99\n100 100.02 99.98\n"
 

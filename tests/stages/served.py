@@ -17,7 +17,7 @@ from coordinator.motion.planner import Position
 from coordinator.motion.steps import resting_step
 from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
-from tests.system.stage import Hardware
+from tests.stages.processes import Hardware
 
 LIMIT_S = 60.0
 """Nothing here may take longer; most takes a fifth of it."""
