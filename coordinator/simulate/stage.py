@@ -201,7 +201,7 @@ class Stage:
 
     def make_loop(self) -> VirtualLoop:
         """Return a loop in the world's time."""
-        return VirtualLoop(self._world, limit_s=LIMIT_S)
+        return self.host.make_loop()
 
     def cut(self, node: str) -> None:
         """Cut the wires between NODE and its bus, for good."""
@@ -306,6 +306,22 @@ class SimHost:
     def __init__(self, world: ScriptedWorld, ports: dict[str, CanPort | UartPort]) -> None:
         self._world = world
         self._ports = ports
+
+    def make_loop(self) -> VirtualLoop:
+        """Return a loop in the world's time; ``signal`` goes to the last one made."""
+        self._loop = VirtualLoop(self._world, limit_s=LIMIT_S)
+        return self._loop
+
+    def signal(self, number: int, after_s: float = 0.0) -> None:
+        """Send signal NUMBER, in AFTER_S of true time, to the program that runs then."""
+        at_ns = self._world.now_ns + max(1, round(after_s * NS))
+        self._world.at(at_ns, lambda: self._deliver(number), wakes=True)
+
+    def _deliver(self, number: int) -> None:
+        if self._loop is not None:
+            self._loop.deliver(number)
+
+    _loop: VirtualLoop | None = None
 
     def now(self) -> HostTime:
         """Return true time."""
