@@ -1,6 +1,6 @@
 """The stage of a scenario: a simulated world with wires and boards, and the host a machine is run on."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from typing import Any, Final
 
@@ -41,6 +41,7 @@ from nodes.virtual.world import (
     UartPort,
     UartSettings,
     VirtualLoop,
+    WorldNode,
 )
 
 GRID_S: Final = 0.005
@@ -203,6 +204,10 @@ class Stage:
         """Return a loop in the world's time."""
         return self.host.make_loop()
 
+    def call_at(self, at_ns: int, what: Callable[[], object]) -> None:
+        """Call WHAT at AT_NS of true time, between two events; the program goes on at once after it."""
+        self._world.at(at_ns, what, wakes=True)
+
     def cut(self, node: str) -> None:
         """Cut the wires between NODE and its bus, for good."""
         controller = self._boards[node].node.controller
@@ -219,6 +224,14 @@ class Stage:
         return self._world.now_ns
 
     # ------------------------------------------------------------------------------------------ truth
+
+    def node(self, name: str) -> WorldNode:
+        """Return the board NAME."""
+        return self._boards[name].node
+
+    def port(self, wire: str) -> CanPort | UartPort:
+        """Return the host's port on a bus or line, by the name that the configuration has for it."""
+        return self._ports[wire]
 
     def board(self, node: str) -> BoardTruth:
         """Return what NODE's pins did."""

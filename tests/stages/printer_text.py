@@ -1,8 +1,9 @@
 """A small, complete configuration that tests spoil one line at a time."""
 
+import re
 from pathlib import Path
 
-from coordinator.commands import EXAMPLES
+from coordinator.commands import DEMO_MACHINE, EXAMPLES
 
 PRINTER_CFG = """\
 [mcu]
@@ -167,6 +168,16 @@ homing_speed: 8
 second_homing_speed: 2
 """
 """A switch on each axis; that of X is on the other node."""
+
+DEMO_CFG = DEMO_MACHINE.read_text(encoding="utf-8")
+
+
+def without_endstops(text: str = DEMO_CFG, **replaced: str) -> str:
+    """Return a machine whose G28 takes its axes as home where they are; REPLACED: words by words."""
+    text = re.sub(r"endstop_pin: .*\n", "", text)
+    for old, new in replaced.items():
+        text = changed(old, new, text)
+    return text
 
 
 def write(folder: Path, text: str | bytes, name: str = "printer.cfg") -> str:

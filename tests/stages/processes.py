@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 import signal
 import subprocess
 import sys
@@ -14,9 +13,9 @@ from pathlib import Path
 from typing import IO, Any, Self
 
 from nodes.virtual.processes import BusProcess, ChildProcess, NodeProcess
+from tests.stages.printer_text import DEMO_CFG, without_endstops
 
 ROOT = Path(__file__).parents[2]
-DEMO_CFG = (ROOT / "config" / "demo" / "machine.cfg").read_text(encoding="utf-8")
 CANDUCTOR = (sys.executable, "-m", "tests.system.patiently")
 MCU_UUID, TOOLHEAD_UUID = "90a4ae022dfc", "5e1ec7ab1e02"
 END_S = 60.0
@@ -157,8 +156,7 @@ def write_config(folder: Path, *, name: str = "machine.cfg", **replaced: str) ->
     It has no endstops: nothing around these nodes would press them, and G28 takes the axes as home.
     """
     text = DEMO_CFG.replace("canbus_interface: can0", f"canbus_interface: virtual:{folder / 'bus'}")
-    text = text.replace("/dev/ttyUSB0", str(folder / "zboard.tty"))
-    text = re.sub(r"endstop_pin: .*\n", "", text)
+    text = without_endstops(text, **{"/dev/ttyUSB0": str(folder / "zboard.tty")})
     for old, new in replaced.items():
         assert old in text
         text = text.replace(old, new)
