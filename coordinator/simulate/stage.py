@@ -229,6 +229,10 @@ class Stage:
         """Return the board NAME."""
         return self._boards[name].node
 
+    def wires(self) -> list[CanWire | Uart]:
+        """Return all buses and lines."""
+        return list(self._wires.values())
+
     def port(self, wire: str) -> CanPort | UartPort:
         """Return the host's port on a bus or line, by the name that the configuration has for it."""
         return self._ports[wire]

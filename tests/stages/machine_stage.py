@@ -1,4 +1,4 @@
-"""A machine on simulated boards in virtual time, with a plant around their pins: what other stages build on."""
+"""A machine on simulated boards in virtual time, with a plant around their pins: the base of other stages."""
 
 import asyncio
 from collections.abc import Callable, Coroutine, Mapping
