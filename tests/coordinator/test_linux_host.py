@@ -9,8 +9,10 @@ from coordinator.run import run_machine
 from nodes.errors import CanductorError
 from tests.stages.printer_text import changed, without_endstops, write
 
-
-MCU_ON_CAN = "canbus_uuid: 90a4ae022dfc       # what a query of the bus prints, 12 hex digits\ncanbus_interface: can0\n"
+MCU_ON_CAN = """\
+canbus_uuid: 90a4ae022dfc       # what a query of the bus prints, 12 hex digits
+canbus_interface: can0
+"""
 
 
 @pytest.mark.parametrize(
