@@ -1,4 +1,4 @@
-"""What the machine needs of the computer it runs on: its time and its ports.
+"""What the machine needs of the computer it runs on: its time, its ports, and the loop its time passes in.
 
 `LinuxHost` is the real one; a simulation takes its place with virtual time and simulated wires.
 """
@@ -43,8 +43,20 @@ class Host(Protocol):
         ...
 
 
+class Computer(Host, Protocol):
+    """A host that whole commands run on."""
+
+    def make_loop(self) -> asyncio.AbstractEventLoop:
+        """Return a new event loop in which this host's time passes."""
+        ...
+
+
 class LinuxHost:
     """This computer: CLOCK_MONOTONIC, its CAN interfaces and its serial lines."""
+
+    def make_loop(self) -> asyncio.AbstractEventLoop:
+        """Return asyncio's own loop."""
+        return asyncio.new_event_loop()
 
     def now(self) -> HostTime:
         """Return CLOCK_MONOTONIC."""

@@ -11,14 +11,18 @@ from coordinator.commands import Terminated
 T = TypeVar("T")
 
 
-def run_to_end(job: Callable[[], Coroutine[Any, Any, T]]) -> T:
+def run_to_end(
+    job: Callable[[], Coroutine[Any, Any, T]],
+    make_loop: Callable[[], asyncio.AbstractEventLoop] = asyncio.new_event_loop,
+) -> T:
     """Run JOB in a loop of its own; the first Ctrl-C or SIGTERM cancels it, further ones change nothing.
 
     When it has ended, KeyboardInterrupt or Terminated is raised for the signal.
     """
     with _Interrupts() as interrupts:
         try:
-            result = asyncio.run(interrupts.guard(job))
+            with asyncio.Runner(loop_factory=make_loop) as runner:
+                result = runner.run(interrupts.guard(job))
         except asyncio.CancelledError:
             raise interrupts.exception() from None
     if interrupts.received:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from coordinator.commands import RunOptions, machine_name
 from coordinator.compensation import kept_compensation
 from coordinator.gcode.program import Program
+from coordinator.host import Computer, LinuxHost
 from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, load_machine
 from coordinator.progress import Progress, ProgressDisplay
@@ -89,11 +90,13 @@ def _node_line(node: NodeOutcome) -> str:
     )
 
 
-def run_machine(options: RunOptions) -> RunReport:
-    """Run OPTIONS.gcode, or standard input as it comes, on the machine of OPTIONS.config.
+def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
+    """Run OPTIONS.gcode, or standard input as it comes, on the machine of OPTIONS.config and HOST.
 
-    Replies and notices go to standard output as they come. Raises CanductorError, KeyboardInterrupt.
+    HOST: this computer if None. Replies and notices go to standard output as they come. Raises
+    CanductorError, KeyboardInterrupt.
     """
+    host = host or LinuxHost()
     description = load_machine(str(options.config))
     with ExitStack() as stack:
         program = stack.enter_context(
@@ -110,7 +113,9 @@ def run_machine(options: RunOptions) -> RunReport:
                 on_told=lambda told: _say(told.text),
                 cache=DictionaryCache.of_user(),
                 compensation=compensation,
-            )
+                host=host,
+            ),
+            host.make_loop,
         )
         return RunReport(program.name, outcome)
 

@@ -13,20 +13,20 @@ from coordinator.commands import DEMO_GCODE, DemoOptions
 from coordinator.demo.exact_program import program_legs
 from coordinator.demo.expected import ExpectedSteps, expected_steps
 from coordinator.demo.expected_curved import expected_curved
+from coordinator.demo.hardware import Hardware, NodeLog
 from coordinator.demo.heat_proof import HeatProof, HeatWatch, not_steady, prove_heat
 from coordinator.demo.proof import ClockProof, PrimaryClock, StepperProof, prove_clock, prove_stepper
 from coordinator.demo.report import DemoReport, NodeReport
 from coordinator.demo.stage import Stage
 from coordinator.demo.truth import PlaceProof, prove_places
 from coordinator.gcode.program import Program
+from coordinator.host import Computer, LinuxHost
 from coordinator.interrupts import run_to_end
 from coordinator.machine.description import MachineDescription, StepperDescription, load_machine
 from coordinator.motion.specs import StepperSpec
-from coordinator.move_source import Told
 from coordinator.pipeline import PlanRecord
 from coordinator.progress import ProgressDisplay
-from coordinator.session import Outcome, run_job
-from nodes.virtual.edge_log import EdgeLog
+from coordinator.session import OnProgress, Outcome, run_job
 from nodes.virtual.firmware import firmware_dictionary
 
 BEFORE_S = 1e-3
@@ -36,10 +36,22 @@ BEFORE_S = 1e-3
 def run_demo(options: DemoOptions) -> DemoReport:
     """Run the demo; raises CanductorError when it cannot be brought to its end."""
     description = load_machine(str(options.machine))
+    with ExitStack() as stack:
+        folder = stack.enter_context(_folder(options.keep))
+        program = stack.enter_context(Program.open(options.gcode or DEMO_GCODE))
+        stage = stack.enter_context(Stage(description, options, folder))
+        display = stack.enter_context(ProgressDisplay(f"printing {program.name}", quiet=options.json))
+        return print_and_prove(stage, program, LinuxHost(), display.update)
+
+
+def print_and_prove(
+    hardware: Hardware, program: Program, host: Computer, on_progress: OnProgress = lambda _: None
+) -> DemoReport:
+    """Print PROGRAM on HARDWARE, which HOST reaches, and prove every step; raises CanductorError."""
+    description = hardware.description
     record = PlanRecord((0.0, 0.0, 0.0, 0.0))
     told: list[str] = []
     both_edges: dict[str, bool] = {}
-
     claimed: dict[str, list[str]] = {}
     warmth = HeatWatch()
 
@@ -48,32 +60,29 @@ def run_demo(options: DemoOptions) -> DemoReport:
         both_edges.update({name: s.steps_on_both_edges for name, s in machine.devices.steppers.items()})
         warmth.attach(machine)
 
-    with ExitStack() as stack:
-        folder = stack.enter_context(_folder(options.keep))
-        program = stack.enter_context(Program.open(options.gcode or DEMO_GCODE))
-        stage = stack.enter_context(Stage(description, options, folder))
-        display = stack.enter_context(ProgressDisplay(f"printing {program.name}", quiet=options.json))
-        outcome = run_to_end(
-            lambda: run_job(
-                stage.description,
-                program,
-                display.update,
-                record=record,
-                on_told=lambda event: told.append(_text(event)),
-                on_ready=ready,
-            )
-        )
-        figures = stage.stop_nodes()
-        prover = Prover(description, stage.edge_log, outcome, record, both_edges=both_edges, claimed=claimed)
-        heat = [p for node in description.nodes for p in _heat_of(warmth, stage, node.name)]
-        notices = [*map(str, description.not_yet_acting), *description.notes, *told]
-        if (sentence := not_steady(warmth.heaters, heat)) is not None:
-            notices.append(sentence)
-        return report_of(prover, stage, figures, outcome, notices, heat=heat)
-
-
-def _heat_of(warmth: HeatWatch, stage: Stage, node: str) -> list[HeatProof]:
-    return prove_heat(warmth.states, node, stage.plant_log(node))
+    outcome = run_to_end(
+        lambda: run_job(
+            description,
+            program,
+            on_progress,
+            record=record,
+            on_told=lambda event: told.append(event.text),
+            on_ready=ready,
+            host=host,
+        ),
+        host.make_loop,
+    )
+    figures = hardware.stop_nodes()
+    prover = Prover(description, hardware.edge_log, outcome, record, both_edges=both_edges, claimed=claimed)
+    heat = [
+        proof
+        for node in description.nodes
+        for proof in prove_heat(warmth.states, node.name, hardware.plant_log(node.name))
+    ]
+    notices = [*map(str, description.not_yet_acting), *description.notes, *told]
+    if (sentence := not_steady(warmth.heaters, heat)) is not None:
+        notices.append(sentence)
+    return report_of(prover, hardware, figures, outcome, notices, heat=heat)
 
 
 @contextmanager
@@ -86,17 +95,13 @@ def _folder(keep: Path | None) -> Iterator[Path]:
         yield Path(folder)
 
 
-def _text(told: Told) -> str:
-    return told.text
-
-
 class Prover:
     """Compares what the nodes' pins did with the plan."""
 
     def __init__(
         self,
         description: MachineDescription,
-        edge_log: Callable[[str], EdgeLog],
+        edge_log: Callable[[str], NodeLog],
         outcome: Outcome,
         record: PlanRecord,
         *,
@@ -122,9 +127,9 @@ class Prover:
         """Prove every stepper."""
         return [self._stepper(stepper) for stepper in self._description.steppers]
 
-    def places(self, stage: Stage) -> list[PlaceProof]:
+    def places(self, hardware: Hardware) -> list[PlaceProof]:
         """Prove where what was homed stands."""
-        return prove_places(self._description, self._record, stage.axes, stage.motors())
+        return prove_places(self._description, self._record, hardware.axes, hardware.motors())
 
     def clocks(self) -> list[ClockProof]:
         """Measure the clocks of the secondary nodes that step."""
@@ -139,11 +144,11 @@ class Prover:
         """Count level changes of pins that nothing of the configuration is on."""
         return sum(self._stray(node.name, log) for node, log in self._with_logs())
 
-    def _with_logs(self) -> Iterator[tuple[Any, EdgeLog]]:
+    def _with_logs(self) -> Iterator[tuple[Any, NodeLog]]:
         for node in self._description.nodes:
             yield node, self._logs[node.name]
 
-    def _stray(self, node: str, log: EdgeLog) -> int:
+    def _stray(self, node: str, log: NodeLog) -> int:
         owned = [self._pins[name] for name in self._claimed[node]]
         counted = sum(len(clock) for clock, _, _ in log.edges(*owned))
         return log.record_count - counted
@@ -185,7 +190,7 @@ class Prover:
             params=function.params,
         )
 
-    def _executed(self, stepper: StepperDescription, log: EdgeLog) -> Iterator[tuple[Any, Any]]:
+    def _executed(self, stepper: StepperDescription, log: NodeLog) -> Iterator[tuple[Any, Any]]:
         sign = np.int8(-1 if stepper.dir_pin.invert else 1)
         begin = self._outcome.maps[stepper.node].ticks(np.array([self._outcome.span[0] - BEFORE_S]))[0]
         for clock, direction in log.steps(
@@ -200,7 +205,7 @@ class Prover:
 
 def report_of(
     prover: Prover,
-    stage: Stage,
+    hardware: Hardware,
     figures: Mapping[str, Mapping[str, Any]],
     outcome: Outcome,
     notices: Sequence[str],
@@ -208,13 +213,13 @@ def report_of(
     heat: Sequence[HeatProof] = (),
 ) -> DemoReport:
     """Return the report, with every stepper proved; the nodes have ended, with these FIGURES."""
-    frames, frames_lost = stage.frames()
+    frames, frames_lost = hardware.frames()
     return DemoReport(
         moves=outcome.moves,
         print_time_s=outcome.print_time_s,
         queue_steps=outcome.queue_steps,
         steppers=tuple(prover.steppers()),
-        places=tuple(prover.places(stage)),
+        places=tuple(prover.places(hardware)),
         heat=tuple(heat),
         clocks=tuple(prover.clocks()),
         stray_edges=prover.stray_edges(),

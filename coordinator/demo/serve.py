@@ -5,9 +5,9 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from coordinator.commands import DEMO_GCODE, DemoOptions
+from coordinator.commands import DEMO_GCODE, DemoOptions, ServeOptions
 from coordinator.demo.stage import Stage
-from coordinator.machine.description import load_machine
+from coordinator.machine.description import MachineDescription, load_machine
 from coordinator.modules.virtual_sdcard import VirtualSdcard
 from coordinator.service.serve import ServeReport, serve
 
@@ -16,15 +16,19 @@ def serve_demo(options: DemoOptions) -> ServeReport:
     """Serve until Ctrl-C or SIGTERM; raises CanductorError."""
     assert options.serve is not None
     description = load_machine(str(options.machine))
-    serving = options.serve
-    has_jobs = any(source.kind is VirtualSdcard for source in description.modules.sources)
     with (
         tempfile.TemporaryDirectory(prefix="canductor-demo-") as folder,
         Stage(description, options, Path(folder)) as stage,
     ):
-        if serving.jobs is None and not has_jobs:
-            serving = dataclasses.replace(serving, jobs=_demo_jobs(Path(folder)))
-        return serve(lambda: stage.description, serving)
+        return serve(lambda: stage.description, with_jobs(options.serve, description, Path(folder)))
+
+
+def with_jobs(options: ServeOptions, description: MachineDescription, folder: Path) -> ServeOptions:
+    """Return OPTIONS with a job folder in FOLDER unless they name one or the machine has its own."""
+    has_jobs = any(source.kind is VirtualSdcard for source in description.modules.sources)
+    if options.jobs is not None or has_jobs:
+        return options
+    return dataclasses.replace(options, jobs=_demo_jobs(folder))
 
 
 def _demo_jobs(folder: Path) -> Path:

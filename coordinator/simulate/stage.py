@@ -1,6 +1,6 @@
 """The stage of a scenario: a simulated world with wires and boards, and the host a machine is run on."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from typing import Any, Final
 
@@ -41,6 +41,7 @@ from nodes.virtual.world import (
     UartPort,
     UartSettings,
     VirtualLoop,
+    WorldNode,
 )
 
 GRID_S: Final = 0.005
@@ -201,7 +202,11 @@ class Stage:
 
     def make_loop(self) -> VirtualLoop:
         """Return a loop in the world's time."""
-        return VirtualLoop(self._world, limit_s=LIMIT_S)
+        return self.host.make_loop()
+
+    def call_at(self, at_ns: int, what: Callable[[], object]) -> None:
+        """Call WHAT at AT_NS of true time, between two events; the program goes on at once after it."""
+        self._world.at(at_ns, what, wakes=True)
 
     def cut(self, node: str) -> None:
         """Cut the wires between NODE and its bus, for good."""
@@ -219,6 +224,18 @@ class Stage:
         return self._world.now_ns
 
     # ------------------------------------------------------------------------------------------ truth
+
+    def node(self, name: str) -> WorldNode:
+        """Return the board NAME."""
+        return self._boards[name].node
+
+    def wires(self) -> list[CanWire | Uart]:
+        """Return all buses and lines."""
+        return list(self._wires.values())
+
+    def port(self, wire: str) -> CanPort | UartPort:
+        """Return the host's port on a bus or line, by the name that the configuration has for it."""
+        return self._ports[wire]
 
     def board(self, node: str) -> BoardTruth:
         """Return what NODE's pins did."""
@@ -306,6 +323,22 @@ class SimHost:
     def __init__(self, world: ScriptedWorld, ports: dict[str, CanPort | UartPort]) -> None:
         self._world = world
         self._ports = ports
+
+    def make_loop(self) -> VirtualLoop:
+        """Return a loop in the world's time; ``signal`` goes to the last one made."""
+        self._loop = VirtualLoop(self._world, limit_s=LIMIT_S)
+        return self._loop
+
+    def signal(self, number: int, after_s: float = 0.0) -> None:
+        """Send signal NUMBER, in AFTER_S of true time, to the program that runs then."""
+        at_ns = self._world.now_ns + max(1, round(after_s * NS))
+        self._world.at(at_ns, lambda: self._deliver(number), wakes=True)
+
+    def _deliver(self, number: int) -> None:
+        if self._loop is not None:
+            self._loop.deliver(number)
+
+    _loop: VirtualLoop | None = None
 
     def now(self) -> HostTime:
         """Return true time."""

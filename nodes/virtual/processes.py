@@ -115,6 +115,10 @@ class ChildProcess:
         self._statistics = line
         return line
 
+    def signal(self, number: int) -> None:
+        """Send signal NUMBER to the process."""
+        self._process.send_signal(number)
+
     def kill(self) -> None:
         """End the process at once, without counters; harmless when it has ended."""
         self._process.kill()

@@ -15,10 +15,10 @@ from nodes.clock import HostTime
 from nodes.errors import CanductorError
 from nodes.node_states import NodeState
 from nodes.seams import LinkIOLike, OnFrame, OnLost
-from tests.coordinator.machine.printer_cfg import PRINTER_CFG, write
 from tests.nodes import virtual_time
 from tests.nodes.machine import uuid
 from tests.nodes.twin_bus import TwinIO, TwinNode
+from tests.stages.printer_text import PRINTER_CFG, write
 
 NODES = f"""\
 [mcu]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coordinator import cli
+from coordinator.commands import DEMO_GCODE, DEMO_MACHINE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,6 +39,24 @@ def test_what_is_no_address(capsys: pytest.CaptureFixture[str], address: str) ->
 def test_without_serve_there_is_no_page(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["demo", "--web", "8080"]) != 0
     assert "give --serve" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--gcode", "FILE", "--ipc", "sock"), "--gcode prints a file and ends; leave it out"),
+        (("--tcp", "127.0.0.1:7125"), "--tokens"),
+        (("--ipc", "sock", "--jobs", "none"), "must be a folder"),
+    ],
+)
+def test_what_a_machine_cannot_be_run_with(
+    capsys: pytest.CaptureFixture[str], words: tuple[str, ...], sentence: str
+) -> None:
+    words = tuple(str(DEMO_GCODE) if word == "FILE" else word for word in words)
+    assert cli.main(["run", str(DEMO_MACHINE), *words]) == cli.EXIT_USAGE
+    err = capsys.readouterr().err
+    assert sentence in err
+    assert err.count("\n") == 1
 
 
 def test_the_library_is_named_when_it_is_missing(

@@ -7,8 +7,8 @@ import pytest
 
 from coordinator.gcode.basic_commands import BESIDE
 from coordinator.ipc.methods import ApiError
-from tests.sim.printer import PRINTING, Printer, gcode
-from tests.system.service_stage import Served
+from tests.stages.printer import PRINTING, Printer, gcode
+from tests.stages.served import Served
 
 SECTIONS = (
     PRINTING

@@ -6,8 +6,8 @@ from pathlib import Path
 from coordinator.demo.heat_proof import HeatWatch
 from coordinator.demo.plant_heat import HeatSettings
 from coordinator.heat.controller import NEAR_K
-from tests.sim.plant_stage import PlantStage
-from tests.system.service_stage import running
+from tests.stages.plant_stage import PlantStage
+from tests.stages.served import running
 
 DEMO = Path(__file__).parents[2] / "config" / "demo"
 

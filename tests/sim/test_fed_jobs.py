@@ -13,7 +13,7 @@ from coordinator.service.fed import LINES_AHEAD_MAX
 from coordinator.service.journal import NAME, Journal
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
-from tests.system.service_stage import Served, running
+from tests.stages.served import Served, running
 
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
 HEAD = ["G28", "G90", "G1 X50 Y50 F6000"]

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.sim.plant_stage import STEP_MM, PlantStage
-from tests.system.service_stage import running
+from tests.stages.plant_stage import STEP_MM, PlantStage
+from tests.stages.served import running
 
 
 def frames(replies: list[str]) -> dict[str, dict[str, float]]:

@@ -6,7 +6,8 @@ import pytest
 
 from coordinator.gcode.errors import GCodeError
 from coordinator.machine.check import check_config
-from tests.sim.test_g28 import MACHINE, PINS, STEPS_PER_MM, Printer
+from tests.stages.printer_text import SWITCHES_CFG
+from tests.stages.switch_printer import PINS, STEPS_PER_MM, SwitchPrinter
 
 AWAY = {"x": -20.0, "y": 15.0, "z": -4.0}
 """Where the axes stand, by the way to their switches."""
@@ -15,11 +16,11 @@ FORCE = "\n[force_move]\nenable_force_move: True\n"
 ENDSTOPS = {"x": 0.0, "y": 250.0, "z": -0.5}
 
 
-def printer(folder: Path, sections: str) -> Printer:
-    return Printer(folder, dict(AWAY), machine=MACHINE + sections)
+def printer(folder: Path, sections: str) -> SwitchPrinter:
+    return SwitchPrinter(folder, dict(AWAY), machine=SWITCHES_CFG + sections)
 
 
-def track(found: Printer, axis: str) -> list[tuple[int, float]]:
+def track(found: SwitchPrinter, axis: str) -> list[tuple[int, float]]:
     """Return every step of AXIS: when it was made, and where the axis was then."""
     step, direction, sign = PINS[axis]
     pins = found.stage.pins("mcu")
@@ -33,13 +34,13 @@ def track(found: Printer, axis: str) -> list[tuple[int, float]]:
     return track
 
 
-def check_places(found: Printer, x: float, y: float, z: float) -> None:
+def check_places(found: SwitchPrinter, x: float, y: float, z: float) -> None:
     for axis, wanted in zip("xyz", (x, y, z), strict=True):
         off = found.true_mm(axis, ENDSTOPS[axis]) - wanted
         assert abs(off) < 1.1 / STEPS_PER_MM[axis], (axis, off)
 
 
-def check_told(found: Printer, x: float, y: float, z: float) -> None:
+def check_told(found: SwitchPrinter, x: float, y: float, z: float) -> None:
     """Make sure that the last answer of M114 is this place, but for the rest of a step."""
     told = [float(word[2:]) for word in found.told[-1].split()[:3]]
     for axis, at, wanted in zip("xyz", told, (x, y, z), strict=True):
@@ -114,7 +115,7 @@ def test_the_lines_are_a_template_that_sees_what_is_asked_and_where_the_head_is_
 
 def test_a_bad_template_is_told_with_its_line(tmp_path: Path) -> None:
     path = tmp_path / "printer.cfg"
-    path.write_text(MACHINE + "[homing_override]\ngcode:\n  G28\n  {% if %}\n")
+    path.write_text(SWITCHES_CFG + "[homing_override]\ngcode:\n  G28\n  {% if %}\n")
     (problem,) = check_config(str(path))
     line = path.read_text().splitlines().index("  {% if %}") + 1
     assert str(problem).startswith(f"{path}:{line}: the template of [homing_override]: ")
@@ -129,7 +130,7 @@ def test_g28_of_other_axes_is_not_overridden(tmp_path: Path) -> None:
 
 def test_two_that_stand_in_for_g28_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "printer.cfg"
-    path.write_text(MACHINE + SAFE + "[homing_override]\ngcode:\n  G28 X\n")
+    path.write_text(SWITCHES_CFG + SAFE + "[homing_override]\ngcode:\n  G28 X\n")
     (problem,) = check_config(str(path))
     assert "both say what G28 does; remove one" in str(problem)
 
@@ -144,7 +145,7 @@ def test_two_that_stand_in_for_g28_are_refused(tmp_path: Path) -> None:
 )
 def test_mistakes_in_safe_z_home_are_told(tmp_path: Path, old: str, new: str, sentence: str) -> None:
     path = tmp_path / "printer.cfg"
-    path.write_text(MACHINE + SAFE.replace(old, new))
+    path.write_text(SWITCHES_CFG + SAFE.replace(old, new))
     (problem,) = check_config(str(path))
     assert sentence in str(problem)
 
@@ -212,8 +213,8 @@ def test_without_leave_there_are_no_such_commands(tmp_path: Path) -> None:
 
 def test_homing_keeps_to_its_own_acceleration(tmp_path: Path) -> None:
     """From rest the way is a·t²/2: after 100 steps of 1/80 mm at 50 mm/s², t = √(2·1.25/50) s."""
-    text = MACHINE.replace("homing_speed: 50\n", "homing_speed: 50\nhoming_accel: 50\n")
-    found = Printer(tmp_path, dict(AWAY), machine=text)
+    text = SWITCHES_CFG.replace("homing_speed: 50\n", "homing_speed: 50\nhoming_accel: 50\n")
+    found = SwitchPrinter(tmp_path, dict(AWAY), machine=text)
     found.run("G28 X")
     x = track(found, "x")
     first, later = x[0][0], x[99][0]

@@ -8,8 +8,8 @@ import pytest
 from coordinator.commands import EXAMPLES
 from coordinator.machine.description import load_machine
 from coordinator.simulate.scenario import NodeSetting
-from tests.sim.plant_stage import STEP_MM, PlantStage
-from tests.system.service_stage import running
+from tests.stages.plant_stage import STEP_MM, PlantStage
+from tests.stages.served import running
 
 MACHINES = ("polar", "rotary_delta")
 

@@ -7,8 +7,8 @@ import pytest
 from coordinator.gcode.program import Program
 from coordinator.ipc.methods import ApiError
 from coordinator.service.forward import read_forward
-from tests.sim.printer import Printer, gcode
-from tests.system.service_stage import Served
+from tests.stages.printer import Printer, gcode
+from tests.stages.served import Served
 
 MACROS = Path("tests/data/macros.cfg").read_text(encoding="utf-8")
 LAYERS = 4

@@ -8,8 +8,8 @@ import pytest
 
 from coordinator.ipc.methods import ApiError
 from coordinator.simulate.safety_rig import MACHINE
-from tests.sim.plant_stage import PlantStage
-from tests.system.service_stage import running
+from tests.stages.plant_stage import PlantStage
+from tests.stages.served import running
 
 
 def test_a_height_is_found_and_the_endstop_corrected(tmp_path: Path) -> None:

@@ -5,33 +5,34 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.errors import GCodeError
-from tests.sim.test_g28 import MACHINE, Printer
+from tests.stages.printer_text import SWITCHES_CFG
+from tests.stages.switch_printer import SwitchPrinter
 
 ENABLE = {"x": "PC0", "y": "PC1", "z": "PC2"}
 STEP = {"x": "PB0", "y": "PB3", "z": "PB6"}
 
 
-def printer(folder: Path) -> Printer:
-    text = MACHINE
+def printer(folder: Path) -> SwitchPrinter:
+    text = SWITCHES_CFG
     for axis, direction in (("x", "PB1"), ("y", "!PB4"), ("z", "PB7")):
         text = text.replace(f"dir_pin: {direction}\n", f"dir_pin: {direction}\nenable_pin: !{ENABLE[axis]}\n")
-    return Printer(folder, {"x": -20.0, "y": 15.0, "z": -4.0}, machine=text)
+    return SwitchPrinter(folder, {"x": -20.0, "y": 15.0, "z": -4.0}, machine=text)
 
 
-def switched(found: Printer, axis: str) -> list[tuple[int, bool]]:
+def switched(found: SwitchPrinter, axis: str) -> list[tuple[int, bool]]:
     """Return when a driver was switched, and whether on; its pin is low then. The first is that at start."""
     edges = found.stage.edges("mcu")
     own = edges[edges["pin"] == found.stage.pins("mcu")[ENABLE[axis]]]
     return [(int(at), not level) for at, level in zip(own["true_ps"], own["level"], strict=True)][1:]
 
 
-def steps(found: Printer, axis: str) -> list[int]:
+def steps(found: SwitchPrinter, axis: str) -> list[int]:
     edges = found.stage.edges("mcu")
     own = edges[(edges["pin"] == found.stage.pins("mcu")[STEP[axis]]) & (edges["level"] == 1)]
     return [int(at) for at in own["true_ps"]]
 
 
-def levels(found: Printer, axis: str) -> list[bool]:
+def levels(found: SwitchPrinter, axis: str) -> list[bool]:
     return [on for _, on in switched(found, axis)]
 
 

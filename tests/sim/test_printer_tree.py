@@ -3,8 +3,8 @@
 import re
 from pathlib import Path
 
-from tests.sim.printer import Printer, gcode
-from tests.system.service_stage import Served
+from tests.stages.printer import Printer, gcode
+from tests.stages.served import Served
 
 SECTIONS = """
 [pause_resume]

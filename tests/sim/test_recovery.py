@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from coordinator.ipc.methods import ApiError
-from tests.sim.printer import PRINTING, Printer, gcode
-from tests.system.service_stage import Served
+from tests.stages.printer import PRINTING, Printer, gcode
+from tests.stages.served import Served
 
 LAYER_MM = 0.3
 LAYERS = 3

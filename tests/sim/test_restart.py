@@ -12,7 +12,7 @@ from coordinator.modules.live import Live
 from coordinator.modules.save_config import SaveConfig
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
-from tests.system.service_stage import Served, running
+from tests.stages.served import Served, running
 
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
 

@@ -19,79 +19,11 @@ from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
 from nodes.errors import CanductorError
 from nodes.virtual.plant_page import Fault, Kind, PlantPage
+from tests.stages.printer_text import SENSORLESS_CFG
 
 if TYPE_CHECKING:
     from coordinator.modules.base import Value
 
-MACHINE = """
-[mcu]
-canbus_uuid: 90a4ae022dfc
-canbus_interface: can0
-
-[mcu toolhead]
-canbus_uuid: 5e1ec7ab1e02
-canbus_interface: can0
-
-[printer]
-kinematics: cartesian
-max_velocity: 250
-max_accel: 3000
-
-[stepper_x]
-step_pin: PB0
-dir_pin: PB1
-enable_pin: !PC0
-microsteps: 16
-rotation_distance: 40
-endstop_pin: tmc2209_stepper_x:virtual_endstop
-position_endstop: 0
-position_max: 250
-homing_speed: 40
-homing_retract_dist: 0
-
-[tmc2209 stepper_x]
-uart_pin: PD0
-uart_address: 0
-diag_pin: PE0
-run_current: 0.8
-hold_current: 0.5
-home_current: 0.55
-driver_SGTHRS: 70
-
-[stepper_y]
-step_pin: PB3
-dir_pin: !PB4
-enable_pin: !PC0
-microsteps: 32
-rotation_distance: 40
-endstop_pin: tmc2209_stepper_y:virtual_endstop
-position_endstop: 250
-position_max: 250
-homing_speed: 40
-homing_retract_dist: 10
-step_pulse_duration: 0
-
-[tmc2209 stepper_y]
-uart_pin: PD0
-uart_address: 1
-diag_pin: ^toolhead:PE1
-run_current: 0.8
-stealthchop_threshold: 30
-interpolate: False
-driver_SGTHRS: 70
-
-[stepper_z]
-step_pin: PB6
-dir_pin: PB7
-microsteps: 16
-rotation_distance: 8
-position_max: 250
-
-[tmc2208 stepper_z]
-uart_pin: PD2
-tx_pin: PD3
-run_current: 0.6
-"""
 EXAMPLE = Path(__file__).parents[2] / "config" / "sensorless.cfg"
 FULL_STEP_MM = 40 / 200
 
@@ -102,7 +34,7 @@ class Printer:
 
     folder: Path
     start: tuple[float, float, float] = (31.0, 214.0, 20.0)
-    machine: str = MACHINE
+    machine: str = SENSORLESS_CFG
     settings: str = ""
     seed: int = 0
     told: list[str] = field(default_factory=list)
@@ -307,6 +239,6 @@ def test_a_driver_that_falls_silent_while_an_axis_homes(tmp_path: Path) -> None:
 
 
 def test_one_that_feels_nothing_at_that_speed(tmp_path: Path) -> None:
-    text = MACHINE.replace("hold_current: 0.5\n", "coolstep_threshold: 41\n")
+    text = SENSORLESS_CFG.replace("hold_current: 0.5\n", "coolstep_threshold: 41\n")
     with pytest.raises(GCodeError, match=r"^part\.gcode:1: .* cannot feel the end of the axis at 40 mm/s"):
         Printer(tmp_path, machine=text).run("G28 X")

@@ -9,7 +9,7 @@ import pytest
 from coordinator.ipc.methods import ApiError
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
-from tests.system.service_stage import Served, running, zigzag
+from tests.stages.served import Served, running, zigzag
 
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
 MOVES = 150

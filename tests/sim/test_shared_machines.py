@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from coordinator.demo.plant_heat import HeatSettings
-from tests.sim.plant_stage import PlantStage
-from tests.system.service_stage import running
+from tests.stages.plant_stage import PlantStage
+from tests.stages.served import running
 
 SHARED = Path(__file__).parents[2] / ".." / "shared" / "data" / "config"
 HOTEND_C, BED_C = 200, 50

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from coordinator.modules.skew_correction import Skew
-from tests.sim.printer import PRINTING, Printer, gcode
-from tests.system.service_stage import Served
+from tests.stages.printer import PRINTING, Printer, gcode
+from tests.stages.served import Served
 
 SKEW = Skew(xy=0.01, xz=-0.002, yz=0.003)
 SECTIONS = PRINTING + "[skew_correction cold]\nxy_skew: 0.01\nxz_skew: -0.002\nyz_skew: 0.003\n"

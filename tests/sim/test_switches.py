@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.sim.printer import PRINTING, Printer, gcode
-from tests.system.service_stage import Served
+from tests.stages.printer import PRINTING, Printer, gcode
+from tests.stages.served import Served
 
 SECTIONS = (
     PRINTING

@@ -15,7 +15,7 @@ from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from coordinator.table.axis_table import AxisTable
 from coordinator.table.store import TableStore
-from tests.system.service_stage import Served, running
+from tests.stages.served import Served, running
 
 SCENARIOS = Path("coordinator/simulate/scenarios")
 POINTS = 32

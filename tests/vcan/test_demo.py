@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from coordinator.demo.proof import EDGE_TOLERANCE_S
-from tests.system.stage import DEMO_CFG, canductor, write_gcode
+from tests.stages.printer_text import DEMO_CFG
+from tests.stages.processes import canductor, write_gcode
 from tests.vcan.kernel import (
     INTERFACE,
     SECOND_INTERFACE,

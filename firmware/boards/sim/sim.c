@@ -382,5 +382,6 @@ void sim_counters(const struct sim_board *board, struct sim_counters *out) {
         .timers_run = node->stats.timers_run,
         .clock_freq = node->config.clock_freq,
         .node_id = board->can.node_id,
+        .is_shutdown = node->shutdown.active,
     };
 }

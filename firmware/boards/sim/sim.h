@@ -74,6 +74,7 @@ void *sim_plant_page(struct sim_board *board, size_t *size);
 struct sim_counters {
     uint32_t rx_overflow_bytes, rx_lost, rx_out_of_order, rx_blocks, tx_dropped, timers_run;
     uint32_t clock_freq, node_id;
+    uint32_t is_shutdown; // 1 from a shutdown to the restart or clear_shutdown that ends it
 };
 void sim_counters(const struct sim_board *board, struct sim_counters *out);
 // cffi: end

@@ -4,6 +4,7 @@ import asyncio
 import math
 from asyncio import base_events
 from collections.abc import Callable, Coroutine
+from functools import partial
 from typing import Any, Final, TypeVar
 
 from nodes.errors import CanductorError
@@ -58,7 +59,7 @@ class _WorldSelector:
 class VirtualLoop(base_events.BaseEventLoop):
     """A loop whose time() is WORLD's; raises Stuck after LIMIT_S of virtual time, or when nothing can happen.
 
-    Functions for an executor run at once and take EXECUTOR_S of virtual time.
+    Functions for an executor run at once and take EXECUTOR_S of virtual time. Signals come from ``deliver``.
     """
 
     def __init__(self, world: World, *, limit_s: float = 3600.0, executor_s: float = 0.0) -> None:
@@ -67,6 +68,7 @@ class VirtualLoop(base_events.BaseEventLoop):
         self._executor_s = executor_s
         self._selector = _WorldSelector(world, limit_s)
         self._clock_resolution = 1e-9
+        self._signal_handlers: dict[int, Callable[[], object]] = {}
 
     def time(self) -> float:
         """Return the world's time in s."""
@@ -85,6 +87,19 @@ class VirtualLoop(base_events.BaseEventLoop):
         else:
             self.call_later(self._executor_s, _finish, future, result, None)
         return future
+
+    def add_signal_handler(self, sig: int, callback: Callable[..., object], *args: Any) -> None:  # type: ignore[override]
+        """Let ``deliver`` of SIG call CALLBACK."""
+        self._signal_handlers[sig] = partial(callback, *args)
+
+    def remove_signal_handler(self, sig: int) -> bool:
+        """Forget the handler of SIG; return whether there was one."""
+        return self._signal_handlers.pop(sig, None) is not None
+
+    def deliver(self, sig: int) -> None:
+        """Call the handler of signal SIG, as the kernel would; without a handler nothing happens."""
+        if sig in self._signal_handlers:
+            self.call_soon(self._signal_handlers[sig])
 
     def _process_events(self, event_list: list[Callable[[], None]]) -> None:
         for handler in event_list:

@@ -6,7 +6,7 @@ import pytest
 
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.state_commands import SAVED_MAX
-from tests.coordinator.modules.stage import ProgramStage
+from tests.stages.program_stage import ProgramStage
 
 
 @pytest.fixture

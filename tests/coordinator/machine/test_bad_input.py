@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.machine.description import ConfigError, load_machine
-from tests.coordinator.machine.printer_cfg import PRINTER_CFG, changed, write
 from tests.profiles import examples
+from tests.stages.printer_text import PRINTER_CFG, changed, write
 
 
 def without(section: str) -> str:

@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.machine.description import ConfigError, load_machine
 from coordinator.machine.read_printer import KINEMATICS
-from tests.coordinator.machine.printer_cfg import changed, example_text, write
+from tests.stages.printer_text import changed, example_text, write
 
 BAD: dict[str, tuple[str, str, str, str]] = {
     "option of another kinematics": (

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from coordinator.machine import config_text
 from coordinator.machine.config_file import ConfigFile, parse_config
 from coordinator.machine.problem import ConfigError, Place
-from tests.coordinator.machine.printer_cfg import write
 from tests.profiles import examples
+from tests.stages.printer_text import write
 
 
 def values(config: ConfigFile) -> dict[str, dict[str, str]]:

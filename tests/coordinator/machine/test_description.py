@@ -8,7 +8,7 @@ from coordinator.machine.description import CanConnection, MachineDescription, U
 from coordinator.machine.options import Option, SectionSpec
 from coordinator.machine.reference import SECTIONS
 from coordinator.machine.well_known import LATER_SECTIONS
-from tests.coordinator.machine.printer_cfg import PRINTER_CFG, changed, write
+from tests.stages.printer_text import PRINTER_CFG, changed, write
 
 SHARED = Path(__file__).parents[3] / ".." / "shared" / "data" / "config"
 

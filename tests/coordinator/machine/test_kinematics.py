@@ -14,7 +14,7 @@ from coordinator.kinematics.rotary_delta import RotaryDelta
 from coordinator.kinematics.winch import Winch
 from coordinator.machine.description import MachineDescription, load_machine
 from coordinator.machine.read_printer import KINEMATICS
-from tests.coordinator.machine.printer_cfg import PRINTER_CFG, changed, example_text, write
+from tests.stages.printer_text import PRINTER_CFG, changed, example_text, write
 
 
 def example(name: str) -> MachineDescription:

@@ -12,8 +12,9 @@ from coordinator.gcode.program import Program
 from coordinator.motion.planner import Planner
 from coordinator.program_machine import machine_state
 from coordinator.streamer import Streamer
-from tests.coordinator.gcode.test_module_commands import events
-from tests.coordinator.modules.heat_stage import HeatMachine
+from tests.coordinator.motion.planner_helpers import drain
+from tests.stages.heat_machine import HeatMachine
+from tests.stages.program_stage import events_of
 
 HEATER = "control: pid\npid_kp: 10\npid_ki: 1\npid_kd: 15\nmin_extrude_temp: 120\n"
 
@@ -68,7 +69,7 @@ def test_a_plan_is_never_cold(tmp_path: Path) -> None:
     described = stage.stage.description
     vocabulary = described.modules.build(described).vocabulary
     work = job(stage, vocabulary, "G28", "M109 S200", "G1 X10 E0.5 F3000")
-    events(work)
+    events_of(work, lambda: drain(work.planner))
     assert work.planner.moves == 1
     work.planner.cold = True
     assert work.planner.cold

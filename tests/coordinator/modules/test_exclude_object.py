@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.errors import GCodeError
-from tests.coordinator.modules.stage import ProgramStage
+from tests.stages.program_stage import ProgramStage
 
 DEFINED = (
     "EXCLUDE_OBJECT_DEFINE NAME=a CENTER=10,20 POLYGON=[[0,0],[20,0],[20,40]]",

@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.gcode.words import WordError
 from nodes.virtual.plant_page import Fault, Kind
-from tests.coordinator.modules.heat_stage import BASE, BED, FAN, HeatMachine
+from tests.stages.heat_machine import BASE, BED, FAN, HeatMachine
 
 PID = "control: pid\npid_kp: 10\npid_ki: 1\npid_kd: 15\n"
 

@@ -9,7 +9,7 @@ import pytest
 from coordinator.machine.check import check_config
 from coordinator.modules.base import Value
 from nodes.errors import CanductorError
-from tests.coordinator.modules.heat_stage import BASE, BED, HOTEND_PID, HeatMachine
+from tests.stages.heat_machine import BASE, BED, HOTEND_PID, HeatMachine
 
 CHIP = "\n[temperature_sensor board]\nsensor_type: temperature_mcu\nsensor_mcu: toolhead\n"
 BOTH = (

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.errors import GCodeError
 from coordinator.machine.problem import ConfigError
 from coordinator.modules.base import Value
 from coordinator.modules.display_status import DisplayStatus
 from coordinator.modules.printer_status import PrinterStatus
-from tests.coordinator.modules.stage import ProgramStage
+from tests.stages.program_stage import ProgramStage
 
 
 def stage(folder: Path, sections: str) -> ProgramStage:
@@ -22,12 +21,6 @@ def stage(folder: Path, sections: str) -> ProgramStage:
 def config_error(folder: Path, sections: str) -> str:
     with pytest.raises(ConfigError) as error:
         ProgramStage(folder, sections)
-    return str(error.value)
-
-
-def program_error(machine: ProgramStage, *lines: str) -> str:
-    with pytest.raises(GCodeError) as error:
-        machine.run(*lines)
     return str(error.value)
 
 
@@ -88,7 +81,7 @@ def test_values_of_variables(tmp_path: Path, value: str, expected: object) -> No
     ],
 )
 def test_mistakes_with_variables(tmp_path: Path, line: str, part: str) -> None:
-    assert part in program_error(stage(tmp_path, PARK), line)
+    assert part in stage(tmp_path, PARK).error(line)
 
 
 def test_macros_see_the_machine_as_it_will_be_when_their_line_comes(tmp_path: Path) -> None:
@@ -265,17 +258,13 @@ gcode:
     )
     path = machine.path
     line = line_of(machine, "G1 X{x}")
-    assert program_error(machine, "G28", "FAR").startswith(
-        f"part.gcode:2: {path}:{line}: [gcode_macro FAR]: "
-    )
+    assert machine.error("G28", "FAR").startswith(f"part.gcode:2: {path}:{line}: [gcode_macro FAR]: ")
     line = line_of(machine, "G4 P")
-    assert program_error(machine, "ZERO X=0") == (
-        f"part.gcode:1: {path}:{line}: [gcode_macro ZERO]: division by zero"
-    )
-    assert program_error(machine, "REFUSE") == "part.gcode:1: no file is named"
-    assert "turns of loops" in program_error(machine, "FOREVER")
+    assert machine.error("ZERO X=0") == (f"part.gcode:1: {path}:{line}: [gcode_macro ZERO]: division by zero")
+    assert machine.error("REFUSE") == "part.gcode:1: no file is named"
+    assert "turns of loops" in machine.error("FOREVER")
     line = line_of(machine, "    AGAIN")
-    assert program_error(machine, "AGAIN") == (
+    assert machine.error("AGAIN") == (
         f"part.gcode:1: {path}:{line}: [gcode_macro AGAIN]: AGAIN calls itself, 30 levels deep; end that"
     )
 
@@ -286,13 +275,13 @@ def test_macros_that_call_one_another_without_end(tmp_path: Path) -> None:
     )
     machine = stage(tmp_path, macros)
     outer, inner = (line_of(machine, f"    M_{name}") for name in "BD")
-    assert program_error(machine, "M_A") == (
+    assert machine.error("M_A") == (
         f"part.gcode:1: {machine.path}:{outer}: [gcode_macro M_A]: …:"
         f" {machine.path}:{inner}: [gcode_macro M_C]:"
         " M_D calls itself by way of M_B and M_C, 30 levels deep; end that"
     )
     many = "".join(f"[gcode_macro N_{n}_]\ngcode:\n    N_{n + 1}_\n" for n in range(40))
-    told = program_error(stage(tmp_path, many), "N_0_")
+    told = stage(tmp_path, many).error("N_0_")
     assert told.endswith("[gcode_macro N_29_]: N_30_ stands in 30 others, one in another; let there be fewer")
     assert told.count("[gcode_macro") == 2
 

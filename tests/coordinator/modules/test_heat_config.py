@@ -9,31 +9,15 @@ from coordinator.gcode.words import WordError, parse
 from coordinator.heat.known_sensors import PT1000, THERMISTORS
 from coordinator.machine.description import ConfigError, load_machine
 from coordinator.modules.heater_sections import ExtruderHeater, HeaterBed
-from coordinator.modules.module_set import ModuleSet
 from coordinator.modules.sensor_module import TemperatureSensor
 from coordinator.modules.temperature_input import TemperatureInput
-from nodes.node_config import NodeConfig
-from nodes.virtual.firmware import firmware_dictionary
-from tests.coordinator.modules.heat_stage import BASE, BED, HOTEND_PID
+from tests.stages.heat_machine import BASE, BED, HOTEND_PID, build, configured
 
 THREE = "\n[thermistor x]\ntemperature1: 25\ntemperature2: 50\ntemperature3: 70\n"
 BLOWER = (
     "\n[temperature_fan x]\npin: PC5\nsensor_type: PT1000\nsensor_pin: PC6\nmin_temp: 0\nmax_temp: 99\n"
     "control: watermark\n"
 )
-
-
-def build(tmp_path: Path, text: str) -> ModuleSet:
-    path = tmp_path / "printer.cfg"
-    path.write_text(BASE + text)
-    machine = load_machine(str(path))
-    return machine.modules.build(machine)
-
-
-def configured(modules: ModuleSet, node: str) -> list[str]:
-    config = NodeConfig(node, firmware_dictionary("canductor-node-mainboard"))
-    modules.configure(config)
-    return [*config.config_commands, *config.init_commands]
 
 
 def error(tmp_path: Path, text: str) -> str:

@@ -7,7 +7,7 @@ import pytest
 
 from nodes.node_states import NodeState
 from nodes.virtual.plant_page import Fault, Kind
-from tests.coordinator.modules.heat_stage import BED, HeatMachine
+from tests.stages.heat_machine import BED, HeatMachine
 
 PID = "control: pid\npid_kp: 10\npid_ki: 1\npid_kd: 15\n"
 LIMIT_S = 1.5

@@ -10,7 +10,7 @@ from coordinator.gcode.words import WordError
 from coordinator.heat.mpc import Mpc
 from coordinator.machine.check import check_config
 from nodes.errors import CanductorError
-from tests.coordinator.modules.heat_stage import BED, FAN, HOTEND_PID, HeatMachine
+from tests.stages.heat_machine import BED, FAN, HOTEND_PID, HeatMachine
 
 MPC = (
     "control: mpc\nheater_power: 40\ncooling_fan: fan\nblock_heat_capacity: 13\nambient_transfer: 0.075\n"

@@ -9,8 +9,7 @@ import pytest
 
 from coordinator.gcode.words import WordError
 from coordinator.machine.check import check_config
-from tests.coordinator.modules.heat_stage import BASE, HOTEND_PID, HeatMachine
-from tests.coordinator.modules.test_heat_config import build, configured
+from tests.stages.heat_machine import BASE, HOTEND_PID, HeatMachine, build, configured
 
 LAMP = "\n[output_pin lamp]\npin: !PC5\nvalue: 1\n"
 SOFT = (

@@ -9,7 +9,7 @@ import pytest
 from coordinator.gcode.words import WordError
 from coordinator.machine.check import check_config
 from coordinator.modules.heaters import Heaters
-from tests.coordinator.modules.heat_stage import BASE, BED, HOTEND_PID, HeatMachine
+from tests.stages.heat_machine import BASE, BED, HOTEND_PID, HeatMachine
 
 FAST = "\n[pid_profile extruder fast]\ncontrol: pid\npid_kp: 30\npid_ki: 2\npid_kd: 120\npid_target: 240\n"
 

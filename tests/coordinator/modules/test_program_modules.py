@@ -7,7 +7,7 @@ import pytest
 from coordinator.gcode.errors import GCodeError
 from coordinator.machine.problem import ConfigError
 from coordinator.modules.save_variables import read_variables
-from tests.coordinator.modules.stage import ProgramStage
+from tests.stages.program_stage import ProgramStage
 
 
 def at(machine: ProgramStage) -> tuple[float, ...]:

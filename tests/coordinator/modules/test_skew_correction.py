@@ -9,8 +9,7 @@ from coordinator.gcode.events import PositionSet, WeightsChange
 from coordinator.machine.description import load_machine
 from coordinator.machine.problem import ConfigError
 from coordinator.modules.skew_correction import Skew, Skews
-from tests.coordinator.modules.stage import ProgramStage
-from tests.coordinator.modules.test_gcode_macro import program_error
+from tests.stages.program_stage import ProgramStage
 
 PROFILE = "[skew_correction cold]\nxy_skew: 0.01\nxz_skew: -0.002\nyz_skew: 0.003\n"
 
@@ -89,7 +88,7 @@ def test_the_head_stays_where_it_is_and_is_called_by_another_place(tmp_path: Pat
     ],
 )
 def test_mistakes_are_told(tmp_path: Path, line: str, sentence: str) -> None:
-    assert sentence in program_error(ProgramStage(tmp_path, PROFILE), line)
+    assert sentence in ProgramStage(tmp_path, PROFILE).error(line)
 
 
 def test_a_machine_that_is_no_sum_of_axes_is_refused(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from coordinator.modules.tmc_driver import TmcDriver
 from coordinator.modules.virtual_endstop import StallEndstop, section_of
 from coordinator.tmc.chips import CHIPS, TMC2209, Chip
 from coordinator.tmc.formulas import currents, largest_current, tstep
-from tests.sim.test_sensorless import MACHINE
+from tests.stages.printer_text import SENSORLESS_CFG
 
 SENSE_OHM_AND_LARGEST_A = (
     *((1.00, 0.23), (0.82, 0.27), (0.75, 0.30), (0.68, 0.33), (0.50, 0.44), (0.47, 0.47)),
@@ -21,7 +21,7 @@ SENSE_OHM_AND_LARGEST_A = (
 
 
 def problems(folder: Path, *changes: tuple[str, str]) -> list[str]:
-    text = MACHINE
+    text = SENSORLESS_CFG
     for old, new in changes:
         assert old in text
         text = text.replace(old, new, 1)
@@ -66,7 +66,7 @@ def test_fields_do_not_overlap_and_addresses_differ(chip: Chip) -> None:
 
 def test_the_endstop_of_a_driver_is_its_diag_pin(tmp_path: Path) -> None:
     path = tmp_path / "printer.cfg"
-    path.write_text(MACHINE)
+    path.write_text(SENSORLESS_CFG)
     machine = load_machine(str(path))
     x, y, _ = machine.rails
     assert x.homing.endstop_pin is not None
@@ -83,7 +83,7 @@ def test_the_endstop_of_a_driver_is_its_diag_pin(tmp_path: Path) -> None:
 def test_options_become_registers(tmp_path: Path) -> None:
     path = tmp_path / "printer.cfg"
     changed = "run_current: 0.8\ncoolstep_threshold: 20\ndriver_SEMIN: 3\ndriver_multistep_filt: False\n"
-    path.write_text(MACHINE.replace("run_current: 0.8\n", changed, 1))
+    path.write_text(SENSORLESS_CFG.replace("run_current: 0.8\n", changed, 1))
     machine = load_machine(str(path))
     driver = machine.modules.build(machine).find("tmc2209 stepper_x", TmcDriver)
     assert driver is not None
@@ -138,7 +138,7 @@ def test_a_further_side_of_an_axis_feels_by_its_own_driver(tmp_path: Path) -> No
     motor = "step_pin: PF0\ndir_pin: PF1\nmicrosteps: 32\nrotation_distance: 40\n"
     side = f"[stepper_y1]\n{motor}endstop_pin: tmc2209_stepper_y1:virtual_endstop\n"
     driver = "[tmc2209 stepper_y1]\nuart_pin: PD0\nuart_address: 2\ndiag_pin: PE2\nrun_current: 0.8\n"
-    path.write_text(MACHINE + side + driver)
+    path.write_text(SENSORLESS_CFG + side + driver)
     machine = load_machine(str(path))
     first, second = (piece.homing for piece in machine.rails[1].pieces)
     assert first.virtual_endstop == "tmc2209_stepper_y:virtual_endstop"

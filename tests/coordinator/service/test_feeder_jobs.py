@@ -11,7 +11,7 @@ from coordinator.modules.pause_resume import PauseResume
 from coordinator.modules.print_stats import PrintStats
 from coordinator.service.feeder import Feeder, Ticket
 from coordinator.service.work import FileWork, LinesWork, MoveWork
-from tests.coordinator.modules.stage import ProgramStage
+from tests.stages.program_stage import ProgramStage
 
 MACROS = """
 [pause_resume]

@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, V
 
 from coordinator.commands import DEMO_MACHINE
 from coordinator.ipc.blocking import BlockingClient
-from tests.system.stage import Command
+from tests.stages.processes import Command
 
 PATIENCE_MS = 30_000
 """Nothing here takes a tenth of it, on a computer that has nothing else to do."""

@@ -12,12 +12,13 @@ from typing import Any
 from coordinator.host import Host, LinuxHost
 from coordinator.ipc.methods import Caller, Registry, Scope
 from coordinator.ipc.state import StateTree
+from coordinator.ipc.uploads import upload_method
 from coordinator.machine.description import MachineDescription, load_machine
 from coordinator.motion.planner import Position
 from coordinator.motion.steps import resting_step
 from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
-from tests.system.stage import Hardware
+from tests.stages.processes import Hardware
 
 LIMIT_S = 60.0
 """Nothing here may take longer; most takes a fifth of it."""
@@ -60,13 +61,14 @@ class Served:
         self.service = MachineService(
             load, host, self.tree, settings, on_line=lambda entry: self.lines.append(str(entry["text"]))
         )
-        self._registry = Registry()
+        self.registry = Registry()
         self._homed: tuple[dict[str, int], Position] = ({}, (0.0,) * 4)
-        add_methods(self.service, self._registry)
+        add_methods(self.service, self.registry)
+        self.registry.add(upload_method(self.jobs))
 
     async def call(self, name: str, /, **params: Any) -> dict[str, Any]:
         """Call a method as the server does."""
-        method = self._registry.methods[name]
+        method = self.registry.methods[name]
         answer = method.call(Caller("a test", Scope.ADMIN), method.check(params))
         if inspect.isawaitable(answer):
             answer = await answer

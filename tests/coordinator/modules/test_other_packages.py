@@ -4,14 +4,19 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.system.stage import ROOT, Command, Hardware, canductor
+from coordinator.commands import EXAMPLES
+from coordinator.gcode.errors import GCodeError
+from coordinator.machine.check import check_config
+from coordinator.modules import registry
+from tests.stages.program_stage import ProgramStage
 
+ROOT = EXAMPLES.parent
 EXAMPLE = ROOT / "docs" / "examples" / "chime"
-CHIME = "\n[chime]\npin: toolhead:PC5\n"
 
 
 @pytest.fixture(scope="module")
@@ -28,45 +33,35 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def package(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Let commands find it."""
-    monkeypatch.setenv("PYTHONPATH", str(installed))
-    return installed
+def known(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """Let the packages on sys.path be looked for again, now and afterwards."""
+    modules = set(sys.modules)
+    registry._others.cache_clear()
+    yield monkeypatch
+    registry._others.cache_clear()
+    for name in set(sys.modules) - modules:
+        if name.startswith(("canductor_chime", "other_bell")):
+            del sys.modules[name]
 
 
-def with_section(machine: Hardware, text: str) -> Path:
-    path = machine.folder / "with.cfg"
-    path.write_text(machine.config.read_text() + text)
-    return path
+def test_its_mistakes_are_reported_like_ours(
+    tmp_path: Path, installed: Path, known: pytest.MonkeyPatch
+) -> None:
+    known.syspath_prepend(str(installed))
+    stage = ProgramStage(tmp_path, "[chime]\npin: toolhead:PC5\n")
+    assert check_config(stage.path) == []
+    with pytest.raises(GCodeError, match=r"part\.gcode:2: LENGTH of CHIME"):
+        stage.run("G28", "CHIME LENGTH=7")
+    config = Path(stage.path)
+    config.write_text(config.read_text().replace("[chime]", "[chmie]"))
+    (problem,) = check_config(stage.path)
+    assert "there is no section [chmie]; did you mean [chime]?" in str(problem)
 
 
-def test_a_program_uses_it_on_nodes(package: Path, machine: Hardware) -> None:
-    config = with_section(machine, CHIME)
-    checked = canductor("config", "check", config)
-    assert (checked.status, checked.stdout.splitlines()[-1]) == (0, f"{config}: no mistakes")
-    with Command("run", config, "--json") as command:
-        command.type("G28", "G1 X5 F6000", "CHIME LENGTH=0.05", "G1 X10", "CHIME", "M400", "M114")
-        command.stdout.wait_for("X:10.00")
-        ended = command.end()
-    assert ended.status == 0, ended
-    assert "unknown command" not in ended.stdout + ended.stderr
-    assert not any(node["is_shutdown"] for node in machine.stop())
-
-
-def test_its_mistakes_are_told_like_ours(package: Path, machine: Hardware) -> None:
-    config = with_section(machine, "\n[chmie]\npin: PC0\n")
-    told = canductor("config", "check", config)
-    assert told.status == 1
-    assert "there is no section [chmie]; did you mean [chime]?" in told.stdout
-    config = with_section(machine, CHIME)
-    gcode = machine.folder / "bad.gcode"
-    gcode.write_text("G28\nCHIME LENGTH=7\n")
-    assert "bad.gcode:2: LENGTH of CHIME" in canductor("run", config, "--gcode", gcode).sentence()
-
-
-def test_its_own_tests_pass(package: Path) -> None:
+def test_its_own_tests_pass(installed: Path) -> None:
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", str(EXAMPLE / "tests")]
-    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    environment = {"PYTHONPATH": str(installed), "PATH": "/usr/bin:/bin"}
+    ended = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "6 passed" in ended.stdout
 
@@ -92,7 +87,7 @@ class Bell(Module):
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_package_that_is_broken_is_named_in_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
+    tmp_path: Path, known: pytest.MonkeyPatch, case: str
 ) -> None:
     source, sentence = BROKEN[case]
     info = tmp_path / "other_bell-1.0.dist-info"
@@ -102,12 +97,8 @@ def test_a_package_that_is_broken_is_named_in_one_sentence(
     if source is not None:
         (tmp_path / "other_bell.py").write_text(source)
     config = tmp_path / "printer.cfg"
-    config.write_text((ROOT / "config" / "cartesian.cfg").read_text() + "\n[bell]\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    told = canductor("config", "check", config)
-    assert told.status == 1
-    assert "Traceback" not in told.stdout + told.stderr
-    problem, count = told.stdout.splitlines()
-    assert count == f"{config}: 1 mistake"
+    config.write_text((EXAMPLES / "cartesian.cfg").read_text() + "\n[bell]\n")
+    known.syspath_prepend(str(tmp_path))
+    (problem,) = map(str, check_config(str(config)))
     assert problem.startswith(f"{config}:{len(config.read_text().splitlines())}: ")
     assert re.search(sentence, problem), problem

@@ -4,18 +4,43 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pytest
+
 from coordinator.gcode.commands import Done
+from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import End, Event, Full, Notice, Progress, Reply, Resting
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.machine.description import load_machine
 from coordinator.motion.planner import Planner
 from coordinator.program_machine import machine_state
-from tests.coordinator.machine.printer_cfg import PRINTER_CFG, write
+from tests.stages.printer_text import PRINTER_CFG, write
 
 if TYPE_CHECKING:
     from coordinator.gcode.machine_state import MachineState
     from coordinator.modules.module_set import ModuleSet
+
+
+def events_of(
+    job: Job, drain: Callable[[], object], perform: Callable[[Resting], None] | None = None
+) -> list[Event]:
+    """Run JOB to its end, with DRAIN after each step; return its events but for progress.
+
+    What is done at standstill succeeds unless PERFORM says what comes of it.
+    """
+    found: list[Event] = []
+    while not (found and isinstance(found[-1], End)):
+        event = job.step()
+        drain()
+        if isinstance(event, Resting):
+            assert job.planner.at_standstill
+            if perform is not None:
+                perform(event)
+            elif event.done is None:
+                event.done = Done()
+        if not isinstance(event, Progress | Full):
+            found.append(event)
+    return found
 
 
 class ProgramStage:
@@ -42,19 +67,8 @@ class ProgramStage:
 
     def events(self, *lines: str, perform: Callable[[Resting], None] | None = None) -> list[Event]:
         """Run a program to its end; what is done at rest succeeds unless PERFORM says what comes of it."""
-        job, found = self.job(*lines), list[Event]()
-        while not (found and isinstance(found[-1], End)):
-            event = job.step()
-            self._drain()
-            if isinstance(event, Resting):
-                assert self.planner.at_standstill
-                if perform is not None:
-                    perform(event)
-                elif event.done is None:
-                    event.done = Done()
-            if not isinstance(event, Progress | Full):
-                found.append(event)
-        return found
+        job = self.job(*lines)
+        return events_of(job, self._drain, perform)
 
     def run(self, *lines: str) -> list[str]:
         """Run a program to its end; return its replies."""
@@ -62,6 +76,12 @@ class ProgramStage:
 
     def notices(self, *lines: str) -> list[str]:
         return [event.text for event in self.events(*lines) if isinstance(event, Notice)]
+
+    def error(self, *lines: str) -> str:
+        """Run a program that has to end in an error; return its sentence."""
+        with pytest.raises(GCodeError) as error:
+            self.run(*lines)
+        return str(error.value)
 
     def _drain(self) -> None:
         while (waiting := self.planner.take()).count:

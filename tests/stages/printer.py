@@ -11,7 +11,7 @@ from coordinator.modules.base import Value
 from coordinator.simulate.scenario import Scenario
 from coordinator.simulate.stage import Stage
 from nodes.virtual.plant_page import Kind
-from tests.system.service_stage import Served, running
+from tests.stages.served import Served, running
 
 CONFIG = Path("config/corexy_toolhead.cfg")
 PRINTING = """

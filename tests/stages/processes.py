@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 import signal
 import subprocess
 import sys
@@ -14,10 +13,10 @@ from pathlib import Path
 from typing import IO, Any, Self
 
 from nodes.virtual.processes import BusProcess, ChildProcess, NodeProcess
+from tests.stages.printer_text import DEMO_CFG, without_endstops
 
 ROOT = Path(__file__).parents[2]
-DEMO_CFG = (ROOT / "config" / "demo" / "machine.cfg").read_text(encoding="utf-8")
-CANDUCTOR = (sys.executable, "-m", "tests.system.patiently")
+CANDUCTOR = (sys.executable, "-m", "coordinator.cli")
 MCU_UUID, TOOLHEAD_UUID = "90a4ae022dfc", "5e1ec7ab1e02"
 END_S = 60.0
 """No command of these tests may take longer; on a busy machine they take a third of it."""
@@ -37,8 +36,18 @@ G1 Z0.6 F600
 """
 """Every stepper of the demo machine moves, both ways where it can; two seconds."""
 
-LONG = "G28\nG1 X200 F360\nG1 X1 Z20 E50 F360\n"
-"""More than half a minute."""
+SLOW = """\
+G28
+G4 P1500
+G1 X5 Y4 F300
+M83
+G1 Z0.6 F300
+G1 E0.5 F300
+"""
+"""Every stepper of the demo machine moves, slowly; the first commands are sent as early as all others."""
+
+LONG = "G28\nG4 P1500\nG1 X200 F180\n"
+"""More than a minute."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +104,12 @@ class _Output:
         with self._news:
             self._news.wait_for(lambda: self._ended or found(), limit_s)
             assert found(), f"{words!r} was not said, but {self._lines}"
+
+    def word_after(self, words: str) -> str:
+        """Return the word that follows WORDS, once a line has them."""
+        self.wait_for(words)
+        with self._news:
+            return next(line for line in self._lines if words in line).partition(words)[2].split()[0]
 
     def all(self) -> str:
         self._reader.join(END_S)
@@ -157,8 +172,7 @@ def write_config(folder: Path, *, name: str = "machine.cfg", **replaced: str) ->
     It has no endstops: nothing around these nodes would press them, and G28 takes the axes as home.
     """
     text = DEMO_CFG.replace("canbus_interface: can0", f"canbus_interface: virtual:{folder / 'bus'}")
-    text = text.replace("/dev/ttyUSB0", str(folder / "zboard.tty"))
-    text = re.sub(r"endstop_pin: .*\n", "", text)
+    text = without_endstops(text, **{"/dev/ttyUSB0": str(folder / "zboard.tty")})
     for old, new in replaced.items():
         assert old in text
         text = text.replace(old, new)

@@ -11,7 +11,7 @@ from coordinator.kinematics.base import Point
 from coordinator.simulate.safety_rig import MACHINE, START
 from coordinator.simulate.scenario import NodeSetting, Scenario
 from coordinator.simulate.stage import Stage
-from tests.system.service_stage import Served
+from tests.stages.served import Served
 
 STEP_MM = 40 / 200 / 16
 

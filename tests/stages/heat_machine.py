@@ -10,11 +10,15 @@ from coordinator.demo.plant_heat import HeatSettings
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, InTime, Reading
 from coordinator.gcode.program import Program
 from coordinator.gcode.words import parse
+from coordinator.machine.description import load_machine
 from coordinator.modules.base import Value
+from coordinator.modules.module_set import ModuleSet
 from coordinator.session import run_job
 from coordinator.simulate.scenario import BusSetting, Scenario
 from coordinator.simulate.stage import Stage
 from coordinator.simulate.values import Range
+from nodes.node_config import NodeConfig
+from nodes.virtual.firmware import firmware_dictionary
 from nodes.virtual.plant_page import Fault, Kind, PlantPage
 
 TOOLHEAD = "[mcu toolhead]\ncanbus_uuid: 0123456789ac\ncanbus_interface: can0\n"
@@ -77,6 +81,21 @@ max_temp: 130
 control: watermark
 """
 FAN = "\n[fan]\npin: toolhead:PB5\ntachometer_pin: toolhead:PB6\n"
+
+
+def build(folder: Path, text: str) -> ModuleSet:
+    """Return the modules of BASE and TEXT, which is written to FOLDER."""
+    path = folder / "printer.cfg"
+    path.write_text(BASE + text)
+    machine = load_machine(str(path))
+    return machine.modules.build(machine)
+
+
+def configured(modules: ModuleSet, node: str) -> list[str]:
+    """Return the commands that configure NODE, a main board, for MODULES."""
+    config = NodeConfig(node, firmware_dictionary("canductor-node-mainboard"))
+    modules.configure(config)
+    return [*config.config_commands, *config.init_commands]
 
 
 class HeatMachine:

@@ -1,0 +1,23 @@
+"""Where a demo that is served has its jobs."""
+
+from pathlib import Path
+
+from coordinator.commands import DEMO_GCODE, DEMO_MACHINE, ServeOptions
+from coordinator.demo.serve import with_jobs
+from coordinator.machine.description import load_machine
+from tests.stages.printer_text import DEMO_CFG, write
+
+
+def test_without_a_folder_the_demos_own_part_is_copied_to_one(tmp_path: Path) -> None:
+    found = with_jobs(ServeOptions(name="demo"), load_machine(str(DEMO_MACHINE)), tmp_path)
+    assert found.jobs is not None
+    assert found.jobs.is_relative_to(tmp_path), "a service writes its journal there"
+    (part,) = found.jobs.iterdir()
+    assert part.read_bytes() == DEMO_GCODE.read_bytes()
+
+
+def test_a_folder_that_is_named_or_configured_is_taken(tmp_path: Path) -> None:
+    named = ServeOptions(name="demo", jobs=tmp_path)
+    assert with_jobs(named, load_machine(str(DEMO_MACHINE)), tmp_path) is named
+    own = load_machine(write(tmp_path, DEMO_CFG + "\n[virtual_sdcard]\npath: jobs\n"))
+    assert with_jobs(ServeOptions(name="demo"), own, tmp_path).jobs is None

@@ -1,0 +1,35 @@
+"""Hosts and nodes that are killed by SIGKILL, and that stand still by SIGSTOP."""
+
+import re
+import signal
+
+import pytest
+
+from coordinator.simulate import safety_real
+from tests.stages.processes import LONG, Command, Hardware, write_gcode
+
+MOVING = "taken as already home"
+"""Printed once the machine is ready and the job has begun."""
+
+
+@pytest.mark.parametrize(
+    ("end", "told"), [(safety_real.killed, ""), (safety_real.stopped, "node toolhead shut down")]
+)
+def test_without_its_host_a_node_switches_its_heater_off(end: safety_real.End, told: str) -> None:
+    row = safety_real.row("a host that ends", end)  # raises when the heater stays on
+    assert row.off_after_s > 0
+    assert told in row.told
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["SIGKILL", "SIGSTOP"])
+def test_without_a_node_all_others_stop(own_machine: Hardware, number: signal.Signals) -> None:
+    gcode = write_gcode(own_machine.folder, LONG)
+    with Command("run", own_machine.config, "--gcode", gcode, "--json") as command:
+        command.stdout.wait_for(MOVING)
+        own_machine.nodes["toolhead"].signal(number)
+        ended = command.end()
+    sentence = ended.sentence()
+    assert sentence.startswith("lost node toolhead: ")
+    assert ended.json == {"ok": False, "error": sentence}
+    assert set(re.findall(r"(\w+) after \d+ ms", sentence)) == {"mcu", "zboard"}
+    assert all(node["is_shutdown"] for node in own_machine.stop("mcu", "zboard"))
