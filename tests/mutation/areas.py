@@ -37,7 +37,10 @@ LEFT_OUT: Final = ("build_*.py", "__init__.py", "_*")
 
 SAFETY: Final = (
     *(f"firmware/core/{name}" for name in ("sched.c", "node.h")),
-    *(f"firmware/objects/{name}.c" for name in ("digital_out", "pwm_out", "timed_output", "trsync", "endstop")),
+    *(
+        f"firmware/objects/{name}.c"
+        for name in ("digital_out", "pwm_out", "timed_output", "trsync", "endstop")
+    ),
     "firmware/net/bus_signals.c",
     "coordinator/heat/verify.py",
     "coordinator/modules/heater.py",

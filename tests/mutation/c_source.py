@@ -13,14 +13,37 @@ _PARSER: Final = Parser(Language(tree_sitter_c.language()))
 _INTEGER: Final = re.compile(rb"(0[xX][0-9a-fA-F]+|\d+)([uUlL]*)")
 _FLOAT: Final = re.compile(rb"(\d*\.\d*(?:[eE][-+]?\d+)?|\d+[eE][-+]?\d+)([fFlL]?)")
 
-OPERATORS: Final = {
-    **{"+": ("-",), "-": ("+",), "*": ("/",), "/": ("*",), "%": ("*",)},
-    **{"<<": (">>",), ">>": ("<<",), "&": ("|",), "|": ("&",), "^": ("&",)},
-    **{"<": ("<=", ">="), "<=": ("<", ">"), ">": (">=", "<="), ">=": (">", "<"), "==": ("!=",), "!=": ("==",)},
-    **{"&&": ("||",), "||": ("&&",)},
-    **{"+=": ("-=",), "-=": ("+=",), "*=": ("/=",), "/=": ("*=",), "%=": ("*=",)},
-    **{"<<=": (">>=",), ">>=": ("<<=",), "&=": ("|=",), "|=": ("&=",), "^=": ("&=",)},
-    **{"++": ("--",), "--": ("++",)},
+OPERATORS: Final[dict[str, tuple[str, ...]]] = {
+    "+": ("-",),
+    "-": ("+",),
+    "*": ("/",),
+    "/": ("*",),
+    "%": ("*",),
+    "<<": (">>",),
+    ">>": ("<<",),
+    "&": ("|",),
+    "|": ("&",),
+    "^": ("&",),
+    "<": ("<=", ">="),
+    "<=": ("<", ">"),
+    ">": (">=", "<="),
+    ">=": (">", "<"),
+    "==": ("!=",),
+    "!=": ("==",),
+    "&&": ("||",),
+    "||": ("&&",),
+    "+=": ("-=",),
+    "-=": ("+=",),
+    "*=": ("/=",),
+    "/=": ("*=",),
+    "%=": ("*=",),
+    "<<=": (">>=",),
+    ">>=": ("<<=",),
+    "&=": ("|=",),
+    "|=": ("&=",),
+    "^=": ("&=",),
+    "++": ("--",),
+    "--": ("++",),
 }
 COMPARISONS: Final = frozenset({"<", "<=", ">", ">=", "==", "!="})
 DELETABLE: Final = frozenset({"expression_statement", "break_statement", "continue_statement"})
@@ -92,7 +115,13 @@ def _literals(node: Node) -> Iterator[Place]:
 
 
 def _conditions(node: Node) -> Iterator[Place]:
-    if node.type not in {"if_statement", "while_statement", "do_statement", "for_statement", "conditional_expression"}:
+    if node.type not in {
+        "if_statement",
+        "while_statement",
+        "do_statement",
+        "for_statement",
+        "conditional_expression",
+    }:
         return
     condition = node.child_by_field_name("condition")
     if condition is None:
@@ -108,9 +137,9 @@ def _conditions(node: Node) -> Iterator[Place]:
 
 
 def _deletions(node: Node) -> Iterator[Place]:
-    if node.type in DELETABLE and not (node.text or b"").startswith(b"(void)"):
-        yield Place(node.start_byte, node.end_byte, (";",))
-    elif node.type == "return_statement" and not _is_last(node):
+    is_void = (node.text or b"").startswith(b"(void)")
+    is_early_return = node.type == "return_statement" and not _is_last(node)
+    if (node.type in DELETABLE and not is_void) or is_early_return:
         yield Place(node.start_byte, node.end_byte, (";",))
 
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import sys
 import time
 from collections import defaultdict
@@ -22,7 +21,7 @@ C_TEST_LIMIT_S: Final = 300.0
 
 
 @dataclass(frozen=True, slots=True)
-class Test:
+class CoveringTest:
     """A test that passes on the unchanged project."""
 
     name: str
@@ -44,17 +43,17 @@ class Test:
 class CoverageMap:
     """Tests by what they execute."""
 
-    by_statement: dict[tuple[str, int], set[Test]] = field(default_factory=lambda: defaultdict(set))
+    by_statement: dict[tuple[str, int], set[CoveringTest]] = field(default_factory=lambda: defaultdict(set))
     """C: by file and number of the statement in it."""
-    by_line: dict[tuple[str, int], set[Test]] = field(default_factory=lambda: defaultdict(set))
+    by_line: dict[tuple[str, int], set[CoveringTest]] = field(default_factory=lambda: defaultdict(set))
     """Python: by file and line."""
-    by_file: dict[str, set[Test]] = field(default_factory=lambda: defaultdict(set))
+    by_file: dict[str, set[CoveringTest]] = field(default_factory=lambda: defaultdict(set))
     imported: set[tuple[str, int]] = field(default_factory=set)
     """Python lines executed when the file is imported."""
     failed: list[str] = field(default_factory=list)
     """Tests that do not pass on the unchanged project; they do not count."""
 
-    def tests(self, mutation: Mutation, source: bytes) -> set[Test]:
+    def tests(self, mutation: Mutation, source: bytes) -> set[CoveringTest]:
         """Return the tests that execute what MUTATION changes in SOURCE, the unchanged file."""
         if mutation.is_c:
             spans = list(enumerate(c_source.statement_spans(source)))
@@ -71,8 +70,8 @@ class CoverageMap:
         return set()
 
 
-def collect(*, quiet: bool = False) -> CoverageMap:
-    """Return the map, with what is out of date measured again."""
+def collect() -> CoverageMap:
+    """Return the map, with what is out of date measured again: minutes when all is."""
     copy = ProjectCopy("instrumented")
     sources = {file: (ROOT / file).read_bytes() for file in files() if file.endswith((".c", ".h"))}
     firsts, total = {}, 0
@@ -82,9 +81,11 @@ def collect(*, quiet: bool = False) -> CoverageMap:
     state = _digest(*(ROOT / file for file in files()))
     stale = [file for file in _test_files() if not _is_current(file, state)]
     if stale:
-        if not quiet:
-            print(f"coverage: measuring {len(stale)} test files", flush=True)
-        instrumented = {file: c_source.with_counters(source, firsts[file]) for file, source in sources.items()}
+        sys.stdout.write(f"coverage: measuring {len(stale)} test files\n")
+        sys.stdout.flush()
+        instrumented = {
+            file: c_source.with_counters(source, firsts[file]) for file, source in sources.items()
+        }
         copy.update(instrumented)
         flags = ("-O1", "-g0", "-w", f"-DMUTATION_HITS={total}")
         copy.prepare(flags, extra_sources=("tests/mutation/hits.c",))
@@ -107,7 +108,11 @@ def _test_files() -> Iterator[str]:
         path = ROOT / place
         for file in sorted(path.rglob("test_*.*")) if path.is_dir() else [path]:
             name = str(file.relative_to(ROOT))
-            if file.suffix in {".py", ".c"} and not name.startswith(REAL_PROCESSES) and "must_trip" not in name:
+            if (
+                file.suffix in {".py", ".c"}
+                and not name.startswith(REAL_PROCESSES)
+                and "must_trip" not in name
+            ):
                 yield name
 
 
@@ -163,7 +168,7 @@ def _read(firsts: dict[str, int]) -> CoverageMap:
         for file, lines in stored["imported"].items():
             found.imported |= {(file, line) for line in lines}
         for node_id, entry in stored["tests"].items():
-            test = Test(node_id, entry["seconds"])
+            test = CoveringTest(node_id, entry["seconds"])
             if not entry["passed"]:
                 found.failed.append(node_id)
                 continue

@@ -60,7 +60,9 @@ def mutations(file: str, source: bytes, places: list[Place]) -> list[Mutation]:
         line_start = source.rfind(b"\n", 0, place.start) + 1
         line_end = source.find(b"\n", place.start)
         source_line = source[line_start : line_end if line_end >= 0 else len(source)].decode().strip()
-        before = sum(p.end <= place.start and p.start >= line_start and _same(source, p, place) for p in places)
+        before = sum(
+            p.end <= place.start and p.start >= line_start and _same(source, p, place) for p in places
+        )
         for replacement in place.replacements:
             if replacement != original:
                 found[place.start, place.end, replacement] = Mutation(

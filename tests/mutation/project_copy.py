@@ -80,7 +80,7 @@ class ProjectCopy:
 
     # ------------------------------------------------------------------------------------------- contents
 
-    def update(self, changed: Mapping[str, bytes] = {}) -> None:  # noqa: B006 - only read
+    def update(self, changed: Mapping[str, bytes] = {}) -> None:
         """Make the copy equal to the project, but for the files CHANGED; what is equal keeps its time."""
         wanted: set[Path] = set()
         for part in COPIED:
@@ -116,10 +116,18 @@ class ProjectCopy:
     # -------------------------------------------------------------------------------------------- running
 
     def run(
-        self, command: Sequence[str], timeout_s: float = 600.0, environment: Mapping[str, str] = {}  # noqa: B006
+        self,
+        command: Sequence[str],
+        timeout_s: float = 600.0,
+        environment: Mapping[str, str] = {},
     ) -> Outcome:
         """Run COMMAND in the copy; ends it and all that it started after TIMEOUT_S."""
-        variables = {**os.environ, "PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1", **environment}
+        variables = {
+            **os.environ,
+            "PYTHONPATH": str(self.folder),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            **environment,
+        }
         process = subprocess.Popen(
             command,
             cwd=self.folder,
@@ -176,7 +184,9 @@ class ProjectCopy:
                 for pattern in line.split()[2:]:
                     sources += sorted(str(p.relative_to(self.folder)) for p in self.folder.glob(pattern))
         output = f"build/ctest/{file.with_suffix('')}"
-        return Program(str(file), output, (*sources, *self._extra), (*_C_TEST_FLAGS, *self._defines), ("-lm",))
+        return Program(
+            str(file), output, (*sources, *self._extra), (*_C_TEST_FLAGS, *self._defines), ("-lm",)
+        )
 
     def build(self, program: Program) -> None:
         """Compile what of PROGRAM is out of date, and link it; raises BuildError."""

@@ -81,15 +81,17 @@ class _Source:
         """Yield annotations, decorators' flags and what only a type checker executes."""
         for node in ast.walk(self.tree):
             roots: list[ast.AST | None] = []
-            if isinstance(node, ast.AnnAssign):
-                roots.append(node.annotation)
-            elif isinstance(node, ast.arg):
+            if isinstance(node, ast.AnnAssign | ast.arg):
                 roots.append(node.annotation)
             elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 roots += [node.returns, *node.decorator_list]
             elif isinstance(node, ast.ClassDef):
                 roots += node.decorator_list
-            elif isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            elif (
+                isinstance(node, ast.If)
+                and isinstance(node.test, ast.Name)
+                and node.test.id == "TYPE_CHECKING"
+            ):
                 roots.append(node)
             elif isinstance(node, ast.Raise):
                 # What an error's sentence says is not mutated; whether it is raised is.
@@ -115,7 +117,9 @@ def find_mutations(file: str, source: bytes) -> list[Mutation]:
 def statement_line(source: bytes, position: int) -> int:
     """Return the first line of the innermost statement of SOURCE that contains the byte at POSITION."""
     parsed = _Source(source)
-    spans = [(*parsed.span(node), node.lineno) for node in ast.walk(parsed.tree) if isinstance(node, ast.stmt)]
+    spans = [
+        (*parsed.span(node), node.lineno) for node in ast.walk(parsed.tree) if isinstance(node, ast.stmt)
+    ]
     return min((end - start, line) for start, end, line in spans if start <= position < end)[1]
 
 
@@ -173,6 +177,8 @@ def _deletions(parsed: _Source, node: ast.AST) -> Iterator[Place]:
     is_attribute = isinstance(node, ast.Assign) and all(isinstance(t, ast.Attribute) for t in node.targets)
     # A string is a docstring; "..." is a body that is empty.
     is_call = isinstance(node, ast.Expr) and not isinstance(node.value, ast.Constant)
-    deletable = isinstance(node, ast.AugAssign | ast.Raise | ast.Break | ast.Continue | ast.Return | ast.Delete)
+    deletable = isinstance(
+        node, ast.AugAssign | ast.Raise | ast.Break | ast.Continue | ast.Return | ast.Delete
+    )
     if is_attribute or is_call or deletable:
         yield Place(*parsed.span(node), ("pass",))

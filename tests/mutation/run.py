@@ -18,12 +18,11 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from queue import SimpleQueue
 from typing import Final
 
 from tests.mutation import areas, c_source, coverage_map, explained, python_source
-from tests.mutation.coverage_map import CoverageMap, Test
+from tests.mutation.coverage_map import CoverageMap, CoveringTest
 from tests.mutation.mutation import Mutation
 from tests.mutation.project_copy import FOLDER, BuildError, ProjectCopy
 
@@ -54,6 +53,12 @@ class Verdict:
     evidence: str = ""
 
 
+def say(*lines: str) -> None:
+    """Print LINES at once."""
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.flush()
+
+
 def find_mutations(file: str) -> list[Mutation]:
     """Return all mutations of FILE."""
     source = (areas.ROOT / file).read_bytes()
@@ -66,21 +71,23 @@ def draw(mutations: Sequence[Mutation], seed: int, sample: int) -> list[Mutation
     return random.Random(seed).sample(list(mutations), min(sample, len(mutations)))
 
 
-def in_order(tests: set[Test], file: str, history: Counter[str], budget_s: float = BUDGET_S) -> list[Test]:
+def in_order(
+    tests: set[CoveringTest], file: str, history: Counter[str], budget_s: float = BUDGET_S
+) -> list[CoveringTest]:
     """Return which of TESTS are run for a mutant of FILE, and in what order; test files stay together.
 
     First those that have killed mutants of FILE, then those in the folder that mirrors it, then the quick.
     """
-    by_file: dict[str, list[Test]] = {}
+    by_file: dict[str, list[CoveringTest]] = {}
     for test in sorted(tests, key=lambda t: (t.seconds, t.name)):
         by_file.setdefault(test.file, []).append(test)
-    room = file.split("/")[0]
+    room = file.split("/", maxsplit=1)[0]
 
     def rank(name: str) -> tuple[int, bool, float]:
         mirrors = name.startswith(f"tests/{room}/")
         return -history[name], not mirrors, sum(test.seconds for test in by_file[name])
 
-    chosen: list[Test] = []
+    chosen: list[CoveringTest] = []
     spent_s = 0.0
     for name in sorted(by_file, key=rank):
         spent_s += FILE_COST_S
@@ -147,7 +154,7 @@ class Runner:
         except BuildError:
             return NO_CODE, ""
 
-    def _run(self, copy: ProjectCopy, mutation: Mutation, chosen: list[Test]) -> tuple[str, str]:
+    def _run(self, copy: ProjectCopy, mutation: Mutation, chosen: list[CoveringTest]) -> tuple[str, str]:
         seconds = sum(test.seconds for test in chosen)
         limit_s = START_S + FACTOR * seconds
         for group in _groups(chosen):
@@ -156,7 +163,16 @@ class Runner:
                 done = copy.run([f"./{program.output}"], limit_s)
                 failed = group[0].name if done.status else ""
             else:
-                command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--no-header"]
+                command = [
+                    sys.executable,
+                    "-m",
+                    "pytest",
+                    "-q",
+                    "-x",
+                    "-p",
+                    "no:cacheprovider",
+                    "--no-header",
+                ]
                 done = copy.run([*command, "--tb=no", *(test.name for test in group)], limit_s)
                 lines = [line for line in done.output.splitlines() if line.startswith(("FAILED", "ERROR"))]
                 failed = lines[0] if lines else f"status {done.status}" if done.status else ""
@@ -170,9 +186,9 @@ class Runner:
         return SURVIVED, f"{len(chosen)} tests, {seconds:.0f} s"
 
 
-def _groups(tests: list[Test]) -> Iterator[list[Test]]:
+def _groups(tests: list[CoveringTest]) -> Iterator[list[CoveringTest]]:
     """Split TESTS where C programs and pytest's alternate: one call of pytest each."""
-    group: list[Test] = []
+    group: list[CoveringTest] = []
     for test in tests:
         if group and (test.is_c or group[0].is_c):
             yield group
@@ -189,13 +205,13 @@ def report(verdicts: Sequence[Verdict]) -> tuple[list[str], bool]:
     judged = counts[KILLED] + counts[EXPLAINED] + len(alive)
     dangerous = [v for v in alive if v.mutation.file in areas.SAFETY]
     lines = [f"{v.outcome}: {v.mutation}" for v in sorted(alive, key=lambda v: v.mutation)]
-    lines += [
-        f"explained: {v.mutation} ({v.evidence})" for v in verdicts if v.outcome == EXPLAINED
-    ]
+    lines += [f"explained: {v.mutation} ({v.evidence})" for v in verdicts if v.outcome == EXPLAINED]
     figures = ", ".join(f"{counts[name]} {name}" for name in (KILLED, SURVIVED, NOT_COVERED, EXPLAINED))
     lines.append(f"{judged} mutants: {figures}; beside them {counts[SAME_CODE]} compile to the same code")
     share = len(alive) / judged if judged else 0.0
-    lines.append(f"{share:.1%} survive unexplained, {len(dangerous)} of them where heat is made or motion stops")
+    lines.append(
+        f"{share:.1%} survive unexplained, {len(dangerous)} of them where heat is made or motion stops"
+    )
     return lines, share <= SURVIVORS_MAX and not dangerous
 
 
@@ -216,19 +232,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         first, last = map(int, options.lines.split(":"))
         mutations = [mutation for mutation in mutations if first <= mutation.line <= last]
     sample = draw(mutations, options.seed, options.sample)
-    print(f"{len(sample)} of {len(mutations)} mutations in {len(chosen)} files, seed {options.seed}", flush=True)
+    say(f"{len(sample)} of {len(mutations)} mutations in {len(chosen)} files, seed {options.seed}")
     if options.list:
-        print(*sample, sep="\n")
+        say(*map(str, sample))
         return 0
     covered = coverage_map.collect()
     if covered.failed:
-        print(f"not counted, since they do not pass: {len(covered.failed)} tests", *covered.failed, sep="\n  ")
+        say(f"not counted, since they do not pass: {len(covered.failed)} tests", *covered.failed)
     verdicts = []
     for verdict in Runner(covered, options.workers).judge_all(sample):
         verdicts.append(verdict)
-        print(f"{verdict.outcome:<12} {verdict.seconds:5.1f} s  {verdict.mutation}  [{verdict.evidence}]", flush=True)
+        say(f"{verdict.outcome:<12} {verdict.seconds:5.1f} s  {verdict.mutation}  [{verdict.evidence}]")
     lines, good = report(verdicts)
-    print(*lines, sep="\n")
+    say(*lines)
     return 0 if good else 1
 
 
