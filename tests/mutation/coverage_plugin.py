@@ -10,7 +10,7 @@ import json
 import os
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -67,7 +67,9 @@ class Collector:
                 self._shared = self._take()
 
     @pytest.hookimpl(wrapper=True)
-    def pytest_runtest_makereport(self, item: pytest.Item) -> Iterator[Any]:
+    def pytest_runtest_makereport(
+        self, item: pytest.Item
+    ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
         report = yield
         if report.outcome != "passed":
             self._tests[item.nodeid]["passed"] = False
@@ -103,8 +105,8 @@ class Collector:
                     if context == first:
                         for test in self._tests:
                             lines[test][file].add(line)
-        for name, test in self._tests.items():
-            test["python"] = {file: sorted(executed) for file, executed in lines[name].items()}
+        for name, entry in self._tests.items():
+            entry["python"] = {file: sorted(executed) for file, executed in lines[name].items()}
         target = self._folder / (self._module.replace("/", "-") + ".json")
         target.write_text(json.dumps({"imported": imported, "tests": self._tests}))
 
@@ -115,7 +117,8 @@ def _counters(script: str) -> npt.NDArray[np.uint8]:
     module = import_module(f"{folder.replace('/', '.')}._{name.removeprefix('build_')}")
     count = int(os.environ["MUTATION_HITS"])
     library = ctypes.CDLL(str(module.__file__))
-    return np.frombuffer((ctypes.c_ubyte * count).in_dll(library, "mutation_hits"), dtype=np.uint8)
+    counters = (ctypes.c_ubyte * count).in_dll(library, "mutation_hits")
+    return np.frombuffer(memoryview(counters), dtype=np.uint8)
 
 
 def pytest_configure(config: pytest.Config) -> None:

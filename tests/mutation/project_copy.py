@@ -221,8 +221,8 @@ class ProjectCopy:
                     kept += [_keep(target) for target in (*objects, self.folder / program.output)]
                 for program, _ in users:
                     self.build(program)
-                objects = {target for program, objects in users for target in objects}
-                yield bool(objects) and all(_same_content(target) for target in objects)
+                changed = {target for _, objects in users for target in objects}
+                yield bool(changed) and all(_same_content(target) for target in changed)
             else:
                 yield _same_code(original, path.read_bytes())
         finally:

@@ -124,6 +124,7 @@ def statement_line(source: bytes, position: int) -> int:
 
 
 def _operators(parsed: _Source, node: ast.AST) -> Iterator[Place]:
+    operator: ast.AST
     operands: list[tuple[ast.AST, int, int]] = []
     if isinstance(node, ast.BinOp):
         operands = [(node.op, parsed.span(node.left)[1], parsed.span(node.right)[0])]
@@ -131,21 +132,24 @@ def _operators(parsed: _Source, node: ast.AST) -> Iterator[Place]:
         for left, right in pairwise(node.values):
             operands.append((node.op, parsed.span(left)[1], parsed.span(right)[0]))
     elif isinstance(node, ast.Compare):
-        for op, left, right in zip(node.ops, [node.left, *node.comparators], node.comparators, strict=False):
-            operands.append((op, parsed.span(left)[1], parsed.span(right)[0]))
+        for operator, left, right in zip(
+            node.ops, [node.left, *node.comparators], node.comparators, strict=False
+        ):
+            operands.append((operator, parsed.span(left)[1], parsed.span(right)[0]))
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not | ast.USub | ast.Invert):
-        start = parsed.span(node)[0]
-        yield Place(start, parsed.span(node.operand)[0], ("",))
+        text = {ast.Not: "not", ast.USub: "-", ast.Invert: "~"}[type(node.op)]
+        if found := parsed.operator(parsed.span(node)[0], parsed.span(node.operand)[0], text):
+            yield Place(*found, ("",))
     elif isinstance(node, ast.AugAssign):
         text, replacements = OPERATORS[type(node.op)]
         found = parsed.operator(parsed.span(node.target)[1], parsed.span(node.value)[0], text + "=")
         if found:
             yield Place(*found, tuple(f"{replacement}=" for replacement in replacements))
-    for op, after, before in operands:
-        if type(op) in OPERATORS:
-            text, replacements = OPERATORS[type(op)]
-            if found := parsed.operator(after, before, text):
-                yield Place(*found, replacements)
+    for operator, after, before in operands:
+        if type(operator) in OPERATORS:
+            text, replacements = OPERATORS[type(operator)]
+            if place := parsed.operator(after, before, text):
+                yield Place(*place, replacements)
 
 
 def _literals(parsed: _Source, node: ast.AST) -> Iterator[Place]:

@@ -111,7 +111,8 @@ async def one_print(client: Client, address: str, folder: Path, number: int) -> 
 async def soak(pid: int, folder: Path, minutes: float) -> tuple[list[Footprint], int]:
     """Print for MINUTES; return a footprint after each print, and how many visits there were."""
     address = f"unix:{folder / 'soak.sock'}"
-    samples, visits, until_s = [], 0, time.monotonic() + minutes * 60
+    samples: list[Footprint] = []
+    visits, until_s = 0, time.monotonic() + minutes * 60
     async with asyncio.timeout(START_S):
         while not (folder / "soak.sock").exists():  # noqa: ASYNC110 - another process makes it
             await asyncio.sleep(LOOK_S)
