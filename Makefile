@@ -8,7 +8,7 @@ NATIVE_INPUTS := $(C_SOURCES) $(wildcard firmware/Makefile firmware/tools/*.py) 
 
 C_WARNINGS := -std=gnu11 -Wall -Wextra -Wconversion -Wno-psabi -Werror -I. -Ifirmware
 
-.PHONY: demo test check pytest live computed ctest fuzz sim mutants vcan bench clean setup format
+.PHONY: demo test check pytest live computed ctest fuzz vcan bench clean setup format
 .DEFAULT_GOAL := test
 
 setup: $(VENV)/.installed
@@ -67,14 +67,7 @@ FUZZ_SECONDS ?= 600
 fuzz: setup
 	$(MAKE) -C tests/fuzz run SECONDS=$(FUZZ_SECONDS)
 
-# Whole machines in virtual time, each seed with other faults (docs/simulation.md).
-SIM_SEEDS ?= 2000
-sim: setup
-	$(BIN)/canductor simulate --seeds 0:$(SIM_SEEDS)
-
-# Does the simulation find anything? Plants bugs and looks.
-mutants: setup
-	$(BIN)/python tests/sim/mutants.py
+include tests/thorough.mk
 
 # SocketCAN in Linux kernels booted as processes: two, since one has one CPU. Builds nothing inside.
 vcan: setup

@@ -1,0 +1,29 @@
+# What takes too long for `make test`. Each part can run alone; `make thorough` runs all and prints one table.
+SIM_SEEDS ?= 2000
+SEED ?= 1
+SAMPLE ?= 300
+AREA ?=
+MINUTES ?= 15
+STEPS ?=
+
+.PHONY: thorough sim mutants mutation soak
+
+thorough: setup
+	$(BIN)/python -m tests.thorough.run --seeds $(SIM_SEEDS) --seed $(SEED) --sample $(SAMPLE) \
+	  --fuzz-seconds $(FUZZ_SECONDS) --soak-minutes $(MINUTES) $(STEPS)
+
+# Whole machines in virtual time, each seed with other faults (docs/simulation.md).
+sim: setup
+	$(BIN)/canductor simulate --seeds 0:$(SIM_SEEDS)
+
+# Do the simulation and the tests find anything? Plants bugs and looks (tests/sim/mutants.toml).
+mutants: setup
+	$(BIN)/python tests/sim/mutants.py
+
+# Changes one operator, literal, condition or statement at a time; survivors are listed (tests/mutation).
+mutation: setup
+	$(BIN)/python -m tests.mutation.run --seed $(SEED) --sample $(SAMPLE) $(if $(AREA),--area $(AREA))
+
+# A service prints on virtual nodes while clients come and go: memory, descriptors, threads must not grow.
+soak: setup
+	$(BIN)/python -m tests.soak.run --minutes $(MINUTES)
