@@ -10,7 +10,7 @@ from typing import Final
 
 from canbus_tools.frame import Frame
 from canbus_tools.open_bus import BusOptions
-from canbus_tools.talk import NodeTalk
+from canbus_tools.talk import BusTalk, NodeTalk
 from coordinator.simulate.script import ScriptedWorld
 from nodes.assign import (
     ADMIN_ID,
@@ -21,6 +21,7 @@ from nodes.assign import (
     SET_NODEID_BOOTLOADER,
     Uuid,
 )
+from nodes.dictionary_cache import DictionaryCache
 from nodes.link import LinkSettings
 from nodes.message_format import Message
 from nodes.transport import CanFrame
@@ -46,6 +47,14 @@ TWIN: Final = Uuid.parse("777777777777")
 BOOT: Final = Uuid.parse("b007b007b007")
 """In the bootloader Katapult, waits for an id."""
 MAIN_ID, TOOL_ID = 4, 5
+
+
+QUESTIONS: Final = (
+    ("get_uptime", "uptime"),
+    ("get_canbus_id", "canbus_id"),
+    ("get_canbus_status", "canbus_status"),
+)
+"""What the host of ``conversation`` asks."""
 
 
 class CanStage:
@@ -244,6 +253,26 @@ def six_nodes(stage: CanStage) -> SixNodes:
     with stage.user() as host:
         shut_down(host, TOOL_ID, TOOLHEAD)
     return nodes
+
+
+@lru_cache
+def conversation() -> tuple[Frame, ...]:
+    """Return the frames of a host that reads the dictionary of MAIN and asks it a few questions."""
+    stage = CanStage()
+    stage.add_node(MAIN, MAIN_ID)
+
+    async def talk() -> None:
+        async with (
+            BusTalk.open(stage.computer, stage.options, DictionaryCache()) as bus,
+            bus.node(MAIN_ID) as node,
+        ):
+            for question, answer in QUESTIONS:
+                await node.ask(question, answer)
+                await node.drained()
+
+    with stage.computer.listen(stage.options) as listener:
+        stage.computer.run(talk())
+        return tuple(listener.take())
 
 
 def set_nodeid(host: WireUser, uuid: Uuid, nodeid: int, *, times: int = 1) -> None:
