@@ -1,7 +1,6 @@
 """``canductor can doctor`` names faults that are planted on a bus."""
 
 from functools import partial
-from typing import Any
 
 import pytest
 

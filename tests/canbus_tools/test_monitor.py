@@ -57,9 +57,9 @@ def test_json_and_filters(stage: CanStage, can_tool: Command) -> None:
     options = ("--dictionary", DICTIONARY, "--node", "4", "--direction", "from", "--message", "uptime")
     said = can_tool("monitor", "--json", "--duration", "2", *options)
     *lines, last = said.objects
-    assert [(s["name"], s["nodeid"], s["direction"]) for s in lines] == [("uptime", 4, "from")]
+    assert [(s["name"], s["nodeid"], s["direction"]) for s in lines] == [("uptime", 4, "from")] * 2
     assert last["ok"]
-    assert last["lines"] == 1
+    assert last["lines"] == 2
     assert (last["frames"], last["dropped_frames"]) == (len(conversation()), 0)
     assert (last["nodes"][0]["dictionary"], last["nodes"][0]["uuid"]) == ("given", str(MAIN))
 

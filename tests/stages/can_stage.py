@@ -1,4 +1,4 @@
-"""A CAN bus in virtual time: nodes that run the real firmware, other programs, and the computer of the tools."""
+"""A CAN bus in virtual time: nodes with the real firmware, other programs, and the computer of the tools."""
 
 import signal
 import zlib
@@ -28,7 +28,7 @@ from nodes.transport import CanFrame
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary, firmware_path
 from nodes.virtual.world import NodeSettings, WorldNode
 from tests import wire_twin
-from tests.stages.simulated_computer import SimulatedComputer, WireUser
+from tests.stages.simulated_computer import SimulatedComputer, WireListener, WireUser
 
 CHANNEL: Final = "can0"
 BOOT_S: Final = 0.01
@@ -53,8 +53,9 @@ QUESTIONS: Final = (
     ("get_uptime", "uptime"),
     ("get_canbus_id", "canbus_id"),
     ("get_canbus_status", "canbus_status"),
+    ("get_uptime", "uptime"),
 )
-"""What the host of ``conversation`` asks."""
+"""What the host of ``conversation`` asks, with the answers' names."""
 
 
 class CanStage:
@@ -256,23 +257,32 @@ def six_nodes(stage: CanStage) -> SixNodes:
 
 
 @lru_cache
-def conversation() -> tuple[Frame, ...]:
-    """Return the frames of a host that reads the dictionary of MAIN and asks it a few questions."""
+def conversation_parts() -> tuple[tuple[Frame, ...], ...]:
+    """Return what a host and MAIN say: first its dictionary is read, then come the QUESTIONS, one each."""
     stage = CanStage()
     stage.add_node(MAIN, MAIN_ID)
+    parts = []
 
-    async def talk() -> None:
+    async def talk(listener: WireListener) -> None:
         async with (
             BusTalk.open(stage.computer, stage.options, DictionaryCache()) as bus,
             bus.node(MAIN_ID) as node,
         ):
+            parts.append(tuple(listener.take()))
             for question, answer in QUESTIONS:
                 await node.ask(question, answer)
                 await node.drained()
+                await bus.wait(BOOT_S)  # for the answer's acknowledgement
+                parts.append(tuple(listener.take()))
 
     with stage.computer.listen(stage.options) as listener:
-        stage.computer.run(talk())
-        return tuple(listener.take())
+        stage.computer.run(talk(listener))
+    return tuple(parts)
+
+
+def conversation() -> list[Frame]:
+    """Return all frames of ``conversation_parts``."""
+    return [frame for part in conversation_parts() for frame in part]
 
 
 def set_nodeid(host: WireUser, uuid: Uuid, nodeid: int, *, times: int = 1) -> None:

@@ -188,13 +188,17 @@ class WireListener:
             return
         if not self._computer.hears(self._options):
             return
-        if len(self._frames) >= self._limit:
-            self._frames.popleft()
-            self.dropped += 1
         kind = FrameKind.ERROR if is_error else FrameKind.DATA
         time_s = UNIX_AHEAD_S + frame.received_ns * 1e-9
         can_id = frame.can_id & ~_ERROR_FLAG
-        self._frames.append(Frame(time_s, can_id, frame.data, kind, self._options.short_name))
+        self.put(Frame(time_s, can_id, frame.data, kind, self._options.short_name))
+
+    def put(self, frame: Frame) -> None:
+        """Take FRAME as if it had been received."""
+        if len(self._frames) >= self._limit:
+            self._frames.popleft()
+            self.dropped += 1
+        self._frames.append(frame)
 
     def _ended(self, sentence: str) -> None:
         self._cause = sentence
