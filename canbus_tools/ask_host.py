@@ -23,9 +23,12 @@ _REQUESTS: Final = (
 )
 
 
-async def ask_hosts(options: BusOptions) -> dict[int, Facts]:
-    """Return what this user's coordinators say of their nodes on a bus, by id; nothing where none runs."""
-    answers = await asyncio.gather(*(_ask(path) for path in host_sockets()))
+async def ask_hosts(options: BusOptions, timeout_s: float = TIMEOUT_S) -> dict[int, Facts]:
+    """Return what this user's coordinators say of their nodes on a bus, by id; nothing where none runs.
+
+    One that says nothing is waited for TIMEOUT_S.
+    """
+    answers = await asyncio.gather(*(_ask(path, timeout_s) for path in host_sockets()))
     bus = _bus_name(options)
     told: dict[int, Facts] = {}
     for node in (node for nodes in answers for node in nodes if isinstance(node, Mapping)):
@@ -43,10 +46,10 @@ def _bus_name(options: BusOptions) -> str:
     return f"{interface}:{options.channel}"
 
 
-async def _ask(path: Path) -> list[object]:
+async def _ask(path: Path, timeout_s: float) -> list[object]:
     """Return the nodes that the coordinator at PATH lists; none when there is no sense to be had from it."""
     try:
-        async with asyncio.timeout(TIMEOUT_S):
+        async with asyncio.timeout(timeout_s):
             reader, writer = await asyncio.open_unix_connection(path, limit=LINE_MAX)
             try:
                 writer.write(b"".join(json.dumps(request).encode() + b"\n" for request in _REQUESTS))

@@ -1,11 +1,11 @@
 """``canductor can assign UUID NODEID``: gives a node that waits its id, and makes sure that it has it."""
 
 import argparse
-import asyncio
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Final
 
+from canbus_tools.computer import Computer
 from canbus_tools.discovery import declare_listen, listen_option, take_census, where
 from canbus_tools.interview import Facts, interview
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
@@ -27,13 +27,13 @@ def declare(command: argparse.ArgumentParser) -> None:
     declare_listen(command)
 
 
-def make_job(given: argparse.Namespace) -> Callable[[], "AssignReport"]:
+def make_job(given: argparse.Namespace) -> Callable[[Computer], "AssignReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
     uuid = uuid_option("UUID", given.uuid)
     nodeid = whole("NODEID", given.nodeid, FIRST_NODEID, LAST_NODEID)
     listen_s = listen_option(given)
-    return lambda: assign(bus, uuid, nodeid, listen_s=listen_s)
+    return lambda computer: assign(computer, bus, uuid, nodeid, listen_s=listen_s)
 
 
 def uuid_option(option: str, text: str) -> Uuid:
@@ -46,17 +46,19 @@ def uuid_option(option: str, text: str) -> Uuid:
         ) from None
 
 
-def assign(options: BusOptions, uuid: Uuid, nodeid: int, *, listen_s: float = LISTEN_S) -> "AssignReport":
+def assign(
+    computer: Computer, options: BusOptions, uuid: Uuid, nodeid: int, *, listen_s: float = LISTEN_S
+) -> "AssignReport":
     """Give UUID the id NODEID; raises CanductorError with what to do.
 
     LISTEN_S: how long to listen for other hosts first.
     """
 
     async def run() -> AssignReport:
-        async with BusTalk.open(options) as bus:
+        async with BusTalk.open(computer, options) as bus:
             return await _assign(bus, uuid, nodeid, listen_s)
 
-    return asyncio.run(run())
+    return computer.run(run())
 
 
 @record(kw_only=True)

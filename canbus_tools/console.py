@@ -1,7 +1,6 @@
 """``canductor console``: talk to one node in its own words, at a prompt or by a script."""
 
 import argparse
-import asyncio
 import contextlib
 import os
 import re
@@ -9,6 +8,7 @@ import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
 
+from canbus_tools.computer import Computer
 from canbus_tools.console_session import Quit, Session
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.survey import survey
@@ -52,7 +52,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     add("--script", type=Path, metavar="FILE", help="run the lines of a file; an error ends it")
 
 
-def make_job(given: argparse.Namespace) -> Callable[[], "ConsoleReport"]:
+def make_job(given: argparse.Namespace) -> Callable[[Computer], "ConsoleReport"]:
     """Return the job; raises UsageError, CanductorError for a script that is not there."""
     if (given.node is None) == (given.uart is None):
         raise UsageError("console takes either --node, on a CAN bus, or --uart")
@@ -78,12 +78,12 @@ def make_job(given: argparse.Namespace) -> Callable[[], "ConsoleReport"]:
         script=existing_file(given.script),
         as_json=given.json,
     )
-    return lambda: run_console(options)
+    return lambda computer: run_console(computer, options)
 
 
-def run_console(options: ConsoleOptions) -> "ConsoleReport":
+def run_console(computer: Computer, options: ConsoleOptions) -> "ConsoleReport":
     """Run the session to its end; raises CanductorError, with the line of a script that failed."""
-    return asyncio.run(_run(options))
+    return computer.run(_run(computer, options))
 
 
 @record
@@ -110,8 +110,8 @@ class ConsoleReport:
         return ""
 
 
-async def _run(options: ConsoleOptions) -> ConsoleReport:
-    async with _open(options) as talk:
+async def _run(computer: Computer, options: ConsoleOptions) -> ConsoleReport:
+    async with _open(computer, options) as talk:
         session = Session(talk, _say, as_json=options.as_json)
         try:
             if options.commands or options.script or not sys.stdin.isatty():
@@ -174,13 +174,13 @@ def _history_file() -> Path:
 
 
 @contextlib.asynccontextmanager
-async def _open(options: ConsoleOptions) -> AsyncIterator[NodeTalk]:
+async def _open(computer: Computer, options: ConsoleOptions) -> AsyncIterator[NodeTalk]:
     if options.bus is None:
         assert options.uart is not None
-        async with open_uart_talk(options.uart, options.baud) as talk:
+        async with open_uart_talk(computer, options.uart, options.baud) as talk:
             yield talk
         return
-    async with BusTalk.open(options.bus) as bus:
+    async with BusTalk.open(computer, options.bus) as bus:
         nodeid = await _nodeid(bus, options.node)
         if not options.force:
             await refuse_if_in_use(bus, nodeid)

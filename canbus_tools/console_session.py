@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import time
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Final
@@ -158,7 +157,7 @@ class Session:
         ticks = answer.message.integer("clock")
         if "high" in answer.message.params:
             ticks += answer.message.integer("high") << 32
-        return ticks + (time.monotonic_ns() - read_ns) * freq_hz // _PER_S
+        return ticks + (round(asyncio.get_running_loop().time() * _PER_S) - read_ns) * freq_hz // _PER_S
 
     # ---------------------------------------------------------------------------------------- own commands
 

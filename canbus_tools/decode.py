@@ -62,7 +62,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     add("--summary", action="store_true", help="show no lines, only each node's counters")
 
 
-def make_job(given: argparse.Namespace) -> "Callable[[], DecodeReport]":
+def make_job(given: argparse.Namespace) -> "Callable[[object], DecodeReport]":
     """Check what was given and return the job."""
     files = [Path(file) for file in given.files]
     for file in files:
@@ -76,7 +76,7 @@ def make_job(given: argparse.Namespace) -> "Callable[[], DecodeReport]":
         lines=not given.summary,
         as_json=given.json,
     )
-    return lambda: job.run(files)
+    return lambda _: job.run(files)
 
 
 def _moment(option: str, text: str | None) -> Moment | None:

@@ -77,7 +77,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     )
 
 
-def make_job(given: argparse.Namespace) -> Callable[[], "DissectorReport"]:
+def make_job(given: argparse.Namespace) -> Callable[[object], "DissectorReport"]:
     """Check what was given; raises UsageError."""
     paths: dict[int | str, Path] = {}
     for text in given.dictionary:
@@ -92,7 +92,7 @@ def make_job(given: argparse.Namespace) -> Callable[[], "DissectorReport"]:
     if given.json and given.output is None:
         raise UsageError("--json needs --output, as both would go to standard output")
     options = DissectorOptions(output=given.output, dictionaries=paths, json=given.json)
-    return lambda: write_dissector(options)
+    return lambda _: write_dissector(options)
 
 
 def write_dissector(options: DissectorOptions) -> "DissectorReport":

@@ -1,17 +1,17 @@
 """``canductor can doctor``: checks a bus, and explains what is wrong and what to do."""
 
 import argparse
-import asyncio
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from canbus_tools.computer import Computer
 from canbus_tools.discovery import where
 from canbus_tools.doctor_checks.facts import InterfaceFacts, NodeFacts, Place, TrafficFacts
 from canbus_tools.doctor_checks.finding import Finding, Severity, note, problem
 from canbus_tools.doctor_checks.interface import check_link, check_presence
 from canbus_tools.doctor_checks.population import check_nodes
 from canbus_tools.doctor_checks.traffic import check_traffic
-from canbus_tools.doctor_facts import Listener, ask_nodes, fill_queue, read_interface, try_bitrates
+from canbus_tools.doctor_facts import BusListener, ask_nodes, fill_queue, read_interface, try_bitrates
 from canbus_tools.link_facts import LinkFacts, read_link
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.table import count, paragraph
@@ -34,17 +34,24 @@ def declare(command: argparse.ArgumentParser) -> None:
     add("--try-bitrates", action="store_true", help="without a node: listen at other bit rates (listen-only)")
 
 
-def make_job(given: argparse.Namespace) -> Callable[[], "Diagnosis"]:
+def make_job(given: argparse.Namespace) -> Callable[[Computer], "Diagnosis"]:
     """Check what was given; raises UsageError."""
     listen_s = number("--listen", given.listen, LISTEN_S_MIN, LISTEN_S_MAX, "s")
     options = bus_options(given)
     if given.try_bitrates and given.quiet_bus:
         raise UsageError("--try-bitrates is for a bus without nodes, which --quiet-bus does not look for")
-    return lambda: examine(options, listen_s, quiet=given.quiet_bus, try_others=given.try_bitrates)
+    return lambda computer: examine(
+        computer, options, listen_s, quiet=given.quiet_bus, try_others=given.try_bitrates
+    )
 
 
 def examine(
-    options: BusOptions, listen_s: float, *, quiet: bool = False, try_others: bool = False
+    computer: Computer,
+    options: BusOptions,
+    listen_s: float,
+    *,
+    quiet: bool = False,
+    try_others: bool = False,
 ) -> "Diagnosis":
     """Gather facts and judge them; what cannot be found out is a finding, too."""
     interface: InterfaceFacts | None = None
@@ -61,7 +68,7 @@ def examine(
             return Diagnosis(place.name, tuple(findings), tuple(done))
         findings += check_link(interface)
     try:
-        traffic, nodes = _use_bus(options, place, listen_s, quiet=quiet, try_others=try_others)
+        traffic, nodes = _use_bus(computer, options, place, listen_s, quiet=quiet, try_others=try_others)
     except CanductorError as error:
         findings.append(_unusable(str(error), place))
         return Diagnosis(place.name, tuple(findings), tuple(done))
@@ -85,7 +92,13 @@ def examine(
 
 
 def _use_bus(
-    options: BusOptions, place: Place, listen_s: float, *, quiet: bool, try_others: bool
+    computer: Computer,
+    options: BusOptions,
+    place: Place,
+    listen_s: float,
+    *,
+    quiet: bool,
+    try_others: bool,
 ) -> tuple[TrafficFacts, NodeFacts | None]:
     opened = options
     if options.interface in SYSTEMS_BITRATE:
@@ -93,18 +106,18 @@ def _use_bus(
     nodes: NodeFacts | None = None
     queue_full = False
     before = _counters(options)
-    with Listener(opened, place.bitrate) as listener:
+    with BusListener(computer, opened, place.bitrate) as listener:
         listener.wait(listen_s)
         listener.end_of_calm()
         if place.socketcan and not quiet:
             queue_full = fill_queue(opened)
             # Error reports of what we send are the most telling; others have none, or but one handle.
-            nodes = asyncio.run(ask_nodes(opened))
+            nodes = computer.run(ask_nodes(computer, opened))
     if not place.socketcan and not quiet:
-        nodes = asyncio.run(ask_nodes(opened))
+        nodes = computer.run(ask_nodes(computer, opened))
     traffic = listener.facts(before, _counters(options), queue_full=queue_full)
     if nodes is not None and not nodes.survey.entries and try_others and not place.socketcan:
-        nodes = NodeFacts(survey=nodes.survey, heard_at=try_bitrates(options, listen_s))
+        nodes = NodeFacts(survey=nodes.survey, heard_at=try_bitrates(computer, options, listen_s))
     return traffic, nodes
 
 

@@ -3,15 +3,16 @@
 import asyncio
 import errno
 import os
-import threading
-import time
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
+from types import TracebackType
 from typing import Final, Self
 
 import can
 
 from canbus_tools.bus_load import BusLoad, LoadMeter
+from canbus_tools.computer import Computer, now_s
 from canbus_tools.decoder import BusDecoder
 from canbus_tools.doctor_checks.facts import (
     AdapterFacts,
@@ -40,7 +41,6 @@ LATE_S: Final = 0.2
 TRIED_BITRATES: Final = (1_000_000, 500_000, 250_000, 125_000)
 _SYS_NET: Final = Path("/sys/class/net")
 _ARPHRD_CAN: Final = "280"
-_RECV_S: Final = 0.1
 _BURST: Final = 16
 NO_COMMAND: Final = 0xFF
 """An admin command that does not exist: nodes ignore it, and no late answer disturbs what is asked next."""
@@ -85,75 +85,64 @@ def _text(path: Path) -> str:
 # -------------------------------------------------------------------------------------------------- listening
 
 
-class Listener:
-    """Listens on a bus of its own handle, in a thread, from ``with`` on; ``facts`` tells what it heard."""
+class BusListener:
+    """Listens on a bus of its own handle while ``wait`` waits; ``facts`` returns what it heard."""
 
-    def __init__(self, options: BusOptions, bitrate: int | None) -> None:
-        self._bus = open_bus(options)
+    def __init__(self, computer: Computer, options: BusOptions, bitrate: int | None) -> None:
+        self._computer = computer
+        self._opened = computer.listen(options)
         self._meter = None if bitrate is None else LoadMeter(bitrate)
         self._decoder = BusDecoder()
-        self._lock = threading.Lock()
         self._frames = 0
         self._calm: tuple[BusLoad | None, int, tuple[WayFacts, ...]] | None = None
         self._errors: Counter[str] = Counter()
-        self._end = threading.Event()
-        self._failure: can.CanError | None = None
-        self._thread = threading.Thread(
-            target=self._run, name=f"doctor listens on {options.name}", daemon=True
-        )
         self._started_s = self._ended_s = 0.0
 
     def __enter__(self) -> Self:
-        self._started_s = time.time()
+        self._bus = self._opened.__enter__()
+        self._started_s = now_s(self._computer)
         if self._meter is not None:
             self._meter.begin(self._started_s)
-        self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join()
-        self._bus.shutdown()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if error is None:
+                self._take(self._bus.take())
+        finally:
+            self._opened.__exit__(kind, error, trace)
 
     def wait(self, seconds: float) -> None:
-        """Let it listen; raises CanductorError when the bus ends."""
-        self._thread.join(seconds)
-        if self._failure is not None:
-            raise CanductorError(f"the bus failed: {' '.join(str(self._failure).split())}") from self._failure
+        """Listen for SECONDS; raises CanductorError when the bus ends."""
+        end_s = now_s(self._computer) + seconds
+        while (left_s := end_s - now_s(self._computer)) > 0:
+            self._take(self._bus.take(left_s))
 
     def end_of_calm(self) -> None:
         """From now on this program sends, too: only answers and error reports are still taken.
 
         The others are not even read, where the kernel filters: that would slow down what sends and asks.
         """
-        self._bus.set_filters(
-            [can.typechecking.CanFilter(can_id=ADMIN_RESPONSE_ID, can_mask=0x7FF, extended=False)]
-        )
-        with self._lock:
-            self._calm = self._figures()
+        self._bus.only(ADMIN_RESPONSE_ID)
+        self._calm = self._figures()
 
     def _figures(self) -> tuple[BusLoad | None, int, tuple[WayFacts, ...]]:
-        self._ended_s = time.time()
+        self._ended_s = now_s(self._computer)
         if self._meter is not None:
             self._meter.advance(self._ended_s)
         load = None if self._meter is None else self._meter.load()
         return load, self._decoder.other_frames, tuple(self._ways())
 
-    def _run(self) -> None:
-        try:
-            while not self._end.is_set():
-                message = self._bus.recv(_RECV_S)
-                if message is not None:
-                    with self._lock:
-                        self._take(message)
-        except can.CanError as error:
-            self._failure = error
+    def _take(self, frames: Iterable[Frame]) -> None:
+        for frame in frames:
+            if self._meter is not None:
+                # By this clock: some backends have others.
+                self._meter.feed(frame._replace(time_s=now_s(self._computer)))
+            self._count(frame)
 
-    def _take(self, message: can.Message) -> None:
-        frame = Frame.from_message(message)
-        if self._meter is not None:
-            # By this clock: some backends have others.
-            self._meter.feed(frame._replace(time_s=time.time()))
+    def _count(self, frame: Frame) -> None:
         if frame.kind is FrameKind.ERROR:
             self._errors.update(error_kinds(frame))
         else:
@@ -232,9 +221,9 @@ def fill_queue(options: BusOptions) -> bool:
 # ----------------------------------------------------------------------------------------------------- asking
 
 
-async def ask_nodes(options: BusOptions, probed: range = PROBED) -> NodeFacts:
+async def ask_nodes(computer: Computer, options: BusOptions, probed: range = PROBED) -> NodeFacts:
     """Find all nodes, and put questions to those to whom nobody else talks; raises CanductorError."""
-    async with BusTalk.open(options) as bus:
+    async with BusTalk.open(computer, options) as bus:
         found = await survey(bus, probed=probed)
         pings: list[PingFacts] = []
         silenced: dict[int, str] = {}
@@ -285,14 +274,14 @@ def _lost(before: LinkStats, after: LinkStats) -> int:
     return max(0, after.timeouts - before.timeouts - late)
 
 
-def try_bitrates(options: BusOptions, listen_s: float) -> dict[int, int]:
+def try_bitrates(computer: Computer, options: BusOptions, listen_s: float) -> dict[int, int]:
     """Listen at each candidate without disturbing the bus; return the good frames heard. CanductorError."""
     heard = {}
     for bitrate in TRIED_BITRATES:
         other = BusOptions(
             interface=options.interface, channel=options.channel, bitrate=bitrate, listen_only=True
         )
-        with Listener(other, None) as listener:
+        with BusListener(computer, other, None) as listener:
             listener.wait(listen_s)
         heard[bitrate] = listener.facts().frames
     return heard

@@ -10,6 +10,7 @@ from typing import Final, Self
 import can
 
 from canbus_tools.frame import Frame
+from canbus_tools.open_bus import BusOptions
 from nodes.errors import CanductorError
 
 FRAMES_MAX: Final = 100_000
@@ -21,22 +22,21 @@ _POLL_S: Final = 0.1
 
 
 class FrameQueue:
-    """Receives from BUS, which becomes its own. NAME is for messages, and what frames say they came by.
+    """Receives from BUS, opened with OPTIONS, which becomes its own. A context manager.
 
-    A context manager.
     When LIMIT frames wait, the oldest ones give way and are counted in ``dropped``.
     """
 
-    def __init__(self, bus: can.BusABC, name: str, *, limit: int = FRAMES_MAX) -> None:
+    def __init__(self, bus: can.BusABC, options: BusOptions, *, limit: int = FRAMES_MAX) -> None:
         self.dropped = 0
         self._bus = bus
-        self._name = name
+        self._options = options
         self._limit = limit
         self._waiting: deque[Frame] = deque()
         self._changed = threading.Condition()
         self._ending = False
         self._cause: CanductorError | None = None
-        self._thread = threading.Thread(target=self._run, name=f"{name} receiver", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"{options.name} receiver", daemon=True)
         _ask_for_room(bus)
 
     def __enter__(self) -> Self:
@@ -64,18 +64,24 @@ class FrameQueue:
                 raise self._cause.with_traceback(None)
         return frames
 
+    def only(self, can_id: int) -> None:
+        """Receive nothing but frames with this 11-bit id, and error reports, from now on."""
+        self._bus.set_filters([can.typechecking.CanFilter(can_id=can_id, can_mask=0x7FF, extended=False)])
+
     def _run(self) -> None:
+        channel = self._options.short_name
         try:
             while not self._ending:
                 message = self._bus.recv(_POLL_S)
                 if message is not None:
-                    self._put(Frame.from_message(message)._replace(channel=self._name))
+                    self._put(Frame.from_message(message)._replace(channel=channel))
         # Whatever a backend raises ends the reception, and the user is told.
         except Exception as error:  # noqa: BLE001
             said = " ".join(str(error).split()) or type(error).__name__
             with self._changed:
                 self._cause = CanductorError(
-                    f"CAN bus {self._name}: it cannot be listened to any more: {said}"
+                    f"CAN bus {self._options.name}: it cannot be listened to any more: {said}; "
+                    f"'canductor can doctor' may say why"
                 )
                 self._changed.notify()
 

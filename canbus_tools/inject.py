@@ -89,7 +89,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     declare_faults(command)
 
 
-def make_job(given: argparse.Namespace) -> Callable[[], InjectReport]:
+def make_job(given: argparse.Namespace) -> Callable[[object], InjectReport]:
     """Check what was given; raises UsageError."""
     nodes = _nodes(given.nodes)
     name = given.socketcand_bus
@@ -106,7 +106,7 @@ def make_job(given: argparse.Namespace) -> Callable[[], InjectReport]:
         duration_s=None if given.duration is None else number("--duration", given.duration, 0, 1e8, "s"),
         json=given.json,
     )
-    return lambda: Injection(options).run()
+    return lambda _: Injection(options).run()
 
 
 def _nodes(text: str | None) -> dict[str, Flavour]:

@@ -1,15 +1,13 @@
 """``canductor can load``: how busy a bus is, and with what; live or from a recording."""
 
 import argparse
+import contextlib
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
-
-import can
 
 from canbus_tools import load_plot
 from canbus_tools.bus_load import (
@@ -24,8 +22,9 @@ from canbus_tools.bus_load import (
     LoadMeter,
     TrafficClass,
 )
+from canbus_tools.computer import Computer, now_s
 from canbus_tools.link_facts import read_link
-from canbus_tools.open_bus import BusOptions, bus_options, declare_bus, open_bus
+from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.protocol import Direction, frame_format, owner_of
 from canbus_tools.recordings import read_frames
 from canbus_tools.table import count, paragraph, table
@@ -51,7 +50,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     add("--plot", type=Path, metavar="FILE", help="draw load over time: .svg, or .png by rsvg-convert")
 
 
-def make_job(given: argparse.Namespace) -> Callable[[], "LoadReport"]:
+def make_job(given: argparse.Namespace) -> Callable[[Computer], "LoadReport"]:
     """Check what was given; raises UsageError."""
     window_s = number("--window", given.window, WINDOW_S_MIN, WINDOW_S_MAX, "s")
     if given.plot is not None and given.plot.suffix.lower() not in (".svg", ".png"):
@@ -63,13 +62,15 @@ def make_job(given: argparse.Namespace) -> Callable[[], "LoadReport"]:
             raise UsageError("--bitrate is missing: no recording says at which bit rate its bus ran")
         bitrate = whole("--bitrate", given.bitrate, BITRATE_MIN, BITRATE_MAX)
         recording: Path = given.recording
-        return lambda: _finish(measure_recording(recording, bitrate, window_s), str(recording), given.plot)
+        return lambda _: _finish(measure_recording(recording, bitrate, window_s), str(recording), given.plot)
     duration_s = None if given.watch else DURATION_S
     if given.duration is not None:
         duration_s = number("--duration", given.duration, 0.1, DURATION_S_MAX, "s")
     options = bus_options(given)
     shown = _Screen() if given.watch and not given.json else None
-    return lambda: _finish(measure(options, duration_s, window_s, shown), options.name, given.plot)
+    return lambda computer: _finish(
+        measure(computer, options, duration_s, window_s, shown), options.name, given.plot
+    )
 
 
 def find_bitrate(options: BusOptions) -> int:
@@ -105,26 +106,27 @@ def measure_recording(path: Path, bitrate: int, window_s: float = WINDOW_S) -> L
 
 
 def measure(
-    options: BusOptions, duration_s: float | None, window_s: float, screen: "_Screen | None" = None
+    computer: Computer,
+    options: BusOptions,
+    duration_s: float | None,
+    window_s: float,
+    screen: "_Screen | None" = None,
 ) -> LoadMeter:
     """Measure a live bus for DURATION_S, or until Ctrl-C; raises CanductorError."""
     bitrate = find_bitrate(options)
     meter = LoadMeter(bitrate, window_s=window_s)
     # The bit rate of a socketcan interface is the interface's business.
     opened = BusOptions(interface=options.interface, channel=options.channel) if _is_set(options) else options
-    bus = open_bus(opened)
-    try:
-        for message in _receive(bus, duration_s, meter):
-            if message is not None:
-                meter.feed(message)
-            if screen is not None and screen.is_due():
+    with computer.listen(opened) as bus, contextlib.suppress(KeyboardInterrupt):
+        stamps = _Stamps(computer)
+        end_s = None if duration_s is None else stamps.started_s + duration_s
+        meter.begin(stamps.started_s)
+        while (left_s := REFRESH_S if end_s is None else end_s - now_s(computer)) > 0:
+            for frame in bus.take(min(REFRESH_S, left_s)):
+                meter.feed(frame._replace(time_s=stamps.of(frame.time_s)))
+            meter.advance(now_s(computer))
+            if screen is not None and screen.is_due(now_s(computer)):
                 screen.show(LoadReport(meter.load(), options.name))
-    except KeyboardInterrupt:
-        pass  # what was measured until then is the report
-    except can.CanError as error:
-        raise CanductorError(f"CAN bus {options.name}: {' '.join(str(error).split())}") from error
-    finally:
-        bus.shutdown()
     return meter
 
 
@@ -132,28 +134,25 @@ def _is_set(options: BusOptions) -> bool:
     return options.interface in ("socketcan", "canductor")
 
 
-def _receive(bus: can.BusABC, duration_s: float | None, meter: LoadMeter) -> Iterator[can.Message | None]:
-    """Yield messages, and None now and then, as time passes on the meter.
+class _Stamps:
+    """Makes monotonic times of frames' times.
 
-    Some backends count their timestamps from elsewhere than Unix time: then the first one decides.
+    Some backends count those from elsewhere than Unix time: then the first one decides.
     """
-    started_s = time.monotonic()
-    end_s = None if duration_s is None else started_s + duration_s
-    offset_s = time.time() - started_s
-    first = True
-    meter.begin(started_s)
-    while end_s is None or time.monotonic() < end_s:
-        wait_s = REFRESH_S if end_s is None else min(REFRESH_S, max(0.0, end_s - time.monotonic()))
-        message = bus.recv(wait_s)
-        now_s = time.monotonic()
-        if message is not None:
-            if first and abs(message.timestamp - offset_s - now_s) > 2 * REFRESH_S:
-                offset_s = message.timestamp - now_s
-            first = False
-            # Neither a frame from before, nor one from the future of this clock.
-            message.timestamp = min(max(message.timestamp - offset_s, started_s), now_s)
-        meter.advance(now_s)
-        yield message
+
+    def __init__(self, computer: Computer) -> None:
+        self.started_s = now_s(computer)
+        self._computer = computer
+        self._offset_s = computer.unix_s() - self.started_s
+        self._first = True
+
+    def of(self, stamp_s: float) -> float:
+        """Return when a frame came: neither before the start, nor in the future."""
+        at_s = now_s(self._computer)
+        if self._first and abs(stamp_s - self._offset_s - at_s) > 2 * REFRESH_S:
+            self._offset_s = stamp_s - at_s
+        self._first = False
+        return min(max(stamp_s - self._offset_s, self.started_s), at_s)
 
 
 def _finish(meter: LoadMeter, name: str, plot: Path | None) -> "LoadReport":
@@ -312,11 +311,10 @@ class _Screen:
         self._next_s = 0.0
         self._lines = 0
 
-    def is_due(self) -> bool:
-        now_s = time.monotonic()
-        if now_s < self._next_s:
+    def is_due(self, at_s: float) -> bool:
+        if at_s < self._next_s:
             return False
-        self._next_s = now_s + REFRESH_S
+        self._next_s = at_s + REFRESH_S
         return True
 
     def show(self, report: LoadReport) -> None:

@@ -1,25 +1,23 @@
 """``canductor can monitor``: live traffic by names, as lines or on a screen, with figures of every node."""
 
 import argparse
-import asyncio
 import json
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 from canbus_tools.bus_load import BITRATE_MAX, LoadMeter
 from canbus_tools.bus_watch import BusWatch
+from canbus_tools.computer import Computer, Listener, now_s
 from canbus_tools.decoded import Decoded
 from canbus_tools.decoder import BusDecoder
 from canbus_tools.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
 from canbus_tools.filters import Filter, declare_filter, given_filter
-from canbus_tools.frame_queue import FrameQueue
 from canbus_tools.lines import line_of
 from canbus_tools.load import find_bitrate
 from canbus_tools.mcap_file import json_of
-from canbus_tools.open_bus import BusOptions, bus_options, declare_bus, open_bus
+from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.protocol import DATA_NODEID_MAX
 from canbus_tools.survey import survey
 from canbus_tools.talk import BusTalk, refuse_if_in_use
@@ -70,7 +68,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     add("--duration", metavar="S", help="end after so long; else at Ctrl-C")
 
 
-def make_job(given: argparse.Namespace) -> "Callable[[], MonitorReport]":
+def make_job(given: argparse.Namespace) -> "Callable[[Computer], MonitorReport]":
     """Check what was given; raises UsageError, CanductorError."""
     for node in given.fetch or ():
         if node != EVERY_NODE:
@@ -91,31 +89,31 @@ def make_job(given: argparse.Namespace) -> "Callable[[], MonitorReport]":
     )
     if not options.lines and not sys.stdin.isatty():
         raise UsageError("the screen takes keys, and standard input is no terminal; give --lines")
-    return lambda: run_monitor(options)
+    return lambda computer: run_monitor(computer, options)
 
 
-def run_monitor(options: MonitorOptions) -> "MonitorReport":
+def run_monitor(computer: Computer, options: MonitorOptions) -> "MonitorReport":
     """Show the bus until the user has seen enough; raises CanductorError."""
     source = DictionarySource(options.dictionaries, DictionaryCache.of_user())
     if options.fetch:
-        for nodeid, dictionary in asyncio.run(fetch(options.bus, options.fetch)).items():
+        for nodeid, dictionary in computer.run(fetch(computer, options.bus, options.fetch)).items():
             source.put(nodeid, dictionary, FETCHED)
-    watch = BusWatch(BusDecoder(source), LoadMeter(options.bitrate), time.monotonic())
-    with FrameQueue(open_bus(options.bus), options.bus.short_name) as queue:
+    watch = BusWatch(BusDecoder(source), LoadMeter(options.bitrate), now_s(computer))
+    with computer.listen(options.bus) as queue:
         run = _run_lines if options.lines else _run_screen
-        shown = run(options, watch, queue)
+        shown = run(computer, options, watch, queue)
         return MonitorReport(options, watch, shown, queue.dropped)
 
 
-def _run_lines(options: MonitorOptions, watch: BusWatch, queue: FrameQueue) -> int:
-    return Lines(options, watch, queue).run()
+def _run_lines(computer: Computer, options: MonitorOptions, watch: BusWatch, queue: Listener) -> int:
+    return Lines(computer, options, watch, queue).run()
 
 
-def _run_screen(options: MonitorOptions, watch: BusWatch, queue: FrameQueue) -> int:
+def _run_screen(computer: Computer, options: MonitorOptions, watch: BusWatch, queue: Listener) -> int:
     from canbus_tools.monitor_screen import MonitorScreen  # noqa: PLC0415 (only where there is one)
 
     before = signal.getsignal(signal.SIGTERM)
-    screen = MonitorScreen(options, watch, queue)
+    screen = MonitorScreen(computer, options, watch, queue)
     screen.run()
     signal.signal(signal.SIGTERM, before)
     if screen.terminated:
@@ -125,10 +123,10 @@ def _run_screen(options: MonitorOptions, watch: BusWatch, queue: FrameQueue) -> 
     return screen.shown
 
 
-async def fetch(options: BusOptions, nodes: tuple[str, ...]) -> dict[int, Dictionary]:
+async def fetch(computer: Computer, options: BusOptions, nodes: tuple[str, ...]) -> dict[int, Dictionary]:
     """Ask nodes for their dictionaries; raises CanductorError when one is in use, or does not answer."""
     found: dict[int, Dictionary] = {}
-    async with BusTalk.open(options) as bus:
+    async with BusTalk.open(computer, options) as bus:
         if EVERY_NODE in nodes:
             entries = (await survey(bus)).entries
             wanted = [e.nodeid for e in entries if e.facts is not None and e.nodeid is not None]
@@ -149,7 +147,8 @@ async def fetch(options: BusOptions, nodes: tuple[str, ...]) -> dict[int, Dictio
 class Lines:
     """Writes what is said as lines, each at once."""
 
-    def __init__(self, options: MonitorOptions, watch: BusWatch, queue: FrameQueue) -> None:
+    def __init__(self, computer: Computer, options: MonitorOptions, watch: BusWatch, queue: Listener) -> None:
+        self._computer = computer
         self._options = options
         self._watch = watch
         self._queue = queue
@@ -190,8 +189,8 @@ class Lines:
     def _said(self, flag: StopFlag) -> Iterator[Decoded]:
         passes = self._options.filter_.passes
         duration_s = self._options.duration_s
-        end_s = None if duration_s is None else time.monotonic() + duration_s
-        while not flag.stopped and (end_s is None or time.monotonic() < end_s):
+        end_s = None if duration_s is None else now_s(self._computer) + duration_s
+        while not flag.stopped and (end_s is None or now_s(self._computer) < end_s):
             for frame in self._queue.take(_WAIT_S):
                 for said in self._watch.feed(frame):
                     if flag.stopped:

@@ -2,7 +2,6 @@
 
 import asyncio
 import signal
-import time
 from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, ClassVar, Final
@@ -15,9 +14,9 @@ from textual.containers import Vertical
 from textual.widgets import DataTable, Footer, Input, RichLog, Static
 
 from canbus_tools.bus_watch import BusRates, BusWatch
+from canbus_tools.computer import Computer, Listener, now_s
 from canbus_tools.decoded import Decoded, Kind
 from canbus_tools.filters import Filter
-from canbus_tools.frame_queue import FrameQueue
 from canbus_tools.monitor_text import COLUMNS, bar_line, cells, log_line, read_filter
 from nodes.errors import CanductorError
 from nodes.option_values import UsageError
@@ -60,13 +59,16 @@ class MonitorScreen(App[None]):
         Binding("ctrl+c", "quit", "Quit", show=False, priority=True),
     ]
 
-    def __init__(self, options: "MonitorOptions", watch: BusWatch, queue: FrameQueue) -> None:
+    def __init__(
+        self, computer: Computer, options: "MonitorOptions", watch: BusWatch, queue: Listener
+    ) -> None:
         super().__init__()
         self.failure: CanductorError | None = None
         self.terminated = False
         """SIGTERM came."""
         self.shown = 0
         """Lines put into the log."""
+        self._computer = computer
         self._options = options
         self._watch = watch
         self._queue = queue
@@ -80,7 +82,7 @@ class MonitorScreen(App[None]):
         self._left_out = 0
         self._columns: tuple[str, ...] = ()
         self._width = 80
-        self._end_s = None if options.duration_s is None else time.monotonic() + options.duration_s
+        self._end_s = None if options.duration_s is None else now_s(computer) + options.duration_s
 
     def compose(self) -> ComposeResult:
         """Make the widgets."""
@@ -111,7 +113,7 @@ class MonitorScreen(App[None]):
         changed = event.size.width != self._width
         self._width = event.size.width
         self._choose_columns(self._width)
-        self._show(self._watch.update(time.monotonic()))
+        self._show(self._watch.update(now_s(self._computer)))
         if changed:
             self._rewrite()
 
@@ -136,9 +138,9 @@ class MonitorScreen(App[None]):
             self._unshown += len(wanted)
         else:
             self._write(wanted)
-        now_s = time.monotonic()
-        self._show(self._watch.update(now_s))
-        if self._end_s is not None and now_s >= self._end_s:
+        passed_s = now_s(self._computer)
+        self._show(self._watch.update(passed_s))
+        if self._end_s is not None and passed_s >= self._end_s:
             self.exit()
 
     def _passes(self, said: Decoded) -> bool:

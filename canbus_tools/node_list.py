@@ -1,12 +1,12 @@
 """``canductor can nodes``: every node that is alive, and what it is."""
 
 import argparse
-import asyncio
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Final
 
 from canbus_tools.census import Application
+from canbus_tools.computer import Computer
 from canbus_tools.discovery import declare_listen, listen_option, where
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.survey import PROBED, Entry, State, SurveyResult, survey_all
@@ -60,12 +60,12 @@ def declare(command: argparse.ArgumentParser) -> None:
     declare_listen(command)
 
 
-def make_job(given: argparse.Namespace) -> Callable[[], "NodesReport"]:
+def make_job(given: argparse.Namespace) -> Callable[[Computer], "NodesReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
     probed = _ids("--probe", given.probe)
     listen_s = listen_option(given)
-    return lambda: list_nodes(bus, probed=probed, listen_s=listen_s)
+    return lambda computer: list_nodes(computer, bus, probed=probed, listen_s=listen_s)
 
 
 def _ids(option: str, text: str) -> range:
@@ -79,14 +79,16 @@ def _ids(option: str, text: str) -> range:
     return range(low, high + 1)
 
 
-def list_nodes(options: BusOptions, *, probed: range = PROBED, listen_s: float = LISTEN_S) -> "NodesReport":
+def list_nodes(
+    computer: Computer, options: BusOptions, *, probed: range = PROBED, listen_s: float = LISTEN_S
+) -> "NodesReport":
     """Find all nodes and ask those to whom nobody talks who they are. Raises CanductorError."""
 
     async def find() -> SurveyResult:
-        async with BusTalk.open(options) as bus:
+        async with BusTalk.open(computer, options) as bus:
             return await survey_all(bus, options, probed=probed, listen_s=listen_s)
 
-    return NodesReport(options, asyncio.run(find()))
+    return NodesReport(options, computer.run(find()))
 
 
 @record

@@ -1,12 +1,11 @@
 """``canductor can query``: which nodes wait for an id, and what they are."""
 
 import argparse
-import asyncio
-import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
 from canbus_tools.census import ROUNDS, Application, CensusResult, WaitingNode
+from canbus_tools.computer import Computer
 from canbus_tools.discovery import take_census, where
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.table import count, paragraph, table
@@ -34,22 +33,23 @@ def declare(command: argparse.ArgumentParser) -> None:
     )
 
 
-def make_job(given: argparse.Namespace) -> Callable[[], "QueryReport"]:
+def make_job(given: argparse.Namespace) -> Callable[[Computer], "QueryReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
     rounds = whole("--rounds", given.rounds, 1, _ROUNDS_MAX)
-    return lambda: query(bus, rounds)
+    return lambda computer: query(computer, bus, rounds)
 
 
-def query(options: BusOptions, rounds: int = ROUNDS) -> "QueryReport":
+def query(computer: Computer, options: BusOptions, rounds: int = ROUNDS) -> "QueryReport":
     """Ask who waits; changes nothing in any node. Raises CanductorError."""
-    started_s = time.monotonic()
+    started_ns = computer.monotonic_ns()
 
     async def ask() -> CensusResult:
-        async with BusTalk.open(options) as bus:
+        async with BusTalk.open(computer, options) as bus:
             return await take_census(bus, rounds)
 
-    return QueryReport(options, asyncio.run(ask()), time.monotonic() - started_s)
+    found = computer.run(ask())
+    return QueryReport(options, found, (computer.monotonic_ns() - started_ns) * 1e-9)
 
 
 @record

@@ -4,19 +4,17 @@ import argparse
 import contextlib
 import errno
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, Final, Protocol
 
-import can
-
 from canbus_tools.candump import candump_line
+from canbus_tools.computer import Computer, Listener, now_s
 from canbus_tools.decoder import BusDecoder
 from canbus_tools.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
 from canbus_tools.frame import Frame
 from canbus_tools.mcap_file import McapWriter
-from canbus_tools.open_bus import BusOptions, bus_options, declare_bus, open_bus
+from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.until_stopped import StopFlag, stop_flag
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
@@ -53,7 +51,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     declare_dictionaries(command)
 
 
-def make_job(given: argparse.Namespace) -> "Callable[[], RecordReport]":
+def make_job(given: argparse.Namespace) -> "Callable[[Computer], RecordReport]":
     """Check what was given and return the job."""
     path = Path(given.output)
     if path.suffix.lower() not in (".mcap", ".log"):
@@ -65,10 +63,11 @@ def make_job(given: argparse.Namespace) -> "Callable[[], RecordReport]":
     )
     options = bus_options(given)
     dictionaries = given_dictionaries(given)
-    return lambda: record_bus(options, path, duration_s, dictionaries)
+    return lambda computer: record_bus(computer, options, path, duration_s, dictionaries)
 
 
 def record_bus(
+    computer: Computer,
     options: BusOptions,
     path: Path,
     duration_s: float | None = None,
@@ -78,60 +77,35 @@ def record_bus(
     report = RecordReport(path, options.name)
     with (
         stop_flag() as flag,
-        contextlib.closing(_LiveBus(options)) as bus,
+        computer.listen(options) as bus,
         _writing(path, report) as file,
     ):
         recorder = _recorder(path, file, dictionaries or {})
         sys.stderr.write(f"recording {options.name} to '{path}'; Ctrl-C ends it\n")
         sys.stderr.flush()
         try:
-            for frame in _until_end(bus, flag, duration_s):
+            for frame in _until_end(computer, bus, flag, duration_s):
                 recorder.frame(frame)
                 report.frames += 1
         finally:  # whatever ends it, the file is complete up to there
             recorder.finish()
+            report.dropped = bus.dropped
     return report
 
 
-def _until_end(bus: "_LiveBus", flag: StopFlag, duration_s: float | None) -> Iterator[Frame]:
+def _until_end(
+    computer: Computer, bus: Listener, flag: StopFlag, duration_s: float | None
+) -> Iterator[Frame]:
     """Yield frames until the time is over or the user stops it, and then those that are on their way."""
-    end_s = None if duration_s is None else time.monotonic() + duration_s
+    end_s = None if duration_s is None else now_s(computer) + duration_s
     while not flag.stopped:
-        left_s = LOOK_S if end_s is None else min(LOOK_S, end_s - time.monotonic())
+        left_s = LOOK_S if end_s is None else min(LOOK_S, end_s - now_s(computer))
         if left_s <= 0:
             break
-        frame = bus.receive(left_s)
-        if frame is not None:
-            yield frame
-    last_s = time.monotonic() + DRAIN_S
-    while time.monotonic() < last_s and (frame := bus.receive(QUIET_S)) is not None:
-        yield frame
-
-
-class _LiveBus:
-    """The bus, with frames instead of python-can's messages."""
-
-    def __init__(self, options: BusOptions) -> None:
-        self._bus = open_bus(options)
-        self._name = options.name
-        self._channel = options.short_name
-        self._named = options.interface == "socketcan"
-
-    def receive(self, timeout_s: float) -> Frame | None:
-        try:
-            message = self._bus.recv(timeout_s)
-        except (can.CanError, OSError) as error:
-            raise CanductorError(
-                f"CAN bus {self._name}: receiving failed ({error}); 'canductor can doctor' may say why"
-            ) from None
-        if message is None:
-            return None
-        frame = Frame.from_message(message)
-        # Only a kernel's interfaces have names of their own; other backends put sentences and paths there.
-        return frame if self._named and frame.channel else frame._replace(channel=self._channel)
-
-    def close(self) -> None:
-        self._bus.shutdown()
+        yield from bus.take(left_s)
+    last_s = now_s(computer) + DRAIN_S
+    while now_s(computer) < last_s and (frames := bus.take(QUIET_S)):
+        yield from frames
 
 
 @contextlib.contextmanager
@@ -216,11 +190,22 @@ class RecordReport:
         self.bus = bus
         self.frames = 0
         self.size_bytes = 0
+        self.dropped = 0
+        """Frames that came faster than they could be recorded."""
 
     def to_json(self) -> Mapping[str, object]:
         """Return file, frames and bytes."""
-        return {"bus": self.bus, "file": str(self.path), "frames": self.frames, "bytes": self.size_bytes}
+        return {
+            "bus": self.bus,
+            "file": str(self.path),
+            "frames": self.frames,
+            "bytes": self.size_bytes,
+            "dropped_frames": self.dropped,
+        }
 
     def to_text(self) -> str:
         """Return it as a sentence."""
-        return f"{self.frames} frames of {self.bus} recorded to '{self.path}' ({self.size_bytes} bytes)"
+        dropped = f"; {self.dropped} more came too fast and were dropped" if self.dropped else ""
+        return (
+            f"{self.frames} frames of {self.bus} recorded to '{self.path}' ({self.size_bytes} bytes){dropped}"
+        )

@@ -8,6 +8,7 @@ from typing import Final
 
 from canbus_tools.assign_id import uuid_option
 from canbus_tools.census import Application, CensusResult, WaitingNode
+from canbus_tools.computer import Computer
 from canbus_tools.discovery import declare_listen, listen_option, take_census, where
 from canbus_tools.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.query import application_name
@@ -35,7 +36,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     )
 
 
-def make_job(given: argparse.Namespace) -> Callable[[], "ReleaseReport"]:
+def make_job(given: argparse.Namespace) -> Callable[[Computer], "ReleaseReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
     listen_s = listen_option(given)
@@ -43,21 +44,26 @@ def make_job(given: argparse.Namespace) -> Callable[[], "ReleaseReport"]:
     # A uuid has 12 digits, an id at most 3; what is neither is most likely a uuid with a digit amiss.
     if text.isascii() and text.isdecimal() and len(text) < 2 * UUID_SIZE:
         nodeid = whole("NODEID", text, 1, LAST_NODEID)
-        return lambda: release(bus, nodeid, force=given.force, listen_s=listen_s)
+        return lambda computer: release(computer, bus, nodeid, force=given.force, listen_s=listen_s)
     uuid = uuid_option("UUID", text)
-    return lambda: release(bus, uuid, force=given.force, listen_s=listen_s)
+    return lambda computer: release(computer, bus, uuid, force=given.force, listen_s=listen_s)
 
 
 def release(
-    options: BusOptions, node: Uuid | int, *, force: bool = False, listen_s: float = LISTEN_S
+    computer: Computer,
+    options: BusOptions,
+    node: Uuid | int,
+    *,
+    force: bool = False,
+    listen_s: float = LISTEN_S,
 ) -> "ReleaseReport":
     """Reset NODE and wait until it asks for an id again; raises CanductorError with what to do."""
 
     async def run() -> ReleaseReport:
-        async with BusTalk.open(options) as bus:
-            return await _release(bus, node, force=force, listen_s=listen_s)
+        async with BusTalk.open(computer, options) as bus:
+            return await release_on(bus, node, force=force, listen_s=listen_s)
 
-    return asyncio.run(run())
+    return computer.run(run())
 
 
 @record(kw_only=True)
@@ -87,7 +93,10 @@ class ReleaseReport:
         return self.text
 
 
-async def _release(bus: BusTalk, node: Uuid | int, *, force: bool, listen_s: float) -> ReleaseReport:
+async def release_on(
+    bus: BusTalk, node: Uuid | int, *, force: bool = False, listen_s: float = LISTEN_S
+) -> ReleaseReport:
+    """Reset NODE on an open bus, as ``release`` does."""
     before = await take_census(bus)
     if isinstance(node, int):
         nodeid = node

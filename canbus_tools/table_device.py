@@ -5,12 +5,12 @@
 
 import asyncio
 import contextlib
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Final
 
+from canbus_tools.computer import Computer
 from canbus_tools.link_facts import read_link
 from canbus_tools.open_bus import BusOptions
 from canbus_tools.table_nodes import (
@@ -19,6 +19,7 @@ from canbus_tools.table_nodes import (
     TalkBus,
     ask_states,
     judged,
+    loop_ns,
     send_slowly,
     tables_on,
     write_register,
@@ -151,7 +152,7 @@ def _said_text(said: Said) -> str:
 # ------------------------------------------------------------------------------------------------ carry out
 
 
-def carry_out(job: DeviceJob) -> DeviceReport:
+def carry_out(computer: Computer, job: DeviceJob) -> DeviceReport:
     """Do JOB; raises CanductorError when nothing of it can be done."""
     options = None
     if job.kind is DeviceKind.CAN:
@@ -162,8 +163,8 @@ def carry_out(job: DeviceJob) -> DeviceReport:
             raise TalkError(
                 "only nodes can be asked: give --node ID for those on a CAN bus, --link on a serial line"
             )
-        return DeviceReport(job, send_blind(job, options), (), ())
-    return asyncio.run(_with_nodes(job, options))
+        return DeviceReport(job, send_blind(computer, job, options), (), ())
+    return computer.run(_with_nodes(computer, job, options))
 
 
 def _bus_options(job: DeviceJob) -> BusOptions:
@@ -184,13 +185,13 @@ def _known_bitrate(options: BusOptions) -> int | None:
         return None  # the bus itself says what is wrong, when it is opened
 
 
-async def _with_nodes(job: DeviceJob, options: BusOptions | None) -> DeviceReport:
+async def _with_nodes(computer: Computer, job: DeviceJob, options: BusOptions | None) -> DeviceReport:
     async with contextlib.AsyncExitStack() as stack:
         if options is None:
             bus = None
-            talks = [await stack.enter_async_context(open_uart_talk(job.device, job.baud))]
+            talks = [await stack.enter_async_context(open_uart_talk(computer, job.device, job.baud))]
         else:
-            bus = await stack.enter_async_context(BusTalk.open(options))
+            bus = await stack.enter_async_context(BusTalk.open(computer, options))
             if not job.force:
                 await asyncio.gather(*(refuse_if_in_use(bus, nodeid) for nodeid in job.nodes))
             talks = [await stack.enter_async_context(bus.node(nodeid)) for nodeid in job.nodes]
@@ -219,7 +220,7 @@ async def _download(job: DeviceJob, places: _Tables, bus: TalkBus | None) -> Dev
         meant = [Place(t, node, bus) for node, tables in places for t in tables if t.axle in load.axles]
         said += _missing(load, (place.table.axle for place in meant))
         if meant:
-            report = await download(load.pairs, meant, now_ns=time.monotonic_ns, share=job.share)
+            report = await download(load.pairs, meant, now_ns=loop_ns, share=job.share)
             downloads.append((load, report))
             said += [_of(outcome) for outcome in report.outcomes]
     return DeviceReport(job, (), tuple(downloads), tuple(said))

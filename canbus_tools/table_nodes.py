@@ -6,7 +6,6 @@ configured otherwise.
 """
 
 import asyncio
-import time
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Final
 
@@ -30,6 +29,11 @@ POLLS_PER_WORD: Final = 4
 START_S: Final = 0.25
 """From the answer with a node's clock to its first poll: a later command than that stops the node."""
 _REGISTER_OID: Final = 0
+
+
+def loop_ns() -> int:
+    """Return the running event loop's time (HostTime)."""
+    return round(asyncio.get_running_loop().time() * NS_PER_S)
 
 
 class TableTalk:
@@ -219,15 +223,15 @@ async def write_register(node: TableTalk, load: Load, delay_s: float) -> Sent:
 async def send_slowly(load: Load, delay_s: float, write: Callable[[int], Awaitable[None]]) -> Sent:
     """Write one word of LOAD after the other, DELAY_S apart; the last one has its time too."""
     words = transmission(load.pairs, load.axles)
-    began_ns = time.monotonic_ns()
+    began_ns = loop_ns()
     paced = PacedWords(words, round(delay_s * NS_PER_S), began_ns)
     while paced.deadline_ns is not None:
-        await asyncio.sleep(max(0, paced.deadline_ns - time.monotonic_ns()) / NS_PER_S)
-        word = paced.take(time.monotonic_ns())
+        await asyncio.sleep(max(0, paced.deadline_ns - loop_ns()) / NS_PER_S)
+        word = paced.take(loop_ns())
         if word is not None:
-            began_word_ns = time.monotonic_ns()
+            began_word_ns = loop_ns()
             await write(word)
-            paced.delay(time.monotonic_ns() - began_word_ns)
+            paced.delay(loop_ns() - began_word_ns)
     await asyncio.sleep(delay_s)
-    elapsed_s = (time.monotonic_ns() - began_ns) / NS_PER_S
+    elapsed_s = (loop_ns() - began_ns) / NS_PER_S
     return Sent(load, len(words), elapsed_s, register_cost(load, words, delay_s))

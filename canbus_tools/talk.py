@@ -12,7 +12,8 @@ import contextlib
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import Any, Final, Protocol
 
-from canbus_tools.open_bus import BusOptions, open_bus
+from canbus_tools.computer import Computer, Port
+from canbus_tools.open_bus import BusOptions
 from nodes.conversation import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, Conversation
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
@@ -23,10 +24,6 @@ from nodes.link import Frame, LinkIO, LinkSettings, LinkStats, Response
 from nodes.message_format import Message, Value
 from nodes.node_errors import NodeLost
 from nodes.seams import LinkLike
-from nodes.transport import CanTransport
-from nodes.transport.python_can_bridge import PythonCanBridge
-from nodes.transport.socketcan import SocketCanTransport
-from nodes.transport.virtual import VirtualTransport
 
 LISTEN_S: Final = 1.2
 """How long a node's id must be silent before it is talked to; hosts ask for clocks every 0.98 s."""
@@ -53,19 +50,10 @@ def data_ids(nodeid: int) -> tuple[int, int]:
     return nodeid * 2 + 0x100, nodeid * 2 + 0x101
 
 
-def open_transport(options: BusOptions) -> CanTransport:
-    """Open the bus for a link: natively where that is possible. Raises CanductorError."""
-    if options.interface == "socketcan":
-        return SocketCanTransport(options.channel, bitrate=options.bitrate)
-    if options.interface == "canductor":
-        return VirtualTransport(options.channel, bitrate=options.bitrate)
-    return PythonCanBridge(open_bus(options), options.name, bitrate=options.bitrate)
-
-
 class BusTalk:
     """A bus, opened for questions; from ``BusTalk.open``. For one event loop."""
 
-    def __init__(self, options: BusOptions, transport: CanTransport, cache: DictionaryCache) -> None:
+    def __init__(self, options: BusOptions, port: Port, cache: DictionaryCache) -> None:
         self.options = options
         self.cache = cache
         self.closed_because: str | None = None
@@ -76,26 +64,27 @@ class BusTalk:
         self._callbacks: list[FrameCallback] = []
         self._closed = asyncio.Event()
         self._open_nodes: set[NodeTalk] = set()
-        self._io = LinkIO(
-            transport, asyncio.get_running_loop(), on_frame=self._frame_came, on_closed=self._ended
-        )
+        self._io = port.start_io(on_frame=self._frame_came, on_closed=self._ended)
 
     @classmethod
     @contextlib.asynccontextmanager
     async def open(
-        cls, options: BusOptions, cache: DictionaryCache | None = None
+        cls, computer: Computer, options: BusOptions, cache: DictionaryCache | None = None
     ) -> "AsyncIterator[BusTalk]":
-        """Open the bus; dictionaries come from and go to CACHE, the user's if None. CanductorError."""
-        transport = open_transport(options)
+        """Open a bus of COMPUTER; raises CanductorError.
+
+        Dictionaries come from and go to CACHE, the user's if None.
+        """
+        port = computer.open_can(options)
         try:
-            bus = cls(options, transport, cache if cache is not None else DictionaryCache.of_user())
+            bus = cls(options, port, cache if cache is not None else DictionaryCache.of_user())
             try:
                 yield bus
             finally:
                 bus._io.close()
         finally:
             # A python-can backend may take its time; nothing else is left to be done meanwhile.
-            await asyncio.to_thread(transport.close)
+            await asyncio.to_thread(port.close)
 
     @property
     def name(self) -> str:
@@ -207,13 +196,19 @@ class NodeTalk:
     @classmethod
     @contextlib.asynccontextmanager
     async def open(
-        cls, options: BusOptions, nodeid: int, *, force: bool = False, listen_s: float = LISTEN_S
+        cls,
+        computer: Computer,
+        options: BusOptions,
+        nodeid: int,
+        *,
+        force: bool = False,
+        listen_s: float = LISTEN_S,
     ) -> "AsyncIterator[NodeTalk]":
         """Open the bus and talk to node NODEID, after LISTEN_S of silence to it.
 
         Raises CanductorError: no such bus or node, or another host talks to it; FORCE does not listen.
         """
-        async with BusTalk.open(options) as bus:
+        async with BusTalk.open(computer, options) as bus:
             if not force:
                 await refuse_if_in_use(bus, nodeid, listen_s)
             async with bus.node(nodeid) as talk:

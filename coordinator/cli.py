@@ -8,9 +8,9 @@ import os
 import select
 import signal
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from coordinator.command_line import Answered, help_of, print_help, read_words, version
+from coordinator.command_line import Answered, Job, help_of, print_help, read_words, version
 from coordinator.commands import Report, Terminated
 from nodes.errors import CanductorError
 from nodes.option_values import UsageError
@@ -24,13 +24,16 @@ EXIT_BROKEN_PIPE = 141
 EXIT_TERMINATED = 143
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit status; never raises but for SystemExit."""
+def main(arguments: Sequence[str] | None = None, read: Callable[[Sequence[str]], Job] = read_words) -> int:
+    """Run one command and return the exit status; never raises but for SystemExit.
+
+    READ makes a job of the words of the command line.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     as_json = "--json" in words
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
-        status = _run(words, as_json) if words else _no_words()
+        status = _run(words, as_json, read) if words else _no_words()
         sys.stdout.flush()
     except BrokenPipeError:
         if not _stdout_is_gone():
@@ -51,9 +54,9 @@ def _no_words() -> int:
     return EXIT_USAGE
 
 
-def _run(words: list[str], as_json: bool) -> int:
+def _run(words: list[str], as_json: bool, read: Callable[[Sequence[str]], Job]) -> int:
     try:
-        return _show(read_words(words)(), as_json)
+        return _show(read(words)(), as_json)
     except Answered:
         return EXIT_OK
     except CanductorError as error:

@@ -9,8 +9,9 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 from coordinator.commands import (
     DemoOptions,
@@ -22,6 +23,9 @@ from coordinator.commands import (
 )
 from coordinator.serving_words import declare_serving, is_asked_to_serve, read_serving
 from nodes.option_values import UsageError, assignments, existing_file, share, whole
+
+if TYPE_CHECKING:
+    from canbus_tools.computer import Computer
 
 Job = Callable[[], Report]
 
@@ -91,15 +95,15 @@ class _Parser(argparse.ArgumentParser):
         raise Answered
 
 
-def read_words(words: Sequence[str]) -> Job:
-    """Return the job that WORDS ask for.
+def read_words(words: Sequence[str], computer: "Computer | None" = None) -> Job:
+    """Return the job that WORDS ask for; a CAN tool will run on COMPUTER, this one if None.
 
     Raises UsageError, Answered after --help or --version, CanductorError for a file that is not there.
     """
     if words[0] in TOOL_COMMANDS:
-        return _tool(words)
+        return _tool(words, computer)
     if words[0] in FRONT_END_COMMANDS:
-        return _front_end(words)
+        return _front_end(words, computer)
     if words[0] in OTHER_COMMANDS:
         return _other(words)
     arguments = _parser(only=words[0]).parse_args(list(words))
@@ -156,21 +160,22 @@ def _in_list(summary: str) -> str:
     return f"{summary[0].lower()}{summary[1:].rstrip('.')}"
 
 
-def _front_end(words: Sequence[str]) -> Job:
+def _front_end(words: Sequence[str], computer: "Computer | None") -> Job:
     """Read the words of a command that talks to a machine that runs."""
     parser = _Parser(prog="canductor", allow_abbrev=False)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     _declare_front_end(commands, words[0], FRONT_END_COMMANDS[words[0]])
     arguments = parser.parse_args(list(words))
-    arguments.on_device = _on_device
+    arguments.on_device = partial(_on_device, computer)
     return cast("Job", arguments.make_job(arguments))
 
 
-def _on_device(job: Any) -> Report:
+def _on_device(computer: "Computer | None", job: Any) -> Report:
     """Send tables to drives and nodes without a coordinator: a tool's work."""
+    from canbus_tools.computer import ThisComputer  # noqa: PLC0415 (start-up time)
     from canbus_tools.table_device import carry_out  # noqa: PLC0415 (start-up time)
 
-    return carry_out(job)
+    return carry_out(computer or ThisComputer(), job)
 
 
 def _declare_front_end(commands: Any, name: str, summary: str) -> None:
@@ -231,16 +236,17 @@ def _parser(*, whole: bool = False, only: str = "") -> argparse.ArgumentParser:
     return parser
 
 
-def _tool(words: Sequence[str]) -> Job:
+def _tool(words: Sequence[str], computer: "Computer | None") -> Job:
     """Read the words of a bus tool; those that only plan do not pay for the tools' start."""
     from canbus_tools.command_line import add_tools, declare_tool  # noqa: PLC0415 (start-up time)
 
     parser = _Parser(prog="canductor", allow_abbrev=False)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     if words[0] == "console":
-        declare_tool(commands, "console")
+        declare_tool(commands, "console", computer)
     else:
-        add_tools(commands.add_parser("can", allow_abbrev=False, description=TOOL_COMMANDS["can"]), words)
+        can = commands.add_parser("can", allow_abbrev=False, description=TOOL_COMMANDS["can"])
+        add_tools(can, words, computer=computer)
     arguments = parser.parse_args(list(words))
     if "make_job" not in arguments:
         raise UsageError("the CAN tool is missing")

@@ -1,13 +1,16 @@
 """The command line as tests use it."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import pytest
 
+from canbus_tools.computer import Computer
 from coordinator.cli import main
-from tests.canbus_tools.stage import Place
+from coordinator.command_line import read_words
 
 
 @dataclass(frozen=True)
@@ -20,9 +23,15 @@ class Said:
 
     @property
     def json(self) -> dict[str, Any]:
+        """The object on the last line."""
         value = json.loads(self.out.splitlines()[-1])
         assert isinstance(value, dict)
         return value
+
+    @property
+    def objects(self) -> list[dict[str, Any]]:
+        """The objects of all lines."""
+        return [json.loads(line) for line in self.out.splitlines()]
 
     @property
     def words(self) -> str:
@@ -38,14 +47,26 @@ class Said:
 
 
 class Command:
-    """Runs ``canductor can TOOL`` on a bus."""
+    """Runs ``canductor …`` on COMPUTER; WORDS name the bus, for ``canductor can TOOL`` and ``console``."""
 
-    def __init__(self, place: Place, captured: pytest.CaptureFixture[str]) -> None:
-        self._place = place
+    def __init__(
+        self, computer: Computer | None, captured: pytest.CaptureFixture[str], words: Sequence[str] = ()
+    ) -> None:
+        self._computer = computer
         self._captured = captured
+        self._words = words
 
-    def __call__(self, *words: str) -> Said:
+    def __call__(self, tool: str, *words: object) -> Said:
+        """Run ``canductor can TOOL`` on the bus."""
+        return self.run("can", tool, *words, *self._words)
+
+    def console(self, *words: object) -> Said:
+        """Run ``canductor console`` on the bus."""
+        return self.run("console", *words, *self._words)
+
+    def run(self, *words: object) -> Said:
+        """Run ``canductor WORDS``."""
         self._captured.readouterr()
-        status = main(["can", *words, *self._place.words])
+        status = main(list(map(str, words)), partial(read_words, computer=self._computer))
         said = self._captured.readouterr()
         return Said(status, said.out, said.err)

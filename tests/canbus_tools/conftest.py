@@ -1,35 +1,33 @@
-"""The bus and the stage that the tools are tested on."""
+"""The simulated bus that the tools are tested on."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.canbus_tools.command import Command
-from tests.canbus_tools.stage import Place, Stage, any_place, six_nodes
+from tests.stages.can_stage import CanStage, SixNodes, six_nodes
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Iterator[Place]:
-    """Yield a bus with nobody on it: vcan0 where there is one, else a virtual bus."""
-    with any_place(tmp_path) as found:
-        yield found
+def stage() -> CanStage:
+    """Return a bus with nobody on it, in virtual time."""
+    return CanStage()
 
 
 @pytest.fixture
-def stage(place: Place) -> Iterator[Stage]:
-    """Yield the six nodes of stage.py."""
-    with six_nodes(place) as nodes:
-        yield nodes
+def six(stage: CanStage) -> SixNodes:
+    """Return the bus with the six nodes of can_stage.py."""
+    return six_nodes(stage)
 
 
 @pytest.fixture(autouse=True)
-def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep the user's cache of dictionaries out of it."""
+def no_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the user's cache of dictionaries, and the machines that the user runs, out of it."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "run"))
 
 
 @pytest.fixture
-def can_tool(place: Place, capsys: pytest.CaptureFixture[str]) -> Command:
+def can_tool(stage: CanStage, capsys: pytest.CaptureFixture[str]) -> Command:
     """Return what runs ``canductor can`` on the bus of the test."""
-    return Command(place, capsys)
+    return Command(stage.computer, capsys, stage.words)

@@ -1,8 +1,6 @@
 """``canductor can assign`` and ``release``: what they do, and every refusal with what to do about it."""
 
-import asyncio
 import re
-from contextlib import ExitStack, closing
 from typing import Any
 
 import pytest
@@ -10,46 +8,43 @@ import pytest
 from canbus_tools.talk import NodeTalk
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, NEED_NODEID, QUERY_UNASSIGNED, SET_NODEID
 from nodes.transport import CanFrame
+from nodes.virtual.firmware import TOOLHEAD
 from tests.canbus_tools.command import Command
-from tests.canbus_tools.other_host import OtherHost, Witness
-from tests.canbus_tools.stage import BED, BOOT, MAIN, MAIN_ID, TOOL, TOOL_ID, TWIN, Place, Stage, set_nodeid
-
-QUICK = ("--listen", "0.2")
-"""Nobody else is on these buses, but where a test says so."""
-BESIDE = ("--listen", "1")
-"""A busy computer may keep another host from its turn for so long."""
+from tests.stages.can_stage import BED, BOOT, MAIN, MAIN_ID, TOOL, TOOL_ID, TWIN, CanStage, SixNodes
 
 
 def waiting(can_tool: Command) -> dict[str, Any]:
     return {node["uuid"]: node for node in can_tool("query", "--json").json["nodes"]}
 
 
-def ask_uuid(place: Place, nodeid: int) -> bytes:
+def ask_uuid(stage: CanStage, nodeid: int) -> bytes:
     async def ask() -> bytes:
-        async with NodeTalk.open(place.options, nodeid, listen_s=0.05) as talk:
+        async with NodeTalk.open(stage.computer, stage.options, nodeid) as talk:
             return (await talk.ask("get_canbus_id", "canbus_id")).message.data("canbus_uuid")
 
-    return asyncio.run(ask())
+    return stage.computer.run(ask())
 
 
-def test_a_node_gets_its_id_and_gives_it_back(stage: Stage, can_tool: Command) -> None:
-    said = can_tool("assign", str(BED), "17", "--json", *QUICK)
+def test_a_node_gets_its_id_and_gives_it_back(six: SixNodes, can_tool: Command) -> None:
+    said = can_tool("assign", str(BED), "17", "--json")
     assert (said.status, said.err) == (0, "")
     assert (said.json["uuid"], said.json["nodeid"], said.json["had_it_before"]) == (str(BED), 17, False)
     assert said.json["firmware"]["mcu"] == "virtual-mainboard"
     assert str(BED) not in waiting(can_tool)
-    assert ask_uuid(stage.place, 17) == BED.raw
+    assert ask_uuid(six.stage, 17) == BED.raw
 
-    said = can_tool("release", str(BED), "--json", *QUICK)
+    said = can_tool("release", str(BED), "--json")
     assert (said.status, said.err) == (0, "")
     assert (said.json["uuid"], said.json["nodeid"], said.json["waited_before"]) == (str(BED), 17, False)
     assert waiting(can_tool)[str(BED)]["application"] == "klipper-type"
-    assert stage.bed.stop()["resets"] == 1
+    assert six.bed.counters()["resets"] == 1
 
 
-def test_told_in_words(stage: Stage, can_tool: Command) -> None:
+def test_told_in_words(six: SixNodes, can_tool: Command) -> None:
+    del six
+
     def said(*words: str) -> str:
-        return can_tool(*words, *QUICK).out.strip()
+        return can_tool(*words).out.strip()
 
     board = "virtual-mainboard, canductor 0.1.0"
     kind = "(Klipper-type firmware)"
@@ -61,9 +56,10 @@ def test_told_in_words(stage: Stage, can_tool: Command) -> None:
 
 @pytest.mark.parametrize(("node", "uuid"), [(str(MAIN), MAIN), (str(TOOL_ID), TOOL), (str(TOOL), TOOL)])
 def test_release_by_uuid_or_id_also_from_shutdown(
-    stage: Stage, can_tool: Command, node: str, uuid: object
+    six: SixNodes, can_tool: Command, node: str, uuid: object
 ) -> None:
-    assert can_tool("release", node, *QUICK).status == 0
+    del six
+    assert can_tool("release", node).status == 0
     assert waiting(can_tool)[str(uuid)]["several_boards"] is False
 
 
@@ -83,86 +79,71 @@ def test_release_by_uuid_or_id_also_from_shutdown(
     ],
 )
 def test_refused_and_nothing_was_sent(
-    stage: Stage, can_tool: Command, words: tuple[str, str], sentence: str
+    six: SixNodes, can_tool: Command, words: tuple[str, str], sentence: str
 ) -> None:
-    with Witness(stage.place) as witness:
-        said = can_tool("assign", *words, *QUICK)
+    with six.stage.user() as witness:
+        said = can_tool("assign", *words)
     assert said.sentence.startswith("canductor: ")
     assert re.search(sentence, said.sentence)
-    told = [frame for frame in witness.frames if frame.id == ADMIN_ID and frame.data[0] not in (0x00, 0x41)]
-    assert told == []
-    assert not stage.boot.told_as_application.is_set()
+    asked = [frame for frame in witness.frames if frame.id == ADMIN_ID]
+    assert asked
+    assert [frame for frame in asked if frame.data[0] not in (0x00, 0x41)] == []
+    assert not six.boot.addressed_as_application
 
 
 def test_a_twin_that_has_an_id_is_not_given_another_one_beside_its_brother(
-    place: Place, can_tool: Command
+    stage: CanStage, can_tool: Command
 ) -> None:
-    with ExitStack() as stack:
-        stack.enter_context(place.start_node("toolhead", TWIN, legacy=True)).wait_ready()
-        with closing(place.open()) as host:
-            set_nodeid(host, TWIN, 5)
-        stack.enter_context(place.start_node("toolhead", TWIN, legacy=True)).wait_ready()
-        assert "two boards" in can_tool("assign", str(TWIN), "9", *QUICK).sentence
+    stage.add_node(TWIN, 5, build=TOOLHEAD, legacy=True)
+    stage.add_node(TWIN, build=TOOLHEAD, legacy=True)
+    assert "two boards" in can_tool("assign", str(TWIN), "9").sentence
 
 
-def test_a_node_that_has_the_id_already_and_a_host(stage: Stage, can_tool: Command) -> None:
-    with OtherHost(stage.place, MAIN_ID):
-        said = can_tool("assign", str(MAIN), str(MAIN_ID), *BESIDE)
+def test_a_node_that_has_the_id_already_and_a_host(six: SixNodes, can_tool: Command) -> None:
+    with six.stage.other_host(MAIN_ID):
+        said = can_tool("assign", str(MAIN), str(MAIN_ID))
     assert f"has id {MAIN_ID} already, and another program uses it" in said.sentence
 
 
-def test_an_id_that_only_a_host_uses_is_taken(stage: Stage, can_tool: Command) -> None:
-    with OtherHost(stage.place, 6):
-        assert "id 6 on" in can_tool("assign", str(BED), "6", *BESIDE).sentence
+def test_an_id_that_only_a_host_uses_is_taken(six: SixNodes, can_tool: Command) -> None:
+    with six.stage.other_host(6, every_s=0.98):  # as often as hosts ask for clocks
+        assert "id 6 on" in can_tool("assign", str(BED), "6").sentence
 
 
-def test_a_node_that_does_not_take_its_id_is_told_of(place: Place, can_tool: Command) -> None:
+def test_a_node_that_does_not_take_its_id_is_told_of(stage: CanStage, can_tool: Command) -> None:
     """A board whose firmware answers queries for ever."""
-
-    class Deaf(OtherHost):
-        def _run(self) -> None:
-            with closing(self._transport):
-                self._began.set()
-                while not self._ending.is_set():
-                    frame = self._transport.receive(0.02)
-                    if frame == CanFrame(ADMIN_ID, bytes([QUERY_UNASSIGNED])):
-                        answer = bytes([NEED_NODEID, *BED.raw, SET_NODEID])
-                        self._transport.send(CanFrame(ADMIN_RESPONSE_ID, answer))
-
-    with Deaf(place, 1):
-        said = can_tool("assign", str(BED), "9", *QUICK)
+    answer = CanFrame(ADMIN_RESPONSE_ID, bytes([NEED_NODEID, *BED.raw, SET_NODEID]))
+    question = CanFrame(ADMIN_ID, bytes([QUERY_UNASSIGNED]))
+    with stage.user(lambda frame: answer if frame == question else None):
+        said = can_tool("assign", str(BED), "9")
     assert f"{BED} on " in said.sentence
     assert "was told id 9 3 times and still waits for one" in said.sentence
 
 
-def test_release_refuses_what_another_host_uses_unless_forced(stage: Stage, can_tool: Command) -> None:
-    with OtherHost(stage.place, MAIN_ID):
+def test_release_refuses_what_another_host_uses_unless_forced(six: SixNodes, can_tool: Command) -> None:
+    with six.stage.other_host(MAIN_ID, every_s=0.98):
         for node in (str(MAIN), str(MAIN_ID)):
-            assert f"node {MAIN_ID} on " in (said := can_tool("release", node, *BESIDE).sentence)
+            assert f"node {MAIN_ID} on " in (said := can_tool("release", node).sentence)
             assert "is in use: another program talks to it" in said
         assert str(MAIN) not in waiting(can_tool)
-        assert can_tool("release", str(MAIN), "--force", *QUICK).status == 0
+        assert can_tool("release", str(MAIN), "--force").status == 0
     assert str(MAIN) in waiting(can_tool)
 
 
-def test_release_of_nobody(stage: Stage, can_tool: Command) -> None:
-    assert "no node answers on id 66 of bus " in can_tool("release", "66", *QUICK).sentence
+def test_release_of_nobody(can_tool: Command) -> None:
+    assert "no node answers on id 66 of bus " in can_tool("release", "66").sentence
     stranger = "0123456789ab"
-    assert f"that can be asked has the uuid {stranger}" in can_tool("release", stranger, *QUICK).sentence
+    assert f"that can be asked has the uuid {stranger}" in can_tool("release", stranger).sentence
 
 
-def test_release_of_twins_wants_one_named_by_its_id(place: Place, can_tool: Command) -> None:
-    with ExitStack() as stack:
-        stack.enter_context(place.start_node("toolhead", TWIN)).wait_ready()
-        with closing(place.open()) as host:
-            set_nodeid(host, TWIN, 5)
-        stack.enter_context(place.start_node("mainboard", TWIN)).wait_ready()
-        assert (
-            f"two boards on {place.options.name} have the uuid {TWIN}"
-            in can_tool("release", str(TWIN), *QUICK).sentence
-        )
-        assert can_tool("release", "5", *QUICK).status == 0
-        assert waiting(can_tool)[str(TWIN)]["several_boards"] is True
+def test_release_of_twins_wants_one_named_by_its_id(stage: CanStage, can_tool: Command) -> None:
+    stage.add_node(TWIN, 5, build=TOOLHEAD)
+    stage.add_node(TWIN)
+    assert (
+        f"two boards on {stage.options.name} have the uuid {TWIN}" in can_tool("release", str(TWIN)).sentence
+    )
+    assert can_tool("release", "5").status == 0
+    assert waiting(can_tool)[str(TWIN)]["several_boards"] is True
 
 
 @pytest.mark.parametrize(
@@ -178,7 +159,7 @@ def test_release_of_twins_wants_one_named_by_its_id(place: Place, can_tool: Comm
         ("release",),
     ],
 )
-def test_words_that_make_no_command(place: Place, can_tool: Command, words: tuple[str, ...]) -> None:
+def test_words_that_make_no_command(can_tool: Command, words: tuple[str, ...]) -> None:
     said = can_tool(*words)
     assert (said.status, said.out) == (2, "")
     assert said.err.count("\n") == 1

@@ -5,7 +5,6 @@ import random
 from collections.abc import Sequence
 from pathlib import Path
 
-import can
 import pytest
 
 from canbus_tools.decoded import Kind
@@ -18,14 +17,15 @@ from coordinator import cli
 from nodes._wire import lib
 from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.dictionary import Dictionary
+from nodes.transport import CanFrame
 from nodes.virtual.firmware import TOOLHEAD, firmware_dictionary, firmware_path
-from nodes.virtual.hub import VirtualBus
-from nodes.virtual.processes import NodeProcess
 from tests.canbus_tools import recorded
 from tests.canbus_tools.tshark import Tshark
+from tests.stages.can_stage import MAIN, CanStage
+from tests.stages.simulated_computer import WireUser
 
 NODEID = recorded.NODEID
-WAIT_S = 30.0
+WAIT_S = 1.0
 TOOLHEAD_JSON = firmware_path(TOOLHEAD).with_suffix(".json")
 
 
@@ -252,24 +252,24 @@ def test_any_text_is_a_lua_string() -> None:
         lua(object())
 
 
-# ----------------------------------------------------------------------------- real firmware on a virtual bus
+# -------------------------------------------------------------------------- real firmware on a simulated bus
 
 
 class SmallHost:
     """Says things to node 4 and waits until the bus has been quiet for its answers."""
 
-    def __init__(self, bus: can.BusABC, dictionary: Dictionary) -> None:
+    def __init__(self, bus: WireUser, dictionary: Dictionary) -> None:
         self._bus = bus
         self._dictionary = dictionary
         self._seq = 0
 
     def send(self, can_id: int, data: bytes) -> None:
-        self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False), timeout=WAIT_S)
+        self._bus.send(CanFrame(can_id, data))
 
     def wait_for(self, can_id: int, end: bytes) -> None:
         """Until a frame with CAN_ID ends with END."""
-        while (message := self._bus.recv(WAIT_S)) is not None:
-            if message.arbitration_id == can_id and bytes(message.data).endswith(end):
+        while (frame := self._bus.receive(WAIT_S)) is not None:
+            if frame.id == can_id and frame.data.endswith(end):
                 return
         raise AssertionError(f"no frame {can_id:03x} came that ends with {end.hex()}")
 
@@ -295,22 +295,17 @@ class SmallHost:
         """Until the node's stream has WANTED, wherever its frames cut it."""
         stream = b""
         while wanted not in stream:
-            message = self._bus.recv(WAIT_S)
-            assert message is not None, f"the node never said {wanted.hex()}"
-            if message.arbitration_id == data_id(NODEID, Direction.FROM_NODE):
-                stream += message.data
+            frame = self._bus.receive(WAIT_S)
+            assert frame is not None, f"the node never said {wanted.hex()}"
+            if frame.id == data_id(NODEID, Direction.FROM_NODE):
+                stream += frame.data
 
 
-def talk(folder: Path, dictionary: Dictionary) -> list[Frame]:
+def talk(stage: CanStage, dictionary: Dictionary) -> list[Frame]:
     """All frames of a host's talk with a node of our firmware."""
-    uuid = "90a4ae022dfc"
-    with (
-        VirtualBus(folder / "bus") as bus,
-        NodeProcess("toolhead", uuid=uuid, can=bus.path) as node,
-        can.Bus(interface="canductor", channel=str(bus.path)) as recorder,
-        can.Bus(interface="canductor", channel=str(bus.path)) as own,
-    ):
-        node.wait_ready()
+    uuid = str(MAIN)
+    stage.add_node(MAIN, build=TOOLHEAD)
+    with stage.computer.listen(stage.options) as recorder, stage.user() as own:
         host = SmallHost(own, dictionary)
         host.send(ADMIN_ID, b"\x00")
         host.wait_for(ADMIN_RESPONSE_ID, bytes.fromhex(uuid) + b"\x01")
@@ -327,17 +322,13 @@ def talk(folder: Path, dictionary: Dictionary) -> list[Frame]:
         for _ in range(10):
             host.ask("get_clock", "get_uptime", "get_canbus_id")
             host.ask("get_sync_pulse")
-        host.send(0x7FF, b"")
-        frames = []
-        while (message := recorder.recv(WAIT_S)) is not None and message.arbitration_id != 0x7FF:
-            frames.append(Frame.from_message(message))
-        return frames
+        return recorder.take()
 
 
-def test_the_traffic_of_our_firmware_reads_as_our_decoder_reads_it(tmp_path: Path) -> None:
+def test_the_traffic_of_our_firmware_reads_as_our_decoder_reads_it(stage: CanStage, tmp_path: Path) -> None:
     dictionary = firmware_dictionary(TOOLHEAD)
     tshark = Tshark(tmp_path, {NODEID: dictionary})
-    frames = talk(tmp_path, dictionary)
+    frames = talk(stage, dictionary)
     tshark.load(frames)
     expected = said_by_decoder(frames, {NODEID: dictionary})
     names = {text.split()[0] for _, texts in expected for text in texts}

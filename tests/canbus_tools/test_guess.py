@@ -12,14 +12,11 @@ from canbus_tools.decoder import BusDecoder
 from canbus_tools.dictionaries import GUESSED, LEARNT, DictionarySource
 from canbus_tools.filters import Filter
 from canbus_tools.frame import Frame
-from canbus_tools.frame_queue import FrameQueue
 from canbus_tools.monitor import Lines, MonitorOptions
-from canbus_tools.open_bus import BusOptions, open_bus
 from canbus_tools.protocol import Direction
 from coordinator.cli import main
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
-from nodes.virtual.hub import VirtualBus
 from tests import wire_twin as twin
 from tests.canbus_tools.talk_twin import (
     DICTIONARY,
@@ -31,8 +28,19 @@ from tests.canbus_tools.talk_twin import (
     identify_pieces,
     other_dictionary,
 )
+from tests.stages.can_stage import CanStage
 
 DICTIONARIES = Path(__file__).parents[2] / ".." / "shared" / "data" / "dictionaries"
+REAL = (
+    "atmega2560",
+    "linuxprocess",
+    "rp2040-can2040",
+    "stm32f072-can",
+    "stm32f103-usb",
+    "stm32f407-usart1",
+    "stm32g0b1-can",
+    "stm32h723-usbcanbridge",
+)
 
 
 def changed(*words: tuple[bytes, bytes]) -> bytes:
@@ -130,10 +138,10 @@ def test_without_a_cache_nothing_is_guessed() -> None:
 
 
 def test_eight_real_firmwares_are_told_from_one_another(tmp_path: Path) -> None:
-    if not DICTIONARIES.is_dir():
-        pytest.skip("no dictionaries of real firmware in ../shared")
-    texts = {path.stem: path.read_bytes() for path in sorted(DICTIONARIES.glob("*.json"))}
-    assert len(texts) == 8
+    paths = [DICTIONARIES / f"{name}.json" for name in REAL]
+    if not all(path.exists() for path in paths):
+        pytest.skip("the dictionaries of real firmware are not in ../shared")
+    texts = {path.stem: path.read_bytes() for path in paths}
     cache = cache_of(tmp_path, *texts.values())
     for stem, text in texts.items():
         dictionary = Dictionary.from_json(text)
@@ -155,20 +163,21 @@ def test_decode_says_that_it_guessed(tmp_path: Path, capsys: pytest.CaptureFixtu
     )
 
 
-def test_lines_say_once_that_they_are_guessed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lines_say_once_that_they_are_guessed(
+    stage: CanStage, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     decoder = BusDecoder(DictionarySource(cache=cache_of(tmp_path / "cache", DICTIONARY_JSON)))
     watch = BusWatch(decoder, LoadMeter(1_000_000), 0.0)
     for frame in host():
         watch.feed(frame)
-    with VirtualBus(tmp_path / "bus") as bus:
-        options = MonitorOptions(
-            bus=BusOptions(interface="canductor", channel=str(bus.path)),
-            bitrate=1_000_000,
-            bitrate_is_known=False,
-            filter_=Filter(),
-            dictionaries={},
-            duration_s=0.3,  # some rounds
-        )
-        with FrameQueue(open_bus(options.bus), "bus") as queue:
-            assert Lines(options, watch, queue).run() == 0
+    options = MonitorOptions(
+        bus=stage.options,
+        bitrate=1_000_000,
+        bitrate_is_known=False,
+        filter_=Filter(),
+        dictionaries={},
+        duration_s=2.0,  # many rounds
+    )
+    with stage.computer.listen(options.bus) as queue:
+        assert Lines(stage.computer, options, watch, queue).run() == 0
     assert capsys.readouterr().err.count("is guessed") == 1

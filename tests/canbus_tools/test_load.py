@@ -1,15 +1,12 @@
 """``canductor can load``: on recorded traffic of real nodes, live, and what it refuses."""
 
-import asyncio
-import threading
-import time
+import signal
 import xml.etree.ElementTree as ET
-from contextlib import closing
 from pathlib import Path
-from typing import Self
 
 import pytest
 
+from canbus_tools.candump import candump_line
 from canbus_tools.frame import Frame
 from canbus_tools.load import find_bitrate
 from canbus_tools.recordings import read_frames
@@ -17,51 +14,27 @@ from canbus_tools.talk import BusTalk
 from coordinator.cli import main
 from nodes.transport import CanFrame
 from tests.canbus_tools.command import Command, Said
-from tests.canbus_tools.stage import MAIN, MAIN_ID, PATIENCE_S, Place, set_nodeid
 from tests.nodes.wire_bits import bits_on_wire
+from tests.stages.can_stage import MAIN, MAIN_ID, CanStage
 
 BITRATE = "1000000"
 QUESTIONS = 200
 
 
-def record_session(place: Place, path: Path) -> None:
-    """Write what a real node and a host say to each other: id, dictionary, questions and answers."""
-    lines: list[str] = []
-    done = threading.Event()
-
-    def look_on() -> None:
-        with closing(place.open()) as onlooker:
-            ready.set()
-            while True:
-                frame = onlooker.receive(0.05)
-                if frame is not None:
-                    lines.append(f"({time.time():.6f}) can0 {frame.id:03X}#{frame.data.hex().upper()}")
-                elif done.is_set():
-                    return
+@pytest.fixture
+def recording(stage: CanStage, tmp_path: Path) -> Path:
+    """What a real node and a host say to each other: id, dictionary, questions and answers."""
 
     async def talk() -> None:
-        async with BusTalk.open(place.options) as bus, bus.node(MAIN_ID) as node:
+        async with BusTalk.open(stage.computer, stage.options) as bus, bus.node(MAIN_ID) as node:
             for _ in range(QUESTIONS):
                 await node.ask("get_uptime", "uptime")
 
-    ready = threading.Event()
-    thread = threading.Thread(target=look_on)
-    thread.start()
-    assert ready.wait(PATIENCE_S)
-    with place.start_node("mainboard", MAIN) as process:
-        process.wait_ready()
-        with closing(place.open()) as host:
-            set_nodeid(host, MAIN, MAIN_ID)
-        asyncio.run(talk())
-    done.set()
-    thread.join(PATIENCE_S)
-    path.write_text("\n".join(lines) + "\n")
-
-
-@pytest.fixture
-def recording(place: Place, tmp_path: Path) -> Path:
     path = tmp_path / "session.log"
-    record_session(place, path)
+    with stage.computer.listen(stage.options) as listener:
+        stage.add_node(MAIN, MAIN_ID)
+        stage.computer.run(talk())
+        path.write_text("".join(map(candump_line, listener.take())))
     return path
 
 
@@ -105,72 +78,37 @@ def test_as_tables_with_a_plot(recording: Path, tmp_path: Path, capsys: pytest.C
     assert "load of" in plot.read_text()
 
 
-class Babbler:
-    """Sends one and the same frame every PERIOD_S to a bus, until the end."""
-
-    def __init__(self, place: Place, period_s: float) -> None:
-        self.sent = 0
-        self._place = place
-        self._period_s = period_s
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-
-    def _run(self) -> None:
-        with closing(self._place.open()) as bus:
-            while not self._end.wait(self._period_s):
-                bus.send(CanFrame(0x555, b"12345678"))
-                self.sent += 1
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join(PATIENCE_S)
-
-
-def test_live(place: Place, can_tool: Command) -> None:
-    with Babbler(place, 0.005) as babbler:
+def test_live(stage: CanStage, can_tool: Command) -> None:
+    with stage.repeating(CanFrame(0x555, b"12345678"), 0.005):
         said = can_tool("load", "--bitrate", "250000", "--duration", "1", "--json")
     assert said.status == 0
     frames = said.json["frames"]
-    assert 20 < frames <= babbler.sent
-    assert said.json["duration_s"] > 0.99
+    assert 199 <= frames <= 200
+    assert said.json["duration_s"] == pytest.approx(1.0)
     bits = frames * bits_on_wire(0x555, b"12345678")
-    assert said.json["mean"] == pytest.approx(bits / 250_000 / said.json["duration_s"], rel=1e-3)
+    assert said.json["mean"] == pytest.approx(bits / 250_000, rel=1e-3)
     assert list(said.json["ids"]) == ["555"]
 
 
-def test_watch_until_ctrl_c_still_reports(
-    place: Place, can_tool: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shown = 0
-
-    def interrupt(self: object) -> bool:
-        nonlocal shown
-        shown += 1
-        if shown > 3:
-            raise KeyboardInterrupt
-        return True
-
-    monkeypatch.setattr("canbus_tools.load._Screen.is_due", interrupt)
-    with Babbler(place, 0.001):
+def test_watch_until_ctrl_c_still_reports(stage: CanStage, can_tool: Command) -> None:
+    stage.press(signal.SIGINT, after_s=3.5)
+    with stage.repeating(CanFrame(0x555, b"12345678"), 0.001):
         said = can_tool("load", "--bitrate", BITRATE, "--watch")
     assert said.status == 0
-    assert said.out.count("mean") == 3
+    assert said.out.count("mean") == 4, "one line at once and each second"
+    assert "of 1000000 bit/s in 3.5 s" in said.out
     assert "555" in said.out
 
 
-def test_a_silent_bus_is_said_to_be_silent(place: Place, can_tool: Command) -> None:
+def test_a_silent_bus_is_said_to_be_silent(can_tool: Command) -> None:
     said = can_tool("load", "--bitrate", BITRATE, "--duration", "0.1")
-    assert (said.status, "not one frame in 0." in said.out) == (0, True)
+    assert (said.status, "not one frame in 0.1 s" in said.out) == (0, True)
 
 
-def test_bit_rate_must_be_known(place: Place, can_tool: Command) -> None:
+def test_bit_rate_must_be_known(stage: CanStage, can_tool: Command) -> None:
     assert "--bitrate 1000000" in can_tool("load", "--duration", "0.1").sentence
     with pytest.raises(Exception, match="--bitrate 1000000"):
-        find_bitrate(place.options)
+        find_bitrate(stage.options)
 
 
 def test_recordings_of_several_buses_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

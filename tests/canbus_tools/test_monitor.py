@@ -1,185 +1,107 @@
-"""``canductor can monitor`` on a real bus: lines, filters, dictionaries, how it ends, a full bus."""
+"""``canductor can monitor``: lines, filters, dictionaries, how it ends."""
 
-import asyncio
-import contextlib
+import errno
 import io
-import json
+import os
 import signal
-import subprocess
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
-from contextlib import closing
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from canbus_tools.bus_load import LoadMeter
 from canbus_tools.bus_watch import SPAN_S, BusWatch
+from canbus_tools.computer import Listener, now_s
 from canbus_tools.decoder import BusDecoder
 from canbus_tools.filters import Filter
 from canbus_tools.frame import Frame
-from canbus_tools.frame_queue import FrameQueue
 from canbus_tools.monitor import Lines, MonitorOptions, fetch
-from canbus_tools.open_bus import BusOptions, open_bus
-from coordinator.cli import main
 from nodes.errors import CanductorError
-from nodes.transport import CanFrame
 from nodes.virtual.firmware import MAINBOARD, firmware_path
-from nodes.virtual.hub import VirtualBus
-from tests.canbus_tools.stage import MAIN, MAIN_ID, PATIENCE_S, TOOL_ID, Place, Stage, set_nodeid
+from tests.canbus_tools.command import Command
+from tests.stages.can_stage import (
+    MAIN,
+    MAIN_ID,
+    QUESTIONS,
+    TOOL_ID,
+    CanStage,
+    SixNodes,
+    conversation,
+    set_nodeid,
+)
 
 DICTIONARY = f"{MAIN_ID}={firmware_path(MAINBOARD).with_suffix('.json')}"
 Captured = pytest.CaptureFixture[str]
 
 
-@pytest.fixture
-def node(place: Place) -> Iterator[Place]:
-    """One node of our firmware with id 4."""
-    with place.start_node("mainboard", MAIN) as process:
-        process.wait_ready()
-        with closing(place.open()) as host:
-            set_nodeid(host, MAIN, MAIN_ID)
-        yield place
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_lines_learn_the_dictionary_and_end_in_order(
+    stage: CanStage, can_tool: Command, number: signal.Signals
+) -> None:
+    stage.replay(conversation())
+    began_s = stage.computer.unix_s()
+    stage.press(number, after_s=5.0)
+    said = can_tool("monitor")
+    assert (said.status, said.err) == (0, "")
+    lines = said.out.splitlines()
+    [line] = [line for line in lines if "canbus_id canbus_uuid" in line]
+    time_s, bus, way, nodeid, text = line.split(maxsplit=4)
+    assert began_s < float(time_s) < began_s + 5.0
+    assert (bus, way, nodeid) == ("can0", "from", "4")
+    assert text == f"canbus_id canbus_uuid={MAIN} canbus_nodeid=4"
+    assert [any(f"  {name}" in line for line in lines) for name, _ in QUESTIONS] == [True] * len(QUESTIONS)
+    assert not any("  ack" in line for line in lines)
 
 
-def ask(place: Place, *lines: str) -> None:
-    words = [word for line in lines for word in ("-e", line)]
-    assert main(["console", *place.words, "--node", str(MAIN_ID), "--force", *words]) == 0
-
-
-@contextlib.contextmanager
-def monitor(place: Place, *words: str) -> Iterator["subprocess.Popen[str]"]:
-    """Run the tool as a process."""
-    entry = "import sys; from coordinator.entry import main; sys.exit(main())"
-    command = [sys.executable, "-c", entry, "can", "monitor", *place.words, *words]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-def talk_until(place: Place, process: "subprocess.Popen[str]", wanted: str, times: int = 1) -> list[str]:
-    """Ask the node again and again until the monitor has shown WANTED so often; return its lines so far.
-
-    What it has shown twice had both answers between.
-    """
-    seen: list[str] = []
-    found = threading.Event()
-
-    def read() -> None:
-        assert process.stdout is not None
-        for line in process.stdout:
-            seen.append(line)
-            if sum(wanted in line for line in seen) == times:
-                found.set()
-                return
-
-    reader = threading.Thread(target=read)
-    reader.start()
-    end_s = time.monotonic() + PATIENCE_S
-    while not found.is_set() and time.monotonic() < end_s and process.poll() is None:
-        ask(place, "get_uptime", "get_canbus_id")
-    reader.join(PATIENCE_S)
-    assert found.is_set(), (seen[-5:], process.stderr and process.poll())
-    return seen
-
-
-def wait_until(true: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < end_s
-        time.sleep(0.001)
-
-
-def test_lines_learn_the_dictionary_and_end_in_order(node: Place) -> None:
-    with monitor(node) as process:
-        seen = talk_until(node, process, f"canbus_id canbus_uuid={MAIN}")
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=PATIENCE_S)
-    assert (process.returncode, errors) == (0, "")
-    time_s, bus, way, nodeid, text = seen[-1].split(maxsplit=4)
-    assert abs(float(time_s) - time.time()) < 60
-    assert bus == node.channel.rpartition("/")[2]
-    assert (way, nodeid) == ("from", "4")
-    assert text == f"canbus_id canbus_uuid={MAIN} canbus_nodeid=4\n"
-    assert not any("  ack" in line for line in seen)
-
-
-def test_json_and_filters(node: Place) -> None:
-    words = (
-        "--json",
-        "--dictionary",
-        DICTIONARY,
-        "--node",
-        "4",
-        "--direction",
-        "from",
-        "--message",
-        "uptime",
-    )
-    with monitor(node, *words) as process:
-        seen = talk_until(node, process, '"uptime"', times=2)
-        process.send_signal(signal.SIGINT)
-        rest, _ = process.communicate(timeout=PATIENCE_S)
-    lines: list[dict[str, Any]] = [json.loads(line) for line in [*seen, *rest.splitlines()]]
-    *said, last = lines
-    assert {(s["name"], s["nodeid"], s["direction"]) for s in said} == {("uptime", 4, "from")}
+def test_json_and_filters(stage: CanStage, can_tool: Command) -> None:
+    stage.replay(conversation())
+    options = ("--dictionary", DICTIONARY, "--node", "4", "--direction", "from", "--message", "uptime")
+    said = can_tool("monitor", "--json", "--duration", "2", *options)
+    *lines, last = said.objects
+    assert [(s["name"], s["nodeid"], s["direction"]) for s in lines] == [("uptime", 4, "from")] * 2
     assert last["ok"]
-    assert last["lines"] == len(said)
-    assert last["dropped_frames"] == 0
+    assert last["lines"] == 2
+    assert (last["frames"], last["dropped_frames"]) == (len(conversation()), 0)
     assert (last["nodes"][0]["dictionary"], last["nodes"][0]["uuid"]) == ("given", str(MAIN))
 
 
-def test_a_closed_pipe_ends_it_quietly(node: Place) -> None:
-    with monitor(node) as process:
-        talk_until(node, process, "uptime")
-        assert process.stdout is not None
-        process.stdout.close()
-        end_s = time.monotonic() + PATIENCE_S
-        while process.poll() is None and time.monotonic() < end_s:
-            ask(node, "get_uptime")
-        assert process.stderr is not None
-        assert (process.wait(PATIENCE_S), process.stderr.read()) == (141, "")
+def test_a_closed_pipe_ends_it_quietly(
+    stage: CanStage, can_tool: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage.replay(conversation())
+    reader, writer = os.pipe()
+    os.close(reader)
+    begin_ns = stage.world.now_ns
+    with os.fdopen(writer, "w") as pipe, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", pipe)
+        said = can_tool("monitor", "--duration", "3600")
+    assert (said.status, said.err) == (141, "")
+    assert stage.world.now_ns < begin_ns + 60_000_000_000, "it ended with the first line"
 
 
-def test_a_bus_that_ends_is_told(tmp_path: Path, capsys: Captured) -> None:
-    bus = VirtualBus(tmp_path / "bus")
-    bus.start()
-    place = Place("canductor", str(bus.path))
-    with monitor(place) as process, closing(place.open()) as host:
-        set_nodeid(host, MAIN, MAIN_ID)
-        assert process.stdout is not None
-        sender = threading.Event()
-        told = threading.Thread(target=lambda: _send_until(host, sender))
-        told.start()
-        assert "set_nodeid" in process.stdout.readline()
-        sender.set()
-        told.join()
-        bus.close()
-        _, errors = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 1
-    assert errors.startswith("canductor: CAN bus bus: it cannot be listened to any more: ")
+def test_a_bus_that_ends_is_told(stage: CanStage, can_tool: Command) -> None:
+    stage.replay(conversation())
+    stage.world.at(stage.world.now_ns + 2_000_000_000, lambda: stage.computer.unplug(errno.ENODEV))
+    said = can_tool("monitor")
+    assert said.status == 1
+    assert "uptime high" in said.out
+    assert said.err.startswith("canductor: CAN bus canductor:can0: can0: the connection ended")
 
 
-def _send_until(host: Any, ending: threading.Event) -> None:
-    while not ending.wait(0.05):
-        set_nodeid(host, MAIN, MAIN_ID)
+def test_dictionaries_are_fetched_when_asked(six: SixNodes, can_tool: Command) -> None:
+    stage = six.stage
 
+    def fetched(*nodes: str) -> dict[int, str]:
+        words = stage.computer.run(fetch(stage.computer, stage.options, nodes))
+        return {nodeid: dictionary.str_constant("MCU") for nodeid, dictionary in words.items()}
 
-def test_dictionaries_are_fetched_when_asked(stage: Stage) -> None:
-    every = asyncio.run(fetch(stage.place.options, ("all",)))
-    assert {nodeid: words.str_constant("MCU") for nodeid, words in every.items()} == {
-        MAIN_ID: "virtual-mainboard",
-        TOOL_ID: "virtual-toolhead",
-    }
-    one = asyncio.run(fetch(stage.place.options, (str(TOOL_ID),)))
-    assert list(one) == [TOOL_ID]
+    assert fetched("all") == {MAIN_ID: "virtual-mainboard", TOOL_ID: "virtual-toolhead"}
+    assert fetched(str(TOOL_ID)) == {TOOL_ID: "virtual-toolhead"}
     with pytest.raises(CanductorError, match="no node answers on id 9"):
-        asyncio.run(fetch(stage.place.options, ("9",)))
+        fetched("9")
+    with stage.asking_host(MAIN_ID, every_s=0.5):
+        said = can_tool("monitor", "--fetch", "all", "--duration", "2")
+    assert "canductor: node 4 was not asked: another host uses it\n" in said.err
+    assert "no node" not in said.out
 
 
 @pytest.mark.parametrize(
@@ -192,50 +114,13 @@ def test_dictionaries_are_fetched_when_asked(stage: Stage) -> None:
         (["--bitrate", "3"], "--bitrate is '3'"),
     ],
 )
-def test_words_that_make_no_command(words: list[str], said: str, capsys: Captured) -> None:
-    assert main(["can", "monitor", *words]) == 2
-    assert said in capsys.readouterr().err
+def test_words_that_make_no_command(can_tool: Command, words: list[str], said: str) -> None:
+    tried = can_tool("monitor", *words)
+    assert tried.status == 2
+    assert said in tried.err
 
 
 # ----------------------------------------------------------------------------------------------------- inside
-
-
-def opened(bus: VirtualBus) -> BusOptions:
-    return BusOptions(interface="canductor", channel=str(bus.path))
-
-
-def test_a_full_bus_is_received_whole(tmp_path: Path) -> None:
-    frames = 20_000
-    with (
-        VirtualBus(tmp_path / "bus", bitrate=None) as bus,
-        FrameQueue(open_bus(opened(bus)), "bus") as queue,
-        closing(Place("canductor", str(bus.path)).open()) as host,
-    ):
-        for n in range(frames):
-            host.send(CanFrame(0x108, n.to_bytes(8, "little")), PATIENCE_S)
-        got: list[Frame] = []
-        while len(got) < frames:
-            new = queue.take(PATIENCE_S)
-            assert new, f"only {len(got)} came"
-            got += new
-        assert [int.from_bytes(frame.data, "little") for frame in got] == list(range(frames))
-        assert queue.dropped == 0
-        assert got[0].channel == "bus"
-
-
-def test_what_waits_too_long_gives_way_and_is_counted(tmp_path: Path) -> None:
-    with (
-        VirtualBus(tmp_path / "bus", bitrate=None) as bus,
-        FrameQueue(open_bus(opened(bus)), "bus", limit=10) as queue,
-        closing(Place("canductor", str(bus.path)).open()) as host,
-    ):
-        for n in range(25):
-            host.send(CanFrame(0x108, bytes([n])))
-        got: list[Frame] = []
-        wait_until(lambda: queue.dropped >= 15)
-        got = queue.take()
-        assert [frame.data[0] for frame in got] == list(range(15, 25))
-        assert queue.take() == []
 
 
 def test_rates_are_of_the_last_seconds() -> None:
@@ -257,28 +142,26 @@ def test_rates_are_of_the_last_seconds() -> None:
     assert len(watch.loads) == 7
 
 
-def shown_of(bus: VirtualBus, queue: FrameQueue, duration_s: float) -> int:
+def lines_of(stage: CanStage, queue: Listener, duration_s: float) -> int:
+    """Write what QUEUE receives as lines; return how many were counted."""
     options = MonitorOptions(
-        bus=opened(bus),
+        bus=stage.options,
         bitrate=1_000_000,
         bitrate_is_known=False,
         filter_=Filter(),
         dictionaries={},
         duration_s=duration_s,
     )
-    return Lines(options, BusWatch(BusDecoder(), LoadMeter(1_000_000), time.monotonic()), queue).run()
+    watch = BusWatch(BusDecoder(), LoadMeter(1_000_000), now_s(stage.computer))
+    return Lines(stage.computer, options, watch, queue).run()
 
 
-def test_dropped_frames_are_told_now_and_then(tmp_path: Path, capsys: Captured) -> None:
-    with (
-        VirtualBus(tmp_path / "bus", bitrate=None) as bus,
-        FrameQueue(open_bus(opened(bus)), "bus", limit=5) as queue,
-        closing(Place("canductor", str(bus.path)).open()) as host,
-    ):
-        for _ in range(50):
-            set_nodeid(host, MAIN, MAIN_ID)
-        wait_until(lambda: queue.dropped >= 45)
-        assert shown_of(bus, queue, 0.2) == 5
+def test_dropped_frames_are_told_now_and_then(stage: CanStage, capsys: Captured) -> None:
+    with stage.computer.listen(stage.options, limit=5) as queue:
+        with stage.user() as host:
+            set_nodeid(host, MAIN, MAIN_ID, times=50)
+            stage.world.run_for(0.1)
+        assert lines_of(stage, queue, 0.2) == 5
     said = capsys.readouterr()
     assert said.out.count("set_nodeid") == 5
     assert said.err == "canductor: 45 frames were dropped until now: lines are read too slowly\n"
@@ -293,15 +176,12 @@ class Interrupted(io.StringIO):
 
 
 def test_a_line_that_was_written_when_ctrl_c_came_is_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stage: CanStage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with (
-        VirtualBus(tmp_path / "bus", bitrate=None) as bus,
-        FrameQueue(open_bus(opened(bus)), "bus") as queue,
-        closing(Place("canductor", str(bus.path)).open()) as host,
-    ):
-        for _ in range(5):
-            set_nodeid(host, MAIN, MAIN_ID)
+    with stage.computer.listen(stage.options) as queue:
+        with stage.user() as host:
+            set_nodeid(host, MAIN, MAIN_ID, times=5)
+            stage.world.run_for(0.1)
         output = Interrupted()
         monkeypatch.setattr(sys, "stdout", output)
-        assert shown_of(bus, queue, PATIENCE_S) == output.getvalue().count("\n") == 2
+        assert lines_of(stage, queue, 60.0) == output.getvalue().count("\n") == 2

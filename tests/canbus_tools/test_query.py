@@ -1,12 +1,11 @@
 """``canductor can query``: on the stage, on an empty bus, on one where all have their ids."""
 
-from contextlib import closing
-
 from tests.canbus_tools.command import Command
-from tests.canbus_tools.stage import BED, BOOT, MAIN, MAIN_ID, TWIN, Place, Stage, set_nodeid
+from tests.stages.can_stage import BED, BOOT, MAIN, MAIN_ID, TWIN, CanStage, SixNodes
 
 
-def test_who_waits_on_the_stage(stage: Stage, can_tool: Command) -> None:
+def test_who_waits_on_the_stage(six: SixNodes, can_tool: Command) -> None:
+    del six
     said = can_tool("query", "--json")
     assert said.status == 0
     nodes = {node["uuid"]: node for node in said.json["nodes"]}
@@ -21,11 +20,11 @@ def test_who_waits_on_the_stage(stage: Stage, can_tool: Command) -> None:
     assert said.json["assigned_nodeids"] == [MAIN_ID]
 
 
-def test_as_a_table_with_what_to_know(stage: Stage, can_tool: Command) -> None:
+def test_as_a_table_with_what_to_know(six: SixNodes, can_tool: Command) -> None:
     said = can_tool("query")
     assert said.status == 0
     lines = said.out.splitlines()
-    assert lines[0].startswith(f"3 uuids wait for an id on {stage.place.options.name} (asked 5 times in ")
+    assert lines[0].startswith(f"3 uuids wait for an id on {six.stage.options.name} (asked 5 times in 0.")
     rows = {line.split()[0]: line for line in lines if line.startswith("  ")}
     assert "Katapult bootloader" in rows[str(BOOT)]
     assert "Klipper-type firmware" in rows[str(BED)]
@@ -34,28 +33,25 @@ def test_as_a_table_with_what_to_know(stage: Stage, can_tool: Command) -> None:
     assert str(MAIN) not in said.out
     assert f"Two boards have the uuid {TWIN}" in said.words
     assert "'canductor can nodes' lists those as well" in said.words
-    assert max(map(len, lines[1:])) <= 98  # the first has the path of the bus in it
+    assert max(map(len, lines)) <= 98
 
 
-def test_nobody_on_the_bus_is_explained(place: Place, can_tool: Command) -> None:
+def test_nobody_on_the_bus_is_explained(can_tool: Command) -> None:
     said = can_tool("query")
     assert said.status == 0
     assert said.out.startswith("0 uuids wait for an id")
     for hint in ("Only nodes without an id answer", "bit rate", "120 ohm", "can nodes", "can doctor"):
         assert hint in said.words
-    assert f"canductor can nodes {'-i canductor ' if place.is_virtual else ''}-c {place.channel}" in said.out
+    assert "canductor can nodes -i canductor -c can0" in said.out
 
 
-def test_nobody_waits_because_all_have_ids(place: Place, can_tool: Command) -> None:
-    with place.start_node("mainboard", MAIN) as node:
-        node.wait_ready()
-        with closing(place.open()) as host:
-            set_nodeid(host, MAIN, 9)
-        said = can_tool("query")
+def test_nobody_waits_because_all_have_ids(stage: CanStage, can_tool: Command) -> None:
+    stage.add_node(MAIN, 9)
+    said = can_tool("query")
     assert "The bus works: 1 node with an id was heard (9)" in said.words
     assert "120 ohm" not in said.out
 
 
-def test_more_rounds_when_asked_for(stage: Stage, can_tool: Command) -> None:
+def test_more_rounds_when_asked_for(can_tool: Command) -> None:
     assert can_tool("query", "--rounds", "9", "--json").json["rounds"] == 9
     assert can_tool("query", "--rounds", "0").status == 2

@@ -1,15 +1,7 @@
-"""One session with six nodes: recorded and watched while the tools talk, then decoded and measured."""
+"""One session with six nodes: the tools talk, what was on the bus is recorded, decoded and measured."""
 
 import json
-import signal
-import subprocess
-import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
 
 import pytest
 
@@ -18,68 +10,25 @@ from canbus_tools.recordings import read_frames
 from coordinator.cli import main
 from nodes.virtual.firmware import MAINBOARD, firmware_path
 from tests.canbus_tools.command import Command
-from tests.canbus_tools.stage import BED, BOOT, MAIN, MAIN_ID, PATIENCE_S, TOOL, TOOL_ID, TWIN, Place, Stage
 from tests.nodes.wire_bits import bits_on_wire
+from tests.stages.can_stage import BED, BOOT, MAIN, MAIN_ID, TOOL, TOOL_ID, TWIN, CanStage, SixNodes
 
-QUICK = ("--listen", "0.2")
 BED_ID = 17
 
 
-@dataclass
-class Tool:
-    """A tool that runs beside the others, until Ctrl-C."""
-
-    process: "subprocess.Popen[str]"
-    lines: list[str] = field(default_factory=list)
-    _news: threading.Condition = field(default_factory=threading.Condition)
-
-    def read(self, pipe: IO[str]) -> None:
-        for line in pipe:
-            with self._news:
-                self.lines.append(line.rstrip("\n"))
-                self._news.notify_all()
-
-    def wait_for(self, words: str) -> None:
-        """Wait until it has said WORDS."""
-        with self._news:
-            assert self._news.wait_for(lambda: any(words in line for line in self.lines), PATIENCE_S), (
-                words,
-                self.lines[-5:],
-            )
-
-
-@contextmanager
-def running(place: Place, *words: str) -> Iterator[Tool]:
-    command = [sys.executable, "-u", "-m", "coordinator.cli", "can", *words, *place.words]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
-        assert process.stdout is not None
-        tool = Tool(process)
-        reader = threading.Thread(target=tool.read, args=(process.stdout,))
-        reader.start()
-        try:
-            yield tool
-            process.send_signal(signal.SIGINT)
-            assert process.wait(PATIENCE_S) == 0, tool.lines[-5:]
-        finally:
-            process.kill()
-            reader.join(PATIENCE_S)
-
-
-def test_a_session_is_watched_recorded_decoded_and_measured(
-    stage: Stage, can_tool: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_session_is_recorded_decoded_and_measured(
+    six: SixNodes, can_tool: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path = tmp_path / "session.mcap"
-    place = stage.place
-    with running(place, "record", "-o", str(path)) as recorder, running(place, "monitor") as monitor:
-        recorder.wait_for("recording")
-        while not any("node_is_here" in line for line in monitor.lines):  # it may begin to listen later
-            query = can_tool("query", "--json").json
-        assert can_tool("assign", str(BED), str(BED_ID), *QUICK).status == 0
-        nodes = can_tool("nodes", "--json", *QUICK).json["nodes"]
+    stage = six.stage
+    with stage.computer.listen(stage.options) as listener:
+        query = can_tool("query", "--json").json
+        assert can_tool("assign", str(BED), str(BED_ID)).status == 0
+        nodes = can_tool("nodes", "--json").json["nodes"]
         asked = ("-e", "get_uptime", "-e", "get_canbus_id")
-        assert main(["console", *place.words, "--node", str(MAIN_ID), "--force", *asked]) == 0
-        monitor.wait_for(f"canbus_id canbus_uuid={MAIN} canbus_nodeid={MAIN_ID}")
-        assert can_tool("release", str(BED_ID), *QUICK).status == 0
+        said = can_tool.console("--node", MAIN_ID, *asked)
+        assert f"canbus_id canbus_uuid={MAIN} canbus_nodeid={MAIN_ID}" in said.out
+        assert can_tool("release", str(BED_ID)).status == 0
+        session = listener.take()
 
     assert {n["uuid"] for n in query["nodes"]} == {str(u) for u in (BED, TWIN, BOOT)}
     assert sorted((n["uuid"], n["nodeid"], n["state"], n["several_boards"]) for n in nodes) == sorted(
@@ -91,9 +40,23 @@ def test_a_session_is_watched_recorded_decoded_and_measured(
             (str(BOOT), None, "bootloader", False),
         ]
     )
+    path = record(session, capsys, tmp_path)
     frames = list(read_frames(path))
+    assert [frame[1:3] for frame in frames] == [frame[1:3] for frame in session]
     check_decoded(capsys, path, len(frames))
     check_load(capsys, path, frames)
+
+
+def record(session: list[Frame], capsys: pytest.CaptureFixture[str], folder: Path) -> Path:
+    """Have the frames of SESSION recorded from another bus; return the file."""
+    path = folder / "session.mcap"
+    stage = CanStage()
+    stage.replay(session)
+    tool = Command(stage.computer, capsys, stage.words)
+    seconds = session[-1].time_s - session[0].time_s
+    said = tool("record", "-o", path, "--duration", seconds + 1, "--json")
+    assert (said.status, said.json["frames"]) == (0, len(session))
+    return path
 
 
 def check_decoded(capsys: pytest.CaptureFixture[str], path: Path, frames: int) -> None:

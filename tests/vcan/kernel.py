@@ -6,8 +6,11 @@ import shutil
 import socket
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
+
+from nodes.assign import ADMIN_ID, SET_NODEID
+from nodes.transport import CanFrame, open_can
 
 INTERFACE = "vcan0"
 SECOND_INTERFACE = "vcan1"
@@ -91,6 +94,12 @@ def netem_dropped(interface: str = INTERFACE) -> int:
         capture_output=True,
     )
     return int(json.loads(said.stdout)[0]["drops"])
+
+
+def set_nodeid(uuid: str, nodeid: int, interface: str = INTERFACE) -> None:
+    """Give the node with UUID its id."""
+    with closing(open_can(interface)) as host:
+        host.send(CanFrame(ADMIN_ID, bytes([SET_NODEID, *bytes.fromhex(uuid), nodeid])))
 
 
 def frames_sent(interface: str) -> int:
