@@ -13,7 +13,6 @@ import pytest
 from nodes.link import LinkError, LinkIO, LinkSettings, TransportKind
 from tests.nodes.link.peers import TIMEOUT_S, FdTransport, Inbox, bench, open_files, pack_frame
 from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, store
-from tests.wire_twin import block
 
 KINDS = list(TransportKind)
 CAN_KINDS = [TransportKind.CAN_STREAM, TransportKind.CAN_PACKET]
@@ -89,38 +88,6 @@ def test_a_batch_goes_as_motion_and_its_lead_is_measured(kind: TransportKind) ->
             assert 0 < stats.min_lead_s < 3.0
             assert stats.motion_commands_max == 2000
             assert stats.motion_commands == stats.motion_bytes == 0
-
-    run(test())
-
-
-@pytest.mark.parametrize("kind", CAN_KINDS)
-def test_four_links_share_a_bus(kind: TransportKind) -> None:
-    async def test() -> None:
-        nodes = {i: NodeTwin(expected=i & 15) for i in (1, 4, 5, 255)}
-        with bench(kind, nodes) as b:
-            links = {i: b.open(i) for i in nodes}
-            commands = {i: [store(i * 1000 + k, 30) for k in range(150)] for i in nodes}
-            for i, link in links.items():
-                link.send_batch(b"".join(record(c) for c in commands[i]))
-            await asyncio.gather(*(link.drained() for link in links.values()))
-            assert {i: node.executed for i, node in nodes.items()} == commands
-            # Equal among equals: nobody is served last.
-            half = b.peer.order[: len(b.peer.order) // 2]
-            assert min(half.count(i) for i in nodes) > len(half) / 8
-            assert b.io.stats().frames_sent == len(b.peer.frames)
-
-    run(test())
-
-
-def test_blocks_of_one_link_share_frames() -> None:
-    async def test() -> None:
-        node = NodeTwin()
-        with bench(TransportKind.CAN_STREAM, {4: node}) as b:
-            link = b.open(4)
-            link.send_batch(b"".join(record(store(i, 50)) for i in range(90)))
-            await link.drained()
-            full = [data for _, data in b.peer.frames if len(data) == 8]
-            assert len(full) / len(b.peer.frames) > 0.8
 
     run(test())
 
@@ -345,30 +312,5 @@ def test_full_queues_and_bad_arguments_are_refused_in_words() -> None:
             ):
                 with pytest.raises(LinkError, match="pair: node"):
                     b.io.open_link(settings, on_responses=b.inbox.on_responses, on_lost=b.inbox.on_lost)
-
-    run(test())
-
-
-def test_when_python_is_slow_old_responses_give_way_and_motion_goes_on() -> None:
-    async def test() -> None:
-        node = NodeTwin()
-        with bench(TransportKind.BYTES, {0: node}) as b:
-            link = b.open(0)
-            link.send(store(1))
-            await link.drained()
-            b.peer.end.setblocking(True)
-            total = 9000
-            for i in range(total):  # the loop does not run meanwhile: Python is slow
-                b.peer.end.send(block(node.expected, answer(i)))
-            b.peer.end.setblocking(False)
-            link.send(store(2))
-            await link.drained()
-            await b.inbox.until(lambda: b.inbox.responses[-1].content == answer(total - 1))
-            stats = b.io.stats()
-            assert stats.responses_dropped > 0
-            assert stats.responses_max == 4096
-            assert stats.responses_dropped + len(b.inbox.responses) == total
-            kept = [answer(i) for i in range(total - len(b.inbox.responses), total)]
-            assert [r.content for r in b.inbox.responses] == kept
 
     run(test())
