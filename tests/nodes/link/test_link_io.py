@@ -11,10 +11,12 @@ from collections.abc import Callable, Coroutine
 import pytest
 
 from nodes.link import LinkError, LinkIO, LinkSettings, TransportKind
-from tests.nodes.link.peers import TIMEOUT_S, FdTransport, Inbox, bench, open_files, pack_frame
+from tests.nodes.link.peers import TIMEOUT_S, Bench, FdTransport, Inbox, bench, open_files, pack_frame
 from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, store
 
 KINDS = list(TransportKind)
+LEAD_S = 600
+"""How far ahead of its time motion is queued; longer than a busy computer can stand still."""
 CAN_KINDS = [TransportKind.CAN_STREAM, TransportKind.CAN_PACKET]
 
 
@@ -77,7 +79,7 @@ def test_a_batch_goes_as_motion_and_its_lead_is_measured(kind: TransportKind) ->
             link = b.open(node_id(kind))
             now_ns = int(asyncio.get_running_loop().time() * 1e9)
             link.set_clock(1e6, now_ns, 5_000_000)
-            due = 5_000_000 + 3_000_000  # in three seconds
+            due = 5_000_000 + LEAD_S * 1_000_000
             commands = [store(i, 4) for i in range(2000)]
             link.send_batch(b"".join(record(c, 0, due) for c in commands))
             await link.drained()
@@ -85,7 +87,7 @@ def test_a_batch_goes_as_motion_and_its_lead_is_measured(kind: TransportKind) ->
             stats = link.stats()
             assert stats.lead_count == sum(stats.lead_histogram) == 2000
             assert stats.min_lead_s is not None
-            assert 0 < stats.min_lead_s < 3.0
+            assert 0 < stats.min_lead_s < LEAD_S
             assert stats.motion_commands_max == 2000
             assert stats.motion_commands == stats.motion_bytes == 0
 
@@ -120,26 +122,54 @@ def test_a_deaf_peer_stops_sending_without_loss_or_spinning(kind: TransportKind)
             link = b.open(node_id(kind))
             link.send(ask(1))
             await b.inbox.until(lambda: b.inbox.responses)
+            await link.drained()
             b.peer.deafen()
-            if kind != TransportKind.BYTES:  # enough to fill any buffer: admin frames know no window
-                with pytest.raises(LinkError, match="admin frames wait already"):
-                    repeat(lambda: b.io.send_frame(0x3F0, bytes(8)))
-                assert b.io.stats().waits > 0
+            if kind != TransportKind.BYTES:
+                await fill_up(b)
             commands = [store(i, 50) for i in range(30)]
             for command in commands:
                 link.send(command)
-            before = b.io.stats().wakeups
-            with pytest.raises(TimeoutError):
-                async with asyncio.timeout(0.05):
-                    await link.drained()
-            assert b.io.stats().wakeups - before < 200  # spinning would be thousands
             b.peer.listen()
             await link.drained()
             assert node.executed[1:] == commands
-            if kind != TransportKind.BYTES:
-                assert sum(can_id == 0x3F0 for can_id, _ in b.peer.frames) >= 256
 
     run(test())
+
+
+def yield_until(condition: Callable[[], object]) -> None:
+    """Give the thread its turns until CONDITION is true."""
+    end_s = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < end_s
+        os.sched_yield()
+
+
+async def fill_up(b: Bench) -> None:
+    """Send admin frames, which know no window, until the kernel takes no more and they are refused.
+
+    Nothing may be under way at the beginning, and nobody reads.
+    """
+    waits, began_s = b.io.stats().waits, time.monotonic()
+    silent = b.open(9, lost_after_s=0.3)
+    silent.send(ask(2))
+    yield_until(lambda: silent.stats().blocks_sent)
+
+    def refused() -> bool:
+        kernel_full = b.io.stats().waits > waits  # before: the thread takes no frame from then on
+        try:
+            b.io.send_frame(0x3F0, bytes(8))
+        except LinkError:
+            return kernel_full
+        return False
+
+    yield_until(refused)
+    with pytest.raises(LinkError, match="admin frames wait already"):
+        b.io.send_frame(0x3F0, bytes(8))
+    # Until the silent node is lost a thread that spins would wake thousands of times; a sound one wakes for
+    # its timers alone, which come some ten times in a second.
+    wakeups = b.io.stats().wakeups
+    await b.inbox.until(lambda: b.inbox.lost)
+    assert b.io.stats().wakeups - wakeups < 50 + 50 * (time.monotonic() - began_s)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -226,7 +256,7 @@ def test_a_pseudo_terminal_carries_a_link_and_its_end_is_told() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_close_during_traffic_joins_the_thread_and_leaks_nothing(kind: TransportKind) -> None:
     async def test() -> None:
-        for _ in range(5):
+        for _ in range(2):
             with bench(kind, {node_id(kind): NodeTwin()}) as b:
                 link = b.open(node_id(kind))
                 link.send_batch(b"".join(record(store(i, 40)) for i in range(3000)))
@@ -248,7 +278,7 @@ def test_close_during_traffic_joins_the_thread_and_leaks_nothing(kind: Transport
     run(test())
     before = open_files()
     run(test())
-    assert open_files() == before
+    assert open_files() <= before
 
 
 def test_a_callback_may_close_the_bus() -> None:
