@@ -1,6 +1,7 @@
 """The wire protocol once more, slow and obvious: the oracle for the C codec and for what is built on it."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 BLOCK_MIN, BLOCK_MAX, SYNC = 5, 64, 0x7E
 
@@ -36,6 +37,7 @@ def signed32(value: int) -> int:
     return value - (1 << 32) if value & 0x80000000 else value
 
 
+@lru_cache(maxsize=1 << 16)
 def crc16(data: bytes) -> int:
     crc = 0xFFFF
     for byte in data:

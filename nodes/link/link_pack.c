@@ -123,7 +123,10 @@ static void order_classes(const struct link *link, uint64_t now, unsigned allowe
         }
         offers[kind] = offer_of(link, kind, &head, now);
         if (!(allowed & 1u << kind) && !offers[kind].pressing) { // motion may not be sent ahead
-            plan->at_ns = offers[kind].due_ns < plan->at_ns ? offers[kind].due_ns : plan->at_ns;
+            // Motion whose time is unknown waits for the budget alone; its due_ns is now, and a plan for now
+            // without a command would be an empty block.
+            if (offers[kind].due_ns > now && offers[kind].due_ns < plan->at_ns)
+                plan->at_ns = offers[kind].due_ns;
             continue;
         }
         size_t at = plan->classes++;

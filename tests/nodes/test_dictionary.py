@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nodes.dictionary import BOOTSTRAP, MAX_INFLATED_BYTES, Dictionary
 from nodes.dictionary_parts import OUTPUT, DictionaryError
 from nodes.message_format import Message, MessageError, MessageFormat, Value
 from tests import wire_twin as twin
+from tests.profiles import examples
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "tests" / "data"
@@ -68,30 +69,22 @@ def test_dictionaries_of_real_boards_load(path: Path) -> None:
 # ------------------------------------------------------------------------------------------------- round trip
 
 
-def values_of(message: MessageFormat, draw: Any) -> dict[str, Value]:
-    room = 40
-    values: dict[str, Value] = {}
-    for name, code in zip(message.names, message.code_texts, strict=True):
-        if code in twin.CODES:
-            bits, signed = twin.CODES[code]
-            low = -(1 << (bits - 1)) if signed else 0
-            values[name] = draw(st.integers(low, low + (1 << bits) - 1))
-        else:
-            values[name] = draw(st.binary(max_size=min(room, 20)))
-            room -= 20
-    return values
+DICTIONARIES = {"small": SMALL, **{path.stem: Dictionary.from_json(path.read_bytes()) for path in REAL}}
+LONGEST = 20
+"""Bytes of the longest text that is tried; a message has room for 59."""
 
 
-FORMATS = [
-    (dictionary, message)
-    for dictionary in [SMALL, *(Dictionary.from_json(path.read_bytes()) for path in REAL)]
-    for message in [*dictionary.commands.values(), *dictionary.responses.values()]
-]
+def messages_of(dictionary: Dictionary) -> list[MessageFormat]:
+    return [*dictionary.commands.values(), *dictionary.responses.values()]
 
 
-@given(st.data())
-def check_round_trip(dictionary: Dictionary, message: MessageFormat, data: Any) -> None:
-    values = values_of(message, data.draw)
+def bounds(code: str) -> tuple[int, int]:
+    bits, signed = twin.CODES[code]
+    low = -(1 << (bits - 1)) if signed else 0
+    return low, low + (1 << bits) - 1
+
+
+def check_round_trip(dictionary: Dictionary, message: MessageFormat, values: dict[str, Value]) -> None:
     encoded = twin.encode_message(message.message_id, list(message.code_texts), list(values.values()))
     if len(encoded) > 59:
         with pytest.raises(MessageError, match="59 bytes"):
@@ -108,26 +101,39 @@ def check_round_trip(dictionary: Dictionary, message: MessageFormat, data: Any) 
         assert dictionary.encode_text(str(expected)) == encoded
 
 
-@pytest.mark.parametrize("index", range(1 + len(REAL)))
-def test_every_format_round_trips(index: int) -> None:
-    dictionaries = list(dict.fromkeys(dictionary for dictionary, _ in FORMATS))
-    seen: set[str] = set()
-    earlier = {m.text for d, m in FORMATS if d in dictionaries[:index]}
-    for dictionary, message in FORMATS:
-        # Boards share most formats; the same text under another id is one example, a new text is many.
-        if dictionary is not dictionaries[index]:
-            continue
-        seen.add(message.text)
-        if message.text in earlier:
-            values: dict[str, Value] = {
-                name: 200 if code in twin.CODES else b"\x7e\0" for name, code in
-                zip(message.names, message.code_texts, strict=True)
-            }  # fmt: skip
-            encoded = twin.encode_message(message.message_id, list(message.code_texts), list(values.values()))
-            assert message.encode(values) == encoded
-        else:
-            check_round_trip(dictionary, message)
-    assert len(seen) == len(dictionaries[index].commands) + len(dictionaries[index].responses)
+def values_at(message: MessageFormat, place: int) -> dict[str, Value]:
+    """Return the lowest values (PLACE 0), the highest (1), or numbers of a middling size."""
+    numbers = [(*bounds(code), 200) if code in twin.CODES else None for code in message.code_texts]
+    texts = (b"", b"\xff" * LONGEST, b"\x7e\0")
+    return {
+        name: texts[place] if number is None else number[place]
+        for name, number in zip(message.names, numbers, strict=True)
+    }
+
+
+@pytest.mark.parametrize("name", DICTIONARIES)
+def test_every_format_round_trips(name: str) -> None:
+    dictionary = DICTIONARIES[name]
+    for message in messages_of(dictionary):
+        for place in range(3):
+            check_round_trip(dictionary, message, values_at(message, place))
+
+
+@st.composite
+def any_message(draw: st.DrawFn) -> tuple[Dictionary, MessageFormat, dict[str, Value]]:
+    dictionary = draw(st.sampled_from(list(DICTIONARIES.values())))
+    message = draw(st.sampled_from(messages_of(dictionary)))
+    values: dict[str, Value] = {
+        name: draw(st.integers(*bounds(code)) if code in twin.CODES else st.binary(max_size=LONGEST))
+        for name, code in zip(message.names, message.code_texts, strict=True)
+    }
+    return dictionary, message, values
+
+
+@settings(max_examples=examples(400))
+@given(any_message())
+def test_any_values_round_trip(drawn: tuple[Dictionary, MessageFormat, dict[str, Value]]) -> None:
+    check_round_trip(*drawn)
 
 
 @given(st.binary(max_size=70))

@@ -75,11 +75,11 @@ def test_the_memory_alone_knows_a_restarted_node() -> None:
 
 
 def test_of_equal_nodes_that_start_together_one_downloads() -> None:
-    twins = [build("v1") for _ in range(32)]
+    twins = [build("v1") for _ in range(12)]
     start(DictionaryCache(), *twins)
     counts = sorted(asked(twin) for twin in twins)
     assert counts[-1] == full(twins[0])
-    assert counts[:-1] == [3] * 31
+    assert counts[:-1] == [3] * 11
 
 
 def test_of_equal_nodes_on_a_lossy_bus_all_get_it() -> None:

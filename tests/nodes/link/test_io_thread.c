@@ -88,7 +88,9 @@ static void converse(enum io_kind kind) {
     struct io_link_stats stats;
     CHECK_EQUAL(io_get_link_stats(scene.bus, scene.link, &stats), IO_OK);
     CHECK_EQUAL(stats.link.commands_sent, CALLERS * COMMANDS + 1);
-    CHECK_EQUAL(stats.link.blocks_repeated, 0);
+    CHECK_EQUAL(stats.link.bytes_invalid, 0);
+    // A computer that stands still for longer than a timeout has blocks repeated; the node takes each once.
+    CHECK(stats.link.blocks_repeated == 0 || stats.link.timeouts > 0);
     shutdown(fds[1], SHUT_RDWR);
     take_until(scene.thread, IO_ENDED);
     CHECK_EQUAL(io_send(scene.bus, scene.link, LINK_CONTROL, (const uint8_t *)"\4", 1, 0, 0), IO_CLOSED);

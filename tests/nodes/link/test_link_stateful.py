@@ -7,7 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from tests.nodes.link.test_link_faults import DAMAGES
+from tests.nodes.link.damages import DAMAGES
 from tests.nodes.link.twin import STOP, NodeTwin, WindowObserver, ask, store
 from tests.nodes.link.virtual import MS, CoreLink, Delivery, Line
 from tests.profiles import examples

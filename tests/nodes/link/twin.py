@@ -131,8 +131,10 @@ class WindowObserver:
         tail = self.tail + data
         for end in (at for at in range(seen, len(tail)) if tail[at] == SYNC):
             for length in range(5, min(64, end + 1) + 1):
+                if tail[end + 1 - length] != length:
+                    continue
                 whole = tail[end + 1 - length : end + 1]
-                if whole[0] == length and whole == block(whole[1], whole[2:-3]):
+                if whole == block(whole[1], whole[2:-3]):
                     self._answered(whole[1] & 15)
         self.tail = tail[-63:]
 

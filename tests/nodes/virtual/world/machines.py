@@ -7,8 +7,9 @@ from nodes.assign import Uuid
 from nodes.bus import UartBus
 from nodes.can_bus import CanBus
 from nodes.link import LinkIO
+from nodes.node_states import NodeState
 from nodes.seams import IoFactory, LinkIOLike, OnFrame, OnLost
-from nodes.virtual.world import CanPort, CanWire, Port, UartSettings, World, WorldNode
+from nodes.virtual.world import CanPort, CanWire, Port, UartSettings, World, WorldNode, run
 from tests.nodes.machine import make_config, stepper_x
 
 if TYPE_CHECKING:
@@ -61,3 +62,18 @@ class UartMachine:
         self.board = self.world.add_node(self.uart, uuid(1))
         self.bus = UartBus("uart", start_io(self.port))
         self.node = self.bus.add_node("n1", make_config())
+
+
+async def ready(machine: CanMachine) -> None:
+    """Start MACHINE, see all its nodes ready, and close it."""
+    await machine.bus.start()
+    assert [node.state for node in machine.nodes] == [NodeState.READY] * len(machine.nodes)
+    await machine.bus.close()
+
+
+def trace_of(seed: int) -> int:
+    """Return a hash of all that happens when three nodes on a disturbed bus get ready."""
+    machine = CanMachine(seed, 3)
+    machine.wire.set_bit_errors(1e-5)
+    run(machine.world, ready(machine), limit_s=60)
+    return machine.world.trace
