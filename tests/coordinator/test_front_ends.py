@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -15,6 +16,9 @@ import pytest
 
 from coordinator.ipc.methods import Caller, Kind, Method, Param, Scope
 from coordinator.ipc.uploads import PART_MAX, upload_method
+from coordinator.web.methods import add_page_methods
+from coordinator.web.server import WebServer
+from coordinator.web.settings import WebSettings
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, serving
 
 CANDUCTOR = Path(sys.executable).parent / "canductor"
@@ -65,6 +69,28 @@ def test_call_status_estop(tmp_path: Path) -> None:
         assert "nodes.toolhead.state = ready" in out
         status, out, _ = await canductor("estop", folder=tmp_path)
         assert (status, len(served.stops)) == (0, 1)
+
+    run(tmp_path, body)
+
+
+def test_links_to_the_page(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        for words in (("page",), ("page", "--sign-out")):
+            status, _, err = await canductor(*words, folder=tmp_path)
+            assert (status, err) == (1, "canductor: the machine serves no live page; start it with --web\n")
+        page = WebServer(served.server, WebSettings(host="127.0.0.1", port=0))
+        add_page_methods(served.server._common.registry, page)
+        await page.start()
+        status, out, _ = await canductor("page", "--watch", folder=tmp_path)
+        assert status == 0
+        link, sentence = out.splitlines()
+        assert re.fullmatch(rf"http://127\.0\.0\.1:{page.port}/#[\w-]{{43}}", link)
+        assert sentence == "Open it in a browser within 10 minutes; it works once."
+        status, out, _ = await canductor("page", "--sign-out", folder=tmp_path)
+        assert (status, out) == (0, "sessions of browsers that were ended: 0\n")
+        status, _, err = await canductor("page", "--sign-out", "--watch", folder=tmp_path)
+        assert (status, err.startswith("canductor: --sign-out prints no link")) == (2, True)
+        await page.close()
 
     run(tmp_path, body)
 
@@ -256,7 +282,7 @@ def test_what_is_no_regular_file_is_not_sent(tmp_path: Path) -> None:
 def test_completion_knows_every_command(tmp_path: Path, shell: str) -> None:
     status, out, _ = asyncio.run(canductor("completion", shell, folder=tmp_path))
     assert status == 0
-    for word in ("simulate", "estop", "doctor", "--gcode", "--replace"):
+    for word in ("simulate", "estop", "doctor", "--gcode", "--replace", "--sign-out"):
         assert word.removeprefix("--") in out
     if (program := shutil.which(shell)) is None:
         pytest.skip(f"{shell} is not installed: what was written for it was not run")
