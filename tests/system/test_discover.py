@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from coordinator.ipc.discovery import Browser
-from tests.coordinator.ipc.test_discovery import need_own_networks
+from tests.stages.own_networks import need_own_networks
 from tests.system.stage import CANDUCTOR, ROOT, Command, Hardware, canductor
 
 if TYPE_CHECKING:
