@@ -43,6 +43,7 @@ FRONT_END_COMMANDS = {
     "watch": "Show the fields of a machine that runs, and their changes.",
     "status": "Tell how a machine that runs is doing.",
     "send": "Send a file to a machine that runs, and print it.",
+    "page": "Print a link that lets a browser into the live page of a machine that runs, once.",
     "estop": "Stop a machine that runs, at once.",
     "discover": "List the machines that run here or are announced on the network.",
     "table": "Check compensation tables of axes, and give them to a machine that runs.",

@@ -57,6 +57,8 @@ class ServeOptions:
     """Address and port of the live page."""
     web_without_tls: bool = False
     """Serve the page without TLS beyond loopback, too."""
+    web_names: tuple[str, ...] = ()
+    """Host names, in lower case, that the page answers to."""
     announce: bool | None = None
     """Announce the machine on the network; None: if its TCP port can be reached from there."""
     metrics: tuple[str, int] | None = None

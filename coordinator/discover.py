@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from coordinator.ipc.announcement import Announcement, host_word
 from coordinator.ipc.client import Client
-from coordinator.ipc.discovery import Browser
+from coordinator.ipc.discovery import Browser, Listen
 from coordinator.ipc.methods import Scope, printable
 from coordinator.ipc.multicast import places
 from nodes.errors import CanductorError
@@ -98,11 +98,11 @@ def _table(machines: Sequence[Found]) -> list[str]:
     ]
 
 
-async def find_machines(timeout_s: float) -> Discovered:
-    """Return the machines that answer within TIMEOUT_S."""
+async def find_machines(timeout_s: float, listen: Listen | None = None) -> Discovered:
+    """Return the machines that answer within TIMEOUT_S; LISTEN as of Browser."""
     paths = host_sockets()[:SOCKETS_MAX]
     asking = asyncio.gather(*(_ask(path, timeout_s) for path in paths))
-    announced, skipped, problem = await _browse(timeout_s)
+    announced, skipped, problem = await _browse(timeout_s, listen)
     asked = await asking
     found = [machine for machine in asked if machine is not None]
     silent = [path for path, machine in zip(paths, asked, strict=True) if machine is None]
@@ -137,9 +137,9 @@ def _add(found: list[Found], announced: Announcement, own: set[str]) -> None:
     )
 
 
-async def _browse(timeout_s: float) -> tuple[list[Announcement], int, str | None]:
+async def _browse(timeout_s: float, listen: Listen | None) -> tuple[list[Announcement], int, str | None]:
     try:
-        async with Browser() as browser:
+        async with Browser(listen) as browser:
             await asyncio.sleep(timeout_s)
             return browser.machines, browser.skipped, None
     except CanductorError as error:

@@ -47,6 +47,9 @@ def declare(command: argparse.ArgumentParser, name: str) -> None:
         add("--name", help="what it is called there; its own name if not given")
         add("--replace", action="store_true", help="a file of that name may be there")
         add("--no-start", action="store_true", help="only send it")
+    elif name == "page":
+        add("--watch", action="store_true", help="the browser may look, and do nothing else")
+        add("--sign-out", action="store_true", help="end the sessions of all browsers instead")
     elif name == "completion":
         add("shell", choices=SHELLS, help="for which shell")
     elif name == "discover":
@@ -137,6 +140,16 @@ def _estop(given: argparse.Namespace) -> Callable[[], Report]:
     return lambda: _run("estop", target)
 
 
+def _page(given: argparse.Namespace) -> Callable[[], Report]:
+    target = read_target(given)
+    if given.sign_out and given.watch:
+        raise UsageError("--sign-out prints no link; leave --watch out")
+    if given.sign_out:
+        return lambda: _run("sign_out", target)
+    scope = "watch" if given.watch else "operate"
+    return lambda: _run("page_link", target, scope)
+
+
 def _discover(given: argparse.Namespace) -> Callable[[], Report]:
     timeout_s = number("--timeout", given.timeout, 0.1, 60, "s")
     return lambda: _run("discover", timeout_s)
@@ -151,6 +164,7 @@ _MAKERS: Final = {
     "watch": _watch,
     "status": _status,
     "send": _send,
+    "page": _page,
     "estop": _estop,
     "completion": _completion,
     "discover": _discover,

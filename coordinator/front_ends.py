@@ -12,6 +12,7 @@ from coordinator.commands import Report, Terminated
 from coordinator.front_end_words import Target
 from coordinator.interrupts import run_to_end
 from coordinator.ipc.client import Client, Update
+from coordinator.ipc.methods import ApiError
 from coordinator.ipc.uploads import PART_MAX
 from nodes.errors import CanductorError
 
@@ -144,6 +145,33 @@ def estop(target: Target) -> Answer:
 
     result = _with_client(target, body)
     return Answer(result, "stopped: every node was told to shut down")
+
+
+def page_link(target: Target, scope: str) -> Answer:
+    """Print an address that lets one browser into the live page with SCOPE, once; raises CanductorError."""
+    result = _call_page(target, "page.link", {"scope": scope})
+    minutes = result["expires_s"] / 60
+    return Answer(
+        result, f"{result['url']}\nOpen it in a browser within {minutes:.0f} minutes; it works once."
+    )
+
+
+def sign_out(target: Target) -> Answer:
+    """End the sessions of all browsers; raises CanductorError."""
+    result = _call_page(target, "page.sign_out", {})
+    return Answer(result, f"sessions of browsers that were ended: {result['sessions']}")
+
+
+def _call_page(target: Target, method: str, params: dict[str, Any]) -> Any:
+    async def body(client: Client) -> Any:
+        return await client.call(method, params)
+
+    try:
+        return _with_client(target, body)
+    except ApiError as error:
+        if error.code == "no_such_method":
+            raise CanductorError("the machine serves no live page; start it with --web") from None
+        raise
 
 
 def send(target: Target, file: Path, name: str, *, replace: bool, start: bool, quiet: bool) -> Answer:

@@ -3,10 +3,14 @@
 import argparse
 import re
 from pathlib import Path
+from typing import Final
 
 from coordinator.commands import ServeOptions
 from coordinator.network_words import declare_network, read_announce, read_metrics
 from nodes.option_values import UsageError, existing_file
+
+HOST_NAME_MAX: Final = 253
+_LABEL: Final = re.compile(r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9_])?", re.ASCII)
 
 
 def declare_serving(command: argparse.ArgumentParser) -> None:
@@ -27,6 +31,12 @@ def declare_serving(command: argparse.ArgumentParser) -> None:
         help="serve the live page; beyond this computer (0.0.0.0:PORT) it needs --tokens, and TLS",
     )
     add("--web-without-tls", action="store_true", help="the page beyond this computer, readable on the way")
+    add(
+        "--web-name",
+        action="append",
+        metavar="NAME",
+        help="host name under which the page is opened; without, only IP addresses and localhost are",
+    )
     declare_network(add)
 
 
@@ -59,7 +69,19 @@ def read_serving(given: argparse.Namespace, config: Path, announce: bool | None 
         metrics_open=given.metrics_open,
         web=_web_address(given),
         web_without_tls=given.web_without_tls,
+        web_names=_web_names(given),
     )
+
+
+def _web_names(given: argparse.Namespace) -> tuple[str, ...]:
+    """Return the host names that the page answers to, in lower case."""
+    names = tuple(str(name).lower() for name in given.web_name or ())
+    if names and given.web is None:
+        raise UsageError("--web-name goes with --web [HOST:]PORT")
+    for name in names:
+        if len(name) > HOST_NAME_MAX or not all(_LABEL.fullmatch(label) for label in name.split(".")):
+            raise UsageError(f"--web-name is '{name}', must be a host name such as printer.example")
+    return names
 
 
 def _web_address(given: argparse.Namespace) -> tuple[str, int] | None:

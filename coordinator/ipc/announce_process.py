@@ -12,7 +12,7 @@ import dataclasses
 import json
 import signal
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Iterable
 from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.ipc.announcement import SERVICE_TYPE, Announcement, usable_addresses
@@ -31,11 +31,25 @@ TTL_S: Final = 120
 
 
 class Announcing:
-    """Keeps MACHINE announced at the addresses through which its sockets, BOUND to some, are reached."""
+    """Keeps MACHINE announced at the addresses through which its sockets, BOUND to some, are reached.
 
-    def __init__(self, machine: Announcement, bound: list[str]) -> None:
+    SAY gets a kind and a sentence. FIND_PLACES and OPEN_DNS are this computer's networks.
+    """
+
+    def __init__(
+        self,
+        machine: Announcement,
+        bound: list[str],
+        say: Callable[[str, str], None],
+        *,
+        find_places: Callable[[], tuple[Place, ...]] = places,
+        open_dns: "Callable[[Iterable[str]], AsyncZeroconf]" = open_mdns,
+    ) -> None:
         self._machine = machine
         self._bound = bound
+        self._say_to = say
+        self._find_places = find_places
+        self._open_dns = open_dns
         self._here: tuple[Place, ...] | None = None
         self._mdns: AsyncZeroconf | None = None
         self._info: AsyncServiceInfo | None = None
@@ -64,7 +78,7 @@ class Announcing:
 
     async def _look(self) -> None:
         """Announce what is not announced yet, on the networks that there are now."""
-        here = places()
+        here = self._find_places()
         try:
             if here != self._here:
                 self._here = None
@@ -87,7 +101,7 @@ class Announcing:
         if not addresses:
             raise CanductorError("there is no network to announce the machine on; it will be when there is")
         self._machine = dataclasses.replace(self._machine, addresses=addresses)
-        self._mdns = open_mdns(spoken_on(reached, here))
+        self._mdns = self._open_dns(spoken_on(reached, here))
         # With a part of the id, so that machines of one name stay apart, also those on two networks.
         info = self._service(f"{self._machine.name}-{self._machine.id[:8]}.{SERVICE_TYPE}")
         try:
@@ -127,31 +141,45 @@ class Announcing:
         """Tell the parent, once."""
         if sentence != self._said:
             self._said = sentence
-            sys.stdout.write(json.dumps({kind: sentence}) + "\n")
-            sys.stdout.flush()
+            self._say_to(kind, sentence)
 
 
-async def _lines() -> AsyncIterator[dict[str, Any]]:
-    reader = asyncio.StreamReader()
-    await asyncio.get_running_loop().connect_read_pipe(
-        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin.buffer
-    )
+async def follow(lines: AsyncIterator[dict[str, Any]], announce: Callable[..., Announcing]) -> None:
+    """Announce the machine of the first of LINES, with the states of the others, until they end.
+
+    ANNOUNCE gets the machine and the addresses of its sockets.
+    """
+    first = await anext(lines)
+    bound = first.pop("bound")
+    announcing = announce(Announcement(**first, addresses=()), bound)
+    running = asyncio.ensure_future(announcing.run())
+    running.add_done_callback(_end_with)
+    try:
+        async for line in lines:
+            announcing.state(line["state"], line["change"])
+    finally:
+        running.remove_done_callback(_end_with)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+
+
+async def lines_of(reader: asyncio.StreamReader) -> AsyncIterator[dict[str, Any]]:
+    """Read lines of JSON."""
     while line := await reader.readline():
         yield json.loads(line)
 
 
 async def _main() -> None:
-    lines = _lines()
-    first = await anext(lines)
-    bound = first.pop("bound")
-    announcing = Announcing(Announcement(**first, addresses=()), bound)
-    running = asyncio.ensure_future(announcing.run())
-    running.add_done_callback(_end_with)
-    async for line in lines:
-        announcing.state(line["state"], line["change"])
-    running.remove_done_callback(_end_with)
-    running.cancel()
-    await asyncio.gather(running, return_exceptions=True)
+    reader = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(
+        lambda: asyncio.StreamReaderProtocol(reader), sys.stdin.buffer
+    )
+    await follow(lines_of(reader), lambda machine, bound: Announcing(machine, bound, _say))
+
+
+def _say(kind: str, sentence: str) -> None:
+    sys.stdout.write(json.dumps({kind: sentence}) + "\n")
+    sys.stdout.flush()
 
 
 def _end_with(running: "asyncio.Future[None]") -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,13 +20,35 @@ LINE_MAX: Final = 4_096
 _ROOT: Final = Path(__file__).parents[2]
 
 
+async def launch_process() -> asyncio.subprocess.Process:
+    """Start the process that announces a machine; raises OSError."""
+    return await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-P",
+        "-m",
+        "coordinator.ipc.announce_process",
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        limit=LINE_MAX,
+        env=os.environ | {"PYTHONPATH": str(_ROOT)},
+    )
+
+
 class Announcer:
     """Announces MACHINE, whose sockets are BOUND to these addresses, from ``start`` to ``close``.
 
     TELL hears in a sentence what becomes of it. Lives on one loop; ``state`` never waits.
     """
 
-    def __init__(self, machine: Announcement, bound: list[str], tell: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        machine: Announcement,
+        bound: list[str],
+        tell: Callable[[str], None],
+        *,
+        launch: Callable[[], Awaitable[asyncio.subprocess.Process]] = launch_process,
+    ) -> None:
+        self._launch = launch
         self._machine = machine
         self._bound = bound
         self._tell = tell
@@ -62,16 +84,7 @@ class Announcer:
 
     async def _announce(self) -> None:
         """Run the process until it ends by itself, or until cancelled."""
-        self.process = process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-P",
-            "-m",
-            "coordinator.ipc.announce_process",
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            limit=LINE_MAX,
-            env=os.environ | {"PYTHONPATH": str(_ROOT)},
-        )
+        self.process = process = await self._launch()
         told = asyncio.ensure_future(self._tell_it(process))
         try:
             await self._hear_it(process)

@@ -1,5 +1,6 @@
 """Who may come in: tokens with scopes from a file, and a brake on those who guess."""
 
+import hashlib
 import hmac
 import os
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ class Grant:
     """What a token gives."""
 
     name: str
+    """Empty: it has none, and callers are shown without."""
     scope: Scope
 
 
@@ -35,7 +37,7 @@ class Tokens:
     def __init__(self, grants: dict[str, Grant], stamp: tuple[int, ...] = ()) -> None:
         self.stamp = stamp
         """Of the file, as it was read; another one: it has changed since."""
-        self._grants = {token.encode(): grant for token, grant in grants.items()}
+        self._grants = {digest_of(token): grant for token, grant in grants.items()}
 
     @classmethod
     def read(cls, path: Path) -> "Tokens":
@@ -62,12 +64,20 @@ class Tokens:
 
     def check(self, token: str) -> Grant | None:
         """Return what TOKEN gives, None if nothing; takes as long whichever token it resembles."""
-        given = token.encode(errors="replace")
+        return self.grant_of(digest_of(token))
+
+    def grant_of(self, digest: bytes) -> Grant | None:
+        """Return what the token with DIGEST gives, None if nothing; takes as long whichever it is."""
         found: Grant | None = None
         for known, grant in self._grants.items():
-            if hmac.compare_digest(known, given):
+            if hmac.compare_digest(known, digest):
                 found = grant
         return found
+
+
+def digest_of(secret: str) -> bytes:
+    """Return what stands for SECRET where it is only compared with: SHA-256."""
+    return hashlib.sha256(secret.encode(errors="replace")).digest()
 
 
 def stamp_of(path: Path) -> tuple[int, ...]:

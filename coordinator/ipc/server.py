@@ -7,15 +7,15 @@ import socket
 import ssl
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
 
-from coordinator.ipc.auth import FailureBrake, Grant, Tokens, stamp_of
+from coordinator.ipc.auth import FailureBrake, Grant, Tokens, digest_of, stamp_of
 from coordinator.ipc.connection import Connection
 from coordinator.ipc.door import BACKLOG, HANDSHAKES_MAX, Door
-from coordinator.ipc.methods import Registry, Scope, Value
+from coordinator.ipc.methods import ApiError, Registry, Value
 from coordinator.ipc.publisher import Publisher
 from coordinator.ipc.session import Common, Session, SessionCounters
 from coordinator.ipc.session_methods import add_session_methods
@@ -31,6 +31,15 @@ TOKENS_LOOK_S: Final = 1.0
 """Between looks at whether the tokens' file has changed."""
 REFUSALS_MAX: Final = 32
 """Connections beyond the most that are still told so; further ones are just closed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Adopted:
+    """What a client may do that came by another way."""
+
+    grant: Grant
+    token: bytes | None
+    """Digest of the token behind it: when that is taken away the client is let go. None: there is none."""
 
 
 def _ignore(_: str) -> None:
@@ -61,7 +70,9 @@ class IpcServer:
         self._brake = FailureBrake()
         self._on_notice = on_notice
         self._tokens: Tokens | None = None
-        self._shown: dict[Connection, str] = {}  # the token that each client over TCP came in with
+        self._shown: dict[Connection, bytes] = {}  # digests of the tokens that clients came in with
+        self._tcp: set[Connection] = set()
+        """Connections that count against ``tcp_connections_max``."""
         self._watch: asyncio.Task[None] | None = None
         self._turns: Turns | None = None
         self._sessions = 0
@@ -164,7 +175,7 @@ class IpcServer:
             lambda: Connection(self._admit_tcp, self._drop, turns),
             context,
             handshakes_max=min(HANDSHAKES_MAX, most),
-            may_enter=lambda entering: entering + self._over_tcp() < most + REFUSALS_MAX,
+            may_enter=lambda entering: entering + len(self._tcp) < most + REFUSALS_MAX,
         )
         try:
             await door.open(tcp.host, tcp.port)
@@ -198,7 +209,7 @@ class IpcServer:
     def _part_from(self, tokens: Tokens) -> None:
         """End the clients whose token is not in TOKENS any more, or has a lower scope."""
         for connection, token in list(self._shown.items()):
-            grant, caller = tokens.check(token), connection.session.caller
+            grant, caller = tokens.grant_of(token), connection.session.caller
             if caller is not None and (grant is None or grant.scope < caller.scope):
                 connection.session.end(Fault("bad_token", "the token was taken away"))
                 connection.flush()
@@ -210,66 +221,94 @@ class IpcServer:
         """What one client may cost."""
         return self._common.limits
 
-    def adopt(self, transport: asyncio.Transport, address: str, granted: Scope | None) -> Connection:
-        """Take a client that came by another door, such as the live page's; TRANSPORT carries JSON lines.
+    def adopt(
+        self, transport: asyncio.Transport, address: str, check_key: Callable[[str], Adopted | None]
+    ) -> Connection:
+        """Take a client that came by another way, such as the live page's; TRANSPORT carries JSON lines.
 
-        Without a token it may do what is GRANTED; with nothing granted it is let in as one over TCP.
+        What it gives as its token in the hello goes to CHECK_KEY, which returns what it may do.
         """
 
-        def admit(transport: asyncio.Transport, connection: Connection) -> Session:
-            if granted is None:
-                return self._admit_tcp(transport, connection, address)
-            session = self._session(connection, address, address)
-            session.granted = granted
-            return session
+        def admit(_: asyncio.Transport, connection: Connection) -> Session:
+            def check(key: str) -> Grant | None:
+                adopted = check_key(key)
+                if adopted is None:
+                    return None
+                if adopted.token is not None:
+                    self._shown[connection] = adopted.token
+                return adopted.grant
+
+            return self._session(connection, address, check)
 
         assert self._turns is not None, "the server is not started"
         connection = Connection(admit, self._drop, self._turns)
         connection.connection_made(transport)
         return connection
 
+    def check_token(self, token: str, address: str) -> Grant:
+        """Return what TOKEN gives to somebody at ADDRESS; counts failures.
+
+        Raises ApiError ``too_many_failures``, ``bad_token``.
+        """
+        if (wait_s := self._shut_out_s(address)) > 0:
+            raise ApiError("too_many_failures", _shut_out_sentence(address, wait_s))
+        grant = self._grant(token, address)
+        if grant is None:
+            raise ApiError("bad_token", "the token is not known here")
+        return grant
+
+    def grant_of(self, token: bytes) -> Grant | None:
+        """Return what the token with the digest TOKEN gives now, None if nothing."""
+        return None if self._tokens is None else self._tokens.grant_of(token)
+
+    def _grant(self, token: str, address: str) -> Grant | None:
+        """Return what TOKEN gives; None: nothing, which counts as a failure of ADDRESS if it has one."""
+        if self._tokens is None:
+            return None
+        grant = self._tokens.check(token)
+        if grant is None and address:
+            self._brake.failed(address, asyncio.get_running_loop().time())
+        return grant
+
+    def _shut_out_s(self, address: str) -> float:
+        return self._brake.shut_out_s(address, asyncio.get_running_loop().time())
+
     def _admit_unix(self, transport: asyncio.Transport, connection: Connection) -> Session:
         opened = transport.get_extra_info("socket")
         pid, uid, _ = _PEER.unpack(opened.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
-        session = self._session(connection, f"uid {uid}, pid {pid}", "")
+        session = self._session(connection, f"uid {uid}, pid {pid}", self._token_check(connection, ""))
         session.granted = self._settings.unix_scope
         if uid not in (0, os.geteuid()):
             self._refuse(session, Fault("not_allowed", f"this socket is not for the user with uid {uid}"))
         return session
 
-    def _admit_tcp(
-        self, transport: asyncio.Transport, connection: Connection, address: str | None = None
-    ) -> Session:
-        if address is None:
-            address = str((transport.get_extra_info("peername") or ("unknown",))[0])
-        session = self._session(connection, address, address)
-        wait_s = self._brake.shut_out_s(address, asyncio.get_running_loop().time())
-        if self._over_tcp(besides=connection) >= self._settings.tcp_connections_max:
+    def _admit_tcp(self, transport: asyncio.Transport, connection: Connection) -> Session:
+        address = str((transport.get_extra_info("peername") or ("unknown",))[0])
+        session = self._session(connection, address, self._token_check(connection, address))
+        wait_s = self._shut_out_s(address)
+        if len(self._tcp) >= self._settings.tcp_connections_max:
             self._refuse(session, Fault("busy", "there are too many connections over TCP; close others"))
         elif wait_s > 0:
-            sentence = f"too many wrong tokens from {address}; wait {wait_s:.0f} s"
-            self._refuse(session, Fault("too_many_failures", sentence))
+            self._refuse(session, Fault("too_many_failures", _shut_out_sentence(address, wait_s)))
+        self._tcp.add(connection)
         return session
 
-    def _over_tcp(self, besides: Connection | None = None) -> int:
-        """Return how many connections came over TCP; BESIDES is on its way in and has no session yet."""
-        others = (other for other in self._connections if other is not besides)
-        return sum(1 for other in others if other.session.granted is None)
-
-    def _session(self, connection: Connection, peer: str, address: str) -> Session:
-        self._sessions += 1
-        loop = asyncio.get_running_loop()
+    def _token_check(self, connection: Connection, address: str) -> Callable[[str], Grant | None]:
+        """Return what looks at the token of CONNECTION's hello; failures count for ADDRESS, if it has one."""
 
         def check(token: str) -> Grant | None:
-            grant = None if self._tokens is None else self._tokens.check(token)
+            grant = self._grant(token, address)
             if grant is not None:
-                self._shown[connection] = token
-            elif address and self._tokens is not None:
-                self._brake.failed(address, loop.time())
+                self._shown[connection] = digest_of(token)
             return grant
 
+        return check
+
+    def _session(self, connection: Connection, peer: str, check: Callable[[str], Grant | None]) -> Session:
+        self._sessions += 1
+        now_s = asyncio.get_running_loop().time()
         session = Session(
-            self._common, loop.time(), number=self._sessions, peer=peer, granted=None, check_token=check
+            self._common, now_s, number=self._sessions, peer=peer, granted=None, check_token=check
         )
         self._connections.add(connection)
         if len(self._connections) > self._settings.connections_max:
@@ -284,10 +323,15 @@ class IpcServer:
 
     def _drop(self, connection: Connection) -> None:
         self._connections.discard(connection)
+        self._tcp.discard(connection)
         self._shown.pop(connection, None)
         for field in fields(SessionCounters):
             total = getattr(self._gone, field.name) + getattr(connection.session.counters, field.name)
             setattr(self._gone, field.name, total)
+
+
+def _shut_out_sentence(address: str, wait_s: float) -> str:
+    return f"too many wrong tokens from {address}; wait {wait_s:.0f} s"
 
 
 # ------------------------------------------------------------------------------------------------- opening

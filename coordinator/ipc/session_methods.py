@@ -72,7 +72,8 @@ def _scope_of(session: "Session", token: str | None) -> Scope | None:
     if grant is None:
         session.end(Fault("bad_token", "the token is not known here"))
         return None
-    session.peer = f"{session.peer}, token {grant.name}"
+    if grant.name:
+        session.peer = f"{session.peer}, token {grant.name}"
     return grant.scope
 
 

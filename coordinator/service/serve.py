@@ -15,7 +15,7 @@ from coordinator.interrupts import run_to_end
 from coordinator.ipc.announcement import Announcement, bracketed, host_word
 from coordinator.ipc.announcer import Announcer
 from coordinator.ipc.door import raise_files_limit
-from coordinator.ipc.methods import Registry, Value
+from coordinator.ipc.methods import Registry, Scope, Value
 from coordinator.ipc.server import IpcServer
 from coordinator.ipc.session_methods import API_VERSION
 from coordinator.ipc.settings import IpcSettings, TcpSettings
@@ -27,10 +27,13 @@ from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
 from coordinator.service.typed import Typed
 from coordinator.table.store import table_folder
+from coordinator.web.access import LINK_S
+from coordinator.web.methods import add_page_methods
 from coordinator.web.settings import WebSettings
 from nodes.dictionary_cache import DictionaryCache
 from nodes.errors import CanductorError
 from nodes.host_sockets import socket_folder
+from nodes.state_folder import state_folder
 
 if TYPE_CHECKING:
     from coordinator.metrics.server import MetricsServer
@@ -122,13 +125,18 @@ class _Hall:
             _ipc_settings(self._options, self.path),
             on_notice=lambda text: service.log.add("notice", text),
         )
+        page = self._page(registry, service)
         await self._server.start()
-        page = await _open_page(self._server, self._options)
+        await self._open_page(page)
         _say(f"serving at {self.path}")
         if self._options.tcp is not None:
             _say(f"serving at {_address(self._options, self._server.tcp_port)}")
         if page is not None:
             _say(f"the live page is at {page.url}")
+            _say(
+                f"to get in, open {page.new_link(Scope.OPERATE)} within {LINK_S / 60:.0f} minutes;"
+                " it works once, 'canductor page' prints another"
+            )
         metrics = await self._open_metrics(tree)
         self._announcer = self._announce(service)
         typed = Typed(service, _say) if sys.stdin is not None and sys.stdin.isatty() else None
@@ -146,6 +154,35 @@ class _Hall:
             await self._server.close()
             if page is not None:
                 await page.close()
+
+    def _page(self, registry: Registry, service: MachineService) -> "WebServer | None":
+        """Return the live page if it is asked for, with its methods in REGISTRY; raises CanductorError."""
+        options = self._options
+        if options.web is None:
+            return None
+        try:
+            from coordinator.web.server import WebServer  # noqa: PLC0415 (the extra web)
+        except ModuleNotFoundError as error:
+            raise CanductorError(
+                f"the live page needs {error.name}, which is not installed; run: pip install 'canductor[web]'"
+            ) from None
+        host, port = options.web
+        sessions = state_folder(options.name) / f"page-{port}.json"
+        settings = WebSettings(host=host, port=port, names=options.web_names, sessions=sessions)
+        if not settings.on_loopback and not options.web_without_tls:
+            settings = replace(settings, certificate=options.certificate, private_key=options.private_key)
+        page = WebServer(self._server, settings, on_notice=lambda text: service.log.add("notice", text))
+        add_page_methods(registry, page)
+        return page
+
+    async def _open_page(self, page: "WebServer | None") -> None:
+        """Open PAGE, if there is one; raises CanductorError with the server closed."""
+        try:
+            if page is not None:
+                await page.start()
+        except BaseException:
+            await self._server.close()
+            raise
 
     async def _open_metrics(self, tree: StateTree) -> "MetricsServer | None":
         """Open the endpoint for Prometheus if asked for; raises CanductorError with the server closed."""
@@ -211,29 +248,6 @@ def _ipc_settings(options: ServeOptions, path: Path) -> IpcSettings:
             plain_on_loopback=options.plain_on_loopback,
         )
     return IpcSettings(unix_path=path, tcp=tcp, tokens=options.tokens)
-
-
-async def _open_page(server: IpcServer, options: ServeOptions) -> "WebServer | None":
-    """Open the live page if asked for; raises CanductorError with the server closed."""
-    if options.web is None:
-        return None
-    host, port = options.web
-    try:
-        try:
-            from coordinator.web.server import WebServer  # noqa: PLC0415 (the extra web)
-        except ModuleNotFoundError as error:
-            raise CanductorError(
-                f"the live page needs {error.name}, which is not installed; run: pip install 'canductor[web]'"
-            ) from None
-        settings = WebSettings(host=host, port=port)
-        if not settings.on_loopback and not options.web_without_tls:
-            settings = replace(settings, certificate=options.certificate, private_key=options.private_key)
-        page = WebServer(server, settings)
-        await page.start()
-    except BaseException:
-        await server.close()
-        raise
-    return page
 
 
 def _address(options: ServeOptions, port: int | None) -> str:

@@ -1,13 +1,13 @@
 """Keeps the accepted tables of a machine in a folder, one file an axis, so that they survive a restart."""
 
 import json
-import os
 import re
 from pathlib import Path
 from typing import Any, Final
 
 from coordinator.table.axis_table import AxisTable, TableError, Unit
 from coordinator.whole_file import write_whole
+from nodes.state_folder import state_folder
 
 _AXIS: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", re.ASCII)
 _SUFFIX: Final = ".table.json"
@@ -16,11 +16,8 @@ VERSION: Final = 1
 
 
 def table_folder(machine: str) -> Path:
-    """Return where the tables of MACHINE are kept: below XDG_STATE_HOME, by default ~/.local/state."""
-    base = os.environ.get("XDG_STATE_HOME", "")
-    root = Path(base) if base.startswith("/") else Path.home() / ".local" / "state"
-    name = re.sub(r"[^A-Za-z0-9_-]", "_", machine) or "machine"
-    return root / "canductor" / name / "tables"
+    """Return where the tables of MACHINE are kept."""
+    return state_folder(machine) / "tables"
 
 
 class TableStore:

@@ -2,28 +2,51 @@
 
 import asyncio
 import contextlib
+import json
 import logging
+import time
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Final
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, Final
 
 from aiohttp import WSMsgType, web
 
+from coordinator.ipc.auth import Grant, digest_of
 from coordinator.ipc.door import Door
-from coordinator.ipc.methods import Scope
-from coordinator.ipc.server import IpcServer, tls_context
+from coordinator.ipc.methods import ApiError, Scope
+from coordinator.ipc.server import Adopted, IpcServer, tls_context
+from coordinator.ipc.wire import Fault
+from coordinator.web.access import LINK_S, SESSION_S, PageAccess, PageSession, is_key_of
 from coordinator.web.files import PageFile, page_files
-from coordinator.web.peers import is_own_host, is_own_origin, is_own_program, own_names
+from coordinator.web.names import is_known_host, is_own_origin
 from coordinator.web.pipe import Pipe
+from coordinator.web.session_file import read_sessions, write_sessions
 from coordinator.web.settings import WebSettings
 from nodes.errors import CanductorError
 
+if TYPE_CHECKING:
+    from coordinator.ipc.connection import Connection
+
 SOCKET_PATH: Final = "/socket"
+LOGIN_PATH: Final = "/login"
+"""Takes a link's code, or a token; gives a session."""
+SESSION_PATH: Final = "/session"
+"""Whether the browser has a session: it is not told why a WebSocket was refused."""
+LOGIN_BYTES_MAX: Final = 4_096
+COOKIES_MAX: Final = 8
+"""Of our name that are looked at: programs on other ports of this computer can set such cookies, too."""
 CONNECTIONS_MAX: Final = 256
 """Open at a time, WebSockets and TLS handshakes included; further ones are closed."""
 REQUEST_S: Final = 30.0
 """A connection that is no WebSocket is closed after so long: who only fetches files is done by then."""
 HEARTBEAT_S: Final = 15.0
 """Between looks at whether a browser is still there."""
+UNKNOWN: Final = ApiError(
+    "bad_token",
+    "This link or token is not known. A link works once, for "
+    f"{LINK_S / 60:.0f} minutes; 'canductor page' prints another.",
+)
 POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'"
@@ -43,11 +66,18 @@ HEADERS: Final = {
 class WebServer:
     """Serves the page at SETTINGS.host; its clients are clients of IPC. Lives on the loop that starts it."""
 
-    def __init__(self, ipc: IpcServer, settings: WebSettings) -> None:
+    def __init__(
+        self, ipc: IpcServer, settings: WebSettings, *, on_notice: Callable[[str], None] = lambda _: None
+    ) -> None:
         self._ipc = ipc
         self._settings = settings
+        self._on_notice = on_notice
+        """Gets sentences for the machine's owner."""
         self._files = page_files()
-        self._names = own_names()
+        self._names = frozenset(settings.names)
+        self._access = PageAccess()
+        self._saving = asyncio.Lock()
+        self._clients: dict[Connection, PageSession] = {}
         self._door: Door | None = None
         self._sockets: set[asyncio.BaseProtocol] = set()
         """Connections that have become WebSockets."""
@@ -63,6 +93,7 @@ class WebServer:
     async def start(self) -> None:
         """Open the port; raises CanductorError."""
         settings = self._settings
+        await self._read_sessions()
         context = None
         if settings.certificate is not None and settings.private_key is not None:
             context = await asyncio.to_thread(tls_context, settings.certificate, settings.private_key)
@@ -92,6 +123,60 @@ class WebServer:
             self._door.close()
         await self._http.shutdown(timeout=1.0)
 
+    # --------------------------------------------------------------------------------------- sessions
+
+    def new_link(self, scope: Scope) -> str:
+        """Return an address that lets one browser in with SCOPE, once; to be called once the port is open."""
+        return f"{self.url}#{self._access.new_link(scope, asyncio.get_running_loop().time())}"
+
+    async def sign_all_out(self) -> int:
+        """End all sessions with their connections, and all links; return how many sessions there were."""
+        count = self._access.sign_all_out()
+        for connection in list(self._clients):
+            connection.session.end(Fault("bad_token", "all browsers were signed out"))
+            connection.flush()
+        await self._save_sessions()
+        return count
+
+    async def _read_sessions(self) -> None:
+        if self._settings.sessions is None:
+            return
+        try:
+            self._access = PageAccess(await asyncio.to_thread(read_sessions, self._settings.sessions))
+        except CanductorError as error:
+            self._on_notice(f"{error}; until then browsers need a new link after each start")
+
+    async def _save_sessions(self) -> None:
+        """Keep the sessions; when that fails they hold until the end of this run."""
+        if self._settings.sessions is None:
+            return
+        async with self._saving:
+            sessions = [replace(session) for session in self._access.sessions]
+            try:
+                await asyncio.to_thread(write_sessions, self._settings.sessions, sessions)
+            except CanductorError as error:
+                self._on_notice(f"{error}; browsers need a new link after the next start")
+
+    def _session_of(self, request: web.BaseRequest) -> PageSession | None:
+        """Return the session of the browser that asks, None if it has none, or its token was taken away."""
+        host, time_s = _host(request), time.time()
+        for cookie in _cookies(request, self._cookie_name)[:COOKIES_MAX]:
+            session = self._access.find(cookie, host, time_s)
+            if session is not None and self._grant(session) is not None:
+                return session
+        return None
+
+    def _grant(self, session: PageSession) -> Grant | None:
+        """Return what SESSION may do now: no more than its token, if it has one."""
+        if session.token is None:
+            return Grant("", session.scope)
+        grant = self._ipc.grant_of(session.token)
+        return None if grant is None else replace(grant, scope=min(grant.scope, session.scope))
+
+    @property
+    def _cookie_name(self) -> str:
+        return f"canductor-{self.port}"  # cookies are shared by all ports of a host
+
     # ------------------------------------------------------------------------------------ connections
 
     def _may_enter(self, entering: int) -> bool:
@@ -112,16 +197,60 @@ class WebServer:
     # --------------------------------------------------------------------------------------- requests
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
-        if not is_own_host(request.headers.get("Host", ""), self._names):
-            return self._refuse(f"this is not {request.host!r}; use the computer's name or address")
+        if not is_known_host(request.headers.get("Host", ""), self._names):
+            name = repr(request.host)
+            return self._refuse(f"{name} is no name of this page; use its IP address, or give --web-name")
         if request.path == SOCKET_PATH:
             return await self._serve_socket(request)
+        if request.path == LOGIN_PATH:
+            return await self._sign_in(request)
+        return self._serve_file(request)
+
+    def _serve_file(self, request: web.BaseRequest) -> web.Response:
         if request.method not in ("GET", "HEAD"):
             return web.Response(status=405, headers={**HEADERS, "Allow": "GET, HEAD"})
+        if request.path == SESSION_PATH:
+            return web.Response(status=204 if self._session_of(request) else 401, headers=HEADERS)
         file = self._files.get(request.path)
         if file is None:
             return web.Response(status=404, text="there is no such page\n", headers=HEADERS)
         return _send(file, request)
+
+    async def _sign_in(self, request: web.BaseRequest) -> web.Response:
+        """Give a session for the code of a link, or for a token."""
+        if request.method != "POST":
+            return web.Response(status=405, headers={**HEADERS, "Allow": "POST"})
+        if not is_own_origin(request.headers.get("Origin"), request.headers.get("Host", "")):
+            return self._refuse("only the page of this server may sign in here")
+        if request.content_length is None or request.content_length > LOGIN_BYTES_MAX:
+            return web.Response(status=413, headers=HEADERS)
+        given = _read_login(await request.read())
+        if given is None:
+            return _fault(HTTPStatus.BAD_REQUEST, ApiError("bad_message", "token and keep are needed"))
+        token, keep = given
+        scope, digest = self._access.use_link(token, asyncio.get_running_loop().time()), None
+        if scope is None:
+            try:
+                scope, digest = self._ipc.check_token(token, _address(request)).scope, digest_of(token)
+            except ApiError as error:
+                self.refused += 1
+                return _fault(HTTPStatus.FORBIDDEN, UNKNOWN if error.code == UNKNOWN.code else error)
+        former = self._session_of(request)
+        if former is not None:
+            self._access.sign_out(former)
+        signed_in = self._access.sign_in(_host(request), scope, digest, time.time())
+        await self._save_sessions()
+        answer = web.json_response({"key": signed_in.key, "scope": scope.word}, headers=HEADERS)
+        answer.set_cookie(
+            self._cookie_name,
+            signed_in.cookie,
+            path="/",
+            httponly=True,
+            samesite="Strict",
+            secure=self._settings.certificate is not None,
+            max_age=int(SESSION_S) if keep else None,
+        )
+        return answer
 
     def _refuse(self, sentence: str) -> web.Response:
         self.refused += 1
@@ -135,31 +264,33 @@ class WebServer:
         )
         if not socket.can_prepare(request).ok:
             return web.Response(status=426, headers={**HEADERS, "Upgrade": "websocket"})
-        address, granted = await self._judge(request)
+        session = self._session_of(request)
+        if session is None:
+            self.refused += 1
+            return web.Response(status=401, text="sign in first\n", headers=HEADERS)
+        if self._access.note_use(session, time.time()):
+            await self._save_sessions()
         await socket.prepare(request)
         self._sockets.add(request.protocol)
         try:
-            await self._pass_on(socket, address, granted)
+            await self._pass_on(socket, _address(request), session)
         finally:
             self._sockets.discard(request.protocol)
         return socket
 
-    async def _judge(self, request: web.BaseRequest) -> tuple[str, Scope | None]:
-        """Return where a browser is, and what it may do without a token."""
-        transport = request.transport
-        if transport is None:
-            return "unknown", None
-        peer, here = (transport.get_extra_info(name) for name in ("peername", "sockname"))
-        if not peer or not here:
-            return "unknown", None
-        own = await asyncio.to_thread(is_own_program, peer[:2], here[:2])
-        return str(peer[0]), Scope.OPERATE if own else None
-
-    async def _pass_on(self, socket: web.WebSocketResponse, address: str, granted: Scope | None) -> None:
+    async def _pass_on(self, socket: web.WebSocketResponse, address: str, session: PageSession) -> None:
         """Carry messages both ways until one side ends."""
+
+        def check_key(key: str) -> Adopted | None:
+            grant = self._grant(session)
+            if grant is None or session not in self._access.sessions or not is_key_of(session, key):
+                return None
+            return Adopted(grant, session.token)
+
         pipe = Pipe(socket)
-        connection = self._ipc.adopt(pipe, address, granted)
+        connection = self._ipc.adopt(pipe, address, check_key)
         pipe.connection = connection
+        self._clients[connection] = session
         sending = asyncio.ensure_future(pipe.run())
         begun = False
         try:
@@ -171,11 +302,45 @@ class WebServer:
                 connection.receive(message.data.encode() + b"\n")
                 await pipe.readable()
         finally:
+            del self._clients[connection]
             pipe.abort()
             connection.connection_lost(None)
             sending.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError):
                 await sending
+
+
+def _address(request: web.BaseRequest) -> str:
+    peer = None if request.transport is None else request.transport.get_extra_info("peername")
+    return str(peer[0]) if peer else "unknown"
+
+
+def _host(request: web.BaseRequest) -> str:
+    return request.headers.get("Host", "").lower()
+
+
+def _cookies(request: web.BaseRequest, name: str) -> list[str]:
+    """Return the values of the cookies called NAME; there may be several, of other ports and paths."""
+    parts = ";".join(request.headers.getall("Cookie", ())).split(";")
+    pairs = (part.strip().partition("=") for part in parts)
+    return [value for found, _, value in pairs if found == name]
+
+
+def _read_login(body: bytes) -> tuple[str, bool] | None:
+    """Return the code or token of BODY, and whether the browser shall keep its session when it is closed."""
+    try:
+        given: Any = json.loads(body)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(given, dict) or type(given.get("token")) is not str:
+        return None
+    return given["token"], given.get("keep") is True
+
+
+def _fault(status: HTTPStatus, error: ApiError) -> web.Response:
+    return web.json_response(
+        {"code": error.code, "message": error.sentence}, status=status.value, headers=HEADERS
+    )
 
 
 def _send(file: PageFile, request: web.BaseRequest) -> web.Response:

@@ -36,6 +36,17 @@ def test_what_is_no_address(capsys: pytest.CaptureFixture[str], address: str) ->
     assert "--web is '" in refused(capsys, f"--web={address}")
 
 
+@pytest.mark.parametrize(
+    "name", ["", "a b", "-x", "x-", "a..b", "é", "a" * 64, "a." * 128, "1.2.3.4/x", "x:80"]
+)
+def test_what_is_no_host_name(capsys: pytest.CaptureFixture[str], name: str) -> None:
+    assert "must be a host name" in refused(capsys, "--web", "8080", f"--web-name={name}")
+
+
+def test_names_are_of_the_page(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--web-name goes with --web" in refused(capsys, "--web-name", "printer.example")
+
+
 def test_without_serve_there_is_no_page(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["demo", "--web", "8080"]) != 0
     assert "give --serve" in capsys.readouterr().err

@@ -1,12 +1,13 @@
 // One client of the machine's interface (docs/ipc.md): hello, requests, watching, notifications; comes back by itself.
-// Events: "up" (detail: the hello's result), "down" (detail: {message, retry_ms}), "refused" (detail: {code, message}:
-// a token is needed), "notification" (detail: {event, values}).
+// Events: "up" (detail: the hello's result), "down" (detail: {message, retry_ms}), "refused" (this browser has to sign
+// in), "notification" (detail: {event, values}).
 
 const RETRY_MS = [250, 500, 1000, 2000, 3000];
 const PING_MS = 3000; // asked so often whether anybody is there
 const SILENCE_MS = 8000; // nothing heard for so long: the connection is dead, whatever the browser thinks
 const REQUESTS_MAX = 200; // without an answer; further ones fail at once
-const TOKEN_CODES = new Set(["no_token", "bad_token"]);
+const SIGN_IN_CODES = new Set(["no_token", "bad_token"]);
+const UNAUTHORIZED = 401;
 
 export class Refusal extends Error {
   constructor(code, message) {
@@ -17,8 +18,9 @@ export class Refusal extends Error {
 
 export class Link extends EventTarget {
   #client;
-  #token;
+  #key;
   #socket = null;
+  #opened = false;
   #up = false;
   #next_id = 1;
   #open = new Map(); // id → {resolve, reject}
@@ -29,10 +31,9 @@ export class Link extends EventTarget {
   #heard_ms = 0;
   #fault = null; // why the server ended it
 
-  constructor(client, token) {
+  constructor(client) {
     super();
     this.#client = client;
-    this.#token = token;
     setInterval(() => this.#look(), PING_MS);
   }
 
@@ -40,17 +41,21 @@ export class Link extends EventTarget {
     return this.#up;
   }
 
-  /** Connect now, with another token if one is given. */
-  connect(token) {
-    if (token !== undefined) this.#token = token;
+  /** Connect now, with the KEY of another session if one is given. */
+  connect(key) {
+    if (key !== undefined) this.#key = key;
     clearTimeout(this.#retry);
     this.#close();
     const scheme = location.protocol === "https:" ? "wss:" : "ws:";
     const socket = new WebSocket(`${scheme}//${location.host}/socket`);
     this.#socket = socket;
+    this.#opened = false;
     this.#fault = null;
     this.#heard_ms = performance.now();
-    socket.onopen = () => this.#hello(socket);
+    socket.onopen = () => {
+      if (socket === this.#socket) this.#opened = true;
+      this.#hello(socket);
+    };
     socket.onmessage = (message) => {
       if (socket === this.#socket) this.#receive(message.data);
     };
@@ -103,11 +108,9 @@ export class Link extends EventTarget {
   }
 
   async #hello(socket) {
-    const params = { version: 1, client: this.#client };
-    if (this.#token) params.token = this.#token;
     let told;
     try {
-      told = await this.#request("api.hello", params);
+      told = await this.#request("api.hello", { version: 1, client: this.#client, token: this.#key ?? "" });
     } catch {
       return; // the close that follows tells why
     }
@@ -184,14 +187,26 @@ export class Link extends EventTarget {
     this.#open.clear();
   }
 
-  #lost() {
+  async #lost() {
+    const opened = this.#opened;
     this.#close();
-    if (this.#fault && TOKEN_CODES.has(this.#fault.code)) {
-      this.#tell("refused", this.#fault);
+    const has_to_sign_in = this.#fault ? SIGN_IN_CODES.has(this.#fault.code) : !opened && (await is_stranger());
+    if (this.#socket) return; // another attempt was made meanwhile
+    if (has_to_sign_in) {
+      this.#tell("refused");
       return;
     }
     const retry_ms = RETRY_MS[Math.min(this.#tries++, RETRY_MS.length - 1)];
     this.#retry = setTimeout(() => this.connect(), retry_ms);
     this.#tell("down", { message: this.#fault?.message ?? "", retry_ms });
+  }
+}
+
+/** Return whether the server is there and does not know this browser: of a WebSocket the browser does not say why. */
+async function is_stranger() {
+  try {
+    return (await fetch("/session", { cache: "no-store" })).status === UNAUTHORIZED;
+  } catch {
+    return false;
   }
 }

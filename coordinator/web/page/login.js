@@ -1,59 +1,79 @@
-// Asks for a token where one is needed, and keeps it in the browser if that is wanted.
+// Signs this browser in, with the code of a one-time link or with a token of the machine. The server then gives two
+// secrets: a cookie, which scripts cannot read, and a key, which is kept here. Both are needed. A browser sends the
+// cookie to every port of a computer, other users' ports too; the key is kept for this origin alone.
 
 import { $, put, show } from "./dom.js";
 
-const KEY = "canductor.token";
+const KEY = "canductor.key";
 
 export class Login {
-  token = read();
+  #key = read();
+  #on_key;
 
-  constructor(on_token) {
+  /** ON_KEY gets the key of a session, which may have ended meanwhile. */
+  constructor(on_key) {
+    this.#on_key = on_key;
     $("login").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.token = $("token").value.trim();
-      keep(this.token, $("keep").checked);
+      const given = $("token").value.trim().split("#").pop(); // a whole link may be given, too
       $("token").value = "";
-      show($("login"), false);
-      on_token(this.token);
+      this.#sign_in(given, $("keep").checked);
     });
   }
 
+  /** Use the link's code if the address has one, else the key of an earlier visit. */
+  begin() {
+    const code = location.hash.slice(1);
+    if (code) this.#sign_in(code, true);
+    else if (this.#key) this.#on_key(this.#key);
+    else this.ask();
+  }
+
+  /** Show the form; FAULT says why, if something was wrong. */
   ask(fault) {
-    if (fault.code === "bad_token") {
-      forget();
-      this.token = undefined;
-    }
-    put($("login-told"), fault.code === "bad_token" ? "This token is not known to the machine." : "This page needs a token of the machine.");
+    put($("login-told"), fault?.message ?? "Open the link that canductor prints, or give it here.");
     show($("login"), true);
   }
 
   hide() {
     show($("login"), false);
   }
+
+  async #sign_in(token, keep) {
+    show($("login"), false);
+    let answer;
+    let told;
+    try {
+      answer = await fetch("/login", { method: "POST", body: JSON.stringify({ token, keep }) });
+      told = await answer.json();
+    } catch {
+      this.ask({ message: "The machine cannot be reached. Try again." });
+      return;
+    }
+    history.replaceState(null, "", location.pathname); // the code is of no use any more
+    if (answer.ok) {
+      this.#key = told.key;
+      write(told.key);
+    } else if (!this.#key) {
+      this.ask(told);
+      return;
+    }
+    this.#on_key(this.#key); // a link that was used before does no harm to who is in
+  }
 }
 
 function read() {
   try {
-    return sessionStorage.getItem(KEY) ?? localStorage.getItem(KEY) ?? undefined;
+    return localStorage.getItem(KEY) ?? undefined;
   } catch {
     return undefined; // a browser that keeps nothing
   }
 }
 
-function keep(token, for_good) {
+function write(key) {
   try {
-    sessionStorage.setItem(KEY, token);
-    if (for_good) localStorage.setItem(KEY, token);
+    localStorage.setItem(KEY, key);
   } catch {
-    return;
-  }
-}
-
-function forget() {
-  try {
-    sessionStorage.removeItem(KEY);
-    localStorage.removeItem(KEY);
-  } catch {
-    return;
+    return; // it holds until the page is left
   }
 }

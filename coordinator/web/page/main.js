@@ -19,12 +19,12 @@ const SLOW = ["nodes.", "buses.", "tables."];
 const SAMPLE_MS = 500;
 const HIDDEN_MS = 3000; // a tab that is hidden for so long is told nothing more until it is seen
 
-const login = new Login((token) => {
-  link.connect(token);
-  stop.connect(token);
+const login = new Login((key) => {
+  link.connect(key);
+  stop.connect(key);
 });
-const link = new Link("the live page", login.token);
-const stop = new Stop(link, login.token);
+const link = new Link("the live page");
+const stop = new Stop(link);
 const fields = new Fields();
 const path = new Path(link);
 const view = new View(path);
@@ -64,10 +64,10 @@ link.addEventListener("down", (event) => {
   show_down();
 });
 
-link.addEventListener("refused", (event) => {
+link.addEventListener("refused", () => {
   terminal.may = false;
   mark(document.body, "offline", "true");
-  login.ask(event.detail);
+  login.ask();
 });
 
 function watch() {
@@ -95,7 +95,7 @@ document.addEventListener("visibilitychange", () => {
 function introduce(info) {
   put($("name"), info.name);
   document.title = info.name;
-  put($("about"), `canductor ${info.version} on ${info.host}${may ? "" : " · this token may only watch"}`);
+  put($("about"), `canductor ${info.version} on ${info.host}${may ? "" : " · this browser may only watch"}`);
   const axes = info.machine?.axes;
   if (axes) view.axes = ["low_mm", "high_mm"].flatMap((end) => ["x", "y", "z"].map((axis) => axes[axis][end]));
 }
@@ -186,5 +186,4 @@ setInterval(() => {
 }, SAMPLE_MS);
 
 choose_colours(() => view.colours());
-link.connect(login.token);
-stop.connect(login.token);
+login.begin();

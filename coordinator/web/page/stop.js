@@ -17,9 +17,9 @@ export class Stop {
   #told = 0; // timer
   may = true;
 
-  constructor(other, token) {
+  constructor(other) {
     this.#other = other;
-    this.#own = new Link("the live page", token);
+    this.#own = new Link("the live page");
     this.#own.addEventListener("up", (event) => {
       this.may = event.detail.scope !== "watch";
       this.#show();
@@ -37,13 +37,13 @@ export class Stop {
     });
   }
 
-  connect(token) {
-    this.#own.connect(token);
+  connect(key) {
+    this.#own.connect(key);
   }
 
   press() {
     if (!this.may) {
-      this.#tell("refused", "This token may only watch: the stop was not sent.");
+      this.#tell("refused", "This browser may only watch: the stop was not sent.");
       return;
     }
     this.#pressed_ms = performance.now();
@@ -97,7 +97,7 @@ export class Stop {
     mark(button, "line", this.#own.up ? "up" : "down");
     button.title = this.may
       ? "Stops every node at once (Ctrl + Shift + .)"
-      : "This token may only watch";
+      : "This browser may only watch";
     button.setAttribute("aria-disabled", String(!this.may));
   }
 }

@@ -12,6 +12,7 @@ from coordinator.ipc.methods import Caller, Kind, Method, Param, Registry, Scope
 from coordinator.ipc.server import IpcServer
 from coordinator.ipc.settings import IpcSettings, TcpSettings
 from coordinator.ipc.state import StateTree
+from tests.stages import jump_loop
 
 TOKENS = {scope: f"{scope.word}-token-of-at-least-32-characters" for scope in Scope}
 
@@ -125,10 +126,10 @@ def run(folder: Path, body: Callable[[Served], Awaitable[None]], **settings: Any
     """Serve at FOLDER/m.sock and let BODY test what is served."""
 
     async def main() -> None:
-        async with asyncio.timeout(60), serving(folder, **settings) as served:
+        async with serving(folder, **settings) as served:
             await body(served)
 
-    asyncio.run(main())
+    jump_loop.run(main())
 
 
 def tokens_file(folder: Path, mode: int = 0o600) -> Path:

@@ -1,35 +1,36 @@
-"""Announcing and finding machines: multicast DNS on loopback, with strangers who talk nonsense."""
+"""Announcing and finding machines: on a network in memory, in virtual time; once on multicast DNS itself."""
 
 import asyncio
 import dataclasses
-import os
 import random
-import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager
 from ipaddress import ip_address
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from zeroconf import ServiceInfo
-from zeroconf.asyncio import AsyncZeroconf
 
-from coordinator.discover import Discovered, Found, find_machines
+from coordinator.discover import Found, find_machines
+from coordinator.ipc.announce_process import RESCAN_S, UPDATE_SPACING_S, Announcing
 from coordinator.ipc.announcement import ADDRESSES_MAX, SERVICE_TYPE, Announcement, usable_addresses
-from coordinator.ipc.announcer import Announcer
+from coordinator.ipc.announcer import RESTART_S, Announcer
 from coordinator.ipc.discovery import INSTANCES_MAX, Browser
 from coordinator.ipc.multicast import Place, reached_at, spoken_on
-from tests.coordinator.ipc.served import Served, serving
+from tests.coordinator.ipc.memory_network import MemoryNetwork, MemoryProcess
+from tests.coordinator.ipc.served import serving
 from tests.profiles import examples
+from tests.stages import jump_loop
+from tests.stages.own_networks import LOOPBACK_UP, on_own_networks
+
+if TYPE_CHECKING:
+    from asyncio.subprocess import Process
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 (the word, not a socket)
-LIMIT_S = 60.0
-"""Patience for a busy machine; it takes a twentieth of it."""
 
 
 def machine(name: str, **other: Any) -> Announcement:
@@ -45,33 +46,6 @@ def machine(name: str, **other: Any) -> Announcement:
         addresses=("127.0.0.1",),
     )
     return dataclasses.replace(plain, **other)
-
-
-def run(body: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    async def main() -> None:
-        async with asyncio.timeout(LIMIT_S):
-            await body()
-
-    asyncio.run(main())
-
-
-@asynccontextmanager
-async def announced(*machines: Announcement) -> AsyncIterator[list[Announcer]]:
-    announcers = [Announcer(each, ["127.0.0.1"], lambda _: None) for each in machines]
-    try:
-        for announcer in announcers:
-            announcer.start()
-        yield announcers
-    finally:
-        for announcer in announcers:
-            await announcer.close()
-
-
-async def until(browser: Browser, *wanted: Announcement) -> None:
-    """Wait until BROWSER sees exactly those of WANTED, and none of the same ids that are others."""
-    ids = {each.id for each in wanted}
-    while {dataclasses.replace(each, change=0) for each in browser.machines if each.id in ids} != set(wanted):
-        await browser.change()
 
 
 # ------------------------------------------------------------------------------------------- the records
@@ -163,53 +137,147 @@ def test_it_is_announced_where_its_sockets_are_reached(
     assert list(spoken_on(places, HERE)) == spoken
 
 
-# ------------------------------------------------------------------------------------- on the loopback
+# -------------------------------------------------------------------------------------------- announcing
 
 
-def test_machines_come_change_and_go(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("coordinator.ipc.announcer.RESTART_S", 0.0)
-    one, other = machine("same"), machine("same", port=7126)  # of one name, and stay apart
+class Announced:
+    """A machine that is announced in virtual time, without a process."""
 
-    async def body() -> None:
-        async with Browser() as browser, announced(one, other) as (first, second):
-            await until(browser, one, other)
-            for state in ("ready", "printing", "shutdown"):
-                first.state(state)
-            await until(browser, dataclasses.replace(one, state="shutdown"), other)
-            await second.close()
-            await until(browser, dataclasses.replace(one, state="shutdown"))
-            assert all(seen.id != other.id for seen in browser.machines)
-            assert first.process is not None
-            first.process.kill()  # and is begun again, with the state of now
-            first.state("startup")
-            await until(browser, one)
+    def __init__(self, network: MemoryNetwork, one: Announcement, bound: str = "127.0.0.1") -> None:
+        self.said: list[tuple[str, str]] = []
+        self.announcing = Announcing(
+            dataclasses.replace(one, addresses=()),
+            [bound],
+            lambda *words: self.said.append(words),
+            find_places=network.find_places,
+            open_dns=network.open_dns,
+        )
+        self._task = asyncio.ensure_future(self.announcing.run())
 
-    run(body)
+    async def end(self) -> None:
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
 
 
-def test_a_coordinator_that_is_killed_is_seen_to_go() -> None:
-    one = machine("killed")
-    code = (
-        "import asyncio; from coordinator.ipc.announcement import Announcement; "
-        "from coordinator.ipc.announcer import Announcer\n"
-        "async def main():\n"
-        f"    Announcer({one!r}, ['127.0.0.1'], lambda line: print(line, flush=True)).start()\n"
-        "    await asyncio.Event().wait()\n"
-        "asyncio.run(main())"
-    )
+def seen(browser: Browser) -> list[Announcement]:
+    """Return what BROWSER sees, but for the number of changes."""
+    return [dataclasses.replace(each, change=0) for each in browser.machines]
 
-    async def body() -> None:
-        async with Browser() as browser:
-            process = await asyncio.create_subprocess_exec(sys.executable, "-c", code)
-            try:
-                await until(browser, one)
-            finally:
-                process.kill()
-                await process.wait()
-            while any(seen.id == one.id for seen in browser.machines):
-                await browser.change()
 
-    run(body)
+def test_machines_come_change_and_go() -> None:
+    one, other = machine("same", id="1" * 16), machine("same", id="2" * 16, port=7126)
+
+    async def main() -> None:
+        network = MemoryNetwork()
+        async with Browser(network.listen) as browser:
+            first, second = Announced(network, one), Announced(network, other)
+            await asyncio.sleep(UPDATE_SPACING_S)
+            assert seen(browser) == [one, other], "of one name, and apart"
+            assert first.said == [("announced", "announced as same-11111111: tcp://127.0.0.1:7125")]
+            for change, state in enumerate(("ready", "printing", "shutdown"), 1):
+                first.announcing.state(state, change)
+            await asyncio.sleep(UPDATE_SPACING_S)
+            assert seen(browser) == [dataclasses.replace(one, state="shutdown"), other]
+            await second.end()
+            assert [each.port for each in browser.machines] == [one.port]
+            async with Browser(network.listen) as late:
+                await late.change()
+                await asyncio.sleep(1)
+                assert [each.state for each in late.machines] == ["shutdown"]
+            await first.end()
+            assert browser.machines == []
+            assert (len(first.said), len(second.said)) == (1, 1)
+
+    jump_loop.run(main())
+
+
+def test_states_that_follow_fast_are_merged() -> None:
+    async def main() -> None:
+        network = MemoryNetwork()
+        announced = Announced(network, machine("mini"))
+        for change in range(1, 100):
+            announced.announcing.state("ready" if change % 2 else "printing", change)
+            await asyncio.sleep(0.1)
+        await asyncio.sleep(2 * UPDATE_SPACING_S)
+        spacing_s = [b - a for a, b in zip(network.sent_s, network.sent_s[1:], strict=False)]
+        assert len(spacing_s) >= 8
+        assert min(spacing_s) == pytest.approx(UPDATE_SPACING_S)
+        (info,) = network.records.values()
+        assert info.properties[b"change"] == b"99"
+        await announced.end()
+
+    jump_loop.run(main())
+
+
+def test_an_announcer_waits_for_a_network_and_follows_it() -> None:
+    async def main() -> None:
+        network = MemoryNetwork()
+        network.places = (Place(ip_address("127.0.0.1"), 1),)
+        announced = Announced(network, machine("mini", tls=True), EVERYWHERE)
+        await asyncio.sleep(3 * RESCAN_S)
+        waits = "there is no network to announce the machine on; it will be when there is"
+        assert announced.said == [("failed", waits)], "once"
+        network.places += (Place(ip_address("10.0.0.7"), 2),)
+        network.problem = "the port is taken"
+        await asyncio.sleep(RESCAN_S + UPDATE_SPACING_S)
+        assert announced.said[1:] == [("failed", "the port is taken")]
+        network.problem = ""
+        announced.announcing.state("printing", 1)
+        await asyncio.sleep(RESCAN_S + UPDATE_SPACING_S)
+        assert announced.said[2:] == [("announced", announced.said[2][1])]
+        assert announced.said[2][1].endswith(": tls://10.0.0.7:7125")
+        network.places = (Place(ip_address("10.0.9.9"), 2),)
+        await asyncio.sleep(RESCAN_S + UPDATE_SPACING_S)
+        async with Browser(network.listen) as browser:
+            await asyncio.sleep(1)
+            assert [(each.state, each.addresses) for each in browser.machines] == [
+                ("printing", ("10.0.9.9",))
+            ]
+        await announced.end()
+        assert network.records == {}
+
+    jump_loop.run(main())
+
+
+def test_a_process_that_ends_is_begun_again_with_the_state_of_now() -> None:
+    one = machine("mini")
+
+    async def main() -> None:
+        network, said, processes = MemoryNetwork(), list[str](), list[MemoryProcess]()
+
+        async def launch() -> "Process":
+            if len(processes) == 1 and len(said) == 2:
+                raise PermissionError(13, "Permission denied")
+            processes.append(MemoryProcess(network))
+            return cast("Process", processes[-1])
+
+        announcer = Announcer(one, ["127.0.0.1"], said.append, launch=launch)
+        announcer.start()
+        announcer.state("ready")
+        async with Browser(network.listen) as browser:
+            await asyncio.sleep(2 * UPDATE_SPACING_S)
+            assert [each.state for each in browser.machines] == ["ready"]
+            processes[0].kill()
+            announcer.state("printing")
+            await asyncio.sleep(RESTART_S / 2)
+            assert browser.machines == []
+            await asyncio.sleep(RESTART_S / 2 + UPDATE_SPACING_S)
+            assert len(processes) == 1, "it could not be begun"
+            await asyncio.sleep(RESTART_S + UPDATE_SPACING_S)
+            assert [each.state for each in browser.machines] == ["printing"]
+            await announcer.close()
+            assert browser.machines == []
+        assert [words.split(":")[0] for words in said] == [
+            f"announced as mini-{one.id[:8]}",
+            f"announcing the machine ended; it begins again in {RESTART_S:g} s",
+            "the machine cannot be announced",
+            f"announced as mini-{one.id[:8]}",
+        ]
+
+    jump_loop.run(main())
+
+
+# ---------------------------------------------------------------------------------------------- browsing
 
 
 def test_nonsense_is_skipped_and_counted() -> None:
@@ -222,181 +290,98 @@ def test_nonsense_is_skipped_and_counted() -> None:
         (txt, [EVERYWHERE]),
     ]
 
-    async def body() -> None:
-        strangers = AsyncZeroconf(interfaces=["127.0.0.1"])
-        try:
-            infos = [
-                ServiceInfo(
-                    SERVICE_TYPE,
-                    f"stranger-{number}-{one.id}.{SERVICE_TYPE}",
-                    port=9,
-                    properties=properties,
-                    parsed_addresses=addresses,
-                    server=f"stranger-{number}-{one.id}.local.",
-                )
-                for number, (properties, addresses) in enumerate(nonsense)
-            ]
-            await asyncio.gather(*(_register(strangers, info) for info in infos))
-            async with Browser() as browser, announced(one):
-                _send_noise()
-                await until(browser, one)
-                while browser.skipped < len(nonsense):
-                    await browser.change()
-                assert all("stranger" not in seen.name for seen in browser.machines)
-        finally:
-            await strangers.async_unregister_all_services()
-            await strangers.async_close()
+    async def main() -> None:
+        network = MemoryNetwork()
+        for number, (properties, addresses) in enumerate([*nonsense, (txt, ["127.0.0.1"])]):
+            name = f"stranger-{number}.{SERVICE_TYPE}"
+            network.put(
+                ServiceInfo(SERVICE_TYPE, name, 7125, properties=properties, parsed_addresses=addresses)
+            )
+        async with Browser(network.listen) as browser:
+            await asyncio.sleep(1)
+            assert browser.machines == [one]
+            assert browser.skipped == len(nonsense)
+            network.remove(f"stranger-0.{SERVICE_TYPE}")
+            await browser.change()
+            assert browser.skipped == len(nonsense) - 1
 
-    run(body)
-
-
-async def _register(mdns: AsyncZeroconf, info: ServiceInfo) -> None:
-    await (await mdns.async_register_service(info, cooperating_responders=True))
-
-
-def _send_noise() -> None:
-    """Send what is no DNS at all, and what nearly is, to everybody on the loopback."""
-    chance = random.Random(6)
-    sound = b"\0\0\x84\0\0\0\0\1\0\0\0\0\x0b_canductor\x04_tcp\x05local\0\0\x0c\0\1\0\0\x11\x94\0\2\xc0\x0c"
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("127.0.0.1"))
-        for n in range(200):
-            noise = bytearray(sound if n % 2 else chance.randbytes(chance.randrange(1500)))
-            for _ in range(n % 7):
-                if noise:
-                    noise[chance.randrange(len(noise))] = chance.randrange(256)
-            sender.sendto(noise, ("224.0.0.251", 5353))
+    jump_loop.run(main())
 
 
 def test_more_announcements_than_anybody_has_are_counted_only() -> None:
-    async def body() -> None:
-        async with Browser() as browser:
-            already = len(browser.machines) + browser.skipped
-
-            class Added:
-                name = "Added"
-
+    async def main() -> None:
+        network = MemoryNetwork()
+        async with Browser(network.listen) as browser:
+            (heard,) = network.listeners
             for n in range(2 * INSTANCES_MAX + 50):
-                browser._hear(name=f"flood-{n}.{SERVICE_TYPE}", state_change=Added)
-            assert 2 * INSTANCES_MAX - already <= browser.skipped <= 2 * INSTANCES_MAX
+                heard(f"flood-{n}.{SERVICE_TYPE}", True)
+            assert browser.skipped == 2 * INSTANCES_MAX
             assert len(browser._asking) <= INSTANCES_MAX
 
-    run(body)
+    jump_loop.run(main())
 
 
-# ----------------------------------------------------------------------------------- canductor discover
-
-
-async def discover(ready: Callable[[Discovered], bool]) -> Discovered:
-    """Discover until what is found is READY: a busy machine may answer late."""
-    while not ready(found := await find_machines(1.0)):
-        pass
-    return found
-
-
-def test_sockets_and_announcements_in_one_table(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sockets_and_announcements_in_one_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     folder = tmp_path / "canductor"
     folder.mkdir()
     here, other = machine("here", state="ready"), machine("else", tls=True, port=7127)
 
-    async def body(served: Served) -> None:
-        info = served.server._common.registry.methods["machine.info"]
-        told = {"name": "here", "state": "ready", "host": "box", "version": "0.1.0", "id": here.id}
-        object.__setattr__(info, "call", lambda _caller, _params: told)
-        with socket.socket(socket.AF_UNIX) as nobody:
-            nobody.bind(str(folder / "left-behind.sock"))  # and nobody listens
-
-        def ready(found: Discovered) -> bool:
-            addresses = {address for each in found.machines for address in each.at}
-            return {str(served.path), here.at[0], other.at[0]} <= addresses
-
-        async with announced(here, other):
-            found = await discover(ready)
-        first = found.machines[0]
-        assert first == Found(
-            "here", "ready", "box", "0.1.0", 1, (str(served.path), *here.at), here=True, id=here.id
-        )
-        assert any(each.at == other.at and each.name == "else" for each in found.machines)
-        assert found.silent == [folder / "left-behind.sock"]
-        text = found.to_text().splitlines()
-        assert text[0].split() == ["name", "state", "computer", "version", "api", "--at"]
-        assert text[1].split() == ["here", "ready", "box", "0.1.0", "1", str(served.path)]
-        assert text[2].split() == [here.at[0]]
-        assert any(line.startswith("nobody answers at") for line in text)
-
     async def main() -> None:
+        network = MemoryNetwork()
         async with serving(folder) as served:
-            await body(served)
+            info = served.server._common.registry.methods["machine.info"]
+            told = {"name": "here", "state": "ready", "host": "box", "version": "0.1.0", "id": here.id}
+            object.__setattr__(info, "call", lambda _caller, _params: told)
+            with socket.socket(socket.AF_UNIX) as nobody:
+                nobody.bind(str(folder / "left-behind.sock"))  # and nobody listens
+            announced = [Announced(network, each) for each in (here, other)]
+            found = await find_machines(3.0, network.listen)
+            for each in announced:
+                await each.end()
+        by_socket = (str(served.path), *here.at)
+        assert list(found.machines) == [
+            Found("here", "ready", "box", "0.1.0", 1, by_socket, here=True, id=here.id),
+            Found("else", "startup", "here", "0.1.0", 1, other.at, here=False, id=other.id),
+        ]
+        assert found.silent == [folder / "left-behind.sock"]
+        text = [line.split() for line in found.to_text().splitlines()]
+        assert text == [
+            ["name", "state", "computer", "version", "api", "--at"],
+            ["here", "ready", "box", "0.1.0", "1", str(served.path)],
+            [here.at[0]],
+            ["else", "startup", "here", "0.1.0", "1", other.at[0]],
+            ["nobody", "answers", "at", str(folder / "left-behind.sock")],
+        ]
 
-    run(main)
+    jump_loop.run(main())
 
 
-# ------------------------------------------------------------------------- computers with other networks
-
-
-def need_own_networks() -> None:
-    """Skip the test where nobody may make networks of his own, without any interface that is up."""
-    if shutil.which("unshare") is None:
-        pytest.skip("unshare is not installed: it makes a computer without networks")
-    if subprocess.run(["unshare", "-rn", "true"], check=False, capture_output=True).returncode:
-        pytest.skip("this system lets nobody make networks of his own (unshare -rn)")
-
-
-def on_other_networks(code: str) -> str:
-    """Run CODE where there is only a loopback that is down; return what it prints."""
-    need_own_networks()
-    ended = subprocess.run(
-        ["unshare", "-rn", sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=LIMIT_S,
-        env=os.environ | {"XDG_RUNTIME_DIR": "/nowhere"},
-    )
-    assert not ended.stderr, ended.stderr
-    assert ended.returncode == 0
-    return ended.stdout
-
+# ------------------------------------------------------------------- multicast DNS, on networks of its own
 
 _DISCOVER = "from coordinator.cli import main; main(['discover', '--timeout', '0.2'])\n"
 
 
 def test_a_computer_without_networks() -> None:
-    said = on_other_networks(_DISCOVER)
+    said = on_own_networks(_DISCOVER)
     assert "no machine was found\nonly this computer was asked: this computer has no network address" in said
 
 
-_LOOPBACK_UP = """
-import fcntl, socket, struct
+_TAKEN = """
 taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-fcntl.ioctl(taken, 0x8914, struct.pack("16sH14x", b"lo", 0x49))
 taken.bind(("", 5353))
 """
 
 
 def test_the_port_is_taken() -> None:
-    said = on_other_networks(_LOOPBACK_UP + _DISCOVER)
+    said = on_own_networks(LOOPBACK_UP + _TAKEN + _DISCOVER)
     assert "multicast DNS (UDP port 5353) cannot be used: Address already in use" in said
 
 
-def test_an_announcer_waits_for_a_network() -> None:
-    code = """
-import asyncio
-from coordinator.ipc.announcement import Announcement
-from coordinator.ipc.announcer import Announcer
-async def main():
-    told = asyncio.Queue()
-    machine = Announcement(name="m", host="h", version="1", state="ready", api=1, tls=False, id="0" * 16,
-                           port=7125, addresses=())
-    announcer = Announcer(machine, ["0.0.0.0"], told.put_nowait)
-    announcer.start()
-    print(await told.get())
-    announcer.state("printing")
-    await announcer.close()
-asyncio.run(main())
-"""
-    assert "it will be when there is" in on_other_networks(code)
+def test_a_coordinator_that_is_killed_is_seen_to_go() -> None:
+    """Real processes, and nonsense on the network meanwhile."""
+    code = "from tests.coordinator.ipc import multicast_smoke; multicast_smoke.main()"
+    assert on_own_networks(LOOPBACK_UP + code) == "seen to come and to go\n"
 
 
 def test_no_other_command_pays_for_it() -> None:

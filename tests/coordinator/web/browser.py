@@ -90,6 +90,10 @@ class Demo:
         self.command = None
         assert "Traceback" not in ended.stderr, ended.stderr
 
+    def link(self) -> str:
+        """Return a one-time link, as ``canductor page`` prints it."""
+        return str(self.ask("page.link")["url"])
+
     def ask(self, method: str, **params: Any) -> Any:
         """Call a method past the page: what the machine itself says."""
         with BlockingClient(str(self.path)) as client:
@@ -121,6 +125,7 @@ class Visitor:
         **options: Any,
     ) -> None:
         self.url = url
+        """Where it goes first: a one-time link, so that it is let in."""
         self.context: BrowserContext = browser.new_context(viewport=viewport, has_touch=touch, **options)
         self.context.set_default_timeout(PATIENCE_MS)
         self.page: Page = self.context.new_page()

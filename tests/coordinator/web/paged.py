@@ -4,24 +4,31 @@ import asyncio
 import contextlib
 import json
 from collections.abc import AsyncIterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import aiohttp
 
+from coordinator.ipc.methods import Scope
 from coordinator.web.server import WebServer
 from coordinator.web.settings import WebSettings
 from tests.coordinator.ipc.served import Served, serving
 
+LIMIT_S = 20.0
+"""For one answer, in the loop's time."""
+LOOPBACK = WebSettings(host="127.0.0.1", port=0)
+
 
 @dataclass
 class Paged:
-    """The servers, and how to reach the page."""
+    """The servers, and a browser that can reach the page."""
 
     served: Served
     page: WebServer
     http: aiohttp.ClientSession
+    key: str = ""
+    """Of the session, once the browser has signed in."""
 
     @property
     def at(self) -> str:
@@ -31,19 +38,58 @@ class Paged:
         """Connect as the page's script does."""
         return self.http.ws_connect(f"{self.at}/socket", headers={"Origin": self.at, **headers})
 
+    async def log_in(self, token: str, *, keep: bool = True, **headers: str) -> tuple[int, Any]:
+        """Give a link's code, or a token, as the page's script does; return the status and the answer."""
+        origin = {"Origin": self.at, **headers}
+        asked = {"token": token, "keep": keep}
+        async with self.http.post(f"{self.at}/login", json=asked, headers=origin) as answer:
+            told = await answer.json()
+        self.key = told.get("key", self.key)
+        return answer.status, told
+
+    async def sign_in(self, scope: Scope = Scope.OPERATE) -> None:
+        """Open a one-time link."""
+        status, told = await self.log_in(code_of(self.page.new_link(scope)))
+        assert (status, told["scope"]) == (200, scope.word)
+
+    async def hello(self, socket: aiohttp.ClientWebSocketResponse) -> Any:
+        """Say hello as the page's script does, and return the answer."""
+        return await ask(socket, "api.hello", version=1, client="the page", token=self.key)
+
+    async def session_status(self) -> int:
+        """Ask whether this browser is signed in."""
+        async with self.http.get(f"{self.at}/session") as answer:
+            return answer.status
+
+    @contextlib.asynccontextmanager
+    async def other(self) -> AsyncIterator["Paged"]:
+        """Another browser."""
+        async with browser() as http:
+            yield replace(self, http=http, key="")
+
+
+def browser() -> aiohttp.ClientSession:
+    """Return a browser that keeps cookies, as all do; of IP addresses, too."""
+    return aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True))
+
 
 @contextlib.asynccontextmanager
-async def paging(folder: Path, **settings: Any) -> AsyncIterator[Paged]:
-    """Serve the page on loopback in front of ``serving``."""
+async def paging(folder: Path, page: WebSettings = LOOPBACK, **settings: Any) -> AsyncIterator[Paged]:
+    """Serve the page as PAGE says in front of ``serving``."""
     async with serving(folder, **settings) as served:
-        page = WebServer(served.server, WebSettings(host="127.0.0.1", port=0))
-        await page.start()
+        server = WebServer(served.server, page, on_notice=served.notices.put_nowait)
+        await server.start()
         try:
-            async with aiohttp.ClientSession() as http:
-                yield Paged(served, page, http)
+            async with browser() as http:
+                yield Paged(served, server, http)
         finally:
             await served.server.close()
-            await page.close()
+            await server.close()
+
+
+def code_of(link: str) -> str:
+    """Return the code of a one-time link."""
+    return link.partition("#")[2]
 
 
 async def ask(socket: aiohttp.ClientWebSocketResponse, method: str, number: int = 1, **params: Any) -> Any:
@@ -53,7 +99,7 @@ async def ask(socket: aiohttp.ClientWebSocketResponse, method: str, number: int 
 
 
 async def receive(socket: aiohttp.ClientWebSocketResponse) -> Any:
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(LIMIT_S):
         message = await socket.receive()
     assert message.type is aiohttp.WSMsgType.TEXT, message
     return json.loads(message.data)
@@ -62,7 +108,7 @@ async def receive(socket: aiohttp.ClientWebSocketResponse) -> Any:
 async def rest(socket: aiohttp.ClientWebSocketResponse) -> list[Any]:
     """Return what comes until the server closes."""
     found: list[Any] = []
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(LIMIT_S):
         async for message in socket:
             found += [json.loads(line) for line in message.data.splitlines()]
     return found

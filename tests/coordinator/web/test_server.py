@@ -1,4 +1,4 @@
-"""The page's server without a browser: who gets in, what one may do, and that nobody costs without bound."""
+"""The page's server without a browser: what a client of it may do, and that nobody costs without bound."""
 
 import asyncio
 import contextlib
@@ -11,35 +11,28 @@ from typing import Any
 
 import aiohttp
 import pytest
+from yarl import URL
 
-from coordinator.ipc.methods import Scope
+from coordinator.ipc.door import HANDSHAKE_S, HANDSHAKES_MAX
 from coordinator.ipc.settings import Limits
-from coordinator.web import server as web_server
 from coordinator.web.files import FOLDER
+from coordinator.web.server import CONNECTIONS_MAX, REQUEST_S
 from coordinator.web.settings import WebSettings
-from tests.coordinator.web.paged import Paged, ask, paging, receive, rest
+from tests.coordinator.web.paged import LOOPBACK, Paged, ask, paging, receive, rest
+from tests.stages import jump_loop
 
-TOKEN = "t" * 32
 
-
-def run(folder: Path, go: Callable[[Paged], Coroutine[Any, Any, None]], **settings: Any) -> None:
+def run(
+    folder: Path,
+    go: Callable[[Paged], Coroutine[Any, Any, None]],
+    page: WebSettings = LOOPBACK,
+    **settings: Any,
+) -> None:
     async def main() -> None:
-        async with asyncio.timeout(60), paging(folder, **settings) as paged:
+        async with paging(folder, page, **settings) as paged:
             await go(paged)
 
-    asyncio.run(main())
-
-
-def tokens(folder: Path) -> Path:
-    path = folder / "tokens"
-    path.touch(0o600)
-    path.write_text(f"watch hall {'w' * 32}\noperate phone {TOKEN}\nadmin owner {'a' * 32}\n")
-    return path
-
-
-def strangers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every program seem to be another user's."""
-    monkeypatch.setattr(web_server, "is_own_program", lambda *_: False)
+    jump_loop.run(main())
 
 
 # --------------------------------------------------------------------------------------------------- files
@@ -87,106 +80,6 @@ def test_packed_for_those_who_can_unpack(tmp_path: Path) -> None:
     run(tmp_path, go)
 
 
-# ------------------------------------------------------------------------------------------------ who gets in
-
-
-def test_foreign_names_and_pages_are_refused(tmp_path: Path) -> None:
-    async def go(paged: Paged) -> None:
-        async with paged.http.get(paged.at, headers={"Host": "evil.example"}) as answer:
-            assert answer.status == 403
-            assert "evil.example" in await answer.text()
-        port = paged.page.port
-        for headers in (
-            {"Origin": "http://evil.example"},
-            {"Origin": "null"},
-            {"Origin": f"http://127.0.0.1:{port + 1}"},
-            {"Origin": f"http://evil.example:{port}", "Host": f"evil.example:{port}"},
-        ):
-            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-                await paged.socket(**headers)
-            assert refused.value.status == 403
-        with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
-            await paged.http.ws_connect(
-                f"{paged.at}/socket"
-            )  # no browser says nothing of where it comes from
-        assert refused.value.status == 403
-        assert paged.page.refused == 6
-        assert paged.served.server.figures()["connections"] == 0
-
-    run(tmp_path, go)
-
-
-def test_the_users_own_browser_may_operate_and_no_more(tmp_path: Path) -> None:
-    async def go(paged: Paged) -> None:
-        async with paged.socket() as page:
-            told = await ask(page, "api.hello", version=1, client="the page")
-            assert told["result"]["scope"] == "operate"
-            assert (await ask(page, "move.to", 2, x_mm=3.0))["result"] == {"to": 3.0}
-            assert (await ask(page, "node.command", 3, command="x"))["error"]["code"] == "not_allowed"
-            caller = (await ask(page, "machine.info", 4))["result"]["caller"]
-            assert caller == "the page (127.0.0.1)"
-
-    run(tmp_path, go, unix_scope=Scope.ADMIN)
-
-
-@pytest.mark.parametrize(
-    ("token", "scope"), [("w" * 32, "watch"), (TOKEN, "operate"), ("a" * 32, "admin"), (None, None)]
-)
-def test_others_need_a_token(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, token: str | None, scope: str | None
-) -> None:
-    strangers(monkeypatch)
-
-    async def go(paged: Paged) -> None:
-        async with paged.socket() as page:
-            told = await ask(page, "api.hello", version=1, token=token)
-            if scope is None:
-                assert told["error"]["code"] == "no_token"
-                assert (await page.receive()).type is aiohttp.WSMsgType.CLOSE
-                return
-            assert told["result"]["scope"] == scope
-            wanted: list[tuple[str, dict[str, Any]]] = [
-                ("machine.info", {}),
-                ("move.to", {"x_mm": 1.0}),
-                ("machine.emergency_stop", {}),
-                ("node.command", {"command": "x"}),
-            ]
-            answers = {}
-            for number, (name, params) in enumerate(wanted, 2):
-                answers[name] = (await ask(page, name, number, **params)).get("error", {}).get("code")
-            no = "not_allowed"
-            assert answers == {
-                "machine.info": None,
-                "move.to": no if scope == "watch" else None,
-                "machine.emergency_stop": no if scope == "watch" else None,
-                "node.command": None if scope == "admin" else no,
-            }
-
-    run(tmp_path, go, tokens=tokens(tmp_path))
-
-
-def test_who_guesses_tokens_is_shut_out_but_not_the_owner(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    own = False
-    monkeypatch.setattr(web_server, "is_own_program", lambda *_: own)
-
-    async def go(paged: Paged) -> None:
-        nonlocal own
-        codes = []
-        for _ in range(6):
-            async with paged.socket() as page:
-                told = await ask(page, "api.hello", version=1, token="x" * 32)
-                codes.append(told["error"]["code"])
-        assert codes == ["bad_token"] * 5 + ["too_many_failures"]
-        own = True
-        async with paged.socket() as page:
-            assert "result" in await ask(page, "api.hello", version=1)
-            assert "result" in await ask(page, "machine.emergency_stop", 2)
-
-    run(tmp_path, go, tokens=tokens(tmp_path))
-
-
 # ---------------------------------------------------------------------------------------------------- limits
 
 
@@ -197,11 +90,11 @@ def test_who_guesses_tokens_is_shut_out_but_not_the_owner(
 )
 def test_what_is_no_message_ends_that_client(tmp_path: Path, text: str, code: int) -> None:
     async def go(paged: Paged) -> None:
+        await paged.sign_in()
         async with paged.socket() as good, paged.socket() as bad:
-            assert "result" in await ask(good, "api.hello", version=1)
+            assert "result" in await paged.hello(good)
             await bad.send_str(text)
-            async with asyncio.timeout(20):
-                ended = await bad.receive()
+            ended = await bad.receive()
             assert (ended.type, ended.data) == (aiohttp.WSMsgType.CLOSE, code)
             assert "result" in await ask(good, "api.ping", 2)
 
@@ -210,10 +103,10 @@ def test_what_is_no_message_ends_that_client(tmp_path: Path, text: str, code: in
 
 def test_bytes_are_no_text(tmp_path: Path) -> None:
     async def go(paged: Paged) -> None:
+        await paged.sign_in()
         async with paged.socket() as page:
             await page.send_bytes(b'{"id":1,"method":"api.ping"}')
-            async with asyncio.timeout(20):
-                ended = await page.receive()
+            ended = await page.receive()
             assert (ended.type, ended.data) == (aiohttp.WSMsgType.CLOSE, 1003)
 
     run(tmp_path, go)
@@ -221,6 +114,7 @@ def test_bytes_are_no_text(tmp_path: Path) -> None:
 
 def test_deep_messages_and_broken_ones_are_told_why(tmp_path: Path) -> None:
     async def go(paged: Paged) -> None:
+        await paged.sign_in()
         for text, code in (('{"a":' + "[" * 40 + "]" * 40 + "}", "too_deep"), ('{"id":', "bad_message")):
             async with paged.socket() as page:
                 await page.send_str(text)
@@ -231,8 +125,9 @@ def test_deep_messages_and_broken_ones_are_told_why(tmp_path: Path) -> None:
 
 def test_a_stop_overtakes_what_waits(tmp_path: Path) -> None:
     async def go(paged: Paged) -> None:
+        await paged.sign_in()
         async with paged.socket() as page:
-            await ask(page, "api.hello", version=1)
+            await paged.hello(page)
             lines: list[Any] = [{"id": n, "method": "wait"} for n in range(2, 150)]
             lines += [{"method": "machine.info"}, {"id": 1, "method": "machine.emergency_stop"}]
             await page.send_str("\n".join(map(json.dumps, lines)))
@@ -246,17 +141,16 @@ def test_who_does_not_read_gets_the_newest_and_costs_no_more(tmp_path: Path) -> 
     """A browser that sleeps: updates merge in the session, and the pipe holds no more than its limit."""
 
     async def go(paged: Paged) -> None:
-        url = f"{paged.at}/socket"
+        await paged.sign_in()
+        cookies = paged.http.cookie_jar.filter_cookies(URL(paged.at))
         # Small buffers of the kernel, or megabytes would be under way.
         connector = aiohttp.TCPConnector(socket_factory=small_socket)
         async with (
-            aiohttp.ClientSession(connector=connector) as http,
-            http.ws_connect(url, headers={"Origin": paged.at}) as page,
+            aiohttp.ClientSession(connector=connector, cookies=cookies, cookie_jar=unsafe_jar()) as http,
+            http.ws_connect(f"{paged.at}/socket", headers={"Origin": paged.at}) as page,
         ):
-            await ask(page, "api.hello", version=1)
+            await paged.hello(page)
             await ask(page, "api.watch", 2, fields=["big.*"], rate_hz=50)
-            transport = page.get_extra_info("socket")
-            assert transport is not None
             connection = page._conn
             assert connection is not None
             assert connection.transport is not None
@@ -279,69 +173,84 @@ def test_who_does_not_read_gets_the_newest_and_costs_no_more(tmp_path: Path) -> 
     run(tmp_path, go)
 
 
+def unsafe_jar() -> aiohttp.CookieJar:
+    return aiohttp.CookieJar(unsafe=True)
+
+
 def small_socket(info: Any) -> socket.socket:
     made = socket.socket(info[0], info[1], info[2])
     made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     return made
 
 
-def test_connections_that_do_nothing_are_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connections_that_do_nothing_are_closed(tmp_path: Path) -> None:
     async def go(paged: Paged) -> None:
+        await paged.sign_in()
+        loop = asyncio.get_running_loop()
         async with paged.socket() as page:
-            await ask(page, "api.hello", version=1)
-            monkeypatch.setattr(web_server, "REQUEST_S", 0.2)  # now: a busy computer's page may take longer
+            await paged.hello(page)
+            answer = asyncio.ensure_future(page.receive())  # who reads answers what the server pings with
             for begun in (b"", b"GET / HT", b"GET /socket HTTP/1.1\r\nHost: localhost\r\n"):
+                opened_s = loop.time()
                 reader, writer = await asyncio.open_connection("127.0.0.1", paged.page.port)
                 writer.write(begun)
                 with contextlib.suppress(ConnectionResetError):
                     assert await reader.read() == b""
+                assert loop.time() == pytest.approx(opened_s + REQUEST_S)
                 writer.close()
-            assert "result" in await ask(page, "api.ping", 2), "a page stays"
+            await page.send_str('{"id":2,"method":"api.ping"}')
+            assert json.loads((await answer).data)["id"] == 2, "a page stays"
 
     run(tmp_path, go)
 
 
-def test_only_so_many_connections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(web_server, "CONNECTIONS_MAX", 3)
+async def hang_up(opened: list[tuple[asyncio.StreamReader, asyncio.StreamWriter]]) -> None:
+    for _, writer in opened:
+        writer.close()
+        with contextlib.suppress(ConnectionError):
+            await writer.wait_closed()
 
+
+def test_only_so_many_connections(tmp_path: Path) -> None:
     async def go(paged: Paged) -> None:
-        pages = [await paged.socket() for _ in range(3)]
+        await paged.sign_in()
+        page = await paged.socket()
+        others = [await asyncio.open_connection("127.0.0.1", paged.page.port) for _ in range(CONNECTIONS_MAX)]
+        ends = {asyncio.ensure_future(reader.read()) for reader, _ in others}
+        refused, let_in = await asyncio.wait(ends, timeout=1)
+        assert len(let_in) >= CONNECTIONS_MAX - 2, "besides the page, and the connection that signed in"
+        assert paged.page.refused == len(refused) > 0
         with pytest.raises(aiohttp.ClientConnectionError):
             await paged.socket()
-        assert paged.page.refused >= 1
-        assert "result" in await ask(pages[0], "api.hello", version=1)
-        for page in pages:
-            await page.close()
+        assert "result" in await paged.hello(page)
+        await page.close()
+        await asyncio.wait(ends)
+        await hang_up(others)
 
     run(tmp_path, go)
 
 
-def test_silence_before_tls_counts_as_a_connection(
-    tmp_path: Path, certificate: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(web_server, "CONNECTIONS_MAX", 3)
+def test_silence_before_tls_counts_as_a_connection(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
     settings = WebSettings(host="127.0.0.1", port=0, certificate=certificate[0], private_key=certificate[1])
 
     async def go(paged: Paged) -> None:
-        page = web_server.WebServer(paged.served.server, settings)
-        await page.start()
-        silent = [await asyncio.open_connection("127.0.0.1", page.port) for _ in range(5)]
-        ends = [asyncio.ensure_future(reader.read()) for reader, _ in silent]
-        await asyncio.wait(ends[3:])
-        assert not any(end.done() for end in ends[:3])
-        assert page.refused == 2
-        await page.close()
+        port, begun_s = paged.page.port, asyncio.get_running_loop().time()
+        silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(HANDSHAKES_MAX + 2)]
+        ends = {asyncio.ensure_future(reader.read()) for reader, _ in silent}
+        refused, let_in = await asyncio.wait(ends, timeout=1)
+        assert (len(refused), len(let_in)) == (2, HANDSHAKES_MAX)
         await asyncio.wait(ends)
-        for _, writer in silent:
-            writer.close()
+        assert asyncio.get_running_loop().time() == pytest.approx(begun_s + HANDSHAKE_S)
+        await hang_up(silent)
 
-    run(tmp_path, go)
+    run(tmp_path, go, settings)
 
 
 def test_when_the_server_ends_pages_are_told(tmp_path: Path) -> None:
     async def go(paged: Paged) -> None:
+        await paged.sign_in()
         async with paged.socket() as page:
-            await ask(page, "api.hello", version=1)
+            await paged.hello(page)
             await paged.served.server.close()
             assert (await rest(page))[-1]["error"]["code"] == "closing"
 
@@ -350,11 +259,11 @@ def test_when_the_server_ends_pages_are_told(tmp_path: Path) -> None:
 
 def test_a_page_that_goes_ends_what_it_asked_for(tmp_path: Path) -> None:
     async def go(paged: Paged) -> None:
+        await paged.sign_in()
         async with paged.socket() as page:
-            await ask(page, "api.hello", version=1)
+            await paged.hello(page)
             await page.send_str('{"id":2,"method":"wait"}')
             await ask(page, "api.ping", 3)
-        async with asyncio.timeout(20):
-            await paged.served.cancelled.wait()
+        await paged.served.cancelled.wait()
 
     run(tmp_path, go)
