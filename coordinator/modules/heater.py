@@ -174,7 +174,7 @@ class HeaterUnit:
         """Whether who waits for the target may go on."""
         if self.target_c <= 0 or self.controller is None or self.input.celsius is None:
             return True
-        return self.controller.settled(self.input.celsius, self.target_c)
+        return self.input.is_sound and self.controller.settled(self.input.celsius, self.target_c)
 
     async def reach(self) -> None:
         """Wait until the target is reached; raises CanductorError when the heater ends before."""

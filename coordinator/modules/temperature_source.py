@@ -37,6 +37,8 @@ class TemperatureSource:
         self.min_c, self.max_c = min_c, max_c
         self.celsius: float | None = None
         """The last measurement; None before the first."""
+        self.sound_c: float | None = None
+        """The last measurement within the limits; one outside is of a broken wire, or of noise."""
         self.on_measured: OnMeasured = _ignore
         self.ratio: float | None = None
         """What its converter read last, 0 to 1; None: nothing yet, or there is none."""
@@ -63,6 +65,11 @@ class TemperatureSource:
     def node(self) -> str:
         """The node it is on; empty: on none."""
         return ""
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the last measurement is within the limits."""
+        return self.celsius is not None and self.celsius == self.sound_c
 
     def missed(self) -> int:
         """Return how often this was called since the last measurement."""
@@ -94,6 +101,8 @@ class TemperatureSource:
     def _take(self, celsius: float, at_s: Callable[["Live"], float]) -> None:
         """Take a measurement; AT_S tells its print time on a machine that lives."""
         self.celsius = celsius
+        if self.min_c <= celsius <= self.max_c:
+            self.sound_c = celsius
         self._looks = 0
         if self._live is not None:
             self.on_measured(at_s(self._live), celsius)
