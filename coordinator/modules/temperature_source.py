@@ -59,7 +59,7 @@ class TemperatureSource:
         """End all waiting for it, because of CAUSE."""
         self._over = cause
         self._live = None
-        self._wake()
+        self.wake()
 
     @property
     def node(self) -> str:
@@ -106,7 +106,7 @@ class TemperatureSource:
         self._looks = 0
         if self._live is not None:
             self.on_measured(at_s(self._live), celsius)
-        self._wake()
+        self.wake()
 
     def _watch(self, live: "Live", celsius: float) -> None:
         """Stop the machine when CELSIUS stays outside the limits: for sensors that no node watches."""
@@ -117,7 +117,8 @@ class TemperatureSource:
                 f" of {self.max_c:g} °C; find out why, or correct these"
             )
 
-    def _wake(self) -> None:
+    def wake(self) -> None:
+        """Let all who wait for a measurement go on and look again."""
         for waiter in self._waiting:
             if not waiter.done():
                 waiter.set_result(None)
