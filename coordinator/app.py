@@ -245,7 +245,7 @@ class Machine:
 
     def stream_specs(self) -> list[NodeStreamSpec]:
         """Return how the moving nodes take step commands."""
-        return stream_specs((node.name, node.dictionary, node.move_count) for node in self.moving)
+        return stream_specs((node.name, node.dictionary, node.step_slots) for node in self.moving)
 
     def clock_map(self, time_base: TimeBase, node: Node, print_time: float) -> ClockMap:
         """Return the map from print time to NODE's ticks, beginning at PRINT_TIME."""

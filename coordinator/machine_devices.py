@@ -144,7 +144,7 @@ def _stepper(described: StepperDescription) -> Stepper:
 
 
 def stream_specs(nodes: Iterable[tuple[str, Dictionary, int]]) -> list[NodeStreamSpec]:
-    """Return how each node (name, dictionary, move_count) takes step commands."""
+    """Return how each node (name, dictionary, queue slots for steps) takes step commands."""
     return [
         NodeStreamSpec(
             name=name,

@@ -19,6 +19,7 @@ from nodes.message_format import Message, Value
 from nodes.node_config import NodeConfig
 from nodes.node_errors import NodeError, NodeLost, NodeShutdown, shutdown_sentence
 from nodes.node_states import NodeEvent, NodeState, following
+from nodes.queue_slots import share_slots
 from nodes.seams import BuildConfig, Connector, LinkLike
 from nodes.sync_pulse import PulseClock
 from nodes.vigil import Vigil, get_config, restarted
@@ -67,6 +68,10 @@ class Node:
         self.failure: NodeError | None = None
         self.move_count = 0
         """Queue slots shared by all steppers and timed outputs; known when READY."""
+        self.step_slots = 0
+        """Those of them that the steppers have."""
+        self.output_slots = 0
+        """Those that each timed output has."""
         self.load: NodeLoad | None = None
         self.pulse_clock: PulseClock | None = None
         """The node's clock by sync pulses, while its bus has such; kept by the bus."""
@@ -324,6 +329,7 @@ class Node:
             found = await self._finalized()
         self._check_configured(found, wanted)
         self.move_count = found.integer("move_count")
+        self.step_slots, self.output_slots = share_slots(self.move_count, wanted.timed_outputs)
         self._vigil = Vigil(self._talk, wanted.crc)
         for command in wanted.init_commands:
             self._talk.send_text(command)

@@ -23,6 +23,8 @@ class NodeConfig:
         self.name = name
         self.dictionary = dictionary
         self.oid_count = 0
+        self.timed_outputs = 0
+        """Outputs whose values wait in the node's move queue; who adds one counts it."""
         self._config: list[str] = []
         self._init: list[str] = []
 

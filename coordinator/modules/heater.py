@@ -2,9 +2,11 @@
 
 Three nets, each without the one before it: the controller and the watch over the heater here; the node's own
 limits of what its sensor may read; and the node's max_duration, within which it has to hear from the host.
-The host renews the output with every measurement and with nothing else: no measurements, no heat.
+The host renews the output with every measurement and with nothing else: no measurements, no heat. It ends the
+heat a moment before the node would have to stop for the lack of renewal, as what else the node does may go on.
 """
 
+import contextlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -38,6 +40,11 @@ LOOK_S: Final = 1.0
 """How often it is looked whether there still are measurements."""
 SILENT_LOOKS: Final = 2
 """So many looks in a row may find none; looks and not seconds, as the host itself may have stood still."""
+
+STALE_LOOK_S: Final = 0.1
+"""How often it is looked whether the power rests upon a measurement that is too old."""
+STALE_SPARE_S: Final = 0.2
+"""So long before the node would stop such a power is switched off: two looks."""
 
 COMING_S: Final = 1.0
 """Of filament that is going to pass, this long from when a power acts is provided for."""
@@ -94,6 +101,11 @@ class HeaterUnit:
         self._tuning_failure: CanductorError | None = None
         self._live: Live | None = None
         self._on = False
+        self._applied_s = 0.0
+        """When power was applied last, host's time."""
+        self._stale_s = build.get(MAX_DURATION) - AHEAD_S - STALE_SPARE_S
+        self._gone: str | None = None
+        """Why the target was forgotten; None: it was not."""
         self._bad = 0
         self._told_s = 0.0
 
@@ -117,6 +129,7 @@ class HeaterUnit:
             live.machine.filament.want(self.name)
         await self.input.connect(live)
         live.every(LOOK_S, self._look)
+        live.every(STALE_LOOK_S, self._end_stale_heat)
 
     def keep(self, found: dict[str, str]) -> None:
         """Have SAVE_CONFIG write what calibration FOUND: options of the section and their values."""
@@ -165,7 +178,7 @@ class HeaterUnit:
 
     def set_target(self, celsius: float) -> None:
         """Heat to CELSIUS, 0: not at all. Off at once, on with the next measurement."""
-        self.target_c = celsius
+        self.target_c, self._gone = celsius, None
         if celsius <= 0:
             self._apply(0.0)
 
@@ -174,22 +187,28 @@ class HeaterUnit:
         """Whether who waits for the target may go on."""
         if self.target_c <= 0 or self.controller is None or self.input.celsius is None:
             return True
-        return self.controller.settled(self.input.celsius, self.target_c)
+        return self.input.is_sound and self.controller.settled(self.input.celsius, self.target_c)
 
     async def reach(self) -> None:
         """Wait until the target is reached; raises CanductorError when the heater ends before."""
-        await self.input.next()  # with the target in force
+        await self._next()  # with the target in force
         while not self.settled:
-            await self.input.next()
+            await self._next()
+
+    async def _next(self) -> None:
+        """Wait for the next measurement; raises CanductorError when the heater went off for want of a node."""
+        await self.input.next()
+        if self._gone is not None:
+            raise CanductorError(self._gone)
 
     async def tune(self, tuning: Tuning, each: Callable[[], None] = lambda: None) -> None:
         """Let TUNING have the heater until it is done, EACH after every measurement; it is off then."""
         if self._tuning is not None:
             raise CanductorError(f"[{self.name}] is being calibrated already; wait for its end")
-        self._tuning, self._tuning_failure = tuning, None
+        self._tuning, self._tuning_failure, self._gone = tuning, None, None
         try:
             while not tuning.settled(0.0, 0.0):
-                await self.input.next()
+                await self._next()
                 each()
                 if self._tuning_failure is not None:
                     raise self._tuning_failure
@@ -273,7 +292,13 @@ class HeaterUnit:
         except CanductorError as error:
             self._let_go(str(error))
             return
-        self._on = power > 0
+        self._on, self._applied_s = power > 0, live.now_s()
+
+    def _end_stale_heat(self) -> None:
+        """Switch off when no measurement has renewed the power for long: nobody knows how hot it is."""
+        live = self._live
+        if live is not None and self._on and live.now_s() - self._applied_s > self._stale_s:
+            self._apply(0.0)
 
     def _look(self) -> None:
         """Notice that there are no measurements any more, and what that means."""
@@ -292,11 +317,15 @@ class HeaterUnit:
             )
 
     def _let_go(self, why: str) -> None:
-        """Forget the target: a node that may be absent is away, and off."""
-        live, was = self._live, self.target_c
+        """Forget the target: a node that may be absent is away, its own or that of its sensor."""
+        live, was, on = self._live, self.target_c, self._on
         self.target_c, self.power, self._on = 0.0, 0.0, False
-        if self._tuning is not None:
-            self._tuning_failure = CanductorError(f"heater {self.key} went off: {why}")
+        self._gone = f"heater {self.key} went off: {why}"
+        if on and live is not None and live.node(self.node).state is NodeState.READY:
+            with contextlib.suppress(CanductorError):  # then its own max_duration ends it
+                clock = live.ticks_at(self.node, live.print_time_now() + AHEAD_S)
+                self._output.set(live.node(self.node), clock, 0.0)
+        self.input.wake()
         if was > 0 and live is not None:
             live.say(f"heater {self.key} is off, its target of {was:g} °C is forgotten: {why}")
 

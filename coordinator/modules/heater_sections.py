@@ -178,7 +178,7 @@ class ExtruderHeater(Module):
         """Whether it is hot enough to move filament; one without heater always is."""
         if self.unit is None:
             return True
-        celsius = self.unit.input.celsius
+        celsius = self.unit.input.sound_c
         return celsius is not None and celsius >= self.min_extrude_c
 
     def status(self) -> Mapping[str, Value]:

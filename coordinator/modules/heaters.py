@@ -137,7 +137,7 @@ class Heaters(Module):
 
         async def perform() -> None:
             await source.next()
-            while source.celsius is None or not low <= source.celsius <= high:
+            while source.celsius is None or not (source.is_sound and low <= source.celsius <= high):
                 await source.next()
 
         return AtRest(perform)

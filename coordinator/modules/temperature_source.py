@@ -37,6 +37,8 @@ class TemperatureSource:
         self.min_c, self.max_c = min_c, max_c
         self.celsius: float | None = None
         """The last measurement; None before the first."""
+        self.sound_c: float | None = None
+        """The last measurement within the limits; one outside is of a broken wire, or of noise."""
         self.on_measured: OnMeasured = _ignore
         self.ratio: float | None = None
         """What its converter read last, 0 to 1; None: nothing yet, or there is none."""
@@ -57,12 +59,17 @@ class TemperatureSource:
         """End all waiting for it, because of CAUSE."""
         self._over = cause
         self._live = None
-        self._wake()
+        self.wake()
 
     @property
     def node(self) -> str:
         """The node it is on; empty: on none."""
         return ""
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the last measurement is within the limits."""
+        return self.celsius is not None and self.celsius == self.sound_c
 
     def missed(self) -> int:
         """Return how often this was called since the last measurement."""
@@ -94,10 +101,12 @@ class TemperatureSource:
     def _take(self, celsius: float, at_s: Callable[["Live"], float]) -> None:
         """Take a measurement; AT_S tells its print time on a machine that lives."""
         self.celsius = celsius
+        if self.min_c <= celsius <= self.max_c:
+            self.sound_c = celsius
         self._looks = 0
         if self._live is not None:
             self.on_measured(at_s(self._live), celsius)
-        self._wake()
+        self.wake()
 
     def _watch(self, live: "Live", celsius: float) -> None:
         """Stop the machine when CELSIUS stays outside the limits: for sensors that no node watches."""
@@ -108,7 +117,8 @@ class TemperatureSource:
                 f" of {self.max_c:g} °C; find out why, or correct these"
             )
 
-    def _wake(self) -> None:
+    def wake(self) -> None:
+        """Let all who wait for a measurement go on and look again."""
         for waiter in self._waiting:
             if not waiter.done():
                 waiter.set_result(None)

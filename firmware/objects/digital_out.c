@@ -69,6 +69,12 @@ void command_config_digital_out(struct node *node, const struct wire_arg *args) 
 DECL_COMMAND(command_config_digital_out,
              "config_digital_out oid=%c pin=%u value=%c default_value=%c max_duration=%u", 0);
 
+// Brings ON_TICKS to one value for "on", so that it compares with the default.
+static uint32_t normal(const struct digital_out *out, uint32_t on_ticks) {
+    uint32_t full = out->cycle_ticks ? out->cycle_ticks : 1;
+    return on_ticks < full ? on_ticks : full;
+}
+
 void command_set_digital_out_pwm_cycle(struct node *node, const struct wire_arg *args) {
     struct digital_out *out = find(node, args[0].value);
     if (!out)
@@ -79,17 +85,11 @@ void command_set_digital_out_pwm_cycle(struct node *node, const struct wire_arg 
     } else {
         // "On" is a whole cycle from now on; what the pin does stays as it is until the next value.
         out->cycle_ticks = args[1].value;
-        out->output.default_value = out->output.default_value ? out->cycle_ticks : 0;
+        out->output.default_value = out->output.default_value ? normal(out, UINT32_MAX) : 0;
     }
     board_irq_restore(node, irq);
 }
 DECL_COMMAND(command_set_digital_out_pwm_cycle, "set_digital_out_pwm_cycle oid=%c cycle_ticks=%u", 0);
-
-// Brings ON_TICKS to one value for "on", so that it compares with the default.
-static uint32_t normal(const struct digital_out *out, uint32_t on_ticks) {
-    uint32_t full = out->cycle_ticks ? out->cycle_ticks : 1;
-    return on_ticks < full ? on_ticks : full;
-}
 
 void command_queue_digital_out(struct node *node, const struct wire_arg *args) {
     struct digital_out *out = find(node, args[0].value);

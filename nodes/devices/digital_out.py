@@ -40,6 +40,7 @@ class DigitalOut(TimedOutput):
         """Add it to its node's CONFIG; NodeConfigError when firmware or pin do not allow it."""
         config.require(f"the output of {self.name}", COMMANDS)
         self.oid = config.create_oid()
+        config.timed_outputs += 1
         config.add_config(
             self.name,
             f"config_digital_out oid={self.oid} pin={self._pin} value={self._level(self._start)}"

@@ -47,6 +47,7 @@ class PwmOut(TimedOutput):
         """Add it to its node's CONFIG; NodeConfigError when firmware or pin do not allow it."""
         config.require(f"the output of {self.name}", self._commands)
         self.oid = config.create_oid()
+        config.timed_outputs += 1
         if self._hardware:
             self._configure_hardware(config)
         else:

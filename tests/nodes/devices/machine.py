@@ -24,12 +24,14 @@ class Device(Protocol):
 class DeviceMachine:
     """DEVICES on a node whose clock rolls over ROLLS_OVER_S after it has power (ready after some 2.5)."""
 
-    def __init__(self, *devices: Device, rolls_over_s: float = 3.0, seed: int = 1) -> None:
+    def __init__(self, *devices: Device, rolls_over_s: float = 3.0, seed: int = 1, move_count: int = 0) -> None:
         self.devices = devices
         self.world = World(seed)
         wire = self.world.add_can(bitrate=1_000_000)
         port = self.world.add_can_port(wire)
-        self.board = self.world.add_node(wire, uuid(1), start_clock=(1 << 32) - round(rolls_over_s * HZ))
+        self.board = self.world.add_node(
+            wire, uuid(1), start_clock=(1 << 32) - round(rolls_over_s * HZ), move_count=move_count
+        )
         self.bus = CanBus("can0", start_io(port))
         self.node = self.bus.add_node("n1", Uuid.parse(uuid(1)), self.configure, on_state=self.changed)
         self.pins: dict[str, int] = {}

@@ -1,0 +1,111 @@
+"""When an endstop is said to have switched: at the first look that found it so, not at the one planned behind."""
+
+import asyncio
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coordinator.app import Machine
+from coordinator.homing import LOOK_S, HomingMove, HomingResult
+from coordinator.simulate import scenario as scenarios
+from coordinator.simulate.stage import Stage
+
+MACHINE = """
+[mcu]
+canbus_uuid: 90a4ae022dfc
+canbus_interface: can0
+
+[mcu toolhead]
+canbus_uuid: 5e1ec7ab1e02
+canbus_interface: can0
+
+[printer]
+kinematics: cartesian
+max_velocity: 250
+max_accel: 3000
+
+[stepper_x]
+step_pin: PB0
+dir_pin: PB1
+microsteps: 16
+rotation_distance: 40
+endstop_pin: ^{endstop}
+position_endstop: 0
+position_max: 250
+homing_speed: 50
+
+[stepper_y]
+step_pin: PB3
+dir_pin: PB4
+microsteps: 16
+rotation_distance: 40
+position_max: 250
+
+[stepper_z]
+step_pin: PB6
+dir_pin: PB7
+microsteps: 16
+rotation_distance: 8
+position_max: 250
+"""
+CLOCKS_S = 10e-6
+"""What the host may have a secondary node's clock wrong by, on a quiet bus."""
+STEP_S = 2e-6
+"""From a step to what the node's pins show of it, and the rounding to ticks."""
+
+
+class Switch:
+    """A homing of X whose switch closes with a step that is known."""
+
+    def __init__(self, folder: Path, endstop: str, at: int) -> None:
+        (folder / "home.cfg").write_text(MACHINE.format(endstop=endstop))
+        (folder / "home.toml").write_text('about = "Homing."\nmachine = "home.cfg"\n')
+        self.at = at
+        self.stage = Stage(scenarios.find(str(folder / "home.toml")), 0)
+        mcu, toolhead = (self.stage._boards[name].node for name in ("mcu", "toolhead"))
+        pins = self.stage.pins("mcu")
+        mcu.add_axis(
+            pins["PB0"],
+            pins["PB1"],
+            target=toolhead if "toolhead" in endstop else mcu,
+            target_pin=pins["PC5"],
+            at=-at,
+            direction=-1,
+        )
+
+    def run(self, speed: float) -> HomingResult:
+        """Home at SPEED, mm/s."""
+
+        async def main() -> HomingResult:
+            machine = Machine(self.stage.description, self.stage.host, on_notice=lambda _: None)
+            await machine.start()
+            try:
+                rail = self.stage.description.rails[0]
+                move = HomingMove(
+                    machine, [rail], axis="x", direction=-1, way_mm=40.0, speed=speed, accel=3000.0
+                )
+                (result,) = await move.run()
+                return result
+            finally:
+                await machine.close()
+
+        with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
+            return runner.run(main())
+
+    def closed_at_s(self) -> float:
+        """Return the print time at which the switch closed in truth."""
+        truth, pin = self.stage.board("mcu"), self.stage.pins("mcu")["PB0"]
+        steps = truth.at_ns[(truth.pin == pin) & (truth.level == 1)]
+        return float(self.stage.print_time(np.array([steps[self.at - 1]]))[0])
+
+
+@pytest.mark.parametrize("at", [1600, 1607])
+@pytest.mark.parametrize(("endstop", "allowed_s"), [("PC5", STEP_S), ("toolhead:PC5", CLOCKS_S)])
+def test_the_trigger_is_the_first_look_that_found_it_closed(
+    tmp_path: Path, endstop: str, allowed_s: float, at: int
+) -> None:
+    switch = Switch(tmp_path, endstop, at)
+    result = switch.run(47.0)
+    after_s = result.triggered_at_s - switch.closed_at_s()
+    assert -allowed_s <= after_s <= LOOK_S + allowed_s
