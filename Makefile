@@ -36,6 +36,7 @@ check: setup
 	# A board needs its build's constants: firmware/Makefile compiles those, with the same warnings as errors.
 	@for c in $(filter-out firmware/boards/%,$(filter %.c,$(filter firmware/% nodes/% coordinator/%,$(C_SOURCES)))); do \
 	  gcc $(C_WARNINGS) -fsyntax-only $$c || exit 1; done
+	@$(MAKE) --no-print-directory clang-c
 	@! command -v node >/dev/null || for f in coordinator/web/page/*.js; do \
 	  node --check --input-type=module <$$f || exit 1; done
 	$(BIN)/pytest tests/test_import_floors.py
@@ -77,6 +78,8 @@ vcan: setup
 
 bench: setup
 	@for b in bench/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
+
+include tests/eyes.mk
 
 format: setup
 	$(BIN)/ruff check --fix . ; $(BIN)/ruff format .

@@ -11,7 +11,14 @@ from typing import Protocol
 from nodes.errors import CanductorError
 from nodes.records import record
 
-EXAMPLES = Path(__file__).parent.parent / "config"
+
+def _examples() -> Path:
+    """Return the folder of the example machines: inside an installed package, or config/ of a checkout."""
+    installed = Path(__file__).parent / "example_machines"
+    return installed if installed.is_dir() else Path(__file__).parent.parent / "config"
+
+
+EXAMPLES = _examples()
 """The example machines."""
 DEMO_MACHINE = EXAMPLES / "demo" / "machine.cfg"
 DEMO_GCODE = EXAMPLES / "demo" / "part.gcode"

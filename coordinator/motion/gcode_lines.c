@@ -122,7 +122,7 @@ size_t gcode_number(const char *text, size_t size, double *value) {
 // -------------------------------------------------------------------------------------------------
 
 static inline char upper(char c) {
-    return c >= 'a' && c <= 'z' ? (char)(c - 32) : c;
+    return (char)(c >= 'a' && c <= 'z' ? c - 32 : c);
 }
 
 static const char *skip_comments(const char *at, const char *end) {
@@ -284,13 +284,12 @@ static void set_origin(struct gcode_state *state, const struct gcode_words *word
 }
 
 int gcode_accel(struct planner *planner, const struct gcode_words *words) {
-    const double print = words->value[GCODE_P], travel = words->value[GCODE_T];
-    const int both = words->given >> GCODE_P & words->given >> GCODE_T & 1;
+    const int both = words->given >> GCODE_P & words->given >> GCODE_T & 1 ? 1 : 0;
     double accel = planner->accel;
     if (words->given >> GCODE_S & 1)
         accel = words->value[GCODE_S];
     else if (both)
-        accel = travel < print ? travel : print;
+        accel = fmin(words->value[GCODE_P], words->value[GCODE_T]);
     for (int i = GCODE_S; i <= GCODE_T; i++)
         if (words->given >> i & 1 && !(words->value[i] >= MIN_ACCEL))
             return -1;

@@ -12,8 +12,8 @@ void step_set_tick_limits(struct stepper *s, double max_error_s) {
     s->pulse_ticks = (int64_t)ceil(2 * s->config.step_pulse_s * rate);
     s->pulse_ticks = s->pulse_ticks > 1 ? s->pulse_ticks : 1;
     s->closest_ticks = (double)(s->pulse_ticks + STEP_SLACK_TICKS);
-    s->lead_ticks = (int64_t)fmin(STEP_LEAD_S * rate, RESET_GAP / 2);
-    s->reset_margin_ticks = (int64_t)fmin(STEP_RESET_MARGIN_S * rate, RESET_GAP / 4);
+    s->lead_ticks = (int64_t)fmin(STEP_LEAD_S * rate, RESET_GAP / 2.0);
+    s->reset_margin_ticks = (int64_t)fmin(STEP_RESET_MARGIN_S * rate, RESET_GAP / 4.0);
 }
 
 static void set_rate(struct step_gen *gen, struct node *node, double ticks_per_s) {
@@ -176,17 +176,18 @@ int step_set_table(struct step_gen *gen, int axis, int n, const double *position
         return STEP_BAD_CONFIG;
     if (!all_generated(gen))
         return STEP_NOT_IDLE;
-    double planned[AXES], *values = gen->table_values[axis];
+    double planned[AXES], *values = gen->table_values[axis],
+                          *reverses = values + (size_t)2 * STEP_TABLE_POINTS;
     planned_position(gen, planned);
     const size_t size = (size_t)n * sizeof(*values);
     if (size) {
         memcpy(values, position, size);
         memcpy(values + STEP_TABLE_POINTS, forward, size);
-        memcpy(values + 2 * STEP_TABLE_POINTS, reverse, size);
+        memcpy(reverses, reverse, size);
     }
     struct axis_table *t = &gen->tables[axis];
     t->n = n, t->position = values, t->side[0] = values + STEP_TABLE_POINTS;
-    t->side[1] = values + 2 * STEP_TABLE_POINTS, t->take_up = possible_take_up(gen, axis, take_up);
+    t->side[1] = reverses, t->take_up = possible_take_up(gen, axis, take_up);
     step_table_stand(t, planned[axis], t->offset);
     gen->corrected = step_table_acts(gen->tables);
     return STEP_OK;

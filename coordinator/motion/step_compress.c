@@ -228,7 +228,7 @@ static int search(struct search *q, double clock, uint32_t expected) {
 
 static void count_segment(struct stepper *s, const struct segment *g, double worst) {
     s->stats.steps += g->count;
-    s->stats.issued += s->direction * g->count;
+    s->stats.issued += (int64_t)s->direction * g->count;
     s->stats.queue_steps++;
     if (worst > s->stats.worst_error_ticks)
         s->stats.worst_error_ticks = worst;

@@ -227,7 +227,7 @@ static void solve_one_by_one(const struct stepper *s, const struct piece *p, dou
                              int direction, int64_t position, int count, double *t) {
     double last = from, guess = from;
     for (int i = 0; i < count; i++) {
-        const double boundary = (double)(position + i * direction) + 0.5 * direction;
+        const double boundary = (double)(position + (int64_t)i * direction) + 0.5 * direction;
         t[i] = solve(s, p, last, to, guess, direction, boundary);
         guess = t[i] + (t[i] - last);
         last = t[i];
@@ -246,7 +246,7 @@ static int play_solved(struct step_gen *gen, struct stepper *s, const struct pie
         memset(t + count, 0, FILL_BLOCK * sizeof(*t)); // is read, and does not matter
         for (int i = 0; i < count; i += FILL_BLOCK) {
             const int n = count - i < FILL_BLOCK ? count - i : FILL_BLOCK;
-            const int64_t position = s->position + i * direction;
+            const int64_t position = s->position + (int64_t)i * direction;
             if (!p->linear || !solve_block(c, from, to, (double)(position * direction) + 0.5, n, t + i))
                 solve_one_by_one(s, p, from, to, direction, position, n, t + i);
             from = t[i + n - 1];

@@ -22,8 +22,8 @@ static const float FAR = 1e30F;
 
 #define EIGHT(f, k) f(k), f((k) + 1), f((k) + 2), f((k) + 3), f((k) + 4), f((k) + 5), f((k) + 6), f((k) + 7)
 #define FORTY(f, k) EIGHT(f, k), EIGHT(f, (k) + 8), EIGHT(f, (k) + 16), EIGHT(f, (k) + 24), EIGHT(f, (k) + 32)
-#define INVERSE_OF(k) 1.0F / (float)(k)
-#define NOTHING(k) 0 * (k) - 1e36F
+#define INVERSE_OF(k) (1.0F / (float)(k))
+#define NOTHING(k) (0 * (k) - 1e36F)
 // [REACH + k]: 1/k, and what takes a place that is not behind (k < 1) out of a comparison.
 static const float INVERSE[2 * REACH] = {
     [REACH + 1] = FORTY(INVERSE_OF, 1), FORTY(INVERSE_OF, 41), FORTY(INVERSE_OF, 81)};

@@ -88,7 +88,7 @@ static int end(struct mt_receiver *receiver) {
     receiver->mode = MT_COMMAND;
     if (!receiver->selected)
         return 0;
-    receiver->status = judge(receiver);
+    receiver->status = (uint8_t)judge(receiver);
     if (receiver->status != MT_OK)
         return 0;
     struct mt_pair *kept = receiver->shadow;

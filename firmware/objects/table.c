@@ -210,7 +210,7 @@ void command_config_table(struct node *node, const struct wire_arg *args) {
     const struct stepper *stepper = NULL;
     if (stepper_oid != NO_STEPPER && !(stepper = stepper_find(node, stepper_oid)))
         return;
-    struct mt_pair *pairs = node_alloc(node, BUFFERS * capacity * sizeof(*pairs));
+    struct mt_pair *pairs = node_alloc(node, (size_t)BUFFERS * capacity * sizeof(*pairs));
     if (!pairs)
         return;
     struct table *table = oid_create(node, args[0].value, &table_type, sizeof(*table));
@@ -218,7 +218,7 @@ void command_config_table(struct node *node, const struct wire_arg *args) {
         return;
     uint32_t irq = board_irq_save(node);
     for (unsigned i = 0; i < BUFFERS; i++)
-        table->buffers[i] = pairs + i * capacity;
+        table->buffers[i] = pairs + (size_t)i * capacity;
     mt_start(&table->receiver, (uint8_t)axle, table->buffers[0], table->buffers[1], capacity);
     table->bytes.gap = node->config.clock_freq / BYTE_GAP_HZ;
     table->stepper = stepper;

@@ -58,11 +58,8 @@ void io_note_batch(struct io_link *node, const uint8_t *batch, size_t size) {
     drop_sent(node);
     struct batch_record record;
     uint64_t start = node->link.queues[LINK_MOTION].tail - size;
-    for (size_t at = 0; at < size;) {
-        size_t length = batch_read(batch + at, size - at, &record);
+    for (size_t at = 0, length; (length = batch_read(batch + at, size - at, &record)); at += length)
         note_record(node, &record, start + at, start + at + length);
-        at += length;
-    }
 }
 
 // ------------------------------------------------------------------------------------------------ forecast

@@ -152,7 +152,7 @@ static short sleep_unlocked(struct io_thread *thread, uint64_t now) {
     pthread_mutex_lock(&thread->mutex);
     thread->sleeping = 0;
     io_count_wakeup(thread->bus);
-    return ready > 0 ? fds[0].revents : 0;
+    return (short)(ready > 0 ? fds[0].revents : 0);
 }
 
 static int overslept(const struct io_thread *thread, uint64_t now) {

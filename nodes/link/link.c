@@ -214,7 +214,7 @@ void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in) {
     // as many naks may still come as blocks were sent, and they tell nothing about a loss after this repeat.
     // Acting on them would repeat good blocks, cause the same naks again, and so on for ever.
     uint64_t owed = link->naks_owed + (link->cursor - link->first);
-    link->naks_owed = owed < 2 * LINK_BLOCKS_MAX ? owed : 2 * LINK_BLOCKS_MAX;
+    link->naks_owed = owed < 2UL * LINK_BLOCKS_MAX ? owed : 2UL * LINK_BLOCKS_MAX;
     link->owed_until_ns = now + link_rto(link);
     link->owed_until_seq = link->next;
     link->cursor = link->first;

@@ -149,7 +149,7 @@ static void release_finished(struct hub_loop *loop) {
 // Room for half a queue before reading again: many frames for one system call, and never an empty queue
 // while the client has more.
 static short client_events(const struct hub_loop *loop, int i) {
-    bool room = hub_room(&loop->hub, i) >= HUB_INPUT / 2 * HUB_RECORD;
+    bool room = hub_room(&loop->hub, i) >= (size_t)HUB_INPUT / 2 * HUB_RECORD;
     bool blocked = loop->output_blocked[i] && loop->hub.clients[i].state == HUB_PRESENT;
     return (short)((room && !loop->input_closed[i] ? POLLIN : 0) | (blocked ? POLLOUT : 0));
 }
@@ -162,7 +162,7 @@ static uint64_t fill_poll_set(const struct hub_loop *loop, struct pollfd *set, u
     set[AT_WAKE] = (struct pollfd){.fd = loop->wake_fd, .events = POLLIN};
     set[AT_LISTEN] = (struct pollfd){.fd = accepting ? loop->listen_fd : -1, .events = POLLIN};
     for (int i = 0; i < HUB_CLIENTS; i++) {
-        short events = loop->fds[i] >= 0 ? client_events(loop, i) : 0;
+        short events = (short)(loop->fds[i] >= 0 ? client_events(loop, i) : 0);
         // Whose peer is gone would wake us all the time while the bus has not room for all that it had sent.
         bool idle = events == 0 && loop->hub.clients[i].state != HUB_PRESENT;
         set[AT_CLIENTS + i] = (struct pollfd){.fd = idle ? -1 : loop->fds[i], .events = events};

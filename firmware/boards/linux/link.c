@@ -37,7 +37,7 @@ static int open_virtual_can(const char *path) {
         errno = ENAMETOOLONG;
         return complain("cannot join the virtual CAN bus", path);
     }
-    strcpy(address.sun_path, path);
+    memcpy(address.sun_path, path, strlen(path) + 1);
     int fd = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
     if (fd < 0 || connect(fd, (const struct sockaddr *)&address, sizeof(address)))
         return complain("cannot join the virtual CAN bus", path);

@@ -22,9 +22,10 @@ static int complain(const char *program, const char *option, const char *value, 
 }
 
 static int parse_uuid(const char *text, uint8_t uuid[NODE_UUID_SIZE]) {
-    if (strlen(text) != 2 * NODE_UUID_SIZE || strspn(text, "0123456789abcdefABCDEF") != 2 * NODE_UUID_SIZE)
+    if (strlen(text) != 2UL * NODE_UUID_SIZE ||
+        strspn(text, "0123456789abcdefABCDEF") != 2UL * NODE_UUID_SIZE)
         return -1;
-    for (unsigned i = 0; i < NODE_UUID_SIZE; i++) {
+    for (size_t i = 0; i < NODE_UUID_SIZE; i++) {
         char digits[3] = {text[2 * i], text[2 * i + 1], 0};
         uuid[i] = (uint8_t)strtoul(digits, NULL, 16);
     }

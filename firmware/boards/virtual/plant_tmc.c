@@ -210,7 +210,8 @@ static void answer(struct plant_tmc *tmc, uint8_t number, uint64_t ns) {
         reply[3 + i] = (uint8_t)(value >> (24 - 8 * i));
     reply[7] = crc_of(reply, 7) ^ (tmc->fault == PLANT_GARBLED ? 0x10 : 0);
     // SENDDELAY: 8 bit times, and 16 more with each second of its values.
-    double delay = (bits(tmc->registers[SLAVECONF], 8, 4) / 2 * 2 + 1) * 8 * bit_ns(tmc);
+    const uint32_t bit_times = (bits(tmc->registers[SLAVECONF], 8, 4) / 2 * 2 + 1) * 8;
+    const double delay = bit_times * bit_ns(tmc);
     tmc->reply_ns = ns + (uint64_t)delay;
     tmc->reply_bit_ns = bit_ns(tmc);
 }
@@ -349,11 +350,11 @@ static int64_t lag_of(const struct plant *plant, const struct plant_tmc *tmc) {
 static void slip(struct plant *plant, uint64_t ns) {
     for (int i = 0; i < plant->tmc_count; i++) {
         struct plant_tmc *tmc = &plant->tmcs[i];
-        int64_t lag = lag_of(plant, tmc), most = 2 * tmc->microsteps;
+        int64_t lag = lag_of(plant, tmc), most = (int64_t)2 * tmc->microsteps;
         if (lag < most && lag > -most)
             continue;
-        plant_steps_lost(plant, ns, tmc->stepper, (uint64_t)(SLIP_STEPS * tmc->microsteps));
-        tmc->field -= (lag > 0 ? SLIP_STEPS : -SLIP_STEPS) * MICROSTEPS_MAX;
+        plant_steps_lost(plant, ns, tmc->stepper, (uint64_t)SLIP_STEPS * (uint64_t)tmc->microsteps);
+        tmc->field -= (int64_t)(lag > 0 ? SLIP_STEPS : -SLIP_STEPS) * MICROSTEPS_MAX;
         follow(plant, ns);
     }
 }
@@ -368,7 +369,7 @@ void plant_tmc_step(struct plant *plant, struct plant_tmc *tmc, uint64_t ns, int
     tmc->tstep = (double)since(ns, tmc->step_ns) / tmc->step_size * CLOCK_PER_NS;
     tmc->step_ns = ns;
     int64_t full_step = floor_divide(tmc->field, MICROSTEPS_MAX);
-    tmc->field += (bits(tmc->registers[GCONF], 3, 1) ? -direction : direction) * tmc->step_size;
+    tmc->field += (int64_t)(bits(tmc->registers[GCONF], 3, 1) ? -direction : direction) * tmc->step_size;
     follow(plant, ns);
     if (floor_divide(tmc->field, MICROSTEPS_MAX) != full_step) {
         double load = fabs((double)lag_of(plant, tmc)) / tmc->microsteps; // 1: a full step behind

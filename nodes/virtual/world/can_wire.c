@@ -171,6 +171,7 @@ static uint32_t first_collision(struct can_segment *segment) {
     for (uint32_t bit = 0; bit < CAN_LEVELS_MAX && rivals.count > 1; bit++)
         if (collide(segment, &rivals, bit))
             return bit;
+    // One there is: arbitration found it. NOLINTNEXTLINE(clang-analyzer-core.NullDereference)
     segment->frame = *rivals.frames[0];
     segment->wire->counters.same += rivals.count > 1;
     return UINT32_MAX;
@@ -331,10 +332,10 @@ int can_wire_start(struct can_wire *wire, struct agenda *agenda, struct chance c
     wire->agenda = agenda;
     wire->settings = *settings;
     wire->chance = chance;
-    for (uint8_t i = 0; i < CAN_SEGMENTS_MAX; i++)
+    for (unsigned i = 0; i < CAN_SEGMENTS_MAX; i++)
         wire->segments[i] = (struct can_segment){
             .wire = wire,
-            .number = i,
+            .number = (uint8_t)i,
             .event = {.fire = segment_due, .owner = &wire->segments[i]},
         };
     return agenda_reserve(agenda, CAN_SEGMENTS_MAX);

@@ -125,7 +125,7 @@ void can_controller_sent(struct can_controller *controller) {
 static void corrupt(struct can_controller *controller, struct can_bits *frame) {
     if (frame->size == 0)
         return;
-    uint64_t bit = chance_below(&controller->chance, 8u * frame->size);
+    uint64_t bit = chance_below(&controller->chance, 8UL * frame->size);
     frame->data[bit / 8] ^= (uint8_t)(1u << bit % 8);
     controller->counters.corrupted++;
 }

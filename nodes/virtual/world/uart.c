@@ -47,7 +47,7 @@ static size_t way_put(struct uart_way *way, const uint8_t *data, size_t size) {
 static void byte_due(void *owner) {
     struct uart_way *way = owner;
     struct world_uart *uart = way->uart;
-    uint8_t byte;
+    uint8_t byte = 0;
     ring_take(&way->queue, &byte, 1);
     if (way->queue.count)
         plan_byte(way, uart->world->agenda.now_ns);

@@ -57,10 +57,11 @@ static uint32_t longest(const struct fit_problem *p) {
 }
 
 static bool is_right(const struct fit_problem *p, const struct fit_segment *s) {
+    const int64_t shortest = (int64_t)p->shortest; // whole: the problems' makers see to that
     int64_t clock = (int64_t)p->clock, interval = (int64_t)s->interval;
     for (uint32_t i = 0; i < s->count; i++) {
         clock += interval;
-        if (interval < p->shortest || (double)clock < p->low[i] || (double)clock > p->high[i])
+        if (interval < shortest || (double)clock < p->low[i] || (double)clock > p->high[i])
             return false;
         interval += (int64_t)s->add;
     }

@@ -1,0 +1,145 @@
+"""Proves what is shipped: a source distribution becomes a wheel, which is installed and prints far from here.
+
+Usage: python -m tests.package.prove [--keep FOLDER] [PYTHON...]
+
+For each PYTHON (default: this one, and every newer one found on the PATH or below pyenv) a new virtual
+environment in a temporary folder gets the wheel that pip builds from the source distribution, with its
+dependencies from pip's index. There the demo prints a small program and has to end with its proof. Exit
+status 1 when anything fails; the last words say what.
+"""
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from tests.package.build import setup
+
+NAMES: Final = tuple(f"python3.{minor}" for minor in range(11, 20))
+PROGRAM: Final = """\
+G28
+G90
+M82
+G92 E0
+G1 Z0.3 F600
+G1 X20 Y20 F9000
+G1 X40 Y20 E1 F3000
+G1 X40 Y40 E2
+G1 X20 Y40 E3
+G1 X20 Y30 E4
+G1 Z0.6 F600
+"""
+"""Every stepper of the demo machine moves; two seconds."""
+DEMO: Final = ("--machine", "demo", "--json", "--gcode", "square.gcode")
+PAGES: Final = "import coordinator.web.files as f; assert (f.FOLDER / 'index.html').is_file()"
+VERSION: Final = "import sys; print('%d.%d' % sys.version_info[:2])"
+LOCATION: Final = "import coordinator; print(coordinator.__file__)"
+
+
+class ProofError(Exception):
+    """What is shipped does not work; the text says what was run and how it ended."""
+
+
+def run(folder: Path, *words: str | Path, seconds: float = 600.0) -> str:
+    """Return what the command WORDS prints, run in FOLDER without anything of this environment's Python."""
+    kept = {
+        name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))
+    }
+    ended = subprocess.run(
+        [str(word) for word in words],
+        cwd=folder,
+        env=kept,
+        capture_output=True,
+        text=True,
+        timeout=seconds,
+        check=False,
+    )
+    if ended.returncode != 0:
+        command = " ".join(str(word) for word in words)
+        raise ProofError(f"{command}: exit status {ended.returncode}\n{ended.stdout}{ended.stderr}")
+    return ended.stdout
+
+
+def interpreters(named: list[str]) -> Iterator[tuple[str, str]]:
+    """Yield the version and path of each Python: those NAMED, else one of each version from 3.11 on."""
+    found = named or [sys.executable, *_installed()]
+    seen: set[str] = set()
+    for python in found:
+        answer = subprocess.run([python, "-c", VERSION], capture_output=True, text=True, check=False)
+        version = answer.stdout.strip()
+        if answer.returncode != 0:  # such as a shim of pyenv for a version that is not selected
+            if named:
+                raise ProofError(f"{python} does not run: {answer.stderr.strip()}")
+        elif version not in seen and re.fullmatch(r"3\.(1[1-9]|[2-9]\d)", version):
+            seen.add(version)
+            yield version, python
+
+
+def _installed() -> Iterator[str]:
+    for name in NAMES:
+        if path := shutil.which(name):
+            yield path
+    versions = Path(os.environ.get("PYENV_ROOT", "~/.pyenv")).expanduser() / "versions"
+    yield from (str(path) for name in NAMES for path in sorted(versions.glob(f"*/bin/{name}")))
+
+
+def prove(archive: Path, python: str, folder: Path) -> str:
+    """Return in a sentence what was proved of the source distribution ARCHIVE, with PYTHON, in FOLDER."""
+    folder.mkdir()
+    environment = folder / "venv"
+    run(folder, python, "-m", "venv", environment)
+    pip = (environment / "bin" / "python", "-m", "pip", "-q", "--disable-pip-version-check")
+    begun_s = time.monotonic()
+    run(folder, *pip, "wheel", "--no-deps", "--wheel-dir", folder, archive)
+    built_s = time.monotonic() - begun_s
+    (wheel,) = folder.glob("*.whl")
+    run(folder, *pip, "install", f"{wheel}[web]")
+    elsewhere = folder / "elsewhere"
+    elsewhere.mkdir()
+    installed = environment / "bin"
+    where = Path(run(elsewhere, installed / "python", "-c", LOCATION).strip())
+    if not where.is_relative_to(environment):
+        raise ProofError(f"the installation imports {where}")
+    run(elsewhere, installed / "python", "-W", "error", "-c", PAGES)
+    run(elsewhere, installed / "canductor", "simulate", "--list")
+    (elsewhere / "square.gcode").write_text(PROGRAM)
+    shown = run(elsewhere, installed / "canductor", "demo", *DEMO, seconds=120)
+    report = json.loads(shown.splitlines()[-1])
+    if report.get("ok") is not True or not report.get("steps"):
+        raise ProofError(f"the demo is not proved: {shown}")
+    return f"{wheel.name} built in {built_s:.0f} s, demo PROVED, {report['steps']} steps"
+
+
+def main() -> int:
+    """Prove; print a line for each Python."""
+    parser = argparse.ArgumentParser(description="Build, install elsewhere, print.")
+    parser.add_argument("pythons", metavar="PYTHON", nargs="*", help="interpreter; default: all found")
+    parser.add_argument("--keep", metavar="FOLDER", type=Path, help="copy the distributions there")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="canductor-package-") as temporary:
+        folder = Path(temporary)
+        try:
+            setup(folder, "sdist", "--formats=gztar", f"--dist-dir={folder}")
+            (archive,) = folder.glob("*.tar.gz")
+            for version, python in interpreters(options.pythons):
+                print(f"python {version}: {prove(archive, python, folder / version)}", flush=True)
+        except (ProofError, subprocess.SubprocessError) as error:
+            print(f"package: {error}", file=sys.stderr)
+            return 1
+        if options.keep:
+            options.keep.mkdir(parents=True, exist_ok=True)
+            for path in (archive, *folder.glob("*/*.whl")):
+                shutil.copy2(path, options.keep)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
