@@ -17,6 +17,7 @@ from coordinator.machine.description import (
     NodePolicy,
     UartConnection,
 )
+from coordinator.machine.read_nodes import check_distinct
 from coordinator.machine.saved_config import PendingConfig
 from coordinator.machine_devices import MachineDevices, stream_specs
 from coordinator.modules.live import Live
@@ -294,6 +295,7 @@ class Machine:
     # ------------------------------------------------------------------------------------------ assembly
 
     def _open_buses(self) -> None:
+        check_distinct(self.description.nodes, UartConnection)
         can: dict[str, CanBus] = {}
         for node in self.description.nodes:
             connection = node.connection

@@ -5,7 +5,9 @@ from typing import Any
 
 from coordinator.machine import reference as tables
 from coordinator.machine.check import check_config
+from coordinator.machine.consequences import meaning
 from coordinator.machine.description import load_machine
+from coordinator.machine.model import NotYetActing
 from coordinator.machine.problem import ConfigError
 from nodes.errors import CanductorError
 from nodes.records import record
@@ -18,7 +20,9 @@ class CheckReport:
     path: str
     problems: Sequence[CanductorError]
     notices: Sequence[str]
-    """What is right but has no effect, when nothing is wrong."""
+    """What is worth knowing, when nothing is wrong."""
+    not_acting: Sequence[NotYetActing] = ()
+    """What is right but does not act, when nothing is wrong."""
 
     @property
     def ok(self) -> bool:
@@ -35,23 +39,43 @@ class CheckReport:
                 for problem in self.problems
             ],
             "notices": list(self.notices),
+            "not_acting": [
+                {
+                    "section": entry.section,
+                    "options": list(entry.options),
+                    "file": entry.place.path,
+                    "line": entry.place.line,
+                    "reason": entry.reason,
+                    "meaning": meaning(entry),
+                }
+                for entry in self.not_acting
+            ],
         }
 
     def to_text(self) -> str:
         """Return a line for each."""
         count = len(self.problems)
         end = f"{self.path}: {count or 'no'} mistake{'' if count == 1 else 's'}"
-        return "\n".join([*map(str, self.problems), *self.notices, end])
+        return "\n".join([*map(str, self.problems), *self.notices, end, *self._not_acting_lines()])
+
+    def _not_acting_lines(self) -> list[str]:
+        """Return the list of what will not act, and what that means for a print."""
+        if not self.not_acting:
+            return []
+        return [
+            "",
+            "What will not act, and what that means for a print:",
+            *(f"  {entry}: {meaning(entry)}" for entry in self.not_acting),
+        ]
 
 
 def check(path: str) -> CheckReport:
     """Find everything that is wrong with the configuration PATH."""
     problems = check_config(path)
-    notices: list[str] = []
-    if not problems:
-        described = load_machine(path)
-        notices = [*map(str, described.not_yet_acting), *described.notes]
-    return CheckReport(path, problems, notices)
+    if problems:
+        return CheckReport(path, problems, ())
+    described = load_machine(path)
+    return CheckReport(path, problems, described.notes, described.not_yet_acting)
 
 
 @record

@@ -240,7 +240,24 @@ def _plane(plane: Plane) -> Handler:
     return handle
 
 
-_heat = _without_module("heater and fan commands")
+_HEATS = ("M104", "M109", "M140", "M190")
+_told_heat = _without_module("heater and fan commands")
+
+
+def _heat(job: Job, command: Command) -> bool:
+    """Accept what is for a heater or fan that the machine does not have, not for one that does not act."""
+    why = job.vocabulary.not_acting.get(command.name)
+    if why is None:
+        return _told_heat(job, command)
+    words = command.words()
+    asks = [letter for letter in "SR" if letter in words and number(command.name, words, letter) > 0]
+    if command.name in _HEATS and asks:
+        job.refuse_skipping(command, f"heats, but {why}")
+    else:
+        job.notice(command.name, why)
+    return True
+
+
 _motors_off = _without_module("motor-off commands")
 BESIDE = frozenset(
     (

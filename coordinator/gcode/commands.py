@@ -14,7 +14,7 @@ BuiltIn      is what the interpreter makes of another name: a command that a mac
 """
 
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import replace
+from dataclasses import field, replace
 from typing import TYPE_CHECKING
 
 from coordinator.gcode.words import Command, WordError, quoted
@@ -168,6 +168,9 @@ class Vocabulary:
     thread. One that is only planned is never too cold."""
     interrupting: frozenset[str] = frozenset()
     """Commands that may pause or cancel a job: PAUSE, CANCEL_PRINT, and macros in which they come."""
+    not_acting: Mapping[str, str] = field(default_factory=dict)
+    """Why, by the name of a command that a section of the configuration should bring, nothing acts on it:
+    ``[bed_mesh] does not act yet``."""
     set_ups: "tuple[Callable[[Planner], None], ...]" = ()
     """Called for every program that begins."""
 

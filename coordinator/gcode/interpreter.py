@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 from coordinator.gcode import basic_commands, machine_commands
+from coordinator.gcode.absent_commands import ABSENT
 from coordinator.gcode.commands import (
     NO_WORDS,
     AtOnce,
@@ -105,6 +106,7 @@ class Job:
         *,
         beside: bool = False,
         prints: PrintControl | None = None,
+        strict: bool = False,
     ) -> None:
         self.program = program
         self.planner = planner
@@ -116,6 +118,8 @@ class Job:
         """Whether its lines come between those of a job that prints: then only some are carried out."""
         self.prints = prints
         """Has the jobs; None: there are none, this program is all there is."""
+        self.strict = strict
+        """Whether a line that moves, heats or levels and that nothing acts on is an error; else a notice."""
         self._breaks = False
         self.recorded: dict[str, Recorded] = {}
         """By command name."""
@@ -269,7 +273,8 @@ class Job:
             raise self._error(f"{problem}{hint}") from None
 
     def _act(self, command: Command) -> bool:
-        known = self.vocabulary.commands.get(command.name)
+        known = self.vocabulary.commands.get(command.written) if command.written else None
+        known = known or self.vocabulary.commands.get(command.name)
         if known is not None:
             self._check_beside(command, allowed=known.beside)
             return self.follow(command, known.read(self.call(command)))
@@ -283,9 +288,24 @@ class Job:
         if machine_commands.is_tool(command.name):
             self._check_beside(command, allowed=False)
             return machine_commands.select_tool(self, command)
-        what = quoted(command.name).strip("'")
-        self.notice(f"unknown command {what}", "unknown commands are skipped")
+        self._skip(command)
         return True
+
+    def _skip(self, command: Command) -> None:
+        """Tell about a command that nobody knows; raises WordError for one that a job must not go without."""
+        what = quoted(command.name).strip("'")
+        why = self.vocabulary.not_acting.get(command.name, "")
+        absent = ABSENT.get(command.name)
+        if absent is None or absent.harmless:
+            self.notice(f"unknown command {what}", why or "unknown commands are skipped")
+            return
+        self.refuse_skipping(command, f"{absent.effect.value}, but {why or 'nothing here knows it'}")
+
+    def refuse_skipping(self, command: Command, why: str) -> None:
+        """Raise WordError as COMMAND, of which WHY says what it does, must not be skipped; told in a plan."""
+        if self.strict:
+            raise WordError(f"{command.name} {why}; remove the line, or what asks for it")
+        self.notice(f"{quoted(command.name).strip(chr(39))} {why}", "a job would end here")
 
     def _check_beside(self, command: Command, *, allowed: bool) -> None:
         if self.beside and not allowed:

@@ -15,13 +15,13 @@ from coordinator.gcode.events import PositionSet, Reply, ShaperChange, SmoothTim
 from coordinator.gcode.machine_state import SHAPER_AXES, Extruder, MachineState, Shaper
 from coordinator.gcode.words import Command, WordError, number, quoted
 from coordinator.kinematics.dual_carriage import CarriageMode, CarriageState, DualCarriage
+from coordinator.motion.shapers import split_kind
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from coordinator.gcode.interpreter import Job
 
-SHAPER_KINDS = ("zv", "mzv", "zvd", "ei", "2hump_ei", "3hump_ei")
 MAX_FREQUENCY_HZ = 1000.0
 MAX_ADVANCE_S = 10.0
 MAX_SMOOTH_S = 0.2
@@ -236,8 +236,10 @@ def set_input_shaper(job: Job, command: Command) -> bool:
 
 def _shaper(command: Command, values: Mapping[str, str], axis: str, before: Shaper) -> Shaper:
     kind = values.get(f"SHAPER_TYPE_{axis}", values.get("SHAPER_TYPE", before.kind)).lower()
-    if kind not in SHAPER_KINDS:
-        raise WordError(f"{command.name} names the shaper {quoted(kind)}; there are {' '.join(SHAPER_KINDS)}")
+    try:
+        split_kind(kind)
+    except ValueError as problem:
+        raise WordError(f"{command.name} names the shaper {quoted(kind)}; {problem}") from None
     frequency = _number(command, values, f"SHAPER_FREQ_{axis}", MAX_FREQUENCY_HZ)
     damping = _number(command, values, f"DAMPING_RATIO_{axis}", 0.999)
     if frequency is not None and 0 < frequency < 1:

@@ -6,6 +6,7 @@ that could make something huge in a single step are looked at before they are do
 """
 
 import functools
+import pprint
 import re
 import threading
 import time
@@ -32,7 +33,7 @@ _WIDE = re.compile(r"\d{5}|\{[^{}]*\{|\*")
 """In what formats a text: a width of five digits, or one that comes from elsewhere."""
 _PADDING = frozenset(("center", "ljust", "rjust", "zfill", "expandtabs"))
 _WITH_WIDTH = ("batch", "center", "indent", "slice", "tojson", "truncate", "wordwrap")
-_USELESS = ("pprint", "random", "urlize", "xmlattr")
+_USELESS = ("urlize", "xmlattr")
 
 
 class TooMuch(Exception):  # noqa: N818 (told to the user as a sentence)
@@ -114,6 +115,7 @@ class Sandbox(SandboxedEnvironment):
         self.filters["format"] = _formatted
         self.filters["replace"] = _replaced
         self.filters["join"] = _joined
+        self.filters["pprint"] = _printed
         self.filters["turns"] = self._turns
         self.filters["concatenated"] = _concatenated
 
@@ -187,6 +189,13 @@ class Sandbox(SandboxedEnvironment):
             meter.turn(len(items))
             return items
         return _counted(items, meter)
+
+
+def _printed(value: object) -> str:
+    """Return VALUE over several lines, for reading."""
+    text = pprint.pformat(value)
+    _check_size(len(text))
+    return text
 
 
 def _counted(items: Iterable[object], meter: Meter) -> Iterator[object]:

@@ -29,6 +29,8 @@ class Command:
 
     name: str
     text: str
+    written: str = ""
+    """In capitals as it stands in the line, where that is not NAME: ``G00``, ``M104.0``."""
 
     def words(self) -> dict[str, str]:
         """Read the parameters as letters with numbers (or without: ``G28 X``)."""
@@ -97,10 +99,12 @@ def parse(line: bytes) -> Command | None:
     if match := _CODE.match(text):
         fraction = (match[3] or "").rstrip("0").rstrip(".")
         rest = text[match.end() :]
+        name, written = match[1].upper() + str(int(match[2])) + fraction, match[0].upper()
         # Display texts (M117, M118) are not words and may hold anything.
         return Command(
-            match[1].upper() + str(int(match[2])) + fraction,
+            name,
             rest if match[1] in "Mm" and match[2] in {"117", "118"} else _without_comments(rest).strip(),
+            written if written != name else "",
         )
     if _BARE_WORD.match(text):
         raise WordError(f"{quoted(text)} has no command; write G0 or G1 before the axes")

@@ -55,6 +55,10 @@ class WorkSpace:
     """Slopes 0: no cone. Else the head may also be above the box, where homing leaves it, in the cone
     z + √((sx·x)² + (sy·y)²) <= cone_top."""
     cone_top: float = 0.0
+    tower_radius: float = 0.0
+    """Of a delta: how far level its rods reach with the head in the middle."""
+    tower_rod: float = 0.0
+    """Of a delta: length of its shortest rod, which lies flatter the further the head is out. 0: no delta."""
 
     def contains(self, point: Point) -> bool:
         """Tell whether the head may be at POINT."""

@@ -16,8 +16,10 @@ from coordinator.kinematics.geometry import spheres_meet
 from coordinator.motion.specs import StepKinematics
 from nodes.records import record
 
-MAX_TOWER_SPEED = 3.0
-"""How much faster than the head a carriage may be: it would grow without bound as a rod lies down."""
+USUAL_TOWER_SPEED = 3.0
+"""How much faster than the head a carriage may be: where a rod lies flatter, the head is slower instead."""
+MAX_TOWER_SPEED = 12.0
+"""How much faster it would be where the head may not go: it grows without bound as a rod lies down."""
 _FLATTEST = math.sin(math.atan(MAX_TOWER_SPEED))
 """Share of a rod's length that is horizontal then: speed ratio = horizontal / vertical."""
 
@@ -75,7 +77,12 @@ class Delta:
     @property
     def widest_radius(self) -> float:
         """How far from the middle the head may be before a rod lies too flat."""
-        return min(tower.rod_length for tower in self.towers) * _FLATTEST - self.radius
+        return self.shortest_rod * _FLATTEST - self.radius
+
+    @property
+    def shortest_rod(self) -> float:
+        """Length, mm."""
+        return min(tower.rod_length for tower in self.towers)
 
     @property
     def endstop_positions(self) -> tuple[float, ...]:
@@ -90,7 +97,8 @@ class Delta:
         head can be higher, up to where it is after homing. On the way down from there no carriage rises if
         the way is at least as steep as the carriages there are fast: R / √(A² - R²).
         """
-        radius = min(self.radius, self.widest_radius) if self.print_radius is None else self.print_radius
+        asked = self.radius if self.print_radius is None else self.print_radius
+        radius = min(asked, self.widest_radius)
         nearest = max(self.radius - radius, 0.0)
         top = min(
             end - math.sqrt(tower.rod_length**2 - nearest**2)
@@ -99,4 +107,12 @@ class Delta:
         slope = max(self.radius / math.sqrt(t.rod_length**2 - self.radius**2) for t in self.towers)
         low, high = (-radius, -radius, self.min_z), (radius, radius, top)
         cone_top = min(tower.endstop_height for tower in self.towers)
-        return WorkSpace(low, high, max_radius=radius, cone_slope=(slope, slope), cone_top=cone_top)
+        return WorkSpace(
+            low,
+            high,
+            max_radius=radius,
+            cone_slope=(slope, slope),
+            cone_top=cone_top,
+            tower_radius=self.radius,
+            tower_rod=self.shortest_rod,
+        )

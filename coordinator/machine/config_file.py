@@ -1,7 +1,8 @@
 """The configuration file as text: sections, options and where each of them stands.
 
 Sections are ``[name]`` or ``[name instance]``, options ``option: value`` or ``option = value``; a value goes
-on over indented lines. ``#`` and ``;`` begin a comment at the begin of a line or after white space.
+on over indented lines. ``#`` begins a comment wherever it stands, ``;`` at the begin of a line or after
+white space. Of an option that a section has twice the last one holds.
 ``[include FILE]`` takes wildcards. A marked block at the end holds values the machine has saved; they
 override the user's own.
 
@@ -20,7 +21,7 @@ from nodes.records import record
 SAVED_PREFIX = "#*#"
 SAVED_HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
 _SAVED_HEADER = re.compile(r"#\*# <-+ SAVE_CONFIG -+>\s*")
-_COMMENT = re.compile(r"(?:^|\s)(?:#(?!\})|;).*")  # "#}" ends a comment of a template
+_COMMENT = re.compile(r"(?:(?<!\{)#(?!\})|(?:^|\s);).*")  # {# and #} are a template's
 _SECTION = re.compile(r"\[(include .*|[^\[\]]*)\]")  # wildcards of a path may hold brackets
 _SEPARATOR = re.compile(r"[:=]")
 _MAX_NAME_CHARS = 200
@@ -36,6 +37,8 @@ class RawOption:
     place: Place
     numbers: tuple[int, ...] = ()
     """Where each line of the value stands in the file: comments leave gaps."""
+    earlier: tuple[Place, ...] = ()
+    """Where it is given before, under the same header, without effect."""
 
     def is_at(self, place: Place) -> bool:
         """Tell whether its name or any line of its value stands at PLACE."""
@@ -118,7 +121,21 @@ def parse_config(path: str, problems: list[ConfigError] | None = None) -> Config
             saved.name, RawSection(saved.name, saved.place, problems=config.problems)
         )
         section.options.update(saved.options)
+    config.notes += [
+        _repeated(section, option)
+        for section in config.sections.values()
+        for option in section.options.values()
+        if option.earlier
+    ]
     return config
+
+
+def _repeated(section: RawSection, option: RawOption) -> str:
+    lines = ", ".join(str(place.line) for place in option.earlier)
+    return (
+        f"{option.place}: option {shown(option.name)} of [{section.name}] is given before (line {lines});"
+        " the last one holds"
+    )
 
 
 def parse_saved(path: str, lines: list[str]) -> dict[str, dict[str, str]]:
@@ -167,7 +184,7 @@ class _Parser:
         self._sections = sections  # may have been begun by another file
         self._budget = budget  # none: includes are refused
         self._section: RawSection | None = None
-        self._here: dict[str, RawOption] = {}  # under the last header, where a repeat is a mistake
+        self._here: dict[str, RawOption] = {}  # under the last header, where a repeat is worth a notice
         self._option: RawOption | None = None
         self._option_indent = 0
         self._value: list[tuple[int, str]] = []
@@ -262,10 +279,7 @@ def _add(section: RawSection | None, here: dict[str, RawOption], option: RawOpti
             option.place,
             f"option {shown(option.name)} stands outside of a section; put a [section] before it",
         )
-    if option.name in here:
-        raise ConfigError(
-            option.place,
-            f"option {shown(option.name)} of [{section.name}] is given twice, first at"
-            f" {here[option.name].place}; remove one",
-        )
+    before = here.get(option.name)
+    if before is not None:
+        option.earlier = (*before.earlier, before.place)
     here[option.name] = section.options[option.name] = option

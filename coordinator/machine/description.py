@@ -62,6 +62,8 @@ _SINGLE_SECTIONS = (
     *("printer", "stepper_x", "stepper_y", "stepper_z", "extruder", "input_shaper"),
     "axis_tables",
 )
+SHELL_COMMAND = "gcode_shell_command"
+"""Programs of the host, called from macros on other hosts: said once, however many there are."""
 _NAMED_SECTIONS = ("mcu", "board_pins", "duplicate_pin_override")
 _MOTION_SECTIONS = re.compile(
     r"stepper_([a-z]|bed|arm|left|right)|extruder[1-9]?|extruder1[0-5]|dual_carriage"
@@ -114,14 +116,28 @@ def describe(config: ConfigFile) -> MachineDescription:
         shapers=shapers,
         modules=_module_sources(reading),
         not_yet_acting=(),
-        notes=tuple(config.notes),
+        notes=(),
         axis_tables=axis_tables,
         source=ConfigSource(config.path, config.data, saved_values(config)),
     )
+    later += [
+        NotYetActing(_section_of(stepper), stepper.place, ("enable_pin",), stepper.unpowered)
+        for stepper in description.steppers
+        if stepper.unpowered
+    ]
     _check_names(description)
     check_policies(description.nodes, description.steppers)
-    reading.pins = description.modules.build(description).pins  # made once to find mistakes
-    return replace(description, not_yet_acting=(*later, *_later_sections(reading, kinematics)))
+    built = description.modules.build(description)  # made once to find mistakes
+    reading.pins = built.pins
+    return replace(
+        description,
+        not_yet_acting=(
+            *later,
+            *(NotYetActing(one.name, one.place, (), one.reason) for one in built.left_out.values()),
+            *_later_sections(reading, kinematics),
+        ),
+        notes=(*config.notes, *built.notes),
+    )
 
 
 def _module_sources(reading: Reading) -> ModuleSources:
@@ -146,6 +162,11 @@ def _module_sources(reading: Reading) -> ModuleSources:
 def _named(limits: MotionLimits, frame: Frame) -> MotionLimits:
     """Return LIMITS that know which options the ranges come from."""
     return replace(limits, range_options=frame.range_options)
+
+
+def _section_of(stepper: StepperDescription) -> str:
+    """Return the section that STEPPER is of, by what its pins are for."""
+    return stepper.step_pin.purpose.partition("[")[2].rstrip("]")
 
 
 def _check_names(description: MachineDescription) -> None:
@@ -201,7 +222,12 @@ def _later_sections(reading: Reading, kinematics: str) -> list[NotYetActing]:
         if section.name in reading.used and not _is_acting(section):
             continue
         if not _is_acting(section):
-            result.append(NotYetActing(section.name, section.place, ()))
+            if section.kind != SHELL_COMMAND:
+                result.append(NotYetActing(section.name, section.place, ()))
+            elif not any(entry.section == SHELL_COMMAND for entry in result):
+                result.append(
+                    NotYetActing(SHELL_COMMAND, section.place, (), "no section of that kind is run")
+                )
             reading.pins.check_unclaimed(section.options.values(), section.name)
             continue
         if section.name not in reading.used and section.kind not in ("printer", *_NAMED_SECTIONS):

@@ -85,6 +85,8 @@ class StepperDescription:
     step_pulse_s: float
     """Shortest high time of the step pin; 0: the driver steps on both edges."""
     place: Place
+    unpowered: str = ""
+    """Why its driver cannot be switched on yet, though it has an enable pin; empty: it can."""
 
     @property
     def node(self) -> str:
@@ -119,6 +121,8 @@ class HomingDescription:
     """Whether the endstop stands at the upper end."""
     accel: float | None = None
     """mm/s² of all that; None: as fast as the axis may."""
+    refused: str = ""
+    """Why G28 must not move it, whatever its endstop; empty: it may."""
 
     @property
     def waits(self) -> bool:
@@ -240,10 +244,12 @@ class NotYetActing:
     place: Place
     options: tuple[str, ...]
     """Their names; empty: the whole section."""
+    reason: str = ""
+    """What it depends on that does not act; empty: it has no module."""
 
     def __str__(self) -> str:
         what = f"{', '.join(self.options)} of [{self.section}]" if self.options else f"[{self.section}]"
-        return f"{self.place}: {what} recognised, not yet acting"
+        return f"{self.place}: {what} recognised, not yet acting" + (self.reason and f": {self.reason}")
 
 
 @record

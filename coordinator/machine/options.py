@@ -11,7 +11,7 @@ from dataclasses import field
 from typing import Any, Generic, TypeVar
 
 from coordinator.machine.config_file import RawOption, RawSection
-from coordinator.machine.problem import ConfigError, Place, nearest, shown
+from coordinator.machine.problem import ConfigError, NotActing, Place, nearest, shown
 from nodes.records import record
 
 T = TypeVar("T")
@@ -20,6 +20,10 @@ _INT = re.compile(r"[-+]?\d+", re.ASCII)
 _MAX_NUMBER_CHARS = 40
 _TRUE = ("1", "yes", "true", "on")
 _FALSE = ("0", "no", "false", "off")
+
+
+class NotBuilt(ValueError):  # noqa: N818 (no mistake)
+    """The text is a value of the option that nothing of ours acts on yet."""
 
 
 class BadValue(ValueError):  # noqa: N818 (the answer of a parser, not a failure of ours)
@@ -165,12 +169,12 @@ class ChoiceOption(Option[str]):
 
     choices: tuple[str, ...]
     later: tuple[str, ...] = ()
-    """Words known from other hosts that do not act yet: they get a sentence of their own."""
+    """Words known from other hosts that do not act yet."""
 
     def parse(self, text: str) -> str:
         """Return the word."""
         if text in self.later:
-            raise BadValue(f"recognised but not built yet; use {one_of(self.choices)}")
+            raise NotBuilt
         if text not in self.choices:
             raise BadValue
         return text
@@ -227,16 +231,19 @@ class GCodeOption(Option[str]):
 class ListOption(Option[tuple[str, ...]]):
     """Words separated by commas or line ends."""
 
+    may_be_empty: bool = False
+    """Whether an option without any word is an empty list; else it is a mistake."""
+
     def parse(self, text: str) -> tuple[str, ...]:
         """Return the words without outer white space; a comma at the end is allowed."""
         words = tuple(word.strip() for word in text.replace("\n", ",").split(",") if word.strip())
-        if not words:
+        if not words and not self.may_be_empty:
             raise BadValue
         return words
 
     def rule(self) -> str:
         """Return the values allowed."""
-        return "a list of words separated by commas"
+        return "a list of words separated by commas" + (", or nothing" if self.may_be_empty else "")
 
     def stand_in(self) -> tuple[str, ...]:
         """Return none."""
@@ -357,6 +364,12 @@ class SectionReader:
             return None
         try:
             value = self.section.used[option.name] = option.parse(raw.value)
+        except NotBuilt:
+            raise NotActing(
+                raw.place,
+                f"option '{option.name}' of [{self.name}] is {shown(raw.value)}, which is recognised but not"
+                " built yet",
+            ) from None
         except BadValue as error:
             problem = self.bad(option, str(error) if error.args else f"must be {option.rule()}")
         else:

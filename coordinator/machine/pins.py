@@ -10,10 +10,11 @@ from dataclasses import field, replace
 
 from coordinator.machine.config_file import RawOption, RawSection
 from coordinator.machine.options import BadValue, Option
-from coordinator.machine.problem import ConfigError, Place, nearest, shown
+from coordinator.machine.problem import ConfigError, NotActing, Place, nearest, shown
 from nodes.records import record
 
 PRIMARY_NODE = "mcu"
+MULTI_PIN = "multi_pin"
 _PIN = re.compile(r"([!^~ ]*)(?:([A-Za-z0-9_.-]+) *: *)?([!^~ ]*)([A-Za-z0-9_./-]+)", re.ASCII)
 _MAX_PIN_CHARS = 100
 _EXCLUSIVE = ""
@@ -108,6 +109,11 @@ class PinRegistry:
     diag_pins: dict[str, PinName | None] = field(default_factory=dict)
     """Of the sections whose virtual endstop an endstop_pin may name, such as ``tmc2209_stepper_x``; None: it
     has no diag_pin."""
+    chips: dict[str, str] = field(default_factory=dict)
+    """Sections whose pins other sections may name, and that no module is for yet, by what stands in front of
+    the colon: ``sx1509_duex`` is of ``sx1509 duex``."""
+    multi_pins: set[str] = field(default_factory=set)
+    """Names of the sections [multi_pin NAME], whose pins are all behind ``multi_pin:``."""
 
     def copy(self) -> "PinRegistry":
         """Return one that goes on from here by itself."""
@@ -117,6 +123,8 @@ class PinRegistry:
             set(self._shareable),
             dict(self._users),
             dict(self.diag_pins),
+            self.chips,
+            self.multi_pins,
         )
 
     def add_alias(self, node: str, alias: str, name: str, option: RawOption) -> None:
@@ -140,6 +148,8 @@ class PinRegistry:
             return claimed
         try:
             return self._claim(pin, claimed, option.share)
+        except NotActing:
+            raise
         except ConfigError as error:
             section.report(error)
             section.stands_in = True
@@ -147,6 +157,8 @@ class PinRegistry:
 
     def _claim(self, pin: PinName, wanted: PinDescription, share: str) -> PinDescription:
         if pin.node not in self.nodes:
+            if pin.node in self.chips:
+                raise NotActing(wanted.place, self._of_chip(pin, wanted))
             hint = nearest(pin.node, self.nodes, pattern="'{}'") or f"; add a section [mcu {pin.node}]"
             raise ConfigError(wanted.place, f"{wanted.purpose}: there is no node {shown(pin.node)}{hint}")
         claimed = replace(wanted, name=self._resolve(pin, wanted.purpose, wanted.place))
@@ -154,6 +166,18 @@ class PinRegistry:
         if user is not claimed:
             self._check_shared(claimed, share, user, other_share)
         return claimed
+
+    def _of_chip(self, pin: PinName, wanted: PinDescription) -> str:
+        """Say what a pin is that is no node's; raises ConfigError for one that its section does not have."""
+        section = self.chips[pin.node]
+        if pin.node == MULTI_PIN:
+            if pin.name not in self.multi_pins:
+                hint = nearest(pin.name, self.multi_pins) or f"; add a section [{MULTI_PIN} {pin.name}]"
+                raise ConfigError(
+                    wanted.place, f"{wanted.purpose}: there is no [{MULTI_PIN} {pin.name}]{hint}"
+                )
+            section = f"{MULTI_PIN} {pin.name}"
+        return f"{wanted.purpose} is a pin of [{section}], which does not act yet"
 
     def claimed(self, node: str) -> list[str]:
         """Return the names of NODE's pins that are in use."""
@@ -178,6 +202,8 @@ class PinRegistry:
 
     def _resolve(self, pin: PinName, purpose: str, place: Place) -> str:
         name = self._aliases.get((pin.node, pin.name), pin.name)
+        if not name:
+            raise ConfigError(place, f"{purpose}: alias {shown(pin.name)} of [board_pins] has no pin; add it")
         if name.startswith("<"):
             raise ConfigError(place, f"{purpose}: pin {shown(pin.name)} is reserved for {name}; use another")
         return name

@@ -81,9 +81,13 @@ ROTARY_DELTA_PRINTER = SectionSpec(
     help="What a rotary delta needs besides",
     options=(SHOULDER_RADIUS, SHOULDER_HEIGHT, ARMS_PRINT_RADIUS, MINIMUM_Z),
 )
+POLAR_PRINTER = SectionSpec(
+    help="What a polar machine may have besides", options=(), later=("max_angular_velocity",)
+)
 PRINTER_SPECS: Mapping[str, SectionSpec] = {
     "delta": DELTA_PRINTER,
     "deltesian": DELTESIAN_PRINTER,
+    "polar": POLAR_PRINTER,
     "rotary_delta": ROTARY_DELTA_PRINTER,
 }
 """By kinematics."""

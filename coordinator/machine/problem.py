@@ -31,6 +31,14 @@ class ConfigError(CanductorError):
         """Where the mistake stands, for front ends that mark the line."""
 
 
+class NotActing(ConfigError):  # noqa: N818 (no mistake: the configuration is right)
+    """What an option asks for is known, but nothing acts on it yet; its reader leaves it out and lists it."""
+
+    def __init__(self, place: Place, reason: str) -> None:
+        super().__init__(place, reason)
+        self.reason = reason
+
+
 class MissingSection(ConfigError):  # noqa: N818 (what is wrong, as the others)
     """There is no section NAME, without which nothing that follows can be read."""
 

@@ -49,7 +49,7 @@ def read_delta(reading: Reading, printer: SectionReader) -> Frame:
     )
     check_directions(readers, ANGLE, (a.angle, b.angle, c.angle))
     delta = Delta((a, b, c), radius, min_z, print_radius)
-    _check_radius(printer, readers[0], delta)
+    _check_radius(printer, readers[0], delta, reading.config.notes)
     check_height(printer, delta.work_space.high[2], min_z)
     rails = []
     for reader, tower, function in zip(readers, delta.towers, delta.step_functions(), strict=True):
@@ -77,7 +77,7 @@ def _read_tower(reader: SectionReader, first: SectionReader, angle: float, radiu
     return Tower(math.radians(angle if given is None else given), rod, height)
 
 
-def _check_radius(printer: SectionReader, first: SectionReader, delta: Delta) -> None:
+def _check_radius(printer: SectionReader, first: SectionReader, delta: Delta, notes: list[str]) -> None:
     widest = delta.widest_radius
     if widest <= 0:
         raise first.bad(
@@ -86,8 +86,7 @@ def _check_radius(printer: SectionReader, first: SectionReader, delta: Delta) ->
             " in the middle; correct it or delta_radius",
         )
     if delta.print_radius is not None and delta.print_radius > widest:
-        raise printer.bad(
-            PRINT_RADIUS,
-            f"but beyond {widest:.5g} mm carriages would be more than {MAX_TOWER_SPEED:g} times as fast as"
-            " the head; reduce it, or correct delta_radius and arm_length",
+        notes.append(
+            f"{printer.place_of(PRINT_RADIUS)}: 'print_radius' of [printer] is {delta.print_radius:g} mm, but"
+            f" the rods lie too flat beyond {widest:.5g} mm: moves end there"
         )

@@ -93,8 +93,8 @@ EXTRUDER = SectionSpec(
 FOLLOWED = TextOption(
     name="extruder",
     help="the extruder whose motion it follows, which then gives its pressure advance too; by default none",
-    pattern=r"\S+",
-    pattern_rule="the name of an extruder",
+    pattern=r"\S*",
+    pattern_rule="the name of an extruder, or nothing",
 )
 EXTRUDER_STEPPER = SectionSpec(
     help="A further stepper that moves filament along with an extruder",
@@ -224,6 +224,8 @@ def _limits(
         radius_min=space.radius_min,
         cone_slope=space.cone_slope,
         cone_top=space.cone_top,
+        tower_radius=space.tower_radius,
+        tower_rod=space.tower_rod,
         max_extrude_only_velocity=only[0],
         max_extrude_only_accel=only[1],
         max_extrude_only_distance=only[2],

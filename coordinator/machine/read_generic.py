@@ -8,14 +8,15 @@ from coordinator.kinematics.base import StepFunction
 from coordinator.kinematics.generic_cartesian import GenericCartesian
 from coordinator.machine.config_file import RawSection
 from coordinator.machine.frame import Frame, box_of, home_of
-from coordinator.machine.model import RailDescription, StepperDescription
+from coordinator.machine.model import NotYetActing, RailDescription, StepperDescription
 from coordinator.machine.options import BadValue, ChoiceOption, Option, SectionReader, SectionSpec, TextOption
+from coordinator.machine.pins import PinDescription
 from coordinator.machine.problem import ConfigError, Place, nearest, shown
 from coordinator.machine.read_dual import SAFE_DISTANCE, describe_dual, park
 from coordinator.machine.read_homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
 from coordinator.machine.read_rails import RANGE, read_range
 from coordinator.machine.read_steppers import MOTOR, read_stepper
-from coordinator.machine.reading import Reading
+from coordinator.machine.reading import Reading, SecondEndstop
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
 from nodes.records import record
 
@@ -34,7 +35,8 @@ PRIMARY_CARRIAGE = TextOption(
     pattern_rule="the name of a carriage",
 )
 EXTRA_CARRIAGE = SectionSpec(
-    help="A second endstop of a carriage, such as the other side of a gantry; does not act yet",
+    help="A second endstop of a carriage, such as the other side of a gantry; it acts where one stepper has"
+    " that side to itself, and no other moves the axis with another one",
     options=(PRIMARY_CARRIAGE, ENDSTOP_PIN),
 )
 DUAL_CARRIAGE = SectionSpec(
@@ -71,6 +73,10 @@ class SumOption(Option[Sum]):
         """Return the values allowed."""
         return "a sum of different carriages as in carriage_x, x-y or carriage_x+0.5*carriage_y"
 
+    def stand_in(self) -> Sum:
+        """Return no carriage."""
+        return ()
+
 
 CARRIAGES = SumOption(name="carriages", help="what the stepper's way is, per way of the carriages")
 STEPPER = SectionSpec(help="A motor of a generic_cartesian machine", options=(*MOTOR, CARRIAGES))
@@ -81,8 +87,10 @@ class _Motor:
     """A stepper with its way per mm of each axis, and the axis' second carriage if it moves that."""
 
     stepper: StepperDescription
-    second: str = ""
-    """Name of the second carriage that it moves; empty: it moves first ones."""
+    second: tuple[str, ...] = ()
+    """Names of the second carriages that it moves; none: it moves first ones."""
+    extra: tuple[str, ...] = ()
+    """Names of the extra carriages that it moves."""
 
 
 @dataclass(slots=True)
@@ -91,6 +99,8 @@ class _Carriages:
 
     first: dict[str, RailDescription]
     second: dict[str, tuple[RailDescription, SectionReader]]
+    extra: dict[str, RailDescription]
+    """The first carriage of each."""
 
     def range_options(self) -> tuple[str, str, str]:
         """Return which options say how far X, Y and Z may go."""
@@ -104,7 +114,9 @@ class _Carriages:
             return self.first[name]
         if name in self.second:
             return self.second[name][0]
-        names = (*self.first, *self.second)
+        if name in self.extra:
+            return self.extra[name]
+        names = (*self.first, *self.second, *self.extra)
         hint = nearest(name, names) or f"; there is {', '.join(names)}"
         raise reader.bad(option, f"but there is no carriage {shown(name)}{hint}")
 
@@ -112,7 +124,7 @@ class _Carriages:
 def read_generic(reading: Reading, _printer: SectionReader) -> Frame:
     """Return the frame of a generic cartesian machine; raises ConfigError."""
     by_axis: dict[str, RailDescription] = {}
-    carriages = _Carriages({}, {})
+    carriages = _Carriages({}, {}, {})
     for section in reading.named("carriage"):
         rail = _read_carriage(reading, section)
         other = by_axis.setdefault(rail.axis, rail)
@@ -130,7 +142,9 @@ def read_generic(reading: Reading, _printer: SectionReader) -> Frame:
                 f"no [carriage NAME] is on axis {axis}; add one: every axis needs it",
             )
     _read_further_carriages(reading, carriages)
+    ends = _read_extra_carriages(reading, carriages)
     motors = [_read_motor(reading, section, carriages) for section in reading.named("stepper")]
+    _note_second_endstops(reading, ends, motors)
     return _frame(reading, (by_axis["x"], by_axis["y"], by_axis["z"]), carriages, motors)
 
 
@@ -147,17 +161,40 @@ def _read_further_carriages(reading: Reading, carriages: _Carriages) -> None:
     for section in reading.named("dual_carriage"):
         reader = SectionReader(section, DUAL_CARRIAGE)
         first = _primary(reader, carriages)
-        if carriages.second or first.axis == "z":
-            raise reader.bad(PRIMARY_CARRIAGE, "but there can be one second carriage, on x or y; remove it")
+        if first.axis == "z" or any(rail.axis == first.axis for rail, _ in carriages.second.values()):
+            raise reader.bad(
+                PRIMARY_CARRIAGE, "but x and y can have one second carriage each, and z none; remove it"
+            )
         low, high = read_range(reader)
         homing = read_homing(reader, low, high, reading.pins)
         rail = RailDescription(first.axis, (), low, high, homing, section.place)
         carriages.second[section.instance] = (rail, reader)
+
+
+_End = tuple[Place, PinDescription | None, str]
+"""Of an extra carriage: where it stands, its endstop's pin, and the virtual endstop that it is of."""
+
+
+def _read_extra_carriages(reading: Reading, carriages: _Carriages) -> dict[str, _End]:
+    """Return the endstop of each by its name; raises ConfigError."""
+    ends: dict[str, _End] = {}
     for section in reading.named("extra_carriage"):
         reader = SectionReader(section, EXTRA_CARRIAGE)
-        _primary(reader, carriages)
-        read_endstop(reader, reading.pins)
-        reading.finish(reader, waiting=WAITING)
+        carriages.extra[section.instance] = _primary(reader, carriages)
+        ends[section.instance] = (section.place, *read_endstop(reader, reading.pins))
+        reading.finish(reader)
+    return ends
+
+
+def _note_second_endstops(reading: Reading, ends: dict[str, _End], motors: list[_Motor]) -> None:
+    """Note which stepper has an extra carriage to itself; those that can be of no stepper do not act."""
+    for name, (place, pin, virtual) in ends.items():
+        section = f"extra_carriage {name}"
+        movers = [motor.stepper.name for motor in motors if name in motor.extra]
+        if pin is None or len(movers) != 1:
+            reading.later.append(NotYetActing(section, place, (ENDSTOP_PIN.name,)))
+        else:
+            reading.second_endstops[movers[0]] = SecondEndstop(section, place, pin, virtual)
 
 
 def _primary(reader: SectionReader, carriages: _Carriages) -> RailDescription:
@@ -167,17 +204,18 @@ def _primary(reader: SectionReader, carriages: _Carriages) -> RailDescription:
 def _read_motor(reading: Reading, section: RawSection, carriages: _Carriages) -> _Motor:
     reader = SectionReader(section, STEPPER)
     weights = [0.0, 0.0, 0.0, 0.0]
-    second = ""
+    second, extra = [], []
     for name, factor in reader.get(CARRIAGES):
         axis = "xyz".index(carriages.find(reader, CARRIAGES, name).axis)
         if weights[axis]:
             raise reader.bad(CARRIAGES, f"which takes both carriages of axis {'xyz'[axis]}; keep one of them")
         weights[axis] = factor
-        second = name if name in carriages.second else second
+        second += [name] if name in carriages.second else []
+        extra += [name] if name in carriages.extra else []
     function = StepFunction(weights=(weights[0], weights[1], weights[2], weights[3]))
     stepper = read_stepper(reader, function, reading.pins, name=section.instance)
     reading.finish(reader)
-    return _Motor(stepper, second)
+    return _Motor(stepper, tuple(second), tuple(extra))
 
 
 def _frame(
@@ -201,9 +239,11 @@ def _frame(
         own,
         range_options=carriages.range_options(),
     )
+    if len(carriages.second) > 1:
+        return _without_second(reading, frame, carriages)
     for name, (rail, reader) in carriages.second.items():
         axis = "xyz".index(rail.axis)
-        theirs = tuple(motor.stepper for motor in motors if motor.second == name)
+        theirs = tuple(motor.stepper for motor in motors if name in motor.second)
         if not theirs:
             raise ConfigError(
                 rail.place, f"no [stepper NAME] moves carriage '{name}'; name it in 'carriages' of one"
@@ -212,6 +252,19 @@ def _frame(
         reading.finish(reader, waiting=WAITING if rail.homing.waits else ())
         frame = park(frame, dual, theirs, reader.name)
     return frame
+
+
+def _without_second(reading: Reading, frame: Frame, carriages: _Carriages) -> Frame:
+    """Return FRAME without its second carriages, of which two do not act yet: their axes cannot be homed."""
+    rails = {rail.axis: rail for rail in frame.rails}
+    for second, reader in carriages.second.values():
+        reader.find(SAFE_DISTANCE)
+        reading.finish(reader)
+        why = f"second carriages on x and y at once do not act yet, and [{reader.name}] may be in the way"
+        reading.later.append(NotYetActing(reader.name, second.place, (), why))
+        first = rails[second.axis]
+        rails[second.axis] = replace(first, homing=replace(first.homing, refused=f"{why} ({second.place})"))
+    return replace(frame, rails=(rails["x"], rails["y"], rails["z"]))
 
 
 def _movers(steppers: tuple[StepperDescription, ...], axis: int) -> tuple[StepperDescription, ...]:

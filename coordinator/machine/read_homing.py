@@ -3,6 +3,7 @@
 from coordinator.machine.model import HomingDescription
 from coordinator.machine.options import BoolOption, FloatOption, SectionReader
 from coordinator.machine.pins import PinDescription, PinOption, PinRegistry
+from coordinator.machine.problem import NotActing
 from coordinator.machine.read_printer import MAX_ACCEL, MAX_SPEED
 from coordinator.machine.read_steppers import MAX_POSITION
 from coordinator.machine.virtual_endstops import find_diag_pin
@@ -74,7 +75,10 @@ def read_endstop(reader: SectionReader, pins: PinRegistry) -> tuple[PinDescripti
         virtual = f"{pin.node}:{pin.name}"
         diag = find_diag_pin(reader, ENDSTOP_PIN, pin, pins)
         return (None if diag is None else pins.claim(diag, ENDSTOP_PIN, reader.section)), virtual
-    return pins.claim(pin, ENDSTOP_PIN, reader.section), ""
+    try:
+        return pins.claim(pin, ENDSTOP_PIN, reader.section), ""
+    except NotActing:
+        return None, f"{pin.node}:{pin.name}"
 
 
 def read_homing(reader: SectionReader, low: float, high: float, pins: PinRegistry) -> HomingDescription:

@@ -38,6 +38,12 @@ def _frame_reader(kinematics: str) -> Callable[[Reading, SectionReader], Frame]:
             from coordinator.machine.read_generic import read_generic
 
             read = read_generic
+        case "none":
+            from coordinator.kinematics.no_motion import NoMotion
+
+            def read(reading: Reading, printer: SectionReader) -> Frame:
+                del reading, printer
+                return Frame(NoMotion(), (), (0.0, 0.0, 0.0))
         case "polar":
             from coordinator.machine.read_polar import read_polar
 
@@ -53,7 +59,8 @@ def _frame_reader(kinematics: str) -> Callable[[Reading, SectionReader], Frame]:
         case _:
             build = _axes_kinematics(kinematics)
 
-            def read(reading: Reading, _printer: SectionReader) -> Frame:
+            def read(reading: Reading, printer: SectionReader) -> Frame:
+                del printer
                 return _read_axes(reading, build)
 
     return read

@@ -21,7 +21,7 @@ from coordinator.machine.options import (
     SectionSpec,
     TextOption,
 )
-from coordinator.machine.pins import PRIMARY_NODE, PinOption, PinRegistry
+from coordinator.machine.pins import MULTI_PIN, PRIMARY_NODE, PinOption, PinRegistry
 from coordinator.machine.problem import ConfigError, Place, nearest, shown
 from coordinator.machine.virtual_endstops import note_diag_pins
 from coordinator.machine.well_known import LATER_MCU_OPTIONS
@@ -75,6 +75,8 @@ BOARD_PINS = SectionSpec(help="Second names for pins, as printed on a board", op
 SHARED_PINS = ListOption(name="pins", help="pins that several options may use")
 DUPLICATE_PIN_OVERRIDE = SectionSpec(help="Pins that are shared on purpose", options=(SHARED_PINS,))
 
+_CHIP_PINS = {"adc_scaled": "", "ads1x1x": "", "ads1118": "", "sx1509": "sx1509_", "replicape": "replicape"}
+"""Kinds of sections with pins of their own, and what stands in front of NAME where their pins are named."""
 _NODE_NAME = re.compile(r"[A-Za-z0-9_.-]+", re.ASCII)
 
 
@@ -153,10 +155,23 @@ def _read_can(reader: SectionReader) -> CanConnection | UartConnection:
 
 
 def _check_distinct(nodes: tuple[NodeDescription, ...]) -> None:
-    """Refuse two nodes that claim to be the same board."""
+    """Refuse two nodes on CAN that claim to be the same board."""
+    check_distinct(nodes, CanConnection)
+
+
+def check_distinct(
+    nodes: Iterable[NodeDescription], kind: type[CanConnection] | type[UartConnection]
+) -> None:
+    """Refuse two nodes with a connection of KIND that claim to be the same board; raises ConfigError.
+
+    Serial lines are only compared before they are opened: published configurations have the same
+    placeholder for all.
+    """
     seen: dict[str, NodeDescription] = {}
     for node in nodes:
         connection = node.connection
+        if not isinstance(connection, kind):
+            continue
         key = connection.uuid if isinstance(connection, CanConnection) else connection.path
         other = seen.setdefault(key, node)
         if other is not node:
@@ -178,13 +193,24 @@ def make_pin_registry(config: ConfigFile, nodes: tuple[NodeDescription, ...]) ->
         if section.kind == "duplicate_pin_override":
             _read_shared(section, registry)
     note_diag_pins(config, registry)
+    _note_chips(config, registry)
     return registry
+
+
+def _note_chips(config: ConfigFile, registry: PinRegistry) -> None:
+    """Have REGISTRY know the sections whose pins other sections may name."""
+    for section in config.sections.values():
+        if section.kind == MULTI_PIN:
+            registry.chips[MULTI_PIN] = section.name
+            registry.multi_pins.add(section.instance)
+        elif (prefix := _CHIP_PINS.get(section.kind)) is not None:
+            registry.chips[f"{prefix}{section.instance}" or section.kind] = section.name
 
 
 def _read_aliases(section: RawSection, registry: PinRegistry) -> None:
     # Users spread long tables over aliases_exp1, aliases_exp2, …
     tables = [
-        ListOption(name=name, help=ALIASES.help)
+        ListOption(name=name, help=ALIASES.help, may_be_empty=True)
         for name in section.options
         if name == ALIASES.name or name.startswith(f"{ALIASES.name}_")
     ]
@@ -196,7 +222,7 @@ def _read_aliases(section: RawSection, registry: PinRegistry) -> None:
     for table in tables:
         for pair in reader.get(table):
             alias, equals, pin = (part.strip() for part in pair.partition("="))
-            if not equals or not alias or not pin:
+            if not equals or not alias:
                 raise reader.bad(table, f"{shown(pair)} is not NAME=PIN")
             for node in boards:
                 registry.add_alias(node, alias, pin, section.options[table.name])

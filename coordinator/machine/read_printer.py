@@ -23,11 +23,11 @@ KINEMATICS = ChoiceOption(
         "generic_cartesian",
         "hybrid_corexy",
         "hybrid_corexz",
+        "none",
         "polar",
         "rotary_delta",
         "winch",
     ),
-    later=("none",),
 )
 MAX_VELOCITY = FloatOption(
     name="max_velocity", help="highest speed of the head", unit="mm/s", above=0, maximum=MAX_SPEED

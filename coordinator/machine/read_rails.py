@@ -4,8 +4,15 @@ from coordinator.kinematics.base import StepFunction
 from coordinator.machine.model import RailDescription, StepperDescription
 from coordinator.machine.options import FloatOption, SectionReader, SectionSpec
 from coordinator.machine.read_homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
-from coordinator.machine.read_steppers import MAX_POSITION, MOTOR, TURNING_MOTOR, extra_sections, read_stepper
-from coordinator.machine.reading import Reading
+from coordinator.machine.read_steppers import (
+    MAX_BELT_POSITION,
+    MAX_POSITION,
+    MOTOR,
+    TURNING_MOTOR,
+    extra_sections,
+    read_stepper,
+)
+from coordinator.machine.reading import Reading, SecondEndstop
 from coordinator.machine.well_known import LATER_STEPPER_OPTIONS
 from nodes.records import record
 
@@ -32,7 +39,7 @@ POSITION_MAX = _UpperEnd(
     help="highest position of the axis",
     unit="mm",
     minimum=-MAX_POSITION,
-    maximum=MAX_POSITION,
+    maximum=MAX_BELT_POSITION,
 )
 RANGE = (POSITION_MIN, POSITION_MAX)
 RAIL = SectionSpec(
@@ -87,7 +94,7 @@ def read_extra_steppers(
         if reader.has(ENDSTOP_PIN):
             pin, virtual = read_endstop(reader, reading.pins)
             if pin is not None:
-                reading.second_endstops[reader.name] = (reader.place, pin, virtual)
+                reading.second_endstops[reader.name] = SecondEndstop(reader.name, reader.place, pin, virtual)
                 virtual = ""  # it acts
         reading.finish(reader, waiting=WAITING if virtual else ())
     return tuple(further)

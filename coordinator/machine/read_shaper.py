@@ -1,18 +1,39 @@
 """[input_shaper]: which resonance each axis is shaped against."""
 
 from coordinator.machine.model import ShaperDescription
-from coordinator.machine.options import ChoiceOption, FloatOption, SectionReader, SectionSpec
+from coordinator.machine.options import BadValue, FloatOption, Option, SectionReader, SectionSpec, one_of
 from coordinator.machine.reading import Reading
+from coordinator.motion.shapers import SHAPER_KINDS, split_kind
+from nodes.records import record
 
-KINDS = ("zv", "mzv", "zvd", "ei", "2hump_ei", "3hump_ei")
 MAX_FREQUENCY_HZ = 1000.0
 AXES = "xyz"
 
-SHAPER_TYPE = ChoiceOption(name="shaper_type", help="shaper of every axis", default="mzv", choices=KINDS)
+
+@record(kw_only=True)
+class ShaperOption(Option[str]):
+    """A kind of shaper, those with ei perhaps with their tolerance."""
+
+    def parse(self, text: str) -> str:
+        """Return it in lower case."""
+        try:
+            split_kind(text.lower())
+        except ValueError:
+            raise BadValue from None
+        return text.lower()
+
+    def rule(self) -> str:
+        """Return the values allowed."""
+        return f"{one_of(SHAPER_KINDS)}, those with ei also as in ei(v_tol=0.05)"
+
+    def stand_in(self) -> str:
+        """Return the usual one."""
+        return "mzv"
+
+
+SHAPER_TYPE = ShaperOption(name="shaper_type", help="shaper of every axis", default="mzv")
 AXIS_TYPES = tuple(
-    ChoiceOption(
-        name=f"shaper_type_{axis}", help=f"shaper of {axis.upper()}; by default shaper_type", choices=KINDS
-    )
+    ShaperOption(name=f"shaper_type_{axis}", help=f"shaper of {axis.upper()}; by default shaper_type")
     for axis in AXES
 )
 FREQUENCIES = tuple(

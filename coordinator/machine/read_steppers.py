@@ -9,11 +9,13 @@ from coordinator.machine.config_file import RawSection
 from coordinator.machine.model import StepperDescription
 from coordinator.machine.options import FloatOption, GearRatioOption, IntOption, SectionReader
 from coordinator.machine.pins import PinDescription, PinOption, PinRegistry
-from coordinator.machine.problem import ConfigError
+from coordinator.machine.problem import ConfigError, NotActing
 from coordinator.machine.reading import Reading
 
 MAX_POSITION = 100_000.0
 """mm: a hundred metres; positions stay exact to far below a step."""
+MAX_BELT_POSITION = 1e9
+"""mm: the end of an axis that has none, of a machine with a belt for its bed."""
 
 STEP_PIN = PinOption(name="step_pin", help="the driver's step input")
 DIR_PIN = PinOption(name="dir_pin", help="the driver's direction input; ! when high means negative")
@@ -68,11 +70,12 @@ def read_stepper(
     rotation_distance = math.tau if function.turns else reader.get(ROTATION_DISTANCE)
     full_steps = reader.get(FULL_STEPS)
     gear_ratio = reader.get(TURNING_GEAR_RATIO if function.turns else GEAR_RATIO)
+    enable_pin, unpowered = _claim_enable(reader, pins)
     return StepperDescription(
         name=name or reader.name,
         step_pin=step_pin,
         dir_pin=dir_pin,
-        enable_pin=claim(reader, ENABLE_PIN, pins) if reader.has(ENABLE_PIN) else None,
+        enable_pin=enable_pin,
         function=function,
         step_distance=rotation_distance / (full_steps * microsteps * gear_ratio),
         rotation_distance=rotation_distance,
@@ -81,7 +84,18 @@ def read_stepper(
         gear_ratio=gear_ratio,
         step_pulse_s=reader.get(STEP_PULSE),
         place=reader.place,
+        unpowered=unpowered,
     )
+
+
+def _claim_enable(reader: SectionReader, pins: PinRegistry) -> tuple[PinDescription | None, str]:
+    """Return the enable pin, if there is one, and why it cannot be switched, if so; raises ConfigError."""
+    if not reader.has(ENABLE_PIN):
+        return None, ""
+    try:
+        return claim(reader, ENABLE_PIN, pins), ""
+    except NotActing as error:
+        return None, error.reason
 
 
 def claim(reader: SectionReader, option: PinOption, pins: PinRegistry) -> PinDescription:

@@ -10,6 +10,17 @@ from coordinator.machine.problem import MissingSection, Place
 from nodes.records import record
 
 
+@record
+class SecondEndstop:
+    """The endstop of a further stepper of a rail."""
+
+    section: str
+    place: Place
+    pin: PinDescription
+    virtual: str
+    """The virtual endstop that it is of; empty: it is a switch."""
+
+
 @record(frozen=False)
 class Reading:
     """One reading of a configuration."""
@@ -19,8 +30,8 @@ class Reading:
     later: list[NotYetActing] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
     """Names of sections that have a place in this machine."""
-    second_endstops: dict[str, tuple[Place, PinDescription, str]] = field(default_factory=dict)
-    """Of further steppers of rails, by the stepper: where, its pin, and the virtual endstop that it is of."""
+    second_endstops: dict[str, SecondEndstop] = field(default_factory=dict)
+    """Of further steppers of rails, by the stepper."""
 
     def find(self, name: str) -> RawSection | None:
         """Return a section, which then counts as used, or None."""

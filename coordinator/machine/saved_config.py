@@ -19,6 +19,7 @@ from nodes.errors import CanductorError
 from nodes.records import record
 
 NOTICE: Final = "DO NOT EDIT THIS BLOCK OR BELOW. The machine writes it; its values override those above."
+_SAVED_SECTION = re.compile(re.escape(SAVED_PREFIX) + r" ?\[([^\[\]]+)\]\s*")
 _ENDS = re.compile(rb"\r\n|\r|\n")
 
 Values = Mapping[str, Mapping[str, str]]
@@ -85,19 +86,56 @@ def with_block(data: bytes, values: Values) -> bytes:
     end = first[0] if first else b"\n"
     if own and not own.endswith((b"\r", b"\n")) and own != codecs.BOM_UTF8:
         own += end
-    return own + b"".join(line.encode() + end for line in block_lines(values))
+    lines = block_lines(values, _written_sections(data))
+    return own + b"".join(line.encode() + end for line in lines)
 
 
-def block_lines(values: Values) -> list[str]:
-    """Return the block's lines, without their ends."""
+def block_lines(values: Values, written: Mapping[str, list[str]] | None = None) -> list[str]:
+    """Return the block's lines, without their ends.
+
+    WRITTEN: lines of sections as the block has them now; they stay as they are where they say the same.
+    """
     lines = [SAVED_HEADER, f"{SAVED_PREFIX} {NOTICE}"]
     for section, options in values.items():
-        lines += [SAVED_PREFIX, f"{SAVED_PREFIX} [{section}]"]
+        lines.append(SAVED_PREFIX)
+        before = (written or {}).get(section)
+        if before is not None and _read({section: before}).get(section) == options:
+            lines += before
+            continue
+        lines.append(f"{SAVED_PREFIX} [{section}]")
         for option, text in options.items():
             first, *rest = text.split("\n")
             lines.append(f"{SAVED_PREFIX} {option} = {first}".rstrip())
             lines += [f"{SAVED_PREFIX}   {line}".rstrip() for line in rest]
     return lines
+
+
+def _read(sections: Mapping[str, list[str]]) -> Values:
+    """Return what SECTIONS say, by their lines in a block; nothing if they cannot be read."""
+    try:
+        return parse_saved("", [SAVED_HEADER, *(line for lines in sections.values() for line in lines)])
+    except ConfigError:
+        return {}
+
+
+def _written_sections(data: bytes) -> dict[str, list[str]]:
+    """Return the lines of each section of the block of DATA, but for sections that it has in pieces."""
+    lines = split_lines(data, "")
+    found: dict[str, list[str]] = {}
+    twice: set[str] = set()
+    current: list[str] = []
+    for line in lines[saved_header(lines) + 1 :]:
+        header = _SAVED_SECTION.fullmatch(line)
+        if header is not None:
+            name = " ".join(header[1].split())
+            twice |= {name} & found.keys()
+            current = found[name] = [line]
+        elif line.startswith(SAVED_PREFIX):
+            current.append(line)
+    for section in found.values():
+        while section[-1].removeprefix(SAVED_PREFIX).strip() == "":
+            del section[-1]
+    return {name: section for name, section in found.items() if name not in twice}
 
 
 def _without_block(data: bytes) -> bytes:

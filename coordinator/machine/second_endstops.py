@@ -19,14 +19,15 @@ def with_second_endstops(reading: Reading, frame: Frame) -> Frame:
     """
     rails = tuple(_with_own(reading, frame, rail) for rail in frame.rails)
     acting = {name for rail in rails for name, _, _ in rail.second_endstops}
-    for name, (place, pin, _) in reading.second_endstops.items():
+    for name, second in reading.second_endstops.items():
+        pin = second.pin
         shared = any(
             rail.homing.endstop_pin is not None
             and (rail.homing.endstop_pin.node, rail.homing.endstop_pin.name) == (pin.node, pin.name)
             for rail in frame.rails
         )
         if name not in acting and not shared:
-            reading.later.append(NotYetActing(name, place, ("endstop_pin",)))
+            reading.later.append(NotYetActing(second.section, second.place, ("endstop_pin",)))
     dual = frame.dual_carriage
     if dual is not None:
         same = dict(zip((rail.axis for rail in frame.rails), rails, strict=True))
@@ -39,9 +40,9 @@ def _with_own(reading: Reading, frame: Frame, rail: RailDescription) -> RailDesc
     if pin is None or not _moves_by_itself(frame, rail):
         return rail
     own = tuple(
-        (stepper.name, *reading.second_endstops[stepper.name][1:])
+        (stepper.name, second.pin, second.virtual)
         for stepper in rail.steppers[1:]
-        if stepper.name in reading.second_endstops
+        if (second := reading.second_endstops.get(stepper.name)) is not None
     )
     others = tuple(
         (name, found, virtual)

@@ -16,7 +16,12 @@ if TYPE_CHECKING:
 LOOK_S: Final = 1.0
 FULL: Final = shutdown_speed(1.0)
 OFF: Final = shutdown_speed(0.0)
-HEATER: Final = ListOption(name="heater", help="the heaters it belongs to", default=("extruder",))
+HEATER: Final = ListOption(
+    name="heater",
+    help="the heaters it belongs to; none: it never runs",
+    default=("extruder",),
+    may_be_empty=True,
+)
 HEATER_TEMP: Final = FloatOption(
     name="heater_temp",
     help="it runs while a heater is hotter than this, or has a target",
@@ -43,7 +48,7 @@ STEPPER: Final = ListOption(
     name="stepper", help="the steppers it cools: it runs while one of them is on; by default all"
 )
 CONTROLLER_HEATER: Final = ListOption(
-    name="heater", help="the heaters whose drivers it cools", default=("extruder",)
+    name="heater", help="the heaters whose drivers it cools", default=("extruder",), may_be_empty=True
 )
 
 
@@ -56,14 +61,14 @@ class _HeaterNames:
         self._given = build.reader.has(option)
         self._heaters = build.shared(Heaters)
 
-    def find(self) -> list[HeaterUnit]:
-        """Return them; raises ConfigError. A default that does not exist is nobody's mistake."""
+    def find(self, modules: Modules) -> list[HeaterUnit]:
+        """Return those that act; raises ConfigError. A default that does not exist is nobody's mistake."""
         known = {name: unit for unit in self._heaters.units.values() for name in (unit.key, unit.name)}
         found = []
         for name in self._names:
             if name in known:
                 found.append(known[name])
-            elif self._given:
+            elif self._given and not modules.is_left_out(name):
                 hint = nearest(name, tuple(known)) or f"; there is {', '.join(known) or 'none'}"
                 raise ConfigError(
                     self._reader.place_of(self._option),
@@ -85,14 +90,15 @@ class HeaterFan(FanModule):
         super().__init__(build)
         self.unit = FanUnit(build, FULL)
         self._names = _HeaterNames(build, HEATER)
+        if not build.get(HEATER):
+            build.note(HEATER, "names no heater, so the fan never runs")
         self._hot_c = build.get(HEATER_TEMP)
         self._speed = build.get(FAN_SPEED)
         self._heaters: list[HeaterUnit] = []
 
     def link(self, modules: Modules) -> None:
         """Find its heaters."""
-        del modules
-        self._heaters = self._names.find()
+        self._heaters = self._names.find(modules)
 
     async def connect(self, live: "Live") -> None:
         """Begin to look."""
@@ -153,8 +159,7 @@ class ControllerFan(FanModule):
 
     def link(self, modules: Modules) -> None:
         """Find its heaters."""
-        del modules
-        self._heaters = self._names.find()
+        self._heaters = self._names.find(modules)
 
     async def connect(self, live: "Live") -> None:
         """Begin to look."""

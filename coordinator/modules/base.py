@@ -14,14 +14,14 @@ A restart makes new modules: all state is in the object. Everything happens on t
 ``GCodeCommand.read`` runs where the program is read (coordinator/gcode/commands.py).
 """
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, ClassVar, Protocol, TypeVar
+from collections.abc import Callable, Collection, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from coordinator.gcode.commands import GCodeCommand
 from coordinator.machine.config_file import RawSection
 from coordinator.machine.options import BadValue, ListOption, Option, SectionReader, SectionSpec
 from coordinator.machine.pins import PinDescription, PinOption, PinRegistry
-from coordinator.machine.problem import ConfigError, Place, nearest, shown
+from coordinator.machine.problem import ConfigError, NotActing, Place, nearest, shown
 from nodes.node_config import NodeConfig
 
 if TYPE_CHECKING:  # planning needs neither, and they draw in asyncio
@@ -52,6 +52,9 @@ class Modules(Protocol):
 
     def names(self, kind: "type[Module]") -> list[str]:
         """Return the section names of all modules of KIND, in the order of the file."""
+
+    def is_left_out(self, name: str) -> bool:
+        """Tell whether NAME, a section or a heater of that name, is one that does not act yet."""
 
     def knows(self, command: str) -> bool:
         """Tell whether programs know COMMAND, by a module or anyway."""
@@ -132,6 +135,7 @@ class Build:
         *,
         whole: bool = True,
         share: "Callable[[type[Module]], Module]",
+        later: Collection[str] = (),
     ) -> None:
         self.name = section.name
         self.machine = machine
@@ -143,6 +147,9 @@ class Build:
         self.replacements: list[tuple[GCodeCommand, str]] = []
         """Commands that may take another's name, and the name that one has then; empty: there is no other."""
         self.set_ups: list[Callable[[Planner], None]] = []
+        self.notes: list[str] = []
+        self.later = later
+        """Sections that nothing acts on yet."""
         self._pins = pins
         self._share = share
 
@@ -185,6 +192,15 @@ class Build:
             found.append(self._pins.claim(pin, each, self.reader.section))
         return found
 
+    def needs_acting(self, section: str) -> None:
+        """Raise NotActing if SECTION stands in the configuration and nothing acts on its kind yet."""
+        if section in self.later:
+            raise NotActing(self.place, f"it is for [{section}], which does not act yet")
+
+    def note(self, option: Option[Any], sentence: str) -> None:
+        """Tell the user something about an option that is no mistake; SENTENCE goes on after its name."""
+        self.notes.append(f"{self.reader.place_of(option)}: '{option.name}' of [{self.name}] {sentence}")
+
     def add_device(self, node: str, device: Device) -> None:
         """Have DEVICE on a node."""
         self.devices.append((node, device))
@@ -217,6 +233,10 @@ class Build:
         def find(modules: Modules) -> M:
             found = modules.find(name, kind)
             if found is None:
+                if modules.is_left_out(name):
+                    raise NotActing(
+                        self.reader.place_of(option), f"it needs [{name}], which does not act yet"
+                    )
                 others = modules.names(kind)
                 hint = nearest(name, others, pattern="[{}]") or f"; there is {', '.join(others) or 'none'}"
                 raise ConfigError(

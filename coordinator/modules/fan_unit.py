@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 from coordinator.machine.options import BoolOption, FloatOption, IntOption, Option
 from coordinator.machine.pins import PinOption
 from coordinator.modules.base import Build, Module, Value
-from coordinator.modules.pinned import AHEAD_S, add_pinned
+from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
 from nodes.devices.counter import Counter
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
@@ -108,10 +108,11 @@ class FanUnit:
         pin = build.pin(PIN)
         self.node = pin.node
         hardware, stopped = build.get(HARDWARE_PWM), build.get(shutdown)
+        cycle_s = pwm_cycle(build, CYCLE_TIME, hardware=hardware)
         self._output = PwmOut(
             f"[{build.name}]",
             pin=pin.name,
-            cycle_s=build.get(CYCLE_TIME),
+            cycle_s=cycle_s,
             hardware=hardware,
             invert=pin.invert,
             shutdown=stopped * self._max_power if hardware else stopped,

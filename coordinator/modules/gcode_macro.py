@@ -20,7 +20,13 @@ RENAME = TextOption(
     pattern=r"\S+",
     pattern_rule="one word",
 )
-DESCRIPTION = TextOption(name="description", help="A sentence about it", default="G-Code macro")
+DESCRIPTION = TextOption(
+    name="description",
+    help="A sentence about it, also over several lines",
+    default="G-Code macro",
+    pattern=r"(?s).*",
+    pattern_rule="text",
+)
 VARIABLE = TextOption(
     name="variable_", help="First value of a variable, as Python writes it: 1, 0.5, 'text', True, [1, 2]"
 )
@@ -105,7 +111,7 @@ class GCodeMacro(Module):
         rename = (build.find(RENAME) or "").upper()
         if rename and not _is_command(rename):
             raise build.reader.bad(RENAME, "is no name that a command can have")
-        help_ = build.get(DESCRIPTION)
+        help_ = " ".join(build.get(DESCRIPTION).split()) or "G-Code macro"
         build.replace_command(GCodeCommand(self.command, help_, self._read, beside=True), rename)
         build.shared(Variables)
 
@@ -238,4 +244,4 @@ def _is_command(name: str) -> bool:
         command = parse(name.encode())
     except WordError:
         return False
-    return command is not None and command.name == name and not command.text
+    return command is not None and name in (command.name, command.written) and not command.text

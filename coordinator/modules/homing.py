@@ -60,7 +60,9 @@ class Homing(Module):
     @property
     def acts(self) -> bool:
         """Whether there is any endstop that it can look for."""
-        return self.instead is not None or any(approach.possible for approach in self._approaches)
+        return self.instead is not None or any(
+            approach.possible or self._refusal(approach) for approach in self._approaches
+        )
 
     def replace_by(self, read: Callable[[Call, str], Reading], build: Build) -> None:
         """Have READ read G28, for the section that BUILD is of; raises ConfigError when another does."""
@@ -92,8 +94,30 @@ class Homing(Module):
 
     # ---------------------------------------------------------------------------------------------- homing
 
+    def check(self, axes: str) -> None:
+        """Raise CanductorError, before anything moves, if one of AXES (letters) cannot be homed."""
+        for approach in self._approaches:
+            if set(approach.letters) & set(axes.upper()) and (why := self._refusal(approach)):
+                raise CanductorError(f"G28 of {approach.letters} is refused: {why}")
+
+    def _refusal(self, approach: Approach) -> str:
+        """Say why nobody would know where the axes of APPROACH are after it; empty: it may be."""
+        for rail in approach.rails:
+            if rail.homing.refused:
+                return rail.homing.refused
+            if rail.homing.waits:
+                return (
+                    f"the endstop {rail.homing.virtual_endstop} ({rail.place}) does not act yet; give the"
+                    " axis a switch as its endstop_pin"
+                )
+        for stepper in self._described.motors:
+            if stepper.name in approach.ways and stepper.unpowered:
+                return f"{stepper.unpowered}, so the motor {stepper.name} cannot be switched on"
+        return ""
+
     async def home(self, call: Call, axes: str) -> Done:
         """Home AXES (letters) from where CALL says that the machine stands; raises CanductorError."""
+        self.check(axes)
         described = self._described
         home = dict(zip("XYZ", described.home, strict=True))
         x, y, z, e = call.position

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 WAY_SHARE: Final = 1.5
 """An endstop has to switch within so many lengths of its axis."""
+WAY_MAX_MM: Final = 150_000.0
+"""And within this, of an axis that has no end: a belt."""
 AXES: Final = ("x", "y", "z")
 _TOWERS: Final = ("delta", "deltesian", "rotary_delta")
 """Kinematics whose rails go up together."""
@@ -71,7 +73,7 @@ def _axis(described: "MachineDescription", rail: "RailDescription") -> Approach:
     space, at = described.kinematics.work_space, AXES.index(rail.axis)
     towards = _direction(rail)
     ways = {motor.name: towards * motor.weights[at] for motor in described.motors if motor.weights[at]}
-    most_mm = WAY_SHARE * (space.high[at] - space.low[at])
+    most_mm = min(WAY_SHARE * (space.high[at] - space.low[at]), WAY_MAX_MM)
     return Approach(rail.pieces, rail.axis.upper(), rail.axis, ways, most_mm)
 
 
@@ -92,7 +94,7 @@ def _alone(rail: "RailDescription", letters: str, axis: str) -> Approach:
     assert rail.position_min is not None
     assert rail.position_max is not None
     ways = {stepper.name: float(_direction(rail)) for stepper in rail.steppers}
-    most_mm = WAY_SHARE * (rail.position_max - rail.position_min)
+    most_mm = min(WAY_SHARE * (rail.position_max - rail.position_min), WAY_MAX_MM)
     return Approach((rail,), letters, axis, ways, most_mm)
 
 

@@ -1,4 +1,7 @@
-"""[idle_timeout]: what is done when nothing was done for a while; by default heaters and motors go off."""
+"""[idle_timeout]: what is done when nothing was done for a while; by default heaters and motors go off.
+
+Every machine has it, with its defaults where there is no such section.
+"""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
@@ -101,14 +104,14 @@ class IdleTimeout(Module):
             self._state = "Ready"
         if self._state == "Ready" and now_s >= self._since_s + self._timeout_s:
             self._state = "Idle"
+            if not self._own and not self._default:
+                return
             live.say(f"nothing happened for {self._timeout_s:g} s: {self._told()}")
             runner.run_lines("idle_timeout", ["_IDLE_TIMEOUT"])
             self._acting = True
 
     def _told(self) -> str:
-        return (
-            "the g-code of [idle_timeout] runs" if self._own else " and ".join(self._default) or "that is all"
-        )
+        return "the g-code of [idle_timeout] runs" if self._own else " and ".join(self._default)
 
     def _lines(self, call: Call) -> Reading:
         if self._own:

@@ -5,15 +5,18 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import field
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from coordinator.gcode.absent_commands import ABSENT
 from coordinator.gcode.basic_commands import BESIDE, HANDLERS
 from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
 from coordinator.gcode.helps import HELPS
 from coordinator.machine.config_file import RawSection
 from coordinator.machine.pins import PinRegistry
-from coordinator.machine.problem import ConfigError, Place
+from coordinator.machine.problem import ConfigError, NotActing, Place
+from coordinator.machine.well_known import LATER_SECTIONS
 from coordinator.modules.base import Build, Device, Module, Value
 from coordinator.modules.console import Console
 from coordinator.modules.homing import Homing
+from coordinator.modules.idle_timeout import IdleTimeout
 from coordinator.modules.manual_probe import ManualProbe
 from coordinator.modules.motor_power import MotorPower
 from coordinator.modules.positions import Positions
@@ -30,6 +33,7 @@ if TYPE_CHECKING:
     from nodes.node import Node
 
 M = TypeVar("M", bound=Module)
+IDLE_TIMEOUT: Final = "idle_timeout"
 INTERRUPTING: Final = frozenset(("PAUSE", "CANCEL_PRINT"))
 """Commands that pause or cancel a job, whatever macros they may be."""
 
@@ -42,6 +46,17 @@ class ModuleSource:
     kind: type[Module]
     whole: bool
     """Whether the whole section is the module's."""
+
+
+@record
+class LeftOut:
+    """A section whose module was left out."""
+
+    name: str
+    place: Place
+    kind: type[Module]
+    reason: str
+    """What it depends on that does not act."""
 
 
 @record
@@ -58,11 +73,28 @@ class ModuleSources:
 
     def build(self, machine: "MachineDescription") -> "ModuleSet":
         """Make those of MACHINE, linked with each other; raises ConfigError."""
-        built = ModuleSet(machine, self.pins.copy(), self.config, self.settings)
-        for source in self.sources:
-            built.build(source)
-        built.link()
-        return built
+        without: dict[str, NotActing] = {}
+        while True:
+            built = ModuleSet(machine, self.pins.copy(), self.config, self.settings)
+            for source in self.sources:
+                built.build_or_leave_out(source, without)
+            built.add_always()
+            try:
+                built.link()
+            except _LinkNotActing as found:
+                # What depends on it may have to be left out, too: all is made again.
+                without[found.module] = found.error
+            else:
+                return built
+
+
+class _LinkNotActing(Exception):  # noqa: N818 (no mistake)
+    """A module turned out, when it looked for others, not to act yet."""
+
+    def __init__(self, module: str, error: NotActing) -> None:
+        super().__init__(str(error))
+        self.module = module
+        self.error = error
 
 
 @contextlib.contextmanager
@@ -105,6 +137,10 @@ class ModuleSet:
         self._owners: dict[str, str] = {}
         self._set_ups: list[Callable[[Planner], None]] = []
         self._replacements: list[tuple[GCodeCommand, str, Build]] = []
+        self.notes: list[str] = []
+        """Sentences about what is no mistake."""
+        self.left_out: dict[str, LeftOut] = {}
+        """Sections whose module does not act, as something that it depends on does not act yet."""
         self._live: Live | None = None
         self._homing = self.shared(Homing)
         self._motors = self.shared(MotorPower)
@@ -117,13 +153,40 @@ class ModuleSet:
     def build(self, source: ModuleSource) -> Module:
         """Make the module of SOURCE; raises ConfigError."""
         build = Build(
-            source.section, source.kind.SPEC, self.pins, self._machine, whole=source.whole, share=self._share
+            source.section,
+            source.kind.SPEC,
+            self.pins,
+            self._machine,
+            whole=source.whole,
+            share=self._share,
+            later=[name for name in self.config if name.partition(" ")[0] in LATER_SECTIONS],
         )
         with _blamed(source.kind, source.section.place):
             module = source.kind(build)
         build.reader.finish()
         self._add(module, build)
         return module
+
+    def build_or_leave_out(self, source: ModuleSource, without: Mapping[str, NotActing]) -> None:
+        """Make the module of SOURCE, unless it is among those to be left out or turns out to be one.
+
+        Raises ConfigError for a mistake.
+        """
+        name = source.section.name
+        found = without.get(name)
+        if found is None:
+            try:
+                self.build(source)
+            except NotActing as error:
+                found = error
+        if found is not None:
+            self.left_out[name] = LeftOut(name, source.section.place, source.kind, found.reason)
+
+    def add_always(self) -> None:
+        """Make those that every machine has, with or without their sections."""
+        if self.find(IDLE_TIMEOUT, IdleTimeout) is None and IDLE_TIMEOUT not in self.left_out:
+            section = RawSection(IDLE_TIMEOUT, Place("", 0))
+            self.build(ModuleSource(section, IdleTimeout, whole=True))
 
     def shared(self, kind: type[M]) -> M:
         """Return the one module of KIND that has no section."""
@@ -153,6 +216,7 @@ class ModuleSet:
                 )
             self._commands[command.name] = command
         self._set_ups += build.set_ups
+        self.notes += build.notes
         self._replacements += [(command, rename, build) for command, rename in build.replacements]
 
     def link(self) -> None:
@@ -160,8 +224,11 @@ class ModuleSet:
         for command, rename, build in self._replacements:
             self._replace(command, rename, build)
         for module in self._modules:
-            with _blamed(type(module), self._places[module]):
-                module.link(self)
+            try:
+                with _blamed(type(module), self._places[module]):
+                    module.link(self)
+            except NotActing as error:
+                raise _LinkNotActing(module.name, error) from None
 
     def _replace(self, command: GCodeCommand, rename: str, build: Build) -> None:
         """Let COMMAND have its name, and whoever had it before the name RENAME."""
@@ -179,7 +246,7 @@ class ModuleSet:
                 f" with another name for that one, such as {name}{'.1' if name[1:].isdigit() else '_BASE'}",
             )
         if rename:
-            if not self.knows(name):
+            if not self.knows(name) and name not in self.not_acting:
                 raise ConfigError(
                     build.place,
                     f"[{build.name}] has rename_existing, but there is no command {name}; remove that option",
@@ -207,6 +274,22 @@ class ModuleSet:
         return command in self._commands or command in HANDLERS
 
     @property
+    def not_acting(self) -> Mapping[str, str]:
+        """Why nothing acts on commands that sections of the configuration should bring, by their names."""
+        kinds = {name.partition(" ")[0]: name for name in reversed(tuple(self.config))}
+        found: dict[str, str] = {}
+        for name, absent in ABSENT.items():
+            section = next((kinds[kind] for kind in absent.sections if kind in kinds), None)
+            if section is not None and name not in self._commands:
+                found[name] = f"[{section}] does not act yet"
+        for left in reversed(self.left_out.values()):
+            kind = left.name.partition(" ")[0].rstrip("0123456789")
+            for name, absent in ABSENT.items():
+                if kind in absent.sections and name not in self._commands:
+                    found[name] = f"[{left.name}] does not act yet: {left.reason}"
+        return found
+
+    @property
     def helps(self) -> Mapping[str, str]:
         """What each command of programs does, by its name."""
         return {**HELPS, **{name: command.help for name, command in self._commands.items()}}
@@ -218,6 +301,10 @@ class ModuleSet:
     def names(self, kind: type[Module]) -> list[str]:
         """Return the section names of all modules of KIND."""
         return [module.name for module in self._modules if isinstance(module, kind)]
+
+    def is_left_out(self, name: str) -> bool:
+        """Tell whether NAME, a section or a heater of that name, is one that does not act yet."""
+        return name in self.left_out or f"heater_generic {name}" in self.left_out
 
     def of(self, kind: type[M]) -> Iterator[M]:
         """Yield all modules of KIND."""
@@ -235,6 +322,7 @@ class ModuleSet:
             home if homing.acts else None,
             self._too_cold,
             self._interrupting(),
+            self.not_acting,
             set_ups=tuple(self._set_ups),
         )
 
@@ -248,6 +336,8 @@ class ModuleSet:
     def _too_cold(self, extruder: str) -> bool:
         from coordinator.modules.heater_sections import ExtruderHeater  # noqa: PLC0415 (start-up time)
 
+        if extruder in self.left_out:
+            return self._live is not None  # nobody knows how hot it is; a plan takes it for granted
         found = self.find(extruder, ExtruderHeater)
         return found is not None and found.too_cold
 

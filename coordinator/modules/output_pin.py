@@ -8,7 +8,7 @@ from coordinator.gcode.words import WordError
 from coordinator.machine.options import BoolOption, FloatOption, ListOption, SectionSpec
 from coordinator.machine.pins import PinOption
 from coordinator.modules.base import Build, Module, Value
-from coordinator.modules.pinned import AHEAD_S, add_pinned
+from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
 from coordinator.modules.words import one, parameters, value
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
@@ -104,7 +104,7 @@ class OutputPin(Module):
             self._output = PwmOut(
                 what,
                 pin=pin.name,
-                cycle_s=build.get(CYCLE_TIME),
+                cycle_s=pwm_cycle(build, CYCLE_TIME, hardware=hardware),
                 hardware=hardware,
                 invert=pin.invert,
                 start=stopped if self._begins_late else begin,

@@ -2,8 +2,10 @@
 
 from typing import TYPE_CHECKING, Final
 
+from coordinator.machine.options import FloatOption
 from coordinator.machine.pins import PinDescription
 from coordinator.modules.base import Build, Device
+from nodes.devices.pwm_out import SOFTWARE_FASTEST_S
 from nodes.node_config import NodeConfig
 
 if TYPE_CHECKING:
@@ -34,6 +36,19 @@ class Pinned:
     def started(self, node: "Node") -> None:
         """Its node is ready."""
         self._device.started(node)
+
+
+def pwm_cycle(build: Build, option: FloatOption, *, hardware: bool) -> float:
+    """Return the cycle that OPTION asks for, s; in software no shorter than a node can make it."""
+    asked = build.get(option)
+    if hardware or asked >= SOFTWARE_FASTEST_S:
+        return asked
+    build.note(
+        option,
+        f"is {asked:g} s, too short for PWM in software: {SOFTWARE_FASTEST_S:g} s is used; hardware_pwm: True"
+        " allows less, on pins that have it",
+    )
+    return SOFTWARE_FASTEST_S
 
 
 def add_pinned(build: Build, device: Device, pin: PinDescription) -> None:

@@ -10,6 +10,7 @@ from coordinator.machine.problem import ConfigError
 from coordinator.machine.read_printer import MAX_SPEED
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing import Homing
+from nodes.errors import CanductorError
 from nodes.records import record
 
 if TYPE_CHECKING:
@@ -85,14 +86,20 @@ class SafeZHome(Module):
             raise ConfigError(
                 build.place, f"[{build.name}] has no use on a machine of kinematics {kinematics}; remove it"
             )
+        self._outside = self._find_outside()
+        if self._outside:
+            build.note(PLACE, f"is {self._outside}: G28 of Z is refused until it names a place within")
+        self._homing = build.shared(Homing)
+        self._homing.replace_by(self._read, build)
+
+    def _find_outside(self) -> str:
+        """Say what is wrong with the place for Z; empty: nothing."""
         for axis, value in enumerate(self._place):
             low, high = self._limits.position_min[axis], self._limits.position_max[axis]
             if not low <= value <= high:
-                raise build.reader.bad(
-                    PLACE, f"but {'XY'[axis]} goes from {low:g} to {high:g} mm; name a place within"
-                )
-        self._homing = build.shared(Homing)
-        self._homing.replace_by(self._read, build)
+                x, y = self._place
+                return f"{x:g}, {y:g}, but {'XY'[axis]} goes from {low:g} to {high:g} mm"
+        return ""
 
     async def connect(self, live: "Live") -> None:
         """Take over the machine."""
@@ -105,6 +112,11 @@ class SafeZHome(Module):
         return AtRest(lambda: self._home(call, axes))
 
     async def _home(self, call: Call, axes: str) -> Done:
+        if "Z" in axes and self._outside:
+            raise CanductorError(
+                f"G28 of Z is refused: home_xy_position of [{self.name}] is {self._outside}; correct it"
+            )
+        self._homing.check(axes)
         before = call.position
         call = await self._lift(call)
         done = Done()

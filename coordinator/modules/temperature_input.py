@@ -13,7 +13,7 @@ from coordinator.heat.known_sensors import (
 from coordinator.heat.resistors import SensorError
 from coordinator.heat.sensors import AmplifiedPullUp, PullUp, Sensor, ratio_range
 from coordinator.heat.thermocouples import AMPLIFIERS, amplifier
-from coordinator.machine.problem import ConfigError, nearest, shown
+from coordinator.machine.problem import ConfigError, NotActing, nearest, shown
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.sensor_options import (
@@ -48,6 +48,10 @@ class TemperatureInput(TemperatureSource):
 
         A sensor that is not limited does not stop its node when its wire breaks.
         """
+        self._type = build.get(SENSOR_TYPE)
+        if self._type in LATER_SENSORS:
+            place = build.reader.place_of(SENSOR_TYPE)
+            raise NotActing(place, f"its sensor is a {self._type}, which is recognised but not built yet")
         super().__init__(
             build.name,
             build.get(MIN_TEMP) if min_c is None else _or(build.find(MIN_TEMP), min_c),
@@ -56,7 +60,6 @@ class TemperatureInput(TemperatureSource):
         self._pin = build.pin(SENSOR_PIN)
         self._guarded = min_c is None or build.reader.has(MIN_TEMP) or build.reader.has(MAX_TEMP)
         self._reader = build.reader
-        self._type = build.get(SENSOR_TYPE)
         self._circuit = Circuit(
             build.get(PULLUP), build.get(INLINE), build.get(ADC_VOLTAGE), build.get(VOLTAGE_OFFSET)
         )
@@ -99,8 +102,6 @@ class TemperatureInput(TemperatureSource):
                 SENSOR_TYPE,
                 "which no node can watch: a heater needs a sensor on a pin, with a net of its own",
             )
-        if self._type in LATER_SENSORS:
-            return self._reader.bad(SENSOR_TYPE, "a sensor that is recognised but not built yet")
         own = [name.partition(" ")[2] for kind in KINDS.values() for name in modules.names(kind)]
         hint = nearest(self._type, (*KNOWN_SENSORS, *own), pattern="'{}'")
         add = f"; add a section [thermistor {self._type}]"

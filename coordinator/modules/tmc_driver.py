@@ -9,11 +9,12 @@ import contextlib
 from collections.abc import AsyncIterator, Iterator, Mapping
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from coordinator.machine.problem import ConfigError, nearest, shown
+from coordinator.machine.problem import ConfigError, NotActing, nearest, shown
 from coordinator.modules.base import Build, Value
 from coordinator.modules.tmc_commands import TmcCommands
 from coordinator.modules.tmc_options import (
     DIAG_PIN,
+    ONLY_UART_ADDRESS,
     TX_PIN,
     UART_ADDRESS,
     UART_PIN,
@@ -53,10 +54,13 @@ class TmcDriver(StallEndstop):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.stepper = _stepper(build)
+        select = build.reader.section.options.get("select_pins")
+        if select is not None:
+            raise NotActing(select.place, "drivers that are chosen by select_pins are not built yet")
         self.settings = DriverSettings(build, self.CHIP, self.stepper)
-        self.address = build.get(UART_ADDRESS) if self.CHIP.addresses > 1 else 0
+        self.address = build.get(UART_ADDRESS if self.CHIP.addresses > 1 else ONLY_UART_ADDRESS)
         if self.CHIP.has_stallguard:
-            build.find_pin(DIAG_PIN)
+            build.find(DIAG_PIN)  # taken by the endstop_pin that names its virtual endstop, if one does
         commands = build.shared(TmcCommands)
         self.wire, self.node_name = commands.wire(build, build.pin(UART_PIN), build.find_pin(TX_PIN))
         commands.add(self, build)
@@ -291,6 +295,7 @@ def _stepper(build: Build) -> "StepperDescription":
     steppers = {stepper.name: stepper for stepper in build.machine.steppers}
     found = steppers.get(build.instance)
     if found is None:
+        build.needs_acting(build.instance)
         hint = nearest(build.instance, steppers) or f"; there is {', '.join(steppers)}"
         raise ConfigError(
             build.place,

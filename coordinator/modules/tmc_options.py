@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 MAX_CURRENT_A: Final = 2.0
 """RMS; no chip of these carries more."""
-MAX_SPEED: Final = 100_000.0
+MAX_SPEED: Final = 1e9
+"""mm/s; users write 999999 for a speed that is never reached."""
 
 UART_PIN: Final = PinOption(
     name="uart_pin", help="the driver's PDN_UART", invertible=False, pullable=True, share="tmc_uart"
@@ -27,6 +28,9 @@ TX_PIN: Final = PinOption(
 )
 UART_ADDRESS: Final = IntOption(
     name="uart_address", help="as the driver's MS1 and MS2 are wired", default=0, minimum=0, maximum=3
+)
+ONLY_UART_ADDRESS: Final = IntOption(
+    name="uart_address", help="this driver has no other address", default=0, minimum=0, maximum=0
 )
 RUN_CURRENT: Final = FloatOption(
     name="run_current",
@@ -78,7 +82,7 @@ COOLSTEP: Final = FloatOption(
 )
 DIAG_PIN: Final = PinOption(
     name="diag_pin",
-    help="input, of any node, for the driver's DIAG; for a virtual endstop",
+    help="input, of any node, for the driver's DIAG; in use where an endstop_pin names its virtual endstop",
     pullable=True,
     share="endstop",
 )
@@ -132,7 +136,9 @@ def field_options(chip: Chip) -> dict[str, Option[Any]]:
 
 def driver_spec(chip: Chip) -> SectionSpec:
     """Return all options of [CHIP STEPPER]."""
-    more = (UART_ADDRESS, HOME_CURRENT, COOLSTEP, DIAG_PIN) if chip.has_stallguard else ()
+    more: tuple[Option[Any], ...] = (ONLY_UART_ADDRESS,)
+    if chip.has_stallguard:
+        more = (UART_ADDRESS, HOME_CURRENT, COOLSTEP, DIAG_PIN)
     return SectionSpec(
         help=f"The driver {chip.name.upper()} of a stepper, which is set by its UART: see tmc.md",
         options=(

@@ -4,7 +4,7 @@ from typing import ClassVar, Final
 
 from coordinator.heat.verify import VerifyOptions
 from coordinator.machine.options import FloatOption, SectionSpec
-from coordinator.machine.problem import ConfigError, nearest
+from coordinator.machine.problem import ConfigError, NotActing, nearest
 from coordinator.modules.base import Build, Module, Modules
 
 MAX_ERROR: Final = FloatOption(
@@ -76,5 +76,7 @@ class VerifyHeater(Module):
         heaters = modules.find("heaters", Heaters)
         known = () if heaters is None else tuple(heaters.units)
         if self.heater not in known:
+            if modules.is_left_out(self.heater):
+                raise NotActing(self.place, f"the heater {self.heater} does not act yet")
             hint = nearest(self.heater, known) or f"; there is {', '.join(known) or 'none'}"
             raise ConfigError(self.place, f"[{self.name}] is for no heater{hint}")

@@ -89,13 +89,34 @@ static int check_range(struct planner *p, const double delta[4], const double ta
     return has_cone ? check_cone(p, target) : 0;
 }
 
+// How much faster than the head a carriage of a delta may be.
+static const double TOWER_SPEED = 3;
+
+// A carriage is h / √(rod² − h²) times as fast as the head where its rod reaches h far level. Out where that
+// is more than TOWER_SPEED the move is slower by as much, speed and acceleration; the disc is convex, so no
+// part of a move is further out than its ends.
+static void limit_towers(const struct planner *p, struct planned_move *move, const double target[4]) {
+    const struct planner_limits *l = &p->limits;
+    double from = sqrt(p->position[0] * p->position[0] + p->position[1] * p->position[1]);
+    double to = sqrt(target[0] * target[0] + target[1] * target[1]);
+    double level = l->tower_radius + max_of(from, to);
+    double upright2 = l->tower_rod * l->tower_rod - level * level;
+    double steepest2 = level * level / (TOWER_SPEED * TOWER_SPEED);
+    if (upright2 >= steepest2)
+        return;
+    double slower = sqrt(steepest2 / max_of(upright2, 1e-6 * steepest2));
+    limit(move, slower, l->max_velocity, l->max_accel);
+}
+
 // Limits of a move along X Y Z that may print, from its ratios.
-static int check_path(struct planner *p, struct planned_move *move, double delta_e) {
+static int check_path(struct planner *p, struct planned_move *move, const double target[4], double delta_e) {
     const struct planner_limits *l = &p->limits;
     double ratio = move->ratio[AXIS_E];
     limit_axis(move, move->ratio[AXIS_X], l->max_x_velocity, l->max_x_accel);
     limit_axis(move, move->ratio[AXIS_Y], l->max_y_velocity, l->max_y_accel);
     limit(move, fabs(move->ratio[AXIS_Z]), l->max_z_velocity, l->max_z_accel);
+    if (l->tower_rod > 0)
+        limit_towers(p, move, target);
     if (ratio > l->max_extrude_ratio && delta_e > l->max_extrude_ratio * TINY_PATH)
         return planner_refuse(p, PLANNER_EXTRUDE_RATIO, AXIS_E, ratio, 0, l->max_extrude_ratio);
     if (ratio < 0 || ratio > l->max_extrude_ratio)
@@ -175,7 +196,7 @@ int planner_describe(struct planner *p, struct planned_move *move, const double 
     move->cruise_v2 = p->limits.max_velocity * p->limits.max_velocity;
     if (speed < p->limits.max_velocity)
         move->cruise_v2 = speed * speed;
-    if (move->extrude_only ? check_extrude_only(p, move) : check_path(p, move, delta[AXIS_E]))
+    if (move->extrude_only ? check_extrude_only(p, move) : check_path(p, move, target, delta[AXIS_E]))
         return -1;
     return 1;
 }

@@ -72,6 +72,7 @@ struct planner_limits {
     double max_x_velocity, max_x_accel, max_y_velocity, max_y_accel; // 0: none
     double max_radius, radius_min;                                   // 0: none
     double cone_top, cone_slope[2];                                  // slopes 0: none
+    double tower_radius, tower_rod;                                  // rod 0: no delta
 };
 
 // v2: square of a speed, (mm/s)². The smooth values belong to the profile of the minimum cruise.

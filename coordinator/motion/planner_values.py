@@ -172,7 +172,9 @@ def check_limits(limits: MotionLimits) -> None:
         value = getattr(limits, field.name)
         if field.name in {"position_min", "position_max"}:
             for bound in value:
-                check_number(field.name, bound, -1e6, 1e6)
+                check_number(field.name, bound, -1e6, 1e9)
+        elif field.name in {"tower_radius", "tower_rod"}:
+            check_number(field.name, value, 0, 1e6)
         elif field.name == "cone_top":
             check_number(field.name, value, -1e6, 1e6)
         elif field.name == "cone_slope":

@@ -4,6 +4,7 @@ Sources: Singer and Seering 1990 (zv, zvd), Singhose, Seering and Singer 1996 (e
 """
 
 import math
+import re
 
 from nodes.errors import CanductorError
 
@@ -12,19 +13,43 @@ Impulses = tuple[tuple[float, float], ...]
 
 SHAPER_KINDS = ("zv", "mzv", "zvd", "ei", "2hump_ei", "3hump_ei")
 VIBRATION = 0.05
-"""Share of the vibration that the ei shapers let through at their own frequency."""
+"""Share of the vibration that the ei shapers let through at their own frequency, unless their v_tol says."""
+TOLERANT_KINDS = ("ei", "2hump_ei", "3hump_ei")
+MAX_TOLERANCE = 0.5
+_WRITTEN = re.compile(r"([a-z0-9_]+)(?:\( *v_tol *= *(\d*\.?\d+|\d+\.) *\))?", re.ASCII)
 
 
-def shaper_impulses(kind: str, frequency_hz: float, damping_ratio: float) -> Impulses:
-    """Return the centred impulses of shaper KIND.
+def split_kind(written: str) -> tuple[str, float]:
+    """Return the kind of shaper and its tolerance, of ``mzv`` or ``ei(v_tol=0.03)``.
+
+    Raises ValueError, the end of a sentence.
+    """
+    match = _WRITTEN.fullmatch(written)
+    kind = match[1] if match else ""
+    if match is None or kind not in SHAPER_KINDS:
+        raise ValueError(f"there are {', '.join(SHAPER_KINDS)}; those with ei also as ei(v_tol=0.05)")
+    if match[2] is None:
+        return kind, VIBRATION
+    if kind not in TOLERANT_KINDS:
+        raise ValueError(f"only {', '.join(TOLERANT_KINDS)} have a v_tol; remove it")
+    tolerance = float(match[2])
+    if not 0 < tolerance <= MAX_TOLERANCE:
+        raise ValueError(f"v_tol must be above 0 and at most {MAX_TOLERANCE:g}")
+    return kind, tolerance
+
+
+def shaper_impulses(written: str, frequency_hz: float, damping_ratio: float) -> Impulses:
+    """Return the centred impulses of a shaper, WRITTEN as its kind, perhaps with its tolerance.
 
     FREQUENCY_HZ > 0, 0 <= DAMPING_RATIO < 1. Raises CanductorError on other values.
 
     >>> shaper_impulses("zv", 50.0, 0.0)
     ((0.5, -0.005), (0.5, 0.005))
     """
-    if kind not in SHAPER_KINDS:
-        raise CanductorError(f"there is no input shaper {kind!r}; known are {', '.join(SHAPER_KINDS)}")
+    try:
+        kind, tolerance = split_kind(written)
+    except ValueError as problem:
+        raise CanductorError(f"there is no input shaper {written!r}: {problem}") from None
     if not (0 < frequency_hz < math.inf):
         raise CanductorError(f"a shaper frequency of {frequency_hz} Hz is impossible; it must be above 0")
     if not 0 <= damping_ratio < 1:
@@ -35,7 +60,7 @@ def shaper_impulses(kind: str, frequency_hz: float, damping_ratio: float) -> Imp
     period_s = 1 / (frequency_hz * damped)
     spacing = 0.375 if kind == "mzv" else 0.5
     decay = math.exp(-2 * spacing * math.pi * damping_ratio / damped)
-    amplitudes = [a * decay**i for i, a in enumerate(_undamped(kind))]
+    amplitudes = [a * decay**i for i, a in enumerate(_undamped(kind, tolerance))]
     total = math.fsum(amplitudes)
     amplitudes = [a / total for a in amplitudes]
     times = [i * spacing * period_s for i in range(len(amplitudes))]
@@ -43,9 +68,8 @@ def shaper_impulses(kind: str, frequency_hz: float, damping_ratio: float) -> Imp
     return tuple((a, t - centre) for a, t in zip(amplitudes, times, strict=True))
 
 
-def _undamped(kind: str) -> tuple[float, ...]:
-    """Return amplitudes without damping; they need not sum to 1."""
-    v = VIBRATION
+def _undamped(kind: str, v: float) -> tuple[float, ...]:
+    """Return amplitudes without damping; they need not sum to 1. V: share of vibration to be let through."""
     if kind == "zv":
         return 1.0, 1.0
     if kind == "zvd":

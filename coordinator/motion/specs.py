@@ -50,6 +50,11 @@ class MotionLimits:
     """Slopes 0: no cone. Else Z may be above position_max (as after homing a delta) within the cone
     z + √((sx·x)² + (sy·y)²) <= cone_top, and moves that begin or end above stay within."""
     cone_top: float = 0.0
+    tower_radius: float = 0.0
+    """mm; of a delta: how far level its rods reach with the head in the middle."""
+    tower_rod: float = 0.0
+    """mm; of a delta: length of its shortest rod. Where it lies so flat that its carriage would be more than
+    three times as fast as the head, the head is slower. 0: no delta."""
     range_options: tuple[str, str, str] = AXIS_RANGE_OPTIONS
     """For messages: which options of the configuration say how far X, Y and Z may go."""
 

@@ -49,6 +49,7 @@ class Setting:
             self.vocabulary,
             beside=beside,
             prints=self.prints,
+            strict=True,
         )
 
 

@@ -13,7 +13,7 @@ from coordinator.modules.homing_override import HomingOverride
 from coordinator.plan import plan_file
 
 SAMPLES = 2000
-EXAMPLE_FILES = sorted(EXAMPLES.glob("*.cfg"))
+EXAMPLE_FILES = sorted(path for path in EXAMPLES.glob("*.cfg") if path.stem != "none")  # whose head stands
 
 
 def corners(machine: MachineDescription) -> list[Point]:

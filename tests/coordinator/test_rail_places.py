@@ -11,7 +11,7 @@ from coordinator.machine.description import MachineDescription, load_machine
 from coordinator.motion.planner import Position
 from coordinator.rail_places import RailPlaces
 
-CONFIGS = sorted(EXAMPLES.glob("*.cfg"))
+CONFIGS = sorted(path for path in EXAMPLES.glob("*.cfg") if path.stem != "none")  # whose head stands
 
 
 def counts_at(machine: MachineDescription, position: Position, zero_mm: float) -> dict[str, int]:

@@ -213,15 +213,8 @@ CASES = {
         changed("corexy", "corexyz"),
         (
             "printer.cfg:8: option 'kinematics' of [printer] is 'corexyz', must be cartesian, corexy, corexz,"
-            " delta, deltesian, generic_cartesian, hybrid_corexy, hybrid_corexz, polar, rotary_delta or winch"
-        ),
-    ),
-    "later kinematics": (
-        changed("corexy", "none"),
-        (
-            "printer.cfg:8: option 'kinematics' of [printer] is 'none', recognised but not built yet; use"
-            " cartesian, corexy, corexz, delta, deltesian, generic_cartesian, hybrid_corexy, hybrid_corexz,"
-            " polar, rotary_delta or winch"
+            " delta, deltesian, generic_cartesian, hybrid_corexy, hybrid_corexz, none, polar, rotary_delta or"
+            " winch"
         ),
     ),
     "empty range": (

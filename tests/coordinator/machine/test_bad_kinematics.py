@@ -49,9 +49,9 @@ BAD: dict[str, tuple[str, str, str, str]] = {
     "nearly level rods": (
         "delta",
         "arm_length: 330",
-        "arm_length: 157",
+        "arm_length: 150.3",
         (
-            "option 'arm_length' of [stepper_a] is '157', so short that carriages would be more than 3"
+            "option 'arm_length' of [stepper_a] is '150.3', so short that carriages would be more than 12"
             " times as fast as the head even in the middle; correct it or delta_radius"
         ),
     ),
@@ -62,15 +62,6 @@ BAD: dict[str, tuple[str, str, str, str]] = {
         (
             "option 'angle' of [stepper_b] is '220', only 10° away from [stepper_a]; they must be 30°"
             " apart at least"
-        ),
-    ),
-    "print radius too wide": (
-        "delta",
-        "print_radius: 140",
-        "print_radius: 170",
-        (
-            "option 'print_radius' of [printer] is '170', but beyond 163.07 mm carriages would be more"
-            " than 3 times as fast as the head; reduce it, or correct delta_radius and arm_length"
         ),
     ),
     "no height": (

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.config_commands import check
 from coordinator.machine import check as check_module
 from coordinator.machine.check import check_config
 
@@ -244,3 +245,27 @@ def test_a_name_for_a_command_that_is_wrong_is_not_asked_for_again(tmp_path: Pat
     (told,) = mistakes(tmp_path, text=f"{GOOD}[gcode_macro G28]\n{rename}\ngcode:\n    G28.1\n")
     assert "rename_existing" in told
     assert "takes the name" not in told
+
+
+def test_the_end_says_what_will_not_act_and_what_that_means(tmp_path: Path) -> None:
+    path = tmp_path / "printer.cfg"
+    probed = GOOD.replace(
+        "rotation_distance: 8\n", "rotation_distance: 8\nendstop_pin: probe:z_virtual_endstop\n"
+    )
+    path.write_text(f"{probed}[probe]\npin: PA9\nz_offset: 1\n[neopixel a]\npin: PA8\n")
+    report = check(str(path))
+    assert report.ok
+    head, _, listed = report.to_text().partition("What will not act, and what that means for a print:\n")
+    assert head.strip() == f"{path}: no mistakes"
+    lines = [line.strip().replace(f"{path}:", "") for line in listed.splitlines()]
+    homed = (
+        "endstop_pin of [stepper_z] recognised, not yet acting: an axis that has no other endstop is refused"
+    )
+    probed = "nothing is probed; an axis that it homes is refused by G28, lines that probe end a job"
+    assert lines == [
+        f"21: {homed} by G28",
+        f"29: [probe] recognised, not yet acting: {probed}",
+        "32: [neopixel a] recognised, not yet acting: no light; a print is as it would be",
+    ]
+    means = {entry["section"]: entry["meaning"] for entry in report.to_json()["not_acting"]}
+    assert means["neopixel a"] == "no light; a print is as it would be"

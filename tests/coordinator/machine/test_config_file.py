@@ -32,11 +32,18 @@ def refused(tmp_path: Path, text: str | bytes) -> str:
 def test_sections_options_and_comments(tmp_path: Path) -> None:
     text = (
         "# head\n[ mcu   toolhead ] # why\nSerial: /dev/x  # which\nbaud = 115200 ; speed\n"
-        "; all of it\n[fan]\npin:PA#1\nname: a = b: c\nempty:\n"
+        "; all of it\n[fan]\npin:PA1#right behind\nname: a = b: c\nempty:\n"
+        "template: {# not this #}{a}#this\nturn: a;b\n"
     )
     assert values(parse(tmp_path, text)) == {
         "mcu toolhead": {"serial": "/dev/x", "baud": "115200"},
-        "fan": {"pin": "PA#1", "name": "a = b: c", "empty": ""},
+        "fan": {
+            "pin": "PA1",
+            "name": "a = b: c",
+            "empty": "",
+            "template": "{# not this #}{a}",
+            "turn": "a;b",
+        },
     }
 
 
@@ -73,10 +80,12 @@ def test_a_later_section_of_the_same_name_overrides(tmp_path: Path) -> None:
     assert config.sections["a"].options["y"].place.line == 6
 
 
-def test_an_option_twice_in_one_place_names_both_lines(tmp_path: Path) -> None:
-    assert refused(tmp_path, "[a]\nx: 1\nX = 2\n") == (
-        "printer.cfg:3: option 'x' of [a] is given twice, first at printer.cfg:2; remove one"
-    )
+def test_of_an_option_given_again_the_last_holds_and_one_notice_says_so(tmp_path: Path) -> None:
+    config = parse(tmp_path, "[a]\nx: 1\nX = 2\nx: 3\n[b]\nx: 1\n")
+    assert values(config) == {"a": {"x": "3"}, "b": {"x": "1"}}
+    assert [note.replace(f"{tmp_path}/", "") for note in config.notes] == [
+        "printer.cfg:4: option 'x' of [a] is given before (line 2, 3); the last one holds"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,16 @@ def test_the_print_radius_ends_where_rods_lie_flat(tmp_path: Path) -> None:
     text = changed("print_radius: 140\n", "", example_text("delta"))
     assert load_machine(write(tmp_path, text)).limits.max_radius == 150  # delta_radius
     limits = load_machine(write(tmp_path, changed("arm_length: 330", "arm_length: 200", text))).limits
-    assert limits.max_radius == pytest.approx(200 * math.sin(math.atan(3)) - 150)
+    assert limits.max_radius == pytest.approx(200 * math.sin(math.atan(12)) - 150)
+
+
+def test_a_print_radius_beyond_what_the_rods_allow_ends_there_with_a_notice(tmp_path: Path) -> None:
+    machine = load_machine(
+        write(tmp_path, changed("print_radius: 140", "print_radius: 190", example_text("delta")))
+    )
+    assert machine.limits.max_radius == pytest.approx(330 * math.sin(math.atan(12)) - 150)
+    (note,) = machine.notes
+    assert "'print_radius' of [printer] is 190 mm, but the rods lie too flat beyond 178.86 mm" in note
 
 
 def test_endstops_of_different_height_tilt_where_homing_ends(tmp_path: Path) -> None:

@@ -178,3 +178,35 @@ def test_what_is_accepted_comes_back(user: str, values: dict[str, dict[str, str]
 
     lines = split_lines(data, "")
     assert parse_saved("", lines[lines.index(SAVED_HEADER) :]) == config.pending
+
+
+FOREIGN = """\
+#*# <---------------------- SAVE_CONFIG ---------------------->
+#*# DO NOT EDIT THIS BLOCK OR BELOW. The contents are auto-generated.
+#*#
+#*# [bed_mesh default]
+#*# version = 1
+#*# points =
+#*# \t  0.025000, -0.010000
+#*# \t  0.015000, 0.020000
+#*# x_count=2
+#*#
+#*# [extruder]
+#*# control = pid
+#*#
+#*# [probe]
+#*# z_offset = 1.250
+"""
+
+
+def test_sections_of_others_in_the_block_stay_byte_for_byte(tmp_path: Path) -> None:
+    after = saved(tmp_path / "printer.cfg", USER + FOREIGN, control="mpc").decode()
+    for section, end in (("[bed_mesh default]", "#*#\n#*# [extruder]"), ("[probe]", "")):
+        text = (
+            FOREIGN[FOREIGN.index(f"#*# {section}") :].partition(end)[0]
+            if end
+            else "#*# [probe]\n#*# z_offset"
+        )
+        assert text.replace("\n", "\r\n") in after, section
+    assert "#*# control = mpc\r\n" in after
+    assert "control = pid" not in after.partition("#*#")[2]

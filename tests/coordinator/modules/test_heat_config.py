@@ -152,7 +152,6 @@ def test_an_extruder_without_heater_is_never_cold(tmp_path: Path) -> None:
             BED.replace("Generic 3950", "my_own"),
             "no sensor 'my_own'; add a section [thermistor my_own]",
         ),
-        (BED.replace("Generic 3950", "MAX31865"), "recognised but not built yet"),
         (BED.replace("max_temp: 130", "max_temp: -5"), "min_temp (0 °C) must be below max_temp (-5 °C)"),
         (BED.replace("PC1", "PA1"), "pin mcu:PA1 is already used for 'step_pin' of [stepper_x]"),
         (BED.replace("PC2", "toolhead:PB4"), "pin toolhead:PB4 is already used"),

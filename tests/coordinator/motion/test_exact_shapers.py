@@ -1,11 +1,14 @@
 """The shapers do what they are for: a vibration at their frequency is left small or not at all."""
 
 import cmath
+import itertools
 import math
 
 import pytest
 
 from coordinator.demo.exact_shapers import KINDS, TOLERANCE, impulses
+from coordinator.motion.shapers import shaper_impulses
+from nodes.errors import CanductorError
 
 LEFT = {"zv": 0.0, "mzv": 0.0, "zvd": 0.0, "ei": TOLERANCE, "2hump_ei": 0.0, "3hump_ei": TOLERANCE}
 
@@ -45,3 +48,25 @@ def test_more_impulses_forgive_a_wrong_frequency() -> None:
     rises = [forgiven_hz(kind) for kind in KINDS]
     assert rises == sorted(rises), dict(zip(KINDS, rises, strict=True))
     assert len(set(rises)) == len(KINDS)
+
+
+@pytest.mark.parametrize("kind", ["ei", "2hump_ei", "3hump_ei"])
+@pytest.mark.parametrize("tolerance", [0.02, 0.15])
+def test_a_shaper_lets_through_what_it_is_asked_to(kind: str, tolerance: float) -> None:
+    """The engine's impulses, by the oracle's figure; with two humps the tolerance is not in the middle."""
+    written = f"{kind}(v_tol={tolerance:g})"
+    ours = shaper_impulses(written, 50.0, 0.1)
+    for mine, other in zip(ours, impulses(written, 50.0, 0.1), strict=True):
+        assert mine == pytest.approx(other)
+    left = [vibration_left(written, 50.0, 50.0 + rise / 10, 0.0) for rise in range(250)]
+    hump = next(here for here, beyond in itertools.pairwise(left) if beyond < here)
+    assert hump == pytest.approx(tolerance, rel=0.1)
+    assert shaper_impulses(f"{kind}(v_tol=0.05)", 50.0, 0.1) == shaper_impulses(kind, 50.0, 0.1)
+
+
+@pytest.mark.parametrize(
+    "written", ["ei(v_tol=0)", "ei(v_tol=0.6)", "zv(v_tol=0.1)", "ei(x=1)", "ei(", "who"]
+)
+def test_what_is_no_shaper_is_refused(written: str) -> None:
+    with pytest.raises(CanductorError):
+        shaper_impulses(written, 50.0, 0.1)

@@ -1,0 +1,91 @@
+"""Commands that nothing acts on: an error in a job that needs them, else a notice."""
+
+import pytest
+
+from coordinator.gcode.absent_commands import ABSENT
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, Vocabulary, renamed
+from coordinator.gcode.errors import GCodeError
+from coordinator.gcode.events import End, Event, Notice, Reply
+from coordinator.gcode.interpreter import Job
+from coordinator.gcode.program import Program
+from coordinator.motion.planner import Planner
+from tests.coordinator.motion.planner_helpers import LIMITS
+
+HOME = {"X": 0.0, "Y": 0.0, "Z": 0.0}
+
+
+def run(line: str, vocabulary: Vocabulary, *, strict: bool) -> list[Event]:
+    job = Job(
+        Program.from_lines([line], "part.gcode"), Planner(LIMITS), HOME, vocabulary=vocabulary, strict=strict
+    )
+    found: list[Event] = []
+    while True:
+        event = job.step()
+        if isinstance(event, End):
+            return found
+        found.append(event)
+
+
+def notices(line: str, vocabulary: Vocabulary | None = None, *, strict: bool = True) -> list[str]:
+    events = run(line, vocabulary or Vocabulary({}), strict=strict)
+    return [event.text for event in events if isinstance(event, Notice)]
+
+
+@pytest.mark.parametrize("name", [name for name, absent in ABSENT.items() if absent.harmless])
+def test_harmless_ones_are_skipped_with_a_notice(name: str) -> None:
+    if not name.startswith("M10"):  # those are a machine's own, whatever it has
+        assert len(notices(name)) == 1
+    why = Vocabulary({}, not_acting={name: "[it] does not act yet"})
+    (said,) = notices(name, why)
+    assert "[it] does not act yet" in said
+
+
+OWN = ("M104", "M109", "M140", "M190")
+
+
+@pytest.mark.parametrize("name", [name for name, absent in ABSENT.items() if not absent.harmless])
+def test_others_end_a_job_and_are_told_of_in_a_plan(name: str) -> None:
+    line = f"{name} S200" if name in OWN else name
+    because = Vocabulary({}, not_acting={name: "[it] does not act yet"})
+    with pytest.raises(GCodeError) as error:
+        run(line, because, strict=True)
+    assert "[it] does not act yet; remove the line" in str(error.value)
+    (said,) = notices(line, because, strict=False)
+    assert "a job would end here" in said
+
+
+def test_heat_for_what_a_machine_does_not_have_is_no_error() -> None:
+    assert len(notices("M140 S60")) == 1
+
+
+def test_turning_a_heater_off_that_does_not_act_is_no_error() -> None:
+    off = Vocabulary({}, not_acting={"M140": "[heater_bed] does not act yet"})
+    assert len(notices("M140 S0", off)) == 1
+
+
+def test_what_nobody_knows_is_skipped() -> None:
+    assert notices("WHAT_IS_THIS A=1") == [
+        "part.gcode:1: unknown command WHAT_IS_THIS: unknown commands are skipped"
+    ]
+
+
+@pytest.mark.parametrize("line", ["M104.0 S3", "m104.0 S3"])
+def test_a_name_as_it_is_written_comes_before_what_it_usually_means(line: str) -> None:
+    def says(text: str) -> GCodeCommand:
+        def read(call: Call) -> Reading:
+            return AtOnce((f"{text} {call.command.text}",))
+
+        return GCodeCommand("M104", text, read)
+
+    base = renamed(says("base"), "M104", "M104.0", beside=False)
+    events = run(line, Vocabulary({"M104": says("macro"), "M104.0": base}), strict=True)
+    assert [event.text for event in events if isinstance(event, Reply)] == ["base S3"]
+
+
+def test_a_move_under_another_name_is_a_move() -> None:
+    commands = {
+        "G0": GCodeCommand("G0", "a macro", lambda _: AtOnce(("macro",))),
+        "G00": renamed(None, "G0", "G00", beside=False),
+    }
+    events = run("G00 F600", Vocabulary(commands), strict=True)
+    assert not [event for event in events if isinstance(event, Reply | Notice)]
