@@ -124,7 +124,7 @@ def any_message(draw: st.DrawFn) -> tuple[Dictionary, MessageFormat, dict[str, V
     dictionary = draw(st.sampled_from(list(DICTIONARIES.values())))
     message = draw(st.sampled_from(messages_of(dictionary)))
     values: dict[str, Value] = {
-        name: draw(st.integers(*bounds(code)) if code in twin.CODES else st.binary(max_size=LONGEST))
+        name: draw(st.integers(*bounds(code))) if code in twin.CODES else draw(st.binary(max_size=LONGEST))
         for name, code in zip(message.names, message.code_texts, strict=True)
     }
     return dictionary, message, values

@@ -110,7 +110,7 @@ def test_the_scope_matrix_of_the_machine(tmp_path: Path) -> None:
         assert {m["name"]: m["scope"] for m in listed} == {n: scope for n, (scope, _, _) in MATRIX.items()}
         for name, caller in CALLERS.items():
             await _check_caller(interface, name, caller)
-        for method, (_, params, _) in MATRIX.items():
+        for method, (_scope, params, _can) in MATRIX.items():
             await _check_stranger(interface, method, params)
         for name, caller in CALLERS.items():
             await _check_stop(interface, name, caller)

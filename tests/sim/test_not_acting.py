@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from nodes.errors import CanductorError
-from tests.sim.printer import PRINTING, Printer, gcode
-from tests.system.service_stage import Served
+from tests.stages.printer import PRINTING, Printer, gcode
+from tests.stages.served import Served
 
 NOT_ACTING = """
 [stepper_z]

@@ -208,11 +208,12 @@ def failure(machine: DemoMachine, config: Path | None = None) -> str:
 
 
 def test_a_pin_that_the_board_does_not_have(tmp_path: Path) -> None:
-    machine = DemoMachine(tmp_path, **{"step_pin: PB0": "step_pin: PZ99"})
-    text = machine.config.read_text(encoding="utf-8").splitlines()
+    machine = DemoMachine(tmp_path)
+    config = machine.write_config("pz99.cfg", **{"step_pin: PB0": "step_pin: PZ99"})
+    text = config.read_text(encoding="utf-8").splitlines()
     line = next(number for number, line in enumerate(text, 1) if "PZ99" in line)
-    sentence = failure(machine)
-    assert sentence.startswith(f"{machine.config}:{line}: ")
+    sentence = failure(machine, config)
+    assert sentence.startswith(f"{config}:{line}: ")
     assert "PZ99" in sentence
 
 

@@ -3,15 +3,15 @@
 import asyncio
 import json
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import msgpack
 
-from coordinator.ipc.methods import Scope
-from coordinator.ipc.server import IpcServer
+from coordinator.ipc.methods import ApiError, Scope
+from coordinator.ipc.server import Adopted, IpcServer
 from coordinator.ipc.settings import IpcSettings
 from tests.stages.served import Served
 
@@ -58,13 +58,29 @@ class MemoryTransport(asyncio.Transport):
         """Nothing waits."""
 
 
+ADDRESS = "127.0.0.1"
+
+
+def _check_token_by(server: IpcServer) -> Callable[[str], Adopted | None]:
+    """Return a check of tokens by the file of SERVER, as TCP clients have it."""
+
+    def check(token: str) -> Adopted | None:
+        try:
+            return Adopted(server.check_token(token, ADDRESS), None)
+        except ApiError:
+            return None
+
+    return check
+
+
 class Line:
     """A client that sends whatever it is asked to, in JSON or msgpack."""
 
     def __init__(self, server: IpcServer, granted: Scope | None, *, packed: bool) -> None:
         self._packed = packed
         self._transport = MemoryTransport()
-        self._connection = server.adopt(self._transport, "127.0.0.1", granted)
+        self._connection = server.adopt(self._transport, ADDRESS, _check_token_by(server))
+        self._connection.session.granted = granted  # as the Unix socket does for its owner
         self._updates: list[dict[str, Any]] = []
 
     def encoded(self, message: dict[str, Any]) -> bytes:

@@ -6,7 +6,7 @@ import pytest
 
 from coordinator.machine.description import ConfigError, MachineDescription, load_machine
 from coordinator.modules.idle_timeout import IdleTimeout
-from tests.coordinator.machine.printer_cfg import PRINTER_CFG, changed, write
+from tests.stages.printer_text import PRINTER_CFG, changed, write
 
 DRIVER = "[tmc2209 stepper_x]\nuart_pin: PF0\nrun_current: 0.8\n"
 HEATER = "heater_pin: PB6\nsensor_type: {sensor}\nsensor_pin: {pin}\ncontrol: watermark\n"

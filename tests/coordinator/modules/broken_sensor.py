@@ -3,7 +3,7 @@
 from coordinator.modules.heaters import Heaters
 from coordinator.modules.temperature_input import TemperatureInput
 from nodes.virtual.plant_page import Fault, Kind
-from tests.coordinator.modules.heat_stage import HeatMachine
+from tests.stages.heat_machine import HeatMachine
 
 
 class Sensor:

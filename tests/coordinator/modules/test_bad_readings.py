@@ -13,7 +13,7 @@ from nodes.devices.analog_in import RANGE_CHECKS
 from nodes.errors import CanductorError
 from nodes.virtual.plant_page import Fault
 from tests.coordinator.modules.broken_sensor import Sensor
-from tests.coordinator.modules.heat_stage import HOTEND_PID, HeatMachine
+from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 
 REPORT_S = 0.3
 """Between two measurements."""

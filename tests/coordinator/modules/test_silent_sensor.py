@@ -9,7 +9,7 @@ import pytest
 from coordinator.modules.heater import LOOK_S, SILENT_LOOKS
 from nodes.errors import CanductorError
 from tests.coordinator.modules.broken_sensor import Sensor
-from tests.coordinator.modules.heat_stage import HOTEND_PID, HeatMachine
+from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 
 LIMIT_S = 1.5
 """max_duration, as it is without the option."""
