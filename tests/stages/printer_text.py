@@ -1,6 +1,7 @@
 """A small, complete configuration that tests spoil one line at a time."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 from coordinator.commands import DEMO_MACHINE, EXAMPLES
@@ -172,10 +173,10 @@ second_homing_speed: 2
 DEMO_CFG = DEMO_MACHINE.read_text(encoding="utf-8")
 
 
-def without_endstops(text: str = DEMO_CFG, **replaced: str) -> str:
-    """Return a machine whose G28 takes its axes as home where they are; REPLACED: words by words."""
+def without_endstops(text: str = DEMO_CFG, changes: Mapping[str, str] | None = None) -> str:
+    """Return a machine whose G28 takes its axes as home where they are; CHANGES: words by words."""
     text = re.sub(r"endstop_pin: .*\n", "", text)
-    for old, new in replaced.items():
+    for old, new in (changes or {}).items():
         text = changed(old, new, text)
     return text
 
