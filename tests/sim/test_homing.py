@@ -14,6 +14,7 @@ from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
 from nodes.errors import CanductorError
 from nodes.link import Link
+from tests.profiles import examples
 
 MACHINE = """
 [mcu]
@@ -151,7 +152,7 @@ def check_position(home: Home, result: HomingResult) -> None:
     assert result.beyond_trigger_mm == pytest.approx(overshoot.distance_mm, abs=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(examples(2)))
 def test_a_trigger_group_stops_another_node_within_300_us_on_a_busy_bus(tmp_path: Path, seed: int) -> None:
     home = Home(tmp_path, settings="[buses.can0]\nload = 0.7\n", seed=seed)
     result = home.run()
