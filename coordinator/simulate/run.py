@@ -120,18 +120,18 @@ def _begin_worker() -> None:
     import coordinator.simulate.play  # noqa: F401, PLC0415 (import once, not in the first seed)
 
 
-def run_one(scenario: Scenario, seed: int) -> Result:
+def run_one(scenario: Scenario, seed: int, limit_s: float = SEED_LIMIT_S) -> Result:
     """Run one seed; a bug that shows as an exception is a violation like any other."""
     from coordinator.simulate.play import play  # noqa: PLC0415 (--list needs no native code)
 
     began_s = time.process_time()
     try:
-        with _limit(SEED_LIMIT_S):
+        with _limit(limit_s):
             return play(scenario, seed)
     except ScenarioError:
         raise
     except (Exception, _Hangs) as error:  # noqa: BLE001 (the seed is what is tested)
-        text = f"not over after {SEED_LIMIT_S:g} s" if isinstance(error, _Hangs) else _where(error)
+        text = f"not over after {limit_s:g} s" if isinstance(error, _Hangs) else _where(error)
         return Result(
             scenario=scenario.given,
             seed=seed,

@@ -14,48 +14,43 @@ from numpy.typing import NDArray
 
 from coordinator.table.axis_table import AxisTable
 from tests.coordinator.motion.exact_program import Planned, plan_program
+from tests.stages.printer_text import MCU, printer_section, section, stepper_section
 
 Floats = NDArray[np.float64]
-MACHINE = """
-[mcu]
-canbus_uuid: 90a4ae022dfc
-[printer]
-kinematics: cartesian
-max_velocity: 120
-max_accel: 2000
-max_z_velocity: 10
-[stepper_x]
-step_pin: PB0
-dir_pin: PB1
-microsteps: {microsteps}
-rotation_distance: 8
-endstop_pin: ^PC0
-position_endstop: 0
-position_max: 300
-homing_speed: 20
-[stepper_y]
-step_pin: PB3
-dir_pin: PB4
-microsteps: 16
-rotation_distance: 40
-endstop_pin: ^PC1
-position_endstop: 0
-position_max: 250
-[stepper_z]
-step_pin: PA0
-dir_pin: PA1
-microsteps: 16
-rotation_distance: 8
-endstop_pin: ^PA3
-position_endstop: 0
-position_max: 250
-[input_shaper]
-"""
 MICROSTEPS = 32
 STEP_MM = 8 / (200 * MICROSTEPS)
 KNOT_MM = 0.5
 """Sixteen points a turn: linear between them, they miss 2 % of a wobble at most; eight miss 8 %."""
 TRAVEL_MM = 300
+
+
+def machine_text(microsteps: int) -> str:
+    return (
+        MCU
+        + printer_section(max_velocity=120, max_accel=2000, max_z_velocity=10)
+        + stepper_section(
+            "stepper_x",
+            "PB0",
+            "PB1",
+            microsteps=microsteps,
+            rotation_distance=8,
+            endstop_pin="^PC0",
+            position_endstop=0,
+            position_max=TRAVEL_MM,
+            homing_speed=20,
+        )
+        + stepper_section("stepper_y", "PB3", "PB4", endstop_pin="^PC1", position_endstop=0, position_max=250)
+        + stepper_section(
+            "stepper_z",
+            "PA0",
+            "PA1",
+            rotation_distance=8,
+            endstop_pin="^PA3",
+            position_endstop=0,
+            position_max=250,
+        )
+        + section("input_shaper")
+    )
 
 
 @dataclass(frozen=True)
@@ -113,7 +108,7 @@ def carry_out(
 ) -> Trial:
     """Plan LINES, replay what the node executes, and let SCREW turn it into true positions."""
     config, program = folder / "screw.cfg", folder / "screw.gcode"
-    config.write_text(MACHINE.format(microsteps=microsteps))
+    config.write_text(machine_text(microsteps))
     program.write_text("\n".join(["G28", *lines, ""]))
     plan = plan_program(config, program, tables)
     moves = np.concatenate([moves for _, moves in plan.record.epochs()])

@@ -19,7 +19,7 @@ SENSORS = 0x104
 """An id that wins against the data of all nodes."""
 NOPS = 25
 """In one block, which fills it; nobody answers them."""
-BULK_SAMPLES = 80
+BULK_SAMPLES = 50
 
 
 def zigzag(speed_mm_s: float, segment_mm: float, count: int) -> str:
@@ -88,7 +88,7 @@ class Loaded:
 
 
 def test_motion_is_in_time_on_a_bus_that_is_nearly_full(tmp_path: Path) -> None:
-    loaded = Loaded(tmp_path, sensors=0.60, speed_mm_s=45, count=1500, bulk=True)
+    loaded = Loaded(tmp_path, sensors=0.60, speed_mm_s=45, count=900, bulk=True)
     outcome = loaded.run()
     busy = [s.load for s in loaded.samples[20:BULK_SAMPLES]]
     motion, data, bulk, total = (

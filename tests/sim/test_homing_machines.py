@@ -9,6 +9,7 @@ from coordinator.commands import EXAMPLES
 from coordinator.machine.description import load_machine
 from coordinator.simulate.scenario import NodeSetting
 from tests.stages.plant_stage import STEP_MM, PlantStage
+from tests.stages.printer_text import MCU, TOOLHEAD, printer_section, stepper_section
 from tests.stages.served import running
 
 MACHINES = ("polar", "rotary_delta")
@@ -51,57 +52,24 @@ def test_both_carriages_find_their_own_endstops(tmp_path: Path) -> None:
         runner.run(go())
 
 
-TWO_SIDES = """
-[mcu]
-canbus_uuid: 90a4ae022dfc
-canbus_interface: can0
-
-[mcu toolhead]
-canbus_uuid: 5e1ec7ab1e02
-canbus_interface: can0
-
-[printer]
-kinematics: {kinematics}
-max_velocity: 250
-max_accel: 5000
-
-[stepper_x]
-step_pin: PB0
-dir_pin: PB1
-microsteps: 16
-rotation_distance: 40
-position_max: 250
-
-[stepper_z]
-step_pin: PB3
-dir_pin: PB4
-microsteps: 16
-rotation_distance: 40
-endstop_pin: ^PC5
-position_endstop: 0
-position_max: 250
-homing_speed: 50
-
-[stepper_z1]
-step_pin: toolhead:PB3
-dir_pin: !toolhead:PB4
-microsteps: 16
-rotation_distance: 40
-endstop_pin: ^toolhead:PC6
-
-[stepper_y]
-step_pin: PB6
-dir_pin: PB7
-microsteps: 16
-rotation_distance: 8
-position_max: 250
-"""
+def two_sides(kinematics: str) -> str:
+    """Return a machine whose Z has a motor and an endstop on each side, on two nodes."""
+    ends = {"position_endstop": 0, "position_max": 250, "homing_speed": 50}
+    return (
+        MCU
+        + TOOLHEAD
+        + printer_section(kinematics, max_accel=5000)
+        + stepper_section("stepper_x", "PB0", "PB1", position_max=250)
+        + stepper_section("stepper_z", "PB3", "PB4", endstop_pin="^PC5", **ends)
+        + stepper_section("stepper_z1", "toolhead:PB3", "!toolhead:PB4", endstop_pin="^toolhead:PC6")
+        + stepper_section("stepper_y", "PB6", "PB7", rotation_distance=8, position_max=250)
+    )
 
 
 def test_a_gantry_is_squared_by_the_endstops_of_its_sides(tmp_path: Path) -> None:
     """Its nodes cannot stop each other: the host relays, up to 20 ms late, which is a millimetre."""
     path = tmp_path / "two.cfg"
-    path.write_text(TWO_SIDES.format(kinematics="cartesian"))
+    path.write_text(two_sides("cartesian"))
     nodes = {"toolhead": NodeSetting(legacy=True)}
     stage = PlantStage(tmp_path, path, (100.0, 50.0, 40.0), nodes=nodes, stepper_z1=2.5)
 
@@ -123,13 +91,13 @@ def test_a_gantry_is_squared_by_the_endstops_of_its_sides(tmp_path: Path) -> Non
 def test_endstops_that_cannot_act_are_told(tmp_path: Path) -> None:
     path = tmp_path / "two.cfg"
     for kinematics, acts in (("cartesian", True), ("corexy", True), ("corexz", False)):
-        path.write_text(TWO_SIDES.format(kinematics=kinematics))
+        path.write_text(two_sides(kinematics))
         machine = load_machine(str(path))
         waiting = [(entry.section, entry.options) for entry in machine.not_yet_acting]
         assert waiting == ([] if acts else [("stepper_z1", ("endstop_pin",))])
         assert len(machine.rails[2].pieces) == (2 if acts else 1)
         assert [rail.axis for rail in machine.stops] == (["z", "z1"] if acts else ["z"])
-    path.write_text(TWO_SIDES.format(kinematics="cartesian").replace("^toolhead:PC6", "^PC5"))
+    path.write_text(two_sides("cartesian").replace("^toolhead:PC6", "^PC5"))
     machine = load_machine(str(path))
     assert not machine.not_yet_acting
     assert [rail.axis for rail in machine.stops] == ["z"]

@@ -103,7 +103,7 @@ async def line_of(interface: Interface, name: str, caller: Caller) -> AsyncItera
 def test_the_scope_matrix_of_the_machine(tmp_path: Path) -> None:
     """Every method of the machine, for every kind of caller; a method that is not in the matrix fails."""
 
-    async def main(_: Served, interface: Interface) -> None:
+    async def main(stage: Served, interface: Interface) -> None:
         owner = interface.connect(granted=Scope.ADMIN)
         await owner.ask("api.hello", version=1)
         listed = (await owner.ask("api.methods"))["result"]["methods"]

@@ -6,17 +6,22 @@ import pytest
 
 from coordinator.gcode.errors import GCodeError
 from tests.stages.printer_text import SWITCHES_CFG
+from tests.stages.program_stage import ProgramStage
 from tests.stages.switch_printer import SwitchPrinter
 
 ENABLE = {"x": "PC0", "y": "PC1", "z": "PC2"}
 STEP = {"x": "PB0", "y": "PB3", "z": "PB6"}
 
 
-def printer(folder: Path) -> SwitchPrinter:
+def with_enable_pins() -> str:
     text = SWITCHES_CFG
     for axis, direction in (("x", "PB1"), ("y", "!PB4"), ("z", "PB7")):
         text = text.replace(f"dir_pin: {direction}\n", f"dir_pin: {direction}\nenable_pin: !{ENABLE[axis]}\n")
-    return SwitchPrinter(folder, {"x": -20.0, "y": 15.0, "z": -4.0}, machine=text)
+    return text
+
+
+def printer(folder: Path) -> SwitchPrinter:
+    return SwitchPrinter(folder, {"x": -20.0, "y": 15.0, "z": -4.0}, machine=with_enable_pins())
 
 
 def switched(found: SwitchPrinter, axis: str) -> list[tuple[int, bool]]:
@@ -77,9 +82,9 @@ def test_a_driver_that_was_switched_off_stays_so_while_others_move(tmp_path: Pat
     ],
 )
 def test_bad_parameters_end_the_program_with_the_line(tmp_path: Path, line: str, sentence: str) -> None:
-    with pytest.raises(GCodeError, match=r"^part\.gcode:1: ") as error:
-        printer(tmp_path).run(line)
-    assert sentence in str(error.value)
+    error = ProgramStage(tmp_path, machine=with_enable_pins()).error(line)
+    assert error.startswith("part.gcode:1: ")
+    assert sentence in error
 
 
 def test_a_motor_goes_to_and_fro_ten_times_and_stays_homed(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """A job that its service's end cuts off, on a printer that is hot: it goes on where nothing is guessed."""
 
 import asyncio
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import takewhile
@@ -16,7 +17,17 @@ LAYER_MM = 0.3
 LAYERS = 3
 A_MM, B_MM = 60.0, 180.0
 """Where the two objects are in X."""
-SECTIONS = PRINTING + "[fan_generic box]\npin: PB4\n"
+SECTIONS = (
+    PRINTING
+    + """
+[fan_generic box]
+pin: PB4
+[gcode_macro COUNT]
+variable_n: 0
+gcode:
+    SET_GCODE_VARIABLE MACRO=COUNT VARIABLE=n VALUE={n + 1}
+"""
+)
 
 
 def outline(name: str, x: float) -> str:
@@ -27,11 +38,12 @@ def outline(name: str, x: float) -> str:
 
 
 def job() -> str:
-    lines = ["M140 S60", "M104 S200", "G28", "M190 S60", "M109 S200", "G90", "M83", "M106 S128"]
+    lines = ["M140 S60", "M104 S200", "G28", "M190 S60", "M109 S200", "G90", "M82", "G92 E5", "COUNT"]
+    lines += ["M83", "M106 S128"]
     lines += ["EXCLUDE_OBJECT_DEFINE NAME=A", "EXCLUDE_OBJECT_DEFINE NAME=B"]
     for n in range(1, LAYERS + 1):
         lines += [f"G1 Z{n * LAYER_MM:.1f} F9000", outline("A", A_MM), outline("B", B_MM)]
-    return "\n".join([*lines, "M106 S0", "M104 S0", "M140 S0", ""])
+    return "\n".join([*lines, "COUNT", "M104 S0", "M140 S0", ""])
 
 
 def height(printer: Printer) -> float:
@@ -79,6 +91,13 @@ def test_it_heats_homes_above_the_part_and_goes_on(tmp_path: Path) -> None:
         line = stage.tree.get("job.interrupted_line")
         assert isinstance(line, int)
         assert any(f"job.gcode was interrupted at line {line}; job.recover" in told for told in stage.lines)
+        with pytest.raises(ApiError, match="was interrupted at line"):
+            await stage.call("job.recover", line=line + 1)
+        written_ns = (stage.jobs / "job.gcode").stat().st_mtime_ns
+        os.utime(stage.jobs / "job.gcode", ns=(1, 1))
+        with pytest.raises(ApiError, match="the file has changed"):
+            await stage.call("job.recover", home=True)
+        os.utime(stage.jobs / "job.gcode", ns=(written_ns, written_ns))
         await asyncio.sleep(3)  # it gets cold
         with pytest.raises(ApiError, match="X and Y and Z must be homed before"):
             await stage.call("job.recover")
@@ -98,7 +117,11 @@ def test_it_heats_homes_above_the_part_and_goes_on(tmp_path: Path) -> None:
         assert not any(x > B_MM + 1 for x, _, _, _ in seen), "B is left out"
         assert printer.true_mm("z") == pytest.approx(LAYERS * LAYER_MM + 0.05, abs=0.01)
         assert printer.status("fan_generic box")["speed"] == 0.4
+        assert printer.status("fan")["speed"] == pytest.approx(128 / 255, abs=1e-3)
+        assert printer.status("gcode_macro COUNT") == {"n": 2}
         assert stage.tree.get("job.interrupted_file") is None
+        with pytest.raises(ApiError, match="no job was interrupted"):
+            await stage.call("job.recover")
 
     printer.run(first, second)
 

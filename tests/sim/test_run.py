@@ -121,8 +121,7 @@ def test_a_seed_that_does_not_end_is_a_failure(monkeypatch: pytest.MonkeyPatch) 
             pass
 
     monkeypatch.setattr("coordinator.simulate.play.play", hangs)
-    monkeypatch.setattr(run, "SEED_LIMIT_S", 0.05)
-    found = run.run_one(scenario.find("clean"), 1)
+    found = run.run_one(scenario.find("clean"), 1, limit_s=0.05)
     assert [v.text for v in found.violations] == ["not over after 0.05 s"]
 
 

@@ -49,7 +49,7 @@ def test_a_file_is_printed_and_every_node_counts_what_it_was_sent(tmp_path: Path
     # The next job finds the nodes configured; another configuration configures them again.
     resets = {name: machine.node(name).counters()["resets"] for name in NODES}
     assert steps(machine.print(SQUARE)) == moved
-    finer = machine.write_config("finer.cfg", **{"step_pin: PB0": "step_pin: PB6"})
+    finer = machine.write_config("finer.cfg", {"step_pin: PB0": "step_pin: PB6"})
     assert steps(machine.print(SQUARE, finer)) == moved
     assert machine.edges("PB6", "mcu")
     assert {name: machine.node(name).counters()["resets"] for name in NODES} == resets
@@ -208,18 +208,17 @@ def failure(machine: DemoMachine, config: Path | None = None) -> str:
 
 
 def test_a_pin_that_the_board_does_not_have(tmp_path: Path) -> None:
-    machine = DemoMachine(tmp_path)
-    config = machine.write_config("pz99.cfg", **{"step_pin: PB0": "step_pin: PZ99"})
-    text = config.read_text(encoding="utf-8").splitlines()
+    machine = DemoMachine(tmp_path, changes={"step_pin: PB0": "step_pin: PZ99"})
+    text = machine.config.read_text(encoding="utf-8").splitlines()
     line = next(number for number, line in enumerate(text, 1) if "PZ99" in line)
-    sentence = failure(machine, config)
-    assert sentence.startswith(f"{config}:{line}: ")
+    sentence = failure(machine)
+    assert sentence.startswith(f"{machine.config}:{line}: ")
     assert "PZ99" in sentence
 
 
 def test_a_wrong_uuid_is_reported_with_those_that_wait_and_disturbs_no_other_node(tmp_path: Path) -> None:
     machine = DemoMachine(tmp_path)
-    wrong = machine.write_config("wrong.cfg", **{"5e1ec7ab1e02": "0123456789ab"})
+    wrong = machine.write_config("wrong.cfg", {"5e1ec7ab1e02": "0123456789ab"})
     sentence = failure(machine, wrong)
     assert "0123456789ab" in sentence
     assert "5e1ec7ab1e02" in sentence

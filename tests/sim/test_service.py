@@ -9,13 +9,14 @@ import pytest
 from coordinator.ipc.methods import ApiError
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
+from tests.profiles import examples
 from tests.stages.served import Served, running, zigzag
 
 CLEAN = Path("coordinator/simulate/scenarios/clean.toml")
 MOVES = 150
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(examples(4)))
 def test_pause_and_resume_at_random_moments(tmp_path: Path, seed: int) -> None:
     chance = random.Random(seed)
     world = Stage(load(CLEAN), seed)
@@ -64,7 +65,7 @@ def test_pause_and_resume_at_random_moments(tmp_path: Path, seed: int) -> None:
     assert stood
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(examples(2)))
 def test_cancel_at_random_moments(tmp_path: Path, seed: int) -> None:
     chance = random.Random(seed)
     world = Stage(load(CLEAN), seed)

@@ -1,10 +1,10 @@
 """``canductor run --ipc`` and ``canductor demo --serve``, with clients on their sockets."""
 
 import asyncio
+import http.client
 import json
 import os
 import signal
-import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -79,8 +79,11 @@ def test_a_machine_is_served(machine: Hardware, tmp_path: Path) -> None:
         found = canductor("can", "nodes", "-i", "canductor", "-c", machine.folder / "bus", "--json")
         nodes = {node["uuid"]: node["state"] for node in json.loads(found.stdout.splitlines()[-1])["nodes"]}
         assert nodes == {MCU_UUID: "in use", TOOLHEAD_UUID: "in use"}
-        with urllib.request.urlopen(command.stdout.word_after("metrics are at "), timeout=LIMIT_S) as answer:
-            assert b'canductor_machine_state{state="ready"} 1.0' in answer.read()
+        assert command.stdout.word_after("metrics are at ") == f"http://127.0.0.1:{own_port(0)}/metrics"
+        scraped = http.client.HTTPConnection("127.0.0.1", own_port(0), timeout=LIMIT_S)
+        scraped.request("GET", "/metrics")
+        assert b'canductor_machine_state{state="ready"} 1.0' in scraped.getresponse().read()
+        scraped.close()
         command.signal(signal.SIGTERM)
         ended = command.end()
     assert (ended.status, ended.stderr) == (0, "")

@@ -87,7 +87,7 @@ class TypedRun:
 
 
 class DemoMachine(MachineStage):
-    """The demo's machine, its configuration in FOLDER with words REPLACED; more options as MachineStage."""
+    """The demo's machine, its configuration in FOLDER with CHANGES (words by words) and SECTIONS added."""
 
     def __init__(
         self,
@@ -96,18 +96,18 @@ class DemoMachine(MachineStage):
         seed: int = 1,
         nodes: Mapping[str, NodeSetting] | None = None,
         buses: Mapping[str, BusSetting] | None = None,
+        changes: Mapping[str, str] | None = None,
         sections: str = "",
-        **replaced: str,
     ) -> None:
         self.folder = folder
         config = folder / "machine.cfg"
-        config.write_text(without_endstops(**replaced) + sections, encoding="utf-8")
+        config.write_text(without_endstops(changes=changes) + sections, encoding="utf-8")
         super().__init__(config, seed=seed, nodes=nodes, buses=buses)
 
-    def write_config(self, name: str, **replaced: str) -> Path:
+    def write_config(self, name: str, changes: Mapping[str, str] | None = None) -> Path:
         """Write another configuration for the same boards."""
         path = self.folder / name
-        path.write_text(without_endstops(**replaced), encoding="utf-8")
+        path.write_text(without_endstops(changes=changes), encoding="utf-8")
         return path
 
     def write_gcode(self, text: str | bytes, name: str = "job.gcode") -> Path:

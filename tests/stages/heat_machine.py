@@ -20,56 +20,30 @@ from coordinator.simulate.values import Range
 from nodes.node_config import NodeConfig
 from nodes.virtual.firmware import firmware_dictionary
 from nodes.virtual.plant_page import Fault, Kind, PlantPage
+from tests.stages.printer_text import printer_section, section, stepper_section
 
-TOOLHEAD = "[mcu toolhead]\ncanbus_uuid: 0123456789ac\ncanbus_interface: can0\n"
-BASE = """
-[mcu]
-canbus_uuid: 0123456789ab
-canbus_interface: can0
-
-[mcu toolhead]
-canbus_uuid: 0123456789ac
-canbus_interface: can0
-
-[printer]
-kinematics: cartesian
-max_velocity: 300
-max_accel: 3000
-
-[stepper_x]
-step_pin: PA1
-dir_pin: PA2
-microsteps: 16
-rotation_distance: 40
-position_max: 200
-
-[stepper_y]
-step_pin: PA3
-dir_pin: PA4
-microsteps: 16
-rotation_distance: 40
-position_max: 200
-
-[stepper_z]
-step_pin: PA5
-dir_pin: PA6
-microsteps: 16
-rotation_distance: 8
-position_max: 200
-
-[extruder]
-step_pin: toolhead:PB1
-dir_pin: toolhead:PB2
-microsteps: 16
-rotation_distance: 22
-nozzle_diameter: 0.4
-filament_diameter: 1.75
-heater_pin: toolhead:PB3
-sensor_type: EPCOS 100K B57560G104F
-sensor_pin: toolhead:PB4
-min_temp: 0
-max_temp: 300
-"""
+BASE = (
+    section("mcu", canbus_uuid="0123456789ab", canbus_interface="can0")
+    + section("mcu toolhead", canbus_uuid="0123456789ac", canbus_interface="can0")
+    + printer_section(max_velocity=300)
+    + stepper_section("stepper_x", "PA1", "PA2", position_max=200)
+    + stepper_section("stepper_y", "PA3", "PA4", position_max=200)
+    + stepper_section("stepper_z", "PA5", "PA6", rotation_distance=8, position_max=200)
+    + stepper_section(
+        "extruder",
+        "toolhead:PB1",
+        "toolhead:PB2",
+        rotation_distance=22,
+        nozzle_diameter=0.4,
+        filament_diameter=1.75,
+        heater_pin="toolhead:PB3",
+        sensor_type="EPCOS 100K B57560G104F",
+        sensor_pin="toolhead:PB4",
+        min_temp=0,
+        max_temp=300,
+    )
+).rstrip("\n") + "\n"
+"""More options of the extruder may follow."""
 HOTEND_PID = "control: pid\npid_kp: 22.2\npid_ki: 1.08\npid_kd: 114\n"
 BED = """
 [heater_bed]

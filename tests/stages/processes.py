@@ -172,7 +172,7 @@ def write_config(folder: Path, *, name: str = "machine.cfg", **replaced: str) ->
     It has no endstops: nothing around these nodes would press them, and G28 takes the axes as home.
     """
     text = DEMO_CFG.replace("canbus_interface: can0", f"canbus_interface: virtual:{folder / 'bus'}")
-    text = without_endstops(text, **{"/dev/ttyUSB0": str(folder / "zboard.tty")})
+    text = without_endstops(text, {"/dev/ttyUSB0": str(folder / "zboard.tty")})
     for old, new in replaced.items():
         assert old in text
         text = text.replace(old, new)

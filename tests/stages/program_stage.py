@@ -44,10 +44,10 @@ def events_of(
 
 
 class ProgramStage:
-    """The machine, with sections added to its configuration; programs run one after the other."""
+    """MACHINE with SECTIONS added to its configuration; programs run one after the other."""
 
-    def __init__(self, folder: Path, sections: str = "") -> None:
-        self.path = write(folder, PRINTER_CFG + "\n" + sections)
+    def __init__(self, folder: Path, sections: str = "", machine: str = PRINTER_CFG) -> None:
+        self.path = write(folder, machine + "\n" + sections)
         self.description = load_machine(self.path)
         self.modules: ModuleSet = self.description.modules.build(self.description)
         self.planner = Planner(self.description.limits)

@@ -21,7 +21,9 @@ from coordinator.service.methods import add_methods
 from tests.stages.processes import Hardware
 
 LIMIT_S = 60.0
-"""Nothing here may take longer; most takes a fifth of it."""
+"""Nothing here may take longer, in virtual time."""
+LOOK_S = 0.03
+"""How often it is looked whether something is true that is waited for."""
 
 
 def zigzag(moves: int, seed: int) -> str:
@@ -86,7 +88,7 @@ class Served:
             async with asyncio.timeout(limit_s):
                 while not true():
                     assert self.service.state != "error" or what == "error", self.service.cause
-                    await asyncio.sleep(0.01)
+                    await asyncio.sleep(LOOK_S)
         except TimeoutError:
             told = (str(self.service.state), self.job_state, self.tree.get("job.line"), self.lines[-5:])
             raise AssertionError(f"{what} did not come within {limit_s} s: {told}") from None

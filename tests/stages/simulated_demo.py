@@ -41,7 +41,7 @@ class SimulatedLog:
         self.ticks_per_second = round(clock_freq) / ((last - first) * 1e-9)
 
     def _true_ns(self, clocks: Clocks) -> npt.NDArray[np.float64]:
-        return np.asarray(self._node.true_ps(clocks) * 1e-3, np.float64)
+        return self._node.true_ps(clocks).astype(np.float64) * 1e-3
 
     @property
     def record_count(self) -> int:

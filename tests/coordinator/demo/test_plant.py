@@ -17,6 +17,7 @@ from nodes.virtual.plant import Axis, Beta, NodePlant, Rtd, Steinhart
 from nodes.virtual.plant_page import Fault, Kind
 from nodes.virtual.sim import SimNode
 from nodes.virtual.sim_plant import SimPlant, connect_plants
+from tests.stages.printer_text import printer_section, section, stepper_section
 
 CONFIGS = sorted(EXAMPLES.rglob("*.cfg"))
 SHARED = Path(__file__).parents[4] / "shared" / "data" / "config"
@@ -90,43 +91,16 @@ def test_the_second_carriage_has_an_endstop_of_its_own() -> None:
     assert [term.stepper for term in axes["x"].terms] == ["stepper_x"]
 
 
-CONFIG = """
-[mcu]
-serial: /dev/ttyA
-restart_method: command
-[mcu tool]
-serial: /dev/ttyB
-restart_method: command
-[board_pins tool]
-mcu: tool
-aliases: HOT=PA2
-[printer]
-kinematics: cartesian
-max_velocity: 100
-max_accel: 1000
-max_z_velocity: 10
-max_z_accel: 100
-[stepper_x]
-step_pin: PD0
-dir_pin: PD1
-microsteps: 16
-rotation_distance: 40
-position_endstop: 0
-position_max: 200
-[stepper_y]
-step_pin: PD2
-dir_pin: PD3
-microsteps: 16
-rotation_distance: 40
-position_endstop: 0
-position_max: 200
-[stepper_z]
-step_pin: PD4
-dir_pin: PD5
-microsteps: 16
-rotation_distance: 8
-position_endstop: 0
-position_max: 200
+ENDS = {"position_endstop": 0, "position_max": 200}
+CONFIG = (
+    section("mcu", serial="/dev/ttyA", restart_method="command")
+    + section("mcu tool", serial="/dev/ttyB", restart_method="command")
+    + section("board_pins tool", mcu="tool", aliases="HOT=PA2")
+    + printer_section(max_velocity=100, max_accel=1000, max_z_velocity=10, max_z_accel=100)
+    + stepper_section("stepper_x", "PD0", "PD1", **ENDS)
+    + stepper_section("stepper_y", "PD2", "PD3", **ENDS)
+    + stepper_section("stepper_z", "PD4", "PD5", rotation_distance=8, **ENDS)
+    + """
 [extruder]
 step_pin: PA8
 dir_pin: PA9
@@ -165,6 +139,7 @@ tachometer_ppr: 4
 sensor_type: Generic 3950
 sensor_pin: PB3
 """
+)
 
 
 @pytest.fixture
