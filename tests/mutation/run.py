@@ -27,7 +27,7 @@ from tests.mutation.mutation import Mutation
 from tests.mutation.project_copy import FOLDER, BuildError, ProjectCopy
 
 SURVIVORS_MAX: Final = 0.05
-BUDGET_S: Final = 90.0
+BUDGET_S: Final = 40.0
 """So long, measured on the unchanged project, the tests of one mutant may take together."""
 FACTOR: Final = 3.0
 START_S: Final = 5.0
