@@ -136,7 +136,12 @@ def _run_pytest(copy: ProjectCopy, tests: list[str], total: int) -> None:
         _result(file).unlink(missing_ok=True)
     environment = {"MUTATION_COLLECT": str(COLLECTED), "MUTATION_HITS": str(total)}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p"]
-    done = copy.run([*command, "tests.mutation.coverage_plugin", *tests], COLLECTION_LIMIT_S, environment)
+    done = copy.run(
+        [*command, "tests.mutation.coverage_plugin", *tests],
+        timeout_s=COLLECTION_LIMIT_S,
+        cpu_s=COLLECTION_LIMIT_S,
+        environment=environment,
+    )
     if done.status not in {0, 1} or not all(_result(file).exists() for file in tests):
         raise RuntimeError(f"the coverage of tests could not be measured:\n{done.output[-4000:]}")
 
@@ -150,7 +155,9 @@ def _run_c_tests(copy: ProjectCopy, tests: list[str]) -> None:
         began_s = time.perf_counter()
         hits = COLLECTED / "hits"
         hits.unlink(missing_ok=True)
-        done = copy.run([f"./{program.output}"], C_TEST_LIMIT_S, {"MUTATION_HITS_FILE": str(hits)})
+        done = copy.run(
+            [f"./{program.output}"], timeout_s=C_TEST_LIMIT_S, environment={"MUTATION_HITS_FILE": str(hits)}
+        )
         seconds = round(time.perf_counter() - began_s, 4)
         executed = [at for at, hit in enumerate(hits.read_bytes()) if hit] if hits.exists() else []
         test = {"passed": done.status == 0, "seconds": seconds, "c": executed, "python": {}}

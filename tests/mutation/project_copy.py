@@ -6,6 +6,7 @@ header all objects that include it.
 
 import json
 import marshal
+import math
 import os
 import resource
 import shlex
@@ -14,9 +15,12 @@ import signal
 import subprocess
 import sys
 import sysconfig
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -80,8 +84,12 @@ class ProjectCopy:
 
     # ------------------------------------------------------------------------------------------- contents
 
-    def update(self, changed: Mapping[str, bytes] = {}) -> None:
+    def update(self, changed: Mapping[str, bytes] | None = None) -> None:
         """Make the copy equal to the project, but for the files CHANGED; what is equal keeps its time."""
+        shared, link = ROOT.parent / "shared", FOLDER / "shared"
+        if shared.is_dir() and not link.exists():  # tests look for it beside the project
+            FOLDER.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(shared)
         wanted: set[Path] = set()
         for part in COPIED:
             top = ROOT / part
@@ -89,7 +97,7 @@ class ProjectCopy:
                 relative = path.relative_to(ROOT)
                 if path.is_file() and path.suffix not in BUILT and not set(LEFT_OUT) & set(relative.parts):
                     wanted.add(relative)
-                    self.write(str(relative), changed.get(str(relative), path.read_bytes()))
+                    self.write(str(relative), (changed or {}).get(str(relative), path.read_bytes()))
                     (self.folder / relative).chmod(path.stat().st_mode)
         # Extension modules that are not mutated come compiled.
         for path in ROOT.rglob("*.so"):
@@ -118,33 +126,38 @@ class ProjectCopy:
     def run(
         self,
         command: Sequence[str],
+        *,
         timeout_s: float = 600.0,
-        environment: Mapping[str, str] = {},
+        cpu_s: float = 3600.0,
+        environment: Mapping[str, str] | None = None,
     ) -> Outcome:
-        """Run COMMAND in the copy; ends it and all that it started after TIMEOUT_S."""
-        variables = {
-            **os.environ,
-            "PYTHONPATH": str(self.folder),
-            "PYTHONDONTWRITEBYTECODE": "1",
-            **environment,
-        }
-        process = subprocess.Popen(
-            command,
-            cwd=self.folder,
-            env=variables,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            preexec_fn=_limit,  # noqa: PLW1509 - nothing in the child takes a lock
-        )
-        try:
-            output, _ = process.communicate(timeout=timeout_s)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            output, _ = process.communicate()
-            return Outcome(None, output.decode(errors="replace"))
-        return Outcome(process.returncode, output.decode(errors="replace"))
+        """Run COMMAND in the copy; ends it and all that it started after TIMEOUT_S.
+
+        CPU_S of computing end it, too: unlike TIMEOUT_S that does not depend on how busy the computer is.
+        """
+        variables = {**os.environ, "PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"}
+        # A file: what outlives the command could hold a pipe open.
+        with tempfile.TemporaryFile() as output:
+            process = subprocess.Popen(
+                command,
+                cwd=self.folder,
+                env={**variables, **(environment or {})},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=partial(_limit, math.ceil(cpu_s)),  # noqa: PLW1509 - takes no lock
+            )
+            try:
+                status: int | None = process.wait(timeout_s)
+            except subprocess.TimeoutExpired:
+                status = None
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            output.seek(0)
+            text = output.read().decode(errors="replace")
+        return Outcome(None if status in {-signal.SIGXCPU, -signal.SIGKILL} else status, text)
 
     # ------------------------------------------------------------------------------------------- building
 
@@ -204,10 +217,11 @@ class ProjectCopy:
 
     @contextmanager
     def planted(self, mutation: Mutation, c_tests: Sequence[Program] = ()) -> Iterator[bool]:
-        """Make the change, with what it touches compiled; take it back at the end.
+        """Make the change, with the modules that it touches compiled; take it back at the end.
 
-        Gives whether the change makes no difference to any compiled object. Raises BuildError when the
-        changed file does not compile.
+        Gives whether the change makes no difference to any compiled object. Of C_TESTS, which must be built,
+        the objects are set aside, so that build() makes those of the changed source. Raises BuildError when
+        the changed file does not compile.
         """
         path = self.folder / mutation.file
         original, status = path.read_bytes(), path.stat()
@@ -217,11 +231,12 @@ class ProjectCopy:
             path.write_bytes(mutation.applied(original))
             if mutation.is_c:
                 users = self._users(programs, path)
-                for program, objects in users:
-                    kept += [_keep(target) for target in (*objects, self.folder / program.output)]
-                for program, _ in users:
+                touched = [(*objects, self.folder / program.output) for program, objects in users]
+                kept += [_keep(target) for target in dict.fromkeys(chain.from_iterable(touched))]
+                modules = [(program, objects) for program, objects in users if program in self.modules]
+                for program, _ in modules:
                     self.build(program)
-                changed = {target for _, objects in users for target in objects}
+                changed = {target for _, objects in modules for target in objects}
                 yield bool(changed) and all(_same_content(target) for target in changed)
             else:
                 yield _same_code(original, path.read_bytes())
@@ -288,6 +303,7 @@ def _same_code(original: bytes, changed: bytes) -> bool:
     return marshal.dumps(compile(original, "", "exec")) == marshal.dumps(compile(changed, "", "exec"))
 
 
-def _limit() -> None:
+def _limit(cpu_s: int) -> None:
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s + 1))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_MAX_BYTES, FILE_MAX_BYTES))

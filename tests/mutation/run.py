@@ -27,11 +27,20 @@ from tests.mutation.mutation import Mutation
 from tests.mutation.project_copy import FOLDER, BuildError, ProjectCopy
 
 SURVIVORS_MAX: Final = 0.05
-BUDGET_S: Final = 90.0
+BUDGET_S: Final = 40.0
 """So long, measured on the unchanged project, the tests of one mutant may take together."""
-FACTOR: Final = 8.0
-START_S: Final = 60.0
-"""A mutant hangs when its tests take FACTOR times as long as on the unchanged project, and START_S."""
+FACTOR: Final = 3.0
+START_S: Final = 5.0
+"""A mutant hangs when its tests compute FACTOR times as long as on the unchanged project, and START_S."""
+WALL_FACTOR: Final = 10.0
+"""… or take so much longer than that: they wait for what does not come, or the computer is very busy."""
+FIRST_BATCH_S: Final = 1.5
+BATCH_GROWTH: Final = 4.0
+"""Tests run in batches: most mutants die in the first one, and to collect all tests takes seconds."""
+PYTEST: Final = (
+    *(sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "--tb=no"),
+    *("-p", "no:cacheprovider", "-p", "no:xdist"),
+)
 FILE_COST_S: Final = 0.3
 """What it takes to collect a test file."""
 
@@ -155,47 +164,43 @@ class Runner:
             return NO_CODE, ""
 
     def _run(self, copy: ProjectCopy, mutation: Mutation, chosen: list[CoveringTest]) -> tuple[str, str]:
-        seconds = sum(test.seconds for test in chosen)
-        limit_s = START_S + FACTOR * seconds
-        for group in _groups(chosen):
-            if group[0].is_c:
-                program = next(p for p in copy.c_tests if p.name == group[0].name)
-                done = copy.run([f"./{program.output}"], limit_s)
-                failed = group[0].name if done.status else ""
+        for batch in batches(chosen):
+            cpu_s = START_S + FACTOR * sum(test.seconds for test in batch)
+            if batch[0].is_c:
+                program = next(p for p in copy.c_tests if p.name == batch[0].name)
+                copy.build(program)
+                done = copy.run([f"./{program.output}"], timeout_s=WALL_FACTOR * cpu_s, cpu_s=cpu_s)
+                failed = [f"FAILED {batch[0].name}"] if done.status != 0 else []
             else:
-                command = [
-                    sys.executable,
-                    "-m",
-                    "pytest",
-                    "-q",
-                    "-x",
-                    "-p",
-                    "no:cacheprovider",
-                    "--no-header",
-                ]
-                done = copy.run([*command, "--tb=no", *(test.name for test in group)], limit_s)
-                lines = [line for line in done.output.splitlines() if line.startswith(("FAILED", "ERROR"))]
-                failed = lines[0] if lines else f"status {done.status}" if done.status else ""
+                names = [test.name for test in batch]
+                done = copy.run([*PYTEST, *names], timeout_s=WALL_FACTOR * cpu_s, cpu_s=cpu_s)
+                lines = done.output.splitlines()
+                failed = [line for line in lines if line.startswith(("FAILED ", "ERROR "))]
+            if done.status == 0:
+                continue
+            with self._lock:
+                at_fault = failed[0].split()[1] if failed else batch[0].name
+                self._history[mutation.file][at_fault.split("::", maxsplit=1)[0]] += 1
             if done.status is None:
-                return KILLED, f"took longer than {limit_s:.0f} s"
-            if failed:
-                name = failed.split()[-1 if group[0].is_c else 1] if " " in failed else failed
-                with self._lock:
-                    self._history[mutation.file][name.split("::")[0]] += 1
-                return KILLED, failed[:150]
-        return SURVIVED, f"{len(chosen)} tests, {seconds:.0f} s"
+                return KILLED, f"hangs: more than {cpu_s:.0f} s"
+            return KILLED, failed[0][:150] if failed else f"status {done.status}"
+        return SURVIVED, f"{len(chosen)} tests, {sum(test.seconds for test in chosen):.0f} s"
 
 
-def _groups(tests: list[CoveringTest]) -> Iterator[list[CoveringTest]]:
-    """Split TESTS where C programs and pytest's alternate: one call of pytest each."""
-    group: list[CoveringTest] = []
+def batches(tests: list[CoveringTest]) -> Iterator[list[CoveringTest]]:
+    """Split TESTS: C programs alone, others so that the first batches are short."""
+    batch: list[CoveringTest] = []
+    spent_s, room_s = 0.0, FIRST_BATCH_S
     for test in tests:
-        if group and (test.is_c or group[0].is_c):
-            yield group
-            group = []
-        group.append(test)
-    if group:
-        yield group
+        is_full = batch and batch[-1].file != test.file and spent_s >= room_s
+        if batch and (test.is_c or batch[0].is_c or is_full):
+            yield batch
+            room_s *= 1 if batch[0].is_c else BATCH_GROWTH
+            batch, spent_s = [], 0.0
+        batch.append(test)
+        spent_s += test.seconds
+    if batch:
+        yield batch
 
 
 def report(verdicts: Sequence[Verdict]) -> tuple[list[str], bool]:

@@ -95,10 +95,12 @@ static void start(struct sim_board *board) {
 
 static void run_tasks(struct sim_board *board) {
     struct node *node = &board->virtual.node;
+    virtual_irq_check(&board->virtual);
     if (board->owner.context)
         return; // it says when
     if (node->tasks_pending)
         node_run_tasks(node);
+    virtual_irq_check(&board->virtual);
     if (board->reset_wanted)
         start(board);
 }
@@ -238,6 +240,7 @@ int sim_reset_wanted(const struct sim_board *board) {
 
 void sim_run_tasks(struct sim_board *board) {
     node_run_tasks(&board->virtual.node);
+    virtual_irq_check(&board->virtual);
 }
 
 void sim_sent(struct sim_board *board) {

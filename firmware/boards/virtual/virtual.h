@@ -25,6 +25,7 @@ struct virtual_board {
     void (*on_edge)(struct virtual_board *board, uint32_t pin, int level);
     void (*can_status)(struct virtual_board *board, struct board_can_status *out);
     struct plant *plant; // what its pins are connected with; null: nothing
+    uint32_t irq_depth;  // sections of masked interrupts that have begun and not ended
 };
 
 // What one variant of the boards is built as (constants.c).
@@ -36,6 +37,9 @@ extern const struct virtual_variant virtual_variant;
 
 // All pins low, all converters idle. Outputs that were high are logged as falling.
 void virtual_pins_reset(struct virtual_board *board);
+
+// Ends the process, which is a fault of the firmware, when interrupts are still masked. Call between events.
+void virtual_irq_check(const struct virtual_board *board);
 
 // From the board: its clock in 64 bits, the true time of that in ns, and more room in (or a flush of) the
 // full edge buffer.
