@@ -127,7 +127,7 @@ class SimulatedComputer:
 
         def close() -> None:
             io.close()
-            port.close()
+            port.close()  # once more does nothing
 
         return Port(port.name, lambda **_: io, close)
 
@@ -176,6 +176,15 @@ class WireListener:
         self._frames.clear()
         if not frames and self._cause:
             raise CanductorError(f"CAN bus {self._options.name}: {self._cause}")
+        return frames
+
+    def rest(self, quiet_s: float, limit_s: float) -> list[Frame]:
+        """Stop listening once nothing comes for QUIET_S, or after LIMIT_S; return all frames that waited."""
+        end_ns = self._computer.monotonic_ns() + round(limit_s * 1e9)
+        frames = self.take()
+        while self._computer.monotonic_ns() < end_ns and (new := self.take(quiet_s)):
+            frames += new
+        self._port.close()
         return frames
 
     def only(self, can_id: int) -> None:
