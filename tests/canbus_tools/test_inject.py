@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -144,7 +145,7 @@ def test_a_node_that_dies_ends_the_run_with_a_sentence(tmp_path: Path) -> None:
     with running(tmp_path / "bus", "--nodes", "toolhead") as tool:
         children = Path(f"/proc/{tool.process.pid}/task/").glob("*/children")
         node = next(int(pid) for child in children for pid in child.read_text().split())
-        subprocess.run(["kill", "-9", str(node)], check=True)
+        os.kill(node, signal.SIGKILL)
         out, err = tool.process.communicate(timeout=WAIT_S)
         assert tool.process.returncode == 1
         assert err == "canductor: node toolhead did not end in order: ended by signal 9\n"

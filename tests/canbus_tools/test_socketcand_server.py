@@ -2,8 +2,10 @@
 
 import asyncio
 import contextlib
+import os
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from nodes.errors import CanductorError
 from nodes.transport.frame import CanFrame
 from nodes.virtual.hub import VirtualBus
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 @pytest.fixture
@@ -49,12 +51,11 @@ def serving(bus: VirtualBus) -> Iterator[SocketcandServer]:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    pause = threading.Event()
-    for _ in range(2000):
-        if condition():
-            return
-        pause.wait(0.01)
-    raise AssertionError("it did not come to that")
+    """Wait for what the server's thread does."""
+    end_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < end_s, "it did not come to that"
+        os.sched_yield()
 
 
 def python_can(server: SocketcandServer) -> can.BusABC:
