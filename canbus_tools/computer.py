@@ -56,6 +56,12 @@ class Listener(Protocol):
         Raises CanductorError when the bus has failed, once its last frames were returned.
         """
 
+    def rest(self, quiet_s: float, limit_s: float) -> list[Frame]:
+        """Stop listening once nothing comes for QUIET_S, or after LIMIT_S; return all frames that waited.
+
+        Raises CanductorError as ``take`` does.
+        """
+
     def only(self, can_id: int) -> None:
         """Receive nothing but frames with this 11-bit id, and error reports, from now on."""
 

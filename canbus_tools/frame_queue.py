@@ -3,6 +3,7 @@
 import contextlib
 import socket
 import threading
+import time
 from collections import deque
 from types import TracebackType
 from typing import Final, Self
@@ -64,17 +65,27 @@ class FrameQueue:
                 raise self._cause.with_traceback(None)
         return frames
 
+    def rest(self, quiet_s: float, limit_s: float) -> list[Frame]:
+        """Stop listening once nothing comes for QUIET_S, or after LIMIT_S; return all frames that waited."""
+        self._ending = True
+        self._thread.join()
+        end_s = time.monotonic() + limit_s
+        while self._cause is None and time.monotonic() < end_s and self._receive(quiet_s):
+            pass
+        return self.take()
+
     def only(self, can_id: int) -> None:
         """Receive nothing but frames with this 11-bit id, and error reports, from now on."""
         self._bus.set_filters([can.typechecking.CanFilter(can_id=can_id, can_mask=0x7FF, extended=False)])
 
     def _run(self) -> None:
-        channel = self._options.short_name
+        while not self._ending and self._cause is None:
+            self._receive(_POLL_S)
+
+    def _receive(self, timeout_s: float) -> bool:
+        """Take one frame off the bus; return whether there was one."""
         try:
-            while not self._ending:
-                message = self._bus.recv(_POLL_S)
-                if message is not None:
-                    self._put(Frame.from_message(message)._replace(channel=channel))
+            message = self._bus.recv(timeout_s)
         # Whatever a backend raises ends the reception, and the user is told.
         except Exception as error:  # noqa: BLE001
             said = " ".join(str(error).split()) or type(error).__name__
@@ -84,6 +95,11 @@ class FrameQueue:
                     f"'canductor can doctor' may say why"
                 )
                 self._changed.notify()
+            return False
+        if message is None:
+            return False
+        self._put(Frame.from_message(message)._replace(channel=self._options.short_name))
+        return True
 
     def _put(self, frame: Frame) -> None:
         with self._changed:

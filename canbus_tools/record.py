@@ -103,9 +103,7 @@ def _until_end(
         if left_s <= 0:
             break
         yield from bus.take(left_s)
-    last_s = now_s(computer) + DRAIN_S
-    while now_s(computer) < last_s and (frames := bus.take(QUIET_S)):
-        yield from frames
+    yield from bus.rest(QUIET_S, DRAIN_S)
 
 
 @contextlib.contextmanager

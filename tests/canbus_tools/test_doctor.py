@@ -1,5 +1,6 @@
 """``canductor can doctor`` names faults that are planted on a bus."""
 
+import re
 from functools import partial
 
 import pytest
@@ -8,8 +9,7 @@ from canbus_tools.census import Census
 from canbus_tools.doctor_checks.facts import NodeFacts
 from canbus_tools.doctor_checks.facts import Place as Bus
 from canbus_tools.doctor_checks.population import check_nodes
-from canbus_tools.doctor_facts import ASKED, try_bitrates
-from canbus_tools.open_bus import BusOptions
+from canbus_tools.doctor_facts import ASKED
 from canbus_tools.survey import SurveyResult
 from nodes.transport import CanFrame
 from tests.canbus_tools.command import Command
@@ -126,14 +126,15 @@ def test_quiet_bus_sends_nothing(stage: CanStage, can_tool: Command) -> None:
     assert "nothing was heard and nothing was asked" in text
 
 
-def test_other_bit_rates_are_listened_to() -> None:
+def test_other_bit_rates_are_listened_to(capsys: pytest.CaptureFixture[str]) -> None:
     stage = CanStage(bitrate=250_000)
-    options = BusOptions(interface="gs_usb", channel="can0")
+    stage.add_node(MAIN, MAIN_ID)
+    tool = Command(stage.computer, capsys, ("-i", "gs_usb", "-c", "can0"))
     with stage.repeating(CanFrame(0x109, b"12345678"), 0.005):
-        heard = try_bitrates(stage.computer, options, 0.5)
-    assert list(heard) == [1_000_000, 500_000, 250_000, 125_000]
-    assert 95 <= heard.pop(250_000) <= 100
-    assert not any(heard.values())
+        said = examine(tool, "--try-bitrates", "--listen", "0.5")
+    finding = expect(said, "other-bitrate")["other-bitrate"]
+    assert re.search(r"but 10[01] frames were heard at 250000 bit/s", finding["seen"])
+    assert "--bitrate 250000" in finding["do"]
 
 
 @pytest.mark.parametrize(

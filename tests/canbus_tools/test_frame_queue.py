@@ -56,6 +56,14 @@ def test_what_waits_too_long_gives_way_and_is_counted(sender: can.BusABC) -> Non
         assert numbers_of(queue.take()) == list(range(15, 25))
 
 
+def test_the_rest_is_what_had_arrived_when_listening_ends(sender: can.BusABC) -> None:
+    with ThisComputer().listen(OPTIONS) as queue:
+        send(sender, range(1000))
+        assert numbers_of(queue.rest(quiet_s=0.01, limit_s=WAIT_S)) == list(range(1000))
+        send(sender, range(5))
+        assert queue.rest(quiet_s=0.0, limit_s=0.0) == [], "it listens no more"
+
+
 def test_other_frames_can_be_left_out(sender: can.BusABC) -> None:
     with ThisComputer().listen(OPTIONS) as queue:
         queue.only(0x3F1)

@@ -80,7 +80,7 @@ def test_as_tables_with_a_plot(recording: Path, tmp_path: Path, capsys: pytest.C
 
 def test_live(stage: CanStage, can_tool: Command) -> None:
     with stage.repeating(CanFrame(0x555, b"12345678"), 0.005):
-        said = can_tool("load", "--bitrate", "250000", "--duration", "1", "--json")
+        said = can_tool("load", "--bitrate", "250000", "--duration", "1", "--window", "0.1", "--json")
     assert said.status == 0
     frames = said.json["frames"]
     assert 199 <= frames <= 200
@@ -88,6 +88,7 @@ def test_live(stage: CanStage, can_tool: Command) -> None:
     bits = frames * bits_on_wire(0x555, b"12345678")
     assert said.json["mean"] == pytest.approx(bits / 250_000, rel=1e-3)
     assert list(said.json["ids"]) == ["555"]
+    assert [19 <= window["frames"] <= 21 for window in said.json["windows"][:10]] == [True] * 10
 
 
 def test_watch_until_ctrl_c_still_reports(stage: CanStage, can_tool: Command) -> None:

@@ -72,7 +72,7 @@ class Stand:
 
 
 def on_screen(stage: CanStage, size: tuple[int, int], test: Callable[[Stand], Awaitable[None]]) -> None:
-    """Run TEST beside the screen; the bus's time goes on when the test says so."""
+    """Run TEST with the screen; the bus's time goes on when the test says so."""
 
     async def run() -> None:
         options = MonitorOptions(

@@ -13,8 +13,10 @@ from mcap.reader import make_reader
 from canbus_tools.decoder import BusDecoder
 from canbus_tools.frame import Frame
 from canbus_tools.mcap_file import COUNTERS, FRAMES, MESSAGES
+from canbus_tools.record import DRAIN_S
 from canbus_tools.recordings import read_frames
 from coordinator.cli import main
+from nodes.transport import CanFrame
 from tests.canbus_tools.command import Command
 from tests.canbus_tools.talk_twin import Talk, download, identify_pieces
 from tests.stages.can_stage import CanStage
@@ -73,6 +75,28 @@ def test_candump_log(stage: CanStage, can_tool: Command, tmp_path: Path) -> None
     said = can_tool("record", "-o", path, "--json", "--duration", "5")
     assert (said.status, said.json["frames"], said.json["bytes"]) == (0, len(frames), path.stat().st_size)
     assert contents(list(read_frames(path))) == contents(frames)
+
+
+def test_what_is_on_its_way_when_the_user_stops_is_recorded(
+    stage: CanStage, can_tool: Command, tmp_path: Path
+) -> None:
+    path = tmp_path / "some.log"
+    frames = session()  # a millisecond apart
+    stage.replay(frames, after_s=0.1)
+    stage.press(signal.SIGINT, after_s=0.1 + len(frames) / 2 * 0.001)
+    assert can_tool("record", "-o", path).status == 0
+    assert contents(list(read_frames(path))) == contents(frames)
+
+
+def test_a_bus_that_is_never_quiet_ends_soon_all_the_same(
+    stage: CanStage, can_tool: Command, tmp_path: Path
+) -> None:
+    path = tmp_path / "some.log"
+    with stage.repeating(CanFrame(0x555, b"12345678"), 0.005):
+        began_ns = stage.world.now_ns
+        assert can_tool("record", "-o", path, "--duration", "0.5").status == 0
+        assert 0.5e9 <= stage.world.now_ns - began_ns <= (0.5 + DRAIN_S + 0.1) * 1e9
+    assert 0.5 / 0.005 <= len(list(read_frames(path))) <= (0.5 + DRAIN_S) / 0.005 + 1
 
 
 def test_it_ends_after_its_duration(stage: CanStage, can_tool: Command, tmp_path: Path) -> None:

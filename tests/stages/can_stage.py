@@ -126,8 +126,10 @@ class CanStage:
 
         with self.user() as sender:
             again()
-            yield sender
-            lasting = False
+            try:
+                yield sender
+            finally:
+                lasting = False
 
     @contextmanager
     def asking_host(self, nodeid: int, *, every_s: float = 0.01) -> Iterator[None]:
@@ -145,8 +147,10 @@ class CanStage:
                     self.world.at(self.world.now_ns + round(every_s * 1e9), again)
 
             again()
-            yield
-            lasting = False
+            try:
+                yield
+            finally:
+                lasting = False
         port.close()
 
     def replay(self, frames: Sequence[Frame], *, after_s: float = 0.1) -> None:
@@ -168,8 +172,10 @@ class CanStage:
         assert sender.controller is not None
         self.world.run_for(BOOT_S)
         sender.controller.babble(can_id, data, 3600.0)
-        yield
-        sender.power_off()
+        try:
+            yield
+        finally:
+            sender.power_off()
 
     def ask(self, nodeid: int, question: str, answer: str, *, force: bool = False) -> Message:
         """Ask a node by the tools' own way."""

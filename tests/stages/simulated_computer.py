@@ -116,10 +116,6 @@ class SimulatedComputer:
         for port in self._used:
             port.fail(cause)
 
-    def hears(self, options: BusOptions) -> bool:
-        """Return whether an adapter opened with OPTIONS has the bit rate of its wire."""
-        return options.bitrate in (None, self._wires[options.channel].bitrate)
-
     def open_io(self, options: BusOptions, on_frame: FrameHandler, on_closed: Callable[[str], None]) -> Port:
         """Open an adapter and start its I/O; closing the port ends both."""
         port = self.open_can(options)
@@ -127,7 +123,7 @@ class SimulatedComputer:
 
         def close() -> None:
             io.close()
-            port.close()
+            port.close()  # once more does nothing
 
         return Port(port.name, lambda **_: io, close)
 
@@ -139,8 +135,11 @@ class SimulatedComputer:
         if not free:
             settings = ControllerSettings(loss=self._loss, queue=1000)
             free.append(self.world.add_can_port(wire, controller=settings))
-        self._used.append(free.pop())
-        return self._used[-1]
+        port = free.pop()
+        # At another bit rate than the wire's, an adapter is as good as alone.
+        port.controller.cut(0 if options.bitrate in (None, wire.bitrate) else 1)
+        self._used.append(port)
+        return port
 
     def _release(self, port: CanPort) -> None:
         if port in self._used:
@@ -178,6 +177,15 @@ class WireListener:
             raise CanductorError(f"CAN bus {self._options.name}: {self._cause}")
         return frames
 
+    def rest(self, quiet_s: float, limit_s: float) -> list[Frame]:
+        """Stop listening once nothing comes for QUIET_S, or after LIMIT_S; return all frames that waited."""
+        end_ns = self._computer.monotonic_ns() + round(limit_s * 1e9)
+        frames = self.take()
+        while self._computer.monotonic_ns() < end_ns and (new := self.take(quiet_s)):
+            frames += new
+        self._port.close()
+        return frames
+
     def only(self, can_id: int) -> None:
         """Receive nothing but frames with this id, and error reports, from now on."""
         self._only = can_id
@@ -185,8 +193,6 @@ class WireListener:
     def _came(self, frame: LinkFrame) -> None:
         is_error = bool(frame.can_id & _ERROR_FLAG)
         if self._only not in (None, frame.can_id) and not is_error:
-            return
-        if not self._computer.hears(self._options):
             return
         kind = FrameKind.ERROR if is_error else FrameKind.DATA
         time_s = UNIX_AHEAD_S + frame.received_ns * 1e-9

@@ -1,4 +1,4 @@
-"""A print over SocketCAN with the shipped constants: the coordinator's job, two firmware processes on vcan0."""
+"""A print over SocketCAN: the coordinator's job and two firmware processes on vcan0."""
 
 import asyncio
 from collections.abc import Iterator

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from canbus_tools.candump import candump_line
-from canbus_tools.frame import Frame
 from canbus_tools.recordings import read_frames
 from nodes.transport import CanFrame, open_can
 from nodes.virtual.processes import NodeProcess
@@ -21,6 +20,7 @@ pytestmark = pytest.mark.skipif(bool(why_no_socketcan()), reason=why_no_socketca
 
 MAIN, TOOL, BED = "90a4ae022dfc", "5e1ec7ab1e02", "bed000000001"
 WAIT_S = 60.0
+COUNT = 300
 
 
 @pytest.fixture
@@ -64,15 +64,14 @@ def test_recording(tmp_path: Path) -> None:
         assert recorder.stderr is not None
         assert recorder.stderr.readline().startswith(f"recording {INTERFACE} to ")
         with closing(open_can(INTERFACE)) as sender:
-            for number in range(2000):
+            for number in range(COUNT):
                 sender.send(CanFrame(0x108, number.to_bytes(8)))
         recorder.send_signal(signal.SIGTERM)
         assert recorder.wait(WAIT_S) == 0
     frames = list(read_frames(path))
-    assert [int.from_bytes(frame.data) for frame in frames] == list(range(2000))
+    assert [int.from_bytes(frame.data) for frame in frames] == list(range(COUNT))
     assert path.read_text() == "".join(map(candump_line, frames))
     assert {(frame.can_id, frame.channel) for frame in frames} == {(0x108, INTERFACE)}
-    assert all(isinstance(frame, Frame) for frame in frames)
 
 
 def test_an_interface_without_a_bit_rate(tool: Command) -> None:
@@ -82,6 +81,5 @@ def test_an_interface_without_a_bit_rate(tool: Command) -> None:
 def test_an_interface_that_is_not_there(capsys: pytest.CaptureFixture[str]) -> None:
     tool = Command(None, capsys, ("-c", "vcan7"))
     assert "vcan7: cannot open: there is no such interface" in tool("query").sentence
-    assert "CAN bus vcan7: there is no such interface" in tool("monitor", "--lines").sentence
     said = tool.run("demo", "--no-web", "--socketcan", "vcan7")
     assert "vcan7: cannot open: there is no such interface" in said.sentence
