@@ -169,10 +169,13 @@ class BoardProcess:
             nominal_hz, rate_hz, start_ns, start_clock = struct.unpack_from("<ddQQ", log.read(64), 8)
         return nominal_hz, rate_hz, start_ns, start_clock
 
-    def wait_for(self, oid: int, clock: int) -> None:
-        """Wait until its clock is CLOCK: OID, a configured trsync, expires then and reports it."""
+    def arm(self, oid: int, clock: int) -> None:
+        """Let OID, a configured trsync, expire when its clock is CLOCK; `wait_expired` waits for that."""
         self.send(f"trsync_start oid={oid} report_clock=0 report_ticks=0 expire_reason={EXPIRED}")
         self.send(f"trsync_set_timeout oid={oid} clock={clock % ROLLOVER}")
+
+    def wait_expired(self) -> None:
+        """Wait until the trsync of `arm` expires."""
         state = self.read_answer("trsync_state")
         assert (state["can_trigger"], state["trigger_reason"]) == (0, EXPIRED)
 

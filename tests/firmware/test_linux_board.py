@@ -66,13 +66,14 @@ def test_steps_over_a_rollover_are_in_the_edge_log_at_their_ticks(start: Start) 
             node.send(f"reset_step_clock oid={oid} clock={first % ROLLOVER}")
             node.send(f"queue_step oid={oid} interval={freq // 10000} count=500 add=-1")
         node.send("set_next_step_dir oid=1 dir=1", f"queue_step oid=1 interval={freq // 10000} count=3 add=0")
+        node.arm(2, first + freq // 10)
     for node in nodes.values():
         check_steps(node)
 
 
 def check_steps(node: BoardProcess) -> None:
     freq, first = node.freq_hz, 3 * ROLLOVER - node.freq_hz // 40
-    node.wait_for(2, first + freq // 10)
+    node.wait_expired()
     positions = [node.send(f"stepper_get_position oid={oid}")[0]["pos"] for oid in (0, 1)]
     assert positions == [-500, -497]
     statistics = node.end()
@@ -146,7 +147,8 @@ def test_input_finds_the_slots_that_are_free_by_then(start: Start, tmp_path: Pat
     assert stopped.si_status == signal.SIGSTOP
     hold.unlink()
     # Another node's clock says when the first slot has to be free; this one does not run.
-    alarm.wait_for(0, alarm.clock_at(int(node.monotonic_ns_at(free_at))) + alarm.freq_hz // 1000)
+    alarm.arm(0, alarm.clock_at(int(node.monotonic_ns_at(free_at))) + alarm.freq_hz // 1000)
+    alarm.wait_expired()
     node.post("queue_step oid=0 interval=9 count=1 add=0")
     node.process.send_signal(signal.SIGCONT)
     assert node.read_answer("clock")["clock"] - free_at % ROLLOVER > 0, "it was stopped until then"
