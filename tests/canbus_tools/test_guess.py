@@ -20,6 +20,7 @@ from coordinator.cli import main
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
 from nodes.virtual.hub import VirtualBus
+from tests import real_dictionaries
 from tests import wire_twin as twin
 from tests.canbus_tools.talk_twin import (
     DICTIONARY,
@@ -31,8 +32,6 @@ from tests.canbus_tools.talk_twin import (
     identify_pieces,
     other_dictionary,
 )
-
-DICTIONARIES = Path(__file__).parents[2] / ".." / "shared" / "data" / "dictionaries"
 
 
 def changed(*words: tuple[bytes, bytes]) -> bytes:
@@ -129,11 +128,10 @@ def test_without_a_cache_nothing_is_guessed() -> None:
     assert source.known == {}
 
 
-def test_eight_real_firmwares_are_told_from_one_another(tmp_path: Path) -> None:
-    if not DICTIONARIES.is_dir():
-        pytest.skip("no dictionaries of real firmware in ../shared")
-    texts = {path.stem: path.read_bytes() for path in sorted(DICTIONARIES.glob("*.json"))}
-    assert len(texts) == 8
+@pytest.mark.skipif(not real_dictionaries.PATHS, reason=real_dictionaries.MISSING)
+def test_real_firmwares_are_distinguished(tmp_path: Path) -> None:
+    texts = {path.stem: path.read_bytes() for path in real_dictionaries.PATHS}
+    assert tuple(texts) == real_dictionaries.NAMES
     cache = cache_of(tmp_path, *texts.values())
     for stem, text in texts.items():
         dictionary = Dictionary.from_json(text)

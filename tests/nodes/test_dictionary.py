@@ -13,15 +13,16 @@ from hypothesis import strategies as st
 from nodes.dictionary import BOOTSTRAP, MAX_INFLATED_BYTES, Dictionary
 from nodes.dictionary_parts import OUTPUT, DictionaryError
 from nodes.message_format import Message, MessageError, MessageFormat, Value
+from tests import real_dictionaries
 from tests import wire_twin as twin
 from tests.profiles import examples
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "tests" / "data"
-REAL = sorted((ROOT / ".." / "shared" / "data" / "dictionaries").glob("*.json"))
+REAL = real_dictionaries.PATHS
 TEXT = (DATA / "dictionary.json").read_bytes()
 SMALL = Dictionary.from_json(TEXT)
-real_only = pytest.mark.skipif(not REAL, reason="no recorded dictionaries of real boards in ../shared")
+real_only = pytest.mark.skipif(not REAL, reason=real_dictionaries.MISSING)
 
 
 def changed(**parts: Any) -> bytes:
