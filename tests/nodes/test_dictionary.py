@@ -104,12 +104,11 @@ def check_round_trip(dictionary: Dictionary, message: MessageFormat, values: dic
 
 def values_at(message: MessageFormat, place: int) -> dict[str, Value]:
     """Return the lowest values (PLACE 0), the highest (1), or numbers of a middling size."""
-    numbers = [(*bounds(code), 200) if code in twin.CODES else None for code in message.code_texts]
-    texts = (b"", b"\xff" * LONGEST, b"\x7e\0")
-    return {
-        name: texts[place] if number is None else number[place]
-        for name, number in zip(message.names, numbers, strict=True)
-    }
+    texts: tuple[Value, ...] = (b"", b"\xff" * LONGEST, b"\x7e\0")
+    choices: list[tuple[Value, ...]] = [
+        (*bounds(code), 200) if code in twin.CODES else texts for code in message.code_texts
+    ]
+    return {name: choice[place] for name, choice in zip(message.names, choices, strict=True)}
 
 
 @pytest.mark.parametrize("name", DICTIONARIES)

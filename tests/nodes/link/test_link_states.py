@@ -39,9 +39,8 @@ class Asked:
         assert len(data) == 5
         return data[1] & 15
 
-    @property
-    def state(self) -> LinkState:
-        return LinkState(self.link.c.state)
+    def is_in(self, state: LinkState) -> bool:
+        return LinkState(self.link.c.state) is state
 
     def answer(self, sequence: int) -> None:
         self.now += MS
@@ -62,19 +61,22 @@ class Asked:
 def test_the_first_answer_is_confirmed(event: LinkEvent) -> None:
     scene = Asked()
     scene.answer(scene.sequence + (1 if event is LinkEvent.TAKEN else 5))
-    assert scene.state is LinkState.CONFIRMING is following(LinkState.PROBING, event)
+    assert scene.is_in(LinkState.CONFIRMING)
+    assert following(LinkState.PROBING, event) is LinkState.CONFIRMING
 
 
 def test_only_an_answer_behind_the_second_block_confirms() -> None:
     scene = Asked()
     scene.confirming()
     scene.answer(9)
-    assert scene.state is LinkState.CONFIRMING, "a further answer to the first block"
+    assert scene.is_in(LinkState.CONFIRMING), "a further answer to the first block"
     scene.answer(12)
-    assert scene.state is LinkState.CONFIRMING is following(LinkState.CONFIRMING, LinkEvent.REFUSED)
+    assert scene.is_in(LinkState.CONFIRMING)
+    assert following(LinkState.CONFIRMING, LinkEvent.REFUSED) is LinkState.CONFIRMING
     assert scene.probe() == 12, "asked again, with the sequence that was named last"
     scene.answer(13)
-    assert scene.state is LinkState.RUNNING is following(LinkState.CONFIRMING, LinkEvent.TAKEN)
+    assert scene.is_in(LinkState.RUNNING)
+    assert following(LinkState.CONFIRMING, LinkEvent.TAKEN) is LinkState.RUNNING
     data = scene.link.next_block(scene.now).lstrip(b"~")
     assert (data[1] & 15, data[2:-3]) == (13, ask(1))
 
@@ -87,13 +89,14 @@ def test_silence_ends_every_state(state: LinkState) -> None:
     if state is LinkState.RUNNING:
         scene.answer(10)
         scene.link.next_block(scene.now)
-    assert scene.state is state
+    assert scene.is_in(state)
     # First contact as a whole has that time, whatever is answered meanwhile.
     since_ns = scene.now if state is LinkState.RUNNING else START_NS
     scene.be_silent(since_ns + LOST_AFTER_NS - MS)
-    assert scene.state is state
+    assert scene.is_in(state)
     scene.be_silent(since_ns + LOST_AFTER_NS)
-    assert scene.state is LinkState.LOST is following(state, LinkEvent.SILENCE)
+    assert scene.is_in(LinkState.LOST)
+    assert following(state, LinkEvent.SILENCE) is LinkState.LOST
 
 
 def test_a_lost_link_stays_lost() -> None:
@@ -102,5 +105,5 @@ def test_a_lost_link_stays_lost() -> None:
     scene.be_silent(START_NS + LOST_AFTER_NS)
     for sequence in (scene.sequence, scene.sequence + 1, 9):
         scene.answer(sequence)
-        assert scene.state is LinkState.LOST
+        assert scene.is_in(LinkState.LOST)
     assert scene.link.send(ask(2), now=scene.now) == lib.LINK_GONE
