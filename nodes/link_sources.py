@@ -7,7 +7,7 @@ CORE_HEADERS = (
 """In this order."""
 CORE_SOURCES = (
     *(f"firmware/wire/{name}.c" for name in ("vlq", "message", "block")),
-    *(f"nodes/link/{name}.c" for name in ("queue", "link", "link_pack", "link_receive")),
+    *(f"nodes/link/{name}.c" for name in ("queue", "link", "link_states", "link_pack", "link_receive")),
     *(f"nodes/link/{name}.c" for name in ("schedule", "io_core", "io_receive", "io_send", "io_schedule")),
     *(f"nodes/link/{name}.c" for name in ("io_forecast", "io_stats", "io_links")),
     "nodes/can_bits.c",

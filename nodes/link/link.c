@@ -134,7 +134,7 @@ static int make_block(struct link *link, uint64_t now, unsigned allowed) {
         (uint8_t)wire_block_finish(block->bytes, block->length, (unsigned)(link->next % LINK_SLOTS));
     link->stats.commands_sent += block->commands;
     link->flying_commands += block->commands;
-    if (link->first == link->next && !link->probe_answered) // probing as a whole has to end in time
+    if (link->first == link->next && link->state != LINK_CONFIRMING) // probing as a whole has to end in time
         link->progress_ns = now;
     link->next++;
     return 1;
@@ -190,7 +190,7 @@ int link_next_offer(const struct link *link, uint64_t now, unsigned allowed, str
         return 0;
     if (link->cursor < link->next)
         return offer_repeat(link, out);
-    if (link->state == LINK_PROBING) {
+    if (link->state != LINK_RUNNING) {
         *out = (struct link_offer){.kind = LINK_CONTROL};
         return may_probe(link);
     }
@@ -236,7 +236,7 @@ static uint64_t repeat_deadline(const struct link *link) {
 }
 
 static uint64_t lost_deadline(const struct link *link) {
-    int waiting = link->first < link->next || link->probe_answered;
+    int waiting = link->first < link->next || link->state == LINK_CONFIRMING;
     return waiting ? link->progress_ns + link->settings.lost_after_ns : LINK_NEVER;
 }
 
@@ -256,7 +256,7 @@ void link_handle_timer(struct link *link, uint64_t now) {
         return;
     forgive_sleep(link, now);
     if (now >= lost_deadline(link)) {
-        link->state = LINK_LOST;
+        link->state = link_following(link->state, LINK_EVENT_SILENCE);
         link->cause = link->heard_ns > link->progress_ns ? LINK_CAUSE_STUCK : LINK_CAUSE_SILENT;
         return;
     }

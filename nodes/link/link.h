@@ -41,7 +41,25 @@ enum link_class {
     LINK_ALL = (1 << LINK_CLASSES) - 1, // a set of classes has bit 1 << class for each
 };
 
-enum link_state { LINK_PROBING, LINK_RUNNING, LINK_LOST };
+// Where a link is in its life; link_states.c has the table of what follows what.
+enum link_state {
+    LINK_PROBING,    // the node's expected sequence is unknown: an empty block asks for it
+    LINK_CONFIRMING, // it was answered; a second empty block makes sure before commands are trusted to it
+    LINK_RUNNING,    // commands go
+    LINK_LOST,       // final
+    LINK_STATES,
+};
+
+// What moves a link from one state to another.
+enum link_event {
+    LINK_EVENT_TAKEN,   // an answer to an empty block names the sequence behind it
+    LINK_EVENT_REFUSED, // an answer to an empty block names another sequence
+    LINK_EVENT_SILENCE, // lost_after_ns passed without an acknowledgement
+    LINK_EVENTS,
+};
+
+// The state after EVENT in STATE.
+enum link_state link_following(enum link_state state, enum link_event event);
 
 enum link_cause {
     LINK_CAUSE_NONE,
@@ -87,8 +105,7 @@ struct link {
     struct link_settings settings;
     enum link_state state;
     enum link_cause cause;
-    uint8_t probe_answered; // LINK_PROBING: the first answer is in
-    uint8_t urgent;         // link_send_urgent's command is still queued
+    uint8_t urgent; // link_send_urgent's command is still queued
     struct link_queue queues[LINK_CLASSES];
     struct link_block blocks[LINK_SLOTS];
     uint64_t first, cursor, next; // first unacknowledged <= next to transmit (again) <= next new block

@@ -90,16 +90,14 @@ static void handle_probe_answer(struct link *link, unsigned answer, uint64_t now
     if (link->cursor == link->first)
         return; // nothing asked: a left-over from before
     unsigned behind = (answer - (unsigned)link->first) & WIRE_SEQ_MASK;
-    if (!link->probe_answered) {
-        link->probe_answered = 1;
-        adopt(link, link->first + behind);
-    } else if (behind == 1) {
+    if (link->state == LINK_CONFIRMING && behind == 0)
+        return; // a further answer to the first one
+    link->state = link_following(link->state, behind == 1 ? LINK_EVENT_TAKEN : LINK_EVENT_REFUSED);
+    if (link->state == LINK_RUNNING) {
         acknowledge(link, link->first + 1, now);
         link->naks_owed = 0;
-        link->probe_answered = 0;
         link->last_ack = link->first;
-        link->state = LINK_RUNNING;
-    } else if (behind) {
+    } else {
         adopt(link, link->first + behind);
     }
 }
@@ -109,7 +107,7 @@ static void handle_probe_answer(struct link *link, unsigned answer, uint64_t now
 static void handle_sequence(struct link *link, unsigned answer, int empty, uint64_t now) {
     if (link->state == LINK_LOST)
         return;
-    if (link->state == LINK_PROBING) {
+    if (link->state != LINK_RUNNING) {
         handle_probe_answer(link, answer, now);
         return;
     }

@@ -17,6 +17,7 @@ from canbus_tools.protocol import Direction
 from coordinator.cli import main
 from nodes.dictionary import Dictionary
 from nodes.dictionary_cache import DictionaryCache
+from tests import real_dictionaries
 from tests import wire_twin as twin
 from tests.canbus_tools.talk_twin import (
     DICTIONARY,
@@ -29,18 +30,6 @@ from tests.canbus_tools.talk_twin import (
     other_dictionary,
 )
 from tests.stages.can_stage import CanStage
-
-DICTIONARIES = Path(__file__).parents[2] / ".." / "shared" / "data" / "dictionaries"
-REAL = (
-    "atmega2560",
-    "linuxprocess",
-    "rp2040-can2040",
-    "stm32f072-can",
-    "stm32f103-usb",
-    "stm32f407-usart1",
-    "stm32g0b1-can",
-    "stm32h723-usbcanbridge",
-)
 
 
 def changed(*words: tuple[bytes, bytes]) -> bytes:
@@ -137,11 +126,10 @@ def test_without_a_cache_nothing_is_guessed() -> None:
     assert source.known == {}
 
 
-def test_eight_real_firmwares_are_told_from_one_another(tmp_path: Path) -> None:
-    paths = [DICTIONARIES / f"{name}.json" for name in REAL]
-    if not all(path.exists() for path in paths):
-        pytest.skip("the dictionaries of real firmware are not in ../shared")
-    texts = {path.stem: path.read_bytes() for path in paths}
+@pytest.mark.skipif(not real_dictionaries.PATHS, reason=real_dictionaries.MISSING)
+def test_real_firmwares_are_distinguished(tmp_path: Path) -> None:
+    texts = {path.stem: path.read_bytes() for path in real_dictionaries.PATHS}
+    assert tuple(texts) == real_dictionaries.NAMES
     cache = cache_of(tmp_path, *texts.values())
     for stem, text in texts.items():
         dictionary = Dictionary.from_json(text)

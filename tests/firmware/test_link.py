@@ -3,16 +3,14 @@
 import json
 import random
 import zlib
-from pathlib import Path
 
 import pytest
 
 from nodes.virtual.sim import SimNode
-from tests import wire_twin
+from tests import real_dictionaries, wire_twin
 from tests.firmware import twin
 from tests.firmware.host import Host
 
-DICTIONARIES = Path(__file__).parents[2] / ".." / "shared" / "data" / "dictionaries"
 CODES = {"%u", "%i", "%hu", "%hi", "%c", "%s", "%*s", "%.*s"}
 
 
@@ -49,12 +47,11 @@ def test_dictionary_downloads_and_is_sound(transport: str) -> None:
     assert words["enumerations"]["pin"]["PB0"] == [16, 16]
 
 
+@pytest.mark.skipif(not real_dictionaries.PATHS, reason=real_dictionaries.MISSING)
 def test_formats_are_those_of_real_boards() -> None:
-    if not DICTIONARIES.is_dir():
-        pytest.skip("the dictionaries of real boards are not beside the project")
     ours = Host().words.raw
     compared = set()
-    for path in sorted(DICTIONARIES.glob("*.json")):
+    for path in real_dictionaries.PATHS:
         real = json.loads(path.read_text())
         for kind in ("commands", "responses"):
             theirs = {fmt.split()[0]: fmt for fmt in real[kind]}

@@ -13,15 +13,16 @@ from hypothesis import strategies as st
 from nodes.dictionary import BOOTSTRAP, MAX_INFLATED_BYTES, Dictionary
 from nodes.dictionary_parts import OUTPUT, DictionaryError
 from nodes.message_format import Message, MessageError, MessageFormat, Value
+from tests import real_dictionaries
 from tests import wire_twin as twin
 from tests.profiles import examples
 
 ROOT = Path(__file__).parents[2]
 DATA = ROOT / "tests" / "data"
-REAL = sorted((ROOT / ".." / "shared" / "data" / "dictionaries").glob("*.json"))
+REAL = real_dictionaries.PATHS
 TEXT = (DATA / "dictionary.json").read_bytes()
 SMALL = Dictionary.from_json(TEXT)
-real_only = pytest.mark.skipif(not REAL, reason="no recorded dictionaries of real boards in ../shared")
+real_only = pytest.mark.skipif(not REAL, reason=real_dictionaries.MISSING)
 
 
 def changed(**parts: Any) -> bytes:
@@ -103,12 +104,11 @@ def check_round_trip(dictionary: Dictionary, message: MessageFormat, values: dic
 
 def values_at(message: MessageFormat, place: int) -> dict[str, Value]:
     """Return the lowest values (PLACE 0), the highest (1), or numbers of a middling size."""
-    numbers = [(*bounds(code), 200) if code in twin.CODES else None for code in message.code_texts]
-    texts = (b"", b"\xff" * LONGEST, b"\x7e\0")
-    return {
-        name: texts[place] if number is None else number[place]
-        for name, number in zip(message.names, numbers, strict=True)
-    }
+    texts: tuple[Value, ...] = (b"", b"\xff" * LONGEST, b"\x7e\0")
+    choices: list[tuple[Value, ...]] = [
+        (*bounds(code), 200) if code in twin.CODES else texts for code in message.code_texts
+    ]
+    return {name: choice[place] for name, choice in zip(message.names, choices, strict=True)}
 
 
 @pytest.mark.parametrize("name", DICTIONARIES)

@@ -11,12 +11,12 @@ from nodes.dictionary import Dictionary
 from nodes.node_config import NodeConfig
 from nodes.virtual.plant import NodePlant, Stepper, Tmc
 from nodes.virtual.plant_page import Fault, Kind
+from tests import real_dictionaries
 from tests.nodes.devices.machine import DeviceMachine
 
 if TYPE_CHECKING:
     from nodes.virtual.sim_plant import SimPlant
 
-DICTIONARIES = Path(__file__).parents[4] / "shared" / "data" / "dictionaries"
 GCONF, CHOPCONF, SLAVECONF, IOIN = 0x00, 0x6C, 0x03, 0x06
 
 
@@ -105,8 +105,8 @@ def test_one_that_does_not_answer_is_told_of(fault: Fault, sentence: str) -> Non
     rig.machine.run(main)
 
 
-@pytest.mark.skipif(not DICTIONARIES.is_dir(), reason="the dictionaries of real boards are not here")
-@pytest.mark.parametrize("path", sorted(DICTIONARIES.glob("*.json")), ids=lambda path: path.stem)
+@pytest.mark.skipif(not real_dictionaries.PATHS, reason=real_dictionaries.MISSING)
+@pytest.mark.parametrize("path", real_dictionaries.PATHS, ids=lambda path: path.stem)
 def test_real_boards_know_its_commands(path: Path) -> None:
     dictionary = Dictionary.from_json(path.read_bytes())
     rx_pin, tx_pin, *_ = dictionary.enumerations["pin"].values

@@ -29,7 +29,7 @@ from nodes.transport.python_can_bridge import PythonCanBridge
 from nodes.virtual.hub import VirtualBus
 from tests.vcan.kernel import INTERFACE, why_no_socketcan
 
-BURST = 10_000
+BURST = 4_000
 WAIT_S = 30.0
 
 

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -44,6 +44,14 @@ def read_records(sock: socket.socket, count: int) -> list[bytes]:
             break
         data += part
     return [data[at : at + RECORD_SIZE] for at in range(0, len(data), RECORD_SIZE)]
+
+
+def yield_until(condition: Callable[[], object]) -> None:
+    """Give the bus's thread its turns until CONDITION is true: its counters cannot be waited for."""
+    end_s = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < end_s
+        os.sched_yield()
 
 
 def until_end(sock: socket.socket) -> None:
@@ -105,24 +113,19 @@ def test_whoever_is_connected_before_a_frame_is_sent_gets_it(tmp_path: Path) -> 
 
 
 def test_bit_rate_is_kept(tmp_path: Path) -> None:
-    """The bus may be slower than nominal (a busy machine stops it now and then), never faster."""
-    slowness: list[float] = []
-    while not slowness or min(slowness) >= 2:
-        assert len(slowness) < 20, slowness
-        slowness.append(slowness_of_a_bus(tmp_path / f"bus{len(slowness)}"))
-
-
-def slowness_of_a_bus(path: Path) -> float:
-    """Return how much longer frames took than at the bit rate; never less than 1."""
-    count = 1500
-    with VirtualBus(path, bitrate=500_000) as bus, client(bus) as sender, client(bus) as listener:
+    """A bus may be slower than nominal, on a busy machine, never faster; test_hub.c has its time exactly."""
+    count = 500
+    with (
+        VirtualBus(tmp_path / "bus", bitrate=500_000) as bus,
+        client(bus) as sender,
+        client(bus) as listener,
+    ):
         begin_ns = time.monotonic_ns()
         with sending([(sender, b"".join(record(0x123, n) for n in range(count)))]):
             assert len(read_records(listener, count)) == count
         elapsed_ns = time.monotonic_ns() - begin_ns
         assert bus.stats.busy_ns == bus.stats.bits * 2000
         assert elapsed_ns >= bus.stats.busy_ns
-        return elapsed_ns / bus.stats.busy_ns
 
 
 def test_a_slow_reader_gets_everything_and_the_sender_waits(tmp_path: Path) -> None:
@@ -146,13 +149,15 @@ def test_a_stuck_client_is_disconnected_and_the_others_go_on(tmp_path: Path) -> 
     with (
         VirtualBus(tmp_path / "bus", bitrate=None, stuck_limit_s=0.2) as bus,
         client(bus) as sender,
-        client(bus) as listener,
         client(bus) as stuck,
     ):
         with sending([(sender, b"".join(record(5, n) for n in range(count)))]):
-            assert len(read_records(listener, count)) == count
+            yield_until(lambda: bus.stats.expelled)
+        yield_until(lambda: bus.stats.frames == count)
         assert bus.stats.expelled == 1
-        assert len(bus.stats.clients) == 2
+        with client(bus) as listener:
+            sender.sendall(record(6, 1))
+            assert read_records(listener, 1) == [record(6, 1)]
         until_end(stuck)
 
 
@@ -192,20 +197,13 @@ def test_lost_frames_follow_from_the_seed(tmp_path: Path) -> None:
         with VirtualBus(tmp_path / name, bitrate=None, loss=0.2, seed=seed) as bus, client(bus) as listener:
             with client(bus) as sender:
                 sender.sendall(b"".join(record(7, n) for n in range(500)))
-            until_all_sent(bus, 500)
+            yield_until(lambda: bus.stats.frames == 500)
             return read_records(listener, 500 - bus.stats.lost)
 
     first = arrived(1, "a")
     assert 350 < len(first) < 450
     assert arrived(1, "b") == first
     assert arrived(2, "c") != first
-
-
-def until_all_sent(bus: VirtualBus, frames: int) -> None:
-    deadline_s = time.monotonic() + WAIT_S
-    while bus.stats.frames < frames:
-        assert time.monotonic() < deadline_s
-        os.sched_yield()
 
 
 def test_more_clients_than_places_are_refused(tmp_path: Path) -> None:

@@ -21,6 +21,8 @@ from nodes.virtual.plant_page import Fault, Kind
 from nodes.virtual.sim import SimNode
 from nodes.virtual.sim_plant import connect_plants
 from nodes.virtual.world import NodeSettings, World
+from tests.firmware.host import Host
+from tests.nodes.virtual.plants import HOT
 
 START_CLOCK = 2**32 - 1000
 TANK = NodePlant(
@@ -112,3 +114,118 @@ def test_the_text_is_what_the_parts_say() -> None:
         "cooling body=hot node=- fan=f conductance=0.1",
     ]
     assert plant.peers == ("b",)
+
+
+# ----------------------------------------------------------------------------- what the firmware sees of it
+
+
+def test_a_heater_that_is_on_warms_its_sensor_as_the_formula_says() -> None:
+    # Over the 32-bit rollover of the clock, too.
+    host = Host(start_clock=2**32 - 20_000_000)
+    freq, plant = host.node.clock_freq, host.node.start_plant(HOT)
+    host.configure(
+        "config_digital_out oid=0 pin=0 value=0 default_value=0 max_duration=0",
+        "config_analog_in oid=1 pin=16",
+    )
+    begin, rest = host.now + freq // 10, freq // 20
+    host.send(
+        f"query_analog_in oid=1 clock={begin % 2**32} sample_ticks=1000 sample_count=8 rest_ticks={rest} "
+        "bytes_per_report=2 min_value=0 max_value=65535 range_check_count=4"
+    )
+    on = begin + freq // 8
+    host.send(f"queue_digital_out oid=0 clock={on % 2**32} on_ticks=1")
+    answers = [answer for answer in host.run(freq * 8 // 5) if answer.name == "analog_in_state"]
+    assert host.now > 2**32
+    assert len(answers) >= 29
+    for answer in answers:
+        since = (answer["next_clock"] - rest - begin) % 2**32 + begin + 3500 - on  # the middle of 8 samples
+        values = answer.args["values"]
+        assert isinstance(values, bytes)
+        # Each of the eight samples is rounded.
+        assert int.from_bytes(values, "little") == pytest.approx(8 * sample_of_hot(since / freq), abs=4.5)
+    assert plant.page.temperature("block") > 70
+
+
+def sample_of_hot(since_s: float) -> float:
+    """Return what the converter reads of HOT's sensor, SINCE_S after its heater went on: by formula."""
+    tau, lag, end = 2.0 / 0.4, 0.15, 90.0 / 0.4
+    rise = 1 - (tau * np.exp(-since_s / tau) - lag * np.exp(-since_s / lag)) / (tau - lag)
+    kelvin = 20.0 + (end * rise if since_s > 0 else 0.0) + 273.15
+    ohm = 100_000.0 * np.exp(3950.0 * (1 / kelvin - 1 / 298.15))
+    return float(4095 * ohm / (ohm + 4700.0))
+
+
+def test_without_its_host_a_heater_ends_by_itself() -> None:
+    host = Host()
+    freq, plant = host.node.clock_freq, host.node.start_plant(HOT)
+    host.configure(f"config_digital_out oid=0 pin=0 value=0 default_value=0 max_duration={freq // 4}")
+    on = host.now + freq // 10
+    host.send(f"queue_digital_out oid=0 clock={on} on_ticks=1")
+    # And now nobody says anything any more.
+    host.run(freq // 10)
+    assert plant.page.item(Kind.HEATER, "block").value == 1
+    assert "Missed scheduling" in host.dies(run=freq)
+    assert host.steps(0).tolist() == [on, on + freq // 4]
+    assert plant.page.item(Kind.HEATER, "block").value == 0
+    assert plant.page.item(Kind.HEATER, "block").extra == pytest.approx(22.5, rel=1e-6)
+
+
+def test_what_breaks_at_run_time() -> None:
+    host = Host()
+    freq, plant = host.node.clock_freq, host.node.start_plant(HOT)
+    host.configure(
+        "config_digital_out oid=0 pin=0 value=1 default_value=0 max_duration=0",
+        "config_analog_in oid=1 pin=16",
+    )
+
+    def set_fault(kind: Kind, fault: Fault) -> None:
+        plant.page.set_fault(kind, "block", fault)
+        assert plant.page.item(kind, "block").fault is fault  # the plant has seen it now
+
+    host.run(freq)
+    assert plant.page.temperature("block") > 50
+    set_fault(Kind.HEATER, Fault.DEAD)
+    host.run(freq // 10)
+    assert plant.page.item(Kind.HEATER, "block").value == 0
+    set_fault(Kind.HEATER, Fault.STUCK_ON)
+    host.send("update_digital_out oid=0 value=0")
+    warm_c = plant.page.temperature("block")
+    host.run(freq)
+    assert plant.page.temperature("block") > warm_c + 10
+    set_fault(Kind.SENSOR, Fault.FALLEN)
+    host.run(3 * freq)
+    assert plant.page.item(Kind.SENSOR, "block").value < 21
+    assert plant.page.temperature("block") > 40
+    # A broken wire is out of the range a host allows: the firmware shuts down.
+    host.send(
+        f"query_analog_in oid=1 clock={host.now + freq // 100} sample_ticks=1000 sample_count=8 "
+        f"rest_ticks={freq // 50} bytes_per_report=2 min_value=800 max_value=32700 range_check_count=4"
+    )
+    assert host.run(freq // 10)[0].name == "analog_in_state"
+    set_fault(Kind.SENSOR, Fault.OPEN)
+    assert host.dies(run=freq) == "ADC out of range"
+    assert plant.page.item(Kind.SENSOR, "block").extra == 4095
+    with pytest.raises(CanductorError, match="a sensor cannot be stuck_on; it can be open, shorted, fallen"):
+        plant.page.set_fault(Kind.SENSOR, "block", Fault.STUCK_ON)
+    with pytest.raises(CanductorError, match="there is no fan 'fan'; there is part"):
+        plant.page.item(Kind.FAN, "fan")
+
+
+def test_a_motor_that_is_off_moves_nothing() -> None:
+    stepper = Stepper(name="m", step_pin="PA0", dir_pin="PA1", enable_pin="PA2", enable_inverted=True)
+    axis = Axis(name="x", terms=(Term("n", "m", 1.0),), max=3.0)
+    host = Host()
+    plant = host.node.start_plant(NodePlant(node="n", steppers=(stepper,), axes=(axis,)))
+
+    def step(times: int) -> None:
+        for _ in range(times):
+            host.send("set_digital_out pin=0 value=1", "set_digital_out pin=0 value=0")
+
+    host.send("set_digital_out pin=1 value=1")
+    step(2)
+    host.send("set_digital_out pin=2 value=1")
+    step(1)
+    assert (plant.page.motors["m"].count, plant.page.motors["m"].lost) == (2, 1)
+    host.send("set_digital_out pin=2 value=0")
+    step(4)
+    assert (plant.page.motors["m"].count, plant.page.motors["m"].lost) == (3, 4)  # against its stop
