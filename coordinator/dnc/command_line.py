@@ -208,7 +208,7 @@ def _receive(given: argparse.Namespace) -> Callable[[], Report]:
         start=given.start,
         machine=machine,
     )
-    return lambda: _run("receive", job)
+    return DncCommand("receive", job)
 
 
 def _send(given: argparse.Namespace) -> Callable[[], Report]:
@@ -223,7 +223,7 @@ def _send(given: argparse.Namespace) -> Callable[[], Report]:
         file=given.file,
         verify=given.verify,
     )
-    return lambda: _run("send", job)
+    return DncCommand("send", job)
 
 
 def _serve(given: argparse.Namespace) -> Callable[[], Report]:
@@ -238,12 +238,12 @@ def _serve(given: argparse.Namespace) -> Callable[[], Report]:
         verify=given.verify,
         once=given.once,
     )
-    return lambda: _run("serve", job)
+    return DncCommand("serve", job)
 
 
 def _list(given: argparse.Namespace) -> Callable[[], Report]:
     job = DncJob(**_line(given), peripheral=False)  # type: ignore[arg-type]
-    return lambda: _run("list_files", job)
+    return DncCommand("list_files", job)
 
 
 def _drip(given: argparse.Namespace) -> Callable[[], Report]:
@@ -265,12 +265,20 @@ def _drip(given: argparse.Namespace) -> Callable[[], Report]:
         start=given.file is None,
         machine=machine,
     )
-    return lambda: _run("drip", job)
+    return DncCommand("drip", job)
 
 
-def _run(name: str, job: DncJob) -> Report:
-    """Import what does the work when it is needed."""
-    return cast("Report", getattr(importlib.import_module("coordinator.dnc.commands"), name)(job))
+@record
+class DncCommand:
+    """What the words ask for: the function NAME of ``coordinator.dnc.commands`` with JOB."""
+
+    name: str
+    job: DncJob
+
+    def __call__(self) -> Report:
+        """Import what does the work, and do it."""
+        work = getattr(importlib.import_module("coordinator.dnc.commands"), self.name)
+        return cast("Report", work(self.job))
 
 
 _Declare = Callable[[argparse.ArgumentParser], None]

@@ -3,19 +3,20 @@
 import contextlib
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, Protocol
 
 from coordinator.dnc.blocks import INPUT, OUTPUT, Header
 from coordinator.dnc.command_line import DncJob
 from coordinator.dnc.desk import Desk, FileSource, Library, Outcome, Sink, Source, Take
-from coordinator.dnc.driver import Driver
+from coordinator.dnc.driver import Driver, Line
 from coordinator.dnc.engine import Engine
 from coordinator.dnc.feeds import SlowSource
 from coordinator.dnc.files import Check, Entry, Folder, check_lines, check_name
 from coordinator.dnc.numbers import numbered
+from coordinator.dnc.options import DncOptions
 from coordinator.dnc.port import Port
 from coordinator.dnc.tables import check_table
 from coordinator.dnc.verify import Compare, Twice
@@ -26,6 +27,35 @@ NOT_YET_S: Final = 0.02
 UNREADABLE: Final = "what comes cannot be read; are baud rate and frame those of the control?"
 BETWEEN: Final = 4
 """Silences between two transfers."""
+
+
+class SerialPort(Line, Protocol):
+    """What the commands need of a port."""
+
+    @property
+    def is_paced(self) -> bool: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+
+
+def _say_to_user(sentence: str) -> None:
+    sys.stderr.write(f"{sentence}\n")
+    sys.stderr.flush()
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What the commands find around them: ports, a clock, and somebody who reads."""
+
+    open_port: Callable[[str, DncOptions, bool], SerialPort] = Port
+    """Gets a name, options, and whether RTS and CTS are used; raises PortError."""
+    now_s: Callable[[], float] = time.monotonic
+    say: Callable[[str], None] = _say_to_user
+    """Gets sentences about what goes on."""
+    typed: IO[bytes] | None = None
+    """What ``-`` stands for; None: standard input."""
+
+
+HERE: Final = Surroundings()
 
 
 @record
@@ -61,16 +91,17 @@ class DncReport:
 
 
 @contextlib.contextmanager
-def _line(job: DncJob) -> Iterator[Driver]:
+def _line(job: DncJob, around: Surroundings) -> Iterator[Driver]:
     """Open the port for an engine; whatever ends the block, the other side is told."""
-    port = Port(job.port, job.options, rtscts=job.rtscts)
+    port = around.open_port(job.port, job.options, job.rtscts)
     try:
         paced = port.is_paced if job.paced is None else job.paced
         options = replace(job.options, paced=paced)
         driver = Driver(
             port,
-            Engine(options, time.monotonic(), peripheral=job.peripheral),
-            on_unreadable=lambda: _say(job, UNREADABLE),
+            Engine(options, around.now_s(), peripheral=job.peripheral),
+            around.now_s,
+            on_unreadable=lambda: _say(job, around, UNREADABLE),
         )
         try:
             yield driver
@@ -81,11 +112,11 @@ def _line(job: DncJob) -> Iterator[Driver]:
         port.close()
 
 
-def _play(driver: Driver, desk: Desk) -> Outcome:
+def _play(driver: Driver, desk: Desk, around: Surroundings) -> Outcome:
     """Go on until a transfer has ended, well or not."""
     try:
         while True:
-            until_s = time.monotonic() + NOT_YET_S if desk.looks else None
+            until_s = around.now_s() + NOT_YET_S if desk.looks else None
             for event in driver.wait(until_s):
                 if (outcome := desk.handle(event)) is not None:
                     driver.flush()
@@ -115,26 +146,26 @@ def _sentence(outcome: Outcome) -> str:
     return outcome.sentence if named or not name else f"{outcome.name}: {outcome.sentence}"
 
 
-def receive(job: DncJob, check: Check = check_table) -> DncReport:
+def receive(job: DncJob, check: Check = check_table, around: Surroundings = HERE) -> DncReport:
     """Take one file into a folder, and print it if asked to; raises CanductorError. CHECK is for tables."""
     assert job.folder is not None
     with contextlib.ExitStack() as stack:
         folder = Folder(job.folder, overwrite=job.overwrite, newline=job.newline, check=check)
         stack.enter_context(contextlib.closing(folder))
-        driver = stack.enter_context(_line(job))
+        driver = stack.enter_context(_line(job, around))
         twice = stack.enter_context(contextlib.closing(Twice(folder, job.options.block_max)))
         take = numbered(twice.take if job.verify else folder_take(folder), even=job.numbered)
         desk = Desk(driver.engine, take=take)
         if job.peripheral:
-            _say(job, f"waiting for a control at {job.port} to send a file into {folder.path}")
-        outcome = _receive(job, driver, desk)
+            _say(job, around, f"waiting for a control at {job.port} to send a file into {folder.path}")
+        outcome = _receive(job, driver, desk, around)
         while outcome.ok and (name := twice.waits_for) is not None:
             if job.peripheral:
-                _say(job, _once(outcome))
+                _say(job, around, _once(outcome))
             else:
-                _say(job, f"{name} came; asking for it again, to compare")
-                driver.wait(time.monotonic() + BETWEEN * job.options.character_s)
-            outcome = _receive(job, driver, desk)
+                _say(job, around, f"{name} came; asking for it again, to compare")
+                driver.wait(around.now_s() + BETWEEN * job.options.character_s)
+            outcome = _receive(job, driver, desk, around)
     same = ", the same twice" if job.verify else ""
     text = f"{outcome.name}: {outcome.lines} lines are in {job.folder}{same}"
     report = _report(outcome, text)
@@ -152,14 +183,14 @@ def folder_take(folder: Folder) -> Take:
     return lambda header: folder.take(header.code, header.name)
 
 
-def _receive(job: DncJob, driver: Driver, desk: Desk) -> Outcome:
+def _receive(job: DncJob, driver: Driver, desk: Desk, around: Surroundings) -> Outcome:
     """Take a file once."""
     if not job.peripheral:
         desk.begin(Header(job.code, job.name, INPUT))
-    return _play(driver, desk)
+    return _play(driver, desk, around)
 
 
-def send(job: DncJob) -> DncReport:
+def send(job: DncJob, around: Surroundings = HERE) -> DncReport:
     """Give one file; raises CanductorError."""
     assert job.file is not None
     code = job.code or Entry(job.file.name, 0).code
@@ -167,30 +198,30 @@ def send(job: DncJob) -> DncReport:
         content = stack.enter_context(_open(job.file))
         line_max = job.options.block_max - 2
         check_lines(content, job.file.name, line_max, job.options.frame.data_bits)
-        driver = stack.enter_context(_line(job))
+        driver = stack.enter_context(_line(job, around))
         desk = Desk(driver.engine, give=lambda _: (job.name, FileSource(content, line_max)))
         if job.peripheral:
-            _say(job, f"waiting for a control at {job.port} to ask for a file; it gets {job.file}")
+            _say(job, around, f"waiting for a control at {job.port} to ask for a file; it gets {job.file}")
         else:
             desk.begin(Header(code, job.name, OUTPUT))
-        outcome = _play(driver, desk)
+        outcome = _play(driver, desk, around)
         if outcome.ok and job.verify:
-            _fetch_back(job, driver, Header(code, job.name, INPUT))
+            _fetch_back(job, driver, Header(code, job.name, INPUT), around)
             outcome = replace(outcome, confirmed=True)
             return _report(outcome, f"{job.file}: {outcome.lines} lines; the other side has the same")
     how = "was taken" if outcome.confirmed else "was sent, each block acknowledged"
     return _report(outcome, f"{job.file}: {outcome.lines} lines; the file {how}")
 
 
-def _fetch_back(job: DncJob, driver: Driver, header: Header) -> None:
+def _fetch_back(job: DncJob, driver: Driver, header: Header, around: Surroundings) -> None:
     """Make sure that the other side has what was sent to it; raises CanductorError."""
     assert job.file is not None
-    _say(job, f"{job.name} was sent; asking for it, to compare")
-    driver.wait(time.monotonic() + BETWEEN * job.options.character_s)
+    _say(job, around, f"{job.name} was sent; asking for it, to compare")
+    driver.wait(around.now_s() + BETWEEN * job.options.character_s)
     same = Compare(job.name, _open(job.file), job.options.block_max, "delete it at the other side")
     desk = Desk(driver.engine, take=lambda _: same)
     desk.begin(header)
-    outcome = _play(driver, desk)
+    outcome = _play(driver, desk, around)
     if not outcome.ok:
         raise CanductorError(f"{job.name} was sent, but is not confirmed: {outcome.sentence}")
 
@@ -202,31 +233,31 @@ def _open(file: Path) -> IO[bytes]:
         raise CanductorError(f"{file} cannot be read: {(error.strerror or str(error)).lower()}") from None
 
 
-def serve(job: DncJob, check: Check = check_table) -> DncReport:
+def serve(job: DncJob, check: Check = check_table, around: Surroundings = HERE) -> DncReport:
     """Be a file server until Ctrl-C; raises CanductorError when the port is gone. CHECK is for tables."""
     assert job.folder is not None
     outcome = Outcome(did="nothing")
     folder = Folder(job.folder, overwrite=job.overwrite, newline=job.newline, check=check)
-    with contextlib.closing(folder), _line(job) as driver:
+    with contextlib.closing(folder), _line(job, around) as driver:
         library = Library(folder, driver.engine)
         twice = Twice(folder, job.options.block_max)
         take = numbered(twice.take if job.verify else folder_take(folder), even=job.numbered)
         desk = Desk(driver.engine, give=library.give, take=None if job.read_only else take, folder=folder)
-        _say(job, f"serving {folder.path} at {job.port}; Ctrl-C ends it")
+        _say(job, around, f"serving {folder.path} at {job.port}; Ctrl-C ends it")
         with contextlib.closing(twice):
             while True:
-                outcome = _play(driver, desk)
+                outcome = _play(driver, desk, around)
                 once = outcome.ok and twice.waits_for is not None and twice.waits_for == outcome.name
-                _say(job, _once(outcome) if once else _told(outcome))
+                _say(job, around, _once(outcome) if once else _told(outcome))
                 if job.once and not once:
                     return _report(outcome, "")
 
 
-def list_files(job: DncJob) -> DncReport:
+def list_files(job: DncJob, around: Surroundings = HERE) -> DncReport:
     """Ask for the directory; raises CanductorError."""
-    with _line(job) as driver:
+    with _line(job, around) as driver:
         driver.engine.ask_directory()
-        outcome = _play(driver, Desk(driver.engine))
+        outcome = _play(driver, Desk(driver.engine), around)
     if outcome.listing is None:
         raise CanductorError(outcome.sentence)
     lines = [f"{name:<24} {sectors:>7}" for name, sectors in outcome.listing.sectors.items()]
@@ -234,25 +265,27 @@ def list_files(job: DncJob) -> DncReport:
     return _report(outcome, "\n".join([*lines, *([] if free is None else [f"{free} sectors are free"])]))
 
 
-def drip(job: DncJob) -> DncReport:
+def drip(job: DncJob, around: Surroundings = HERE) -> DncReport:
     """Feed a control line by line, or print what the other side sends; raises CanductorError."""
     if job.file is None:
-        return _drip_to_machine(job)
+        return _drip_to_machine(job, around)
     with contextlib.ExitStack() as stack:
-        content = _open_stream(job.file, stack)
-        with _line(job) as driver:
+        content = _open_stream(job.file, stack, around)
+        with _line(job, around) as driver:
             source: Source = SlowSource(content, job.options.block_max - 2)
             desk = Desk(driver.engine, give=lambda header: (header.name, source))
-            _say(job, f"waiting for a control at {job.port} to ask for a program; it gets {job.file}")
-            outcome = _play(driver, desk)
+            _say(job, around, f"waiting for a control at {job.port} to ask for a program; it gets {job.file}")
+            outcome = _play(driver, desk, around)
     return _report(outcome, f"{outcome.lines} lines were fed to the control")
 
 
-def _open_stream(file: Path, stack: contextlib.ExitStack) -> IO[bytes]:
-    return sys.stdin.buffer if str(file) == "-" else stack.enter_context(_open(file))
+def _open_stream(file: Path, stack: contextlib.ExitStack, around: Surroundings) -> IO[bytes]:
+    if str(file) != "-":
+        return stack.enter_context(_open(file))
+    return sys.stdin.buffer if around.typed is None else around.typed
 
 
-def _drip_to_machine(job: DncJob) -> DncReport:
+def _drip_to_machine(job: DncJob, around: Surroundings) -> DncReport:
     from coordinator.dnc.machine import MachineSink  # noqa: PLC0415 (others do without)
     from coordinator.front_ends import tls_of  # noqa: PLC0415 (likewise)
     from coordinator.ipc.blocking import BlockingClient  # noqa: PLC0415 (likewise)
@@ -266,15 +299,16 @@ def _drip_to_machine(job: DncJob) -> DncReport:
             sinks.append(MachineSink(client, check_name(header.name or "NONAME")))
             return sinks[-1]
 
-        with _line(job) as driver:
+        with _line(job, around) as driver:
             desk = Desk(driver.engine, take=numbered(print_as_it_comes, even=job.numbered))
             if job.peripheral:
-                _say(job, f"waiting for a control at {job.port} to send a program; it is printed as it comes")
+                waits = f"waiting for a control at {job.port} to send a program; it is printed as it comes"
+                _say(job, around, waits)
             else:
                 desk.begin(Header(job.code, job.name, INPUT))
-            outcome = _play(driver, desk)
+            outcome = _play(driver, desk, around)
         report = _report(outcome, f"{outcome.name}: {outcome.lines} lines were printed as they came")
-        _say(job, f"{outcome.name}: all {outcome.lines} lines came; waiting for the machine")
+        _say(job, around, f"{outcome.name}: all {outcome.lines} lines came; waiting for the machine")
         sinks[-1].wait_until_over()
     return report
 
@@ -295,7 +329,6 @@ def _told(outcome: Outcome) -> str:
     return f"failed: {_sentence(outcome)}"
 
 
-def _say(job: DncJob, sentence: str) -> None:
+def _say(job: DncJob, around: Surroundings, sentence: str) -> None:
     if not job.json:
-        sys.stderr.write(f"{sentence}\n")
-        sys.stderr.flush()
+        around.say(sentence)

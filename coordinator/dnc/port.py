@@ -30,7 +30,7 @@ class PortError(CanductorError):
 class Port:
     """An open line. NAME is a device or a pyserial URL; raises PortError."""
 
-    def __init__(self, name: str, options: DncOptions, *, rtscts: bool = False) -> None:
+    def __init__(self, name: str, options: DncOptions, rtscts: bool = False) -> None:
         self.name = name
         try:
             self._port: Any = serial.serial_for_url(

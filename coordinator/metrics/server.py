@@ -164,7 +164,7 @@ class MetricsServer:
 
     async def _metrics(self, accept: str) -> bytes:
         """Return the figures in the form that ACCEPT leads to, made at most once in SAME_S."""
-        now_s = time.monotonic()
+        now_s = asyncio.get_running_loop().time()
         self._answers = {k: made for k, made in self._answers.items() if now_s - made[0] < SAME_S}
         if accept not in self._answers:
             self._answers[accept] = (now_s, asyncio.ensure_future(self._make(accept)))

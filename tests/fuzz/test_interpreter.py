@@ -10,7 +10,7 @@ words = st.lists(st.sampled_from(TOKENS) | st.binary(max_size=4), max_size=6).ma
 programs = st.lists(words, max_size=30).map(lambda lines: b"G28\n" + b"\n".join(lines))
 
 
-@settings(max_examples=examples(400), suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(120), suppress_health_check=[HealthCheck.too_slow])
 @given(programs | st.binary(max_size=400))
 def test_no_program_does_harm(text: bytes) -> None:
     run_program(text)

@@ -89,14 +89,20 @@ class _JumpSelector(selectors.BaseSelector):
 
 
 class JumpLoop(asyncio.SelectorEventLoop):
-    """The loop; its time() begins at 0."""
+    """The loop; its time() begins at 0.
 
-    def __init__(self) -> None:
+    Nothing takes time but waiting, and each look at the clock, by whoever, LOOK_S: with more than 0 the
+    computer is a slow one.
+    """
+
+    def __init__(self, look_s: float = 0.0) -> None:
         self._jumps = _JumpSelector()
+        self._look_s = look_s
         super().__init__(self._jumps)
 
     def time(self) -> float:
         """Return the virtual time in s."""
+        self._jumps.now_s += self._look_s
         return self._jumps.now_s
 
     def run_in_executor(  # type: ignore[override]
@@ -112,7 +118,7 @@ class JumpLoop(asyncio.SelectorEventLoop):
         return future
 
 
-def run(main: Coroutine[Any, Any, T]) -> T:
+def run(main: Coroutine[Any, Any, T], *, look_s: float = 0.0) -> T:
     """Run MAIN in virtual time; raises Stuck."""
-    with asyncio.Runner(loop_factory=JumpLoop) as runner:
+    with asyncio.Runner(loop_factory=lambda: JumpLoop(look_s)) as runner:
         return runner.run(main)

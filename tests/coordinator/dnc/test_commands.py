@@ -1,61 +1,27 @@
-"""The commands in processes of their own, over pseudo-terminals, and over TCP."""
+"""The commands at both ends of a cable, in virtual time; and over TCP, by pyserial's ways."""
 
 import contextlib
-import json
+import math
 import os
 import random
 import socket
-import subprocess
-import sys
 import threading
-import time
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-import serial
 from serial import rfc2217
 
 from coordinator.cli import main
-from tests.coordinator.dnc.cable import Cable
+from coordinator.command_line import read_words
+from coordinator.commands import Report
+from coordinator.dnc.options import DncOptions
+from coordinator.dnc.port import Port, PortError
+from tests.coordinator.dnc.virtual_cable import PROGRAM, VirtualCable
 
-CANDUCTOR = Path(sys.executable).parent / "canductor"
-PROGRAM = b"".join(b"N%d G1 X%d.5 Y7\n" % (i, i * 7) for i in range(60))
-PATIENCE_S = 60
 FAST = ("--baud", "115200")
-
-
-@contextlib.contextmanager
-def started(*words: str, folder: Path, stdin: int | None = None) -> Iterator[subprocess.Popen[str]]:
-    """Start a command and wait until it says that it waits for the other side."""
-    process = subprocess.Popen(
-        [CANDUCTOR, "dnc", *words],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        stdin=stdin,
-        text=True,
-        cwd=folder,
-    )
-    try:
-        assert process.stderr is not None
-        said = process.stderr.readline()
-        assert said.startswith(("waiting for a control", "serving")), said + process.stderr.read()
-        yield process
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
-
-
-def run(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [CANDUCTOR, "dnc", *words],
-        capture_output=True,
-        text=True,
-        cwd=folder,
-        timeout=PATIENCE_S,
-        check=False,
-    )
+PATIENT = ("--answer-timeout", "86400")
+"""For what comes from outside of virtual time."""
 
 
 @pytest.fixture
@@ -67,21 +33,22 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
     return ours, theirs
 
 
+def into(folder: Path) -> tuple[str, ...]:
+    return ("--folder", str(folder))
+
+
 @pytest.mark.parametrize("options", [(), ("--frame", "8N1", "--no-dc1", "--avoid-control")])
 def test_send_to_receive(folders: tuple[Path, Path], options: tuple[str, ...]) -> None:
     ours, theirs = folders
-    with (
-        Cable() as cable,
-        started("receive", "-p", cable.names[1], *FAST, *options, folder=theirs) as receiver,
-    ):
-        sent = run("send", "part.nc", "-p", cable.names[0], *FAST, *options, "--json", folder=ours)
-        assert (sent.returncode, sent.stderr) == (0, "")
-        assert json.loads(sent.stdout) == {
-            "ok": True, "did": "sent", "transfers": 1, "name": "part", "code": "D", "lines": 60,
-            "confirmed": False,
+    cable = VirtualCable()
+    with cable.started("receive", "-p", "1", *FAST, *options, *into(theirs)) as receiver:
+        sent = cable.run("send", str(ours / "part.nc"), "-p", "0", *FAST, *options)
+        assert (sent.status, sent.sentences) == (0, [])
+        assert sent.figures == {
+            "did": "sent", "transfers": 1, "name": "part", "code": "D", "lines": 60, "confirmed": False
         }  # fmt: skip
-        out, _ = receiver.communicate(timeout=PATIENCE_S)
-        assert (receiver.returncode, out) == (0, "part.nc: 60 lines are in .\n")
+        took = receiver.end()
+    assert (took.status, took.text) == (0, f"part.nc: 60 lines are in {theirs}")
     assert (theirs / "part.nc").read_bytes() == PROGRAM
     assert [p.name for p in theirs.iterdir()] == ["part.nc"]
 
@@ -89,53 +56,55 @@ def test_send_to_receive(folders: tuple[Path, Path], options: tuple[str, ...]) -
 def test_a_file_server(folders: tuple[Path, Path]) -> None:
     ours, theirs = folders
     (ours / "tab.nc").write_bytes(b"A\tB\n")
-    with Cable() as cable, started("serve", ".", "-p", cable.names[0], *FAST, folder=ours) as server:
-        at = ("-p", cable.names[1], *FAST)
-        listed = run("list", *at, "--json", folder=theirs)
-        assert json.loads(listed.stdout)["files"] == {"part.nc": 2, "tab.nc": 1}
-        assert run("receive", "PART", *at, "--crlf", folder=theirs).returncode == 0
-        assert (theirs / "part.nc").exists() is False
+    cable = VirtualCable()
+    with cable.started("serve", str(ours), "-p", "0", *FAST) as server:
+        at = ("-p", "1", *FAST)
+        assert cable.run("list", *at).figures["files"] == {"part.nc": 2, "tab.nc": 1}
+        assert cable.run("receive", "PART", *at, "--crlf", *into(theirs)).status == 0
         assert (theirs / "PART.nc").read_bytes() == PROGRAM.replace(b"\n", b"\r\n")
-        again = run("receive", "PART", *at, folder=theirs)
-        assert (again.returncode, again.stderr) == (
-            1, "canductor: PART.nc is in . already; choose another name, or allow --overwrite\n"
-        )  # fmt: skip
-        missing = run("receive", "NONE", *at, folder=theirs)
-        assert missing.stderr == "canductor: NONE.nc: the peripheral says: NO SUCH FILE\n"
-        refused = run("receive", "tab.nc", *at, folder=theirs)
-        assert refused.stderr == "canductor: tab.nc: the peripheral says: ERROR IN FILE\n"
-        taken = run("send", "PART.nc", "--name", "NEW", *at, folder=theirs)
-        assert taken.returncode == 0
-        exists = run("send", "PART.nc", "--name", "part.nc", *at, folder=theirs)
-        assert exists.stderr == "canductor: part: the peripheral says: FILE EXISTS\n".replace(
-            "part:", "part.nc:"
-        )
-        server.terminate()
-        assert server.wait(PATIENCE_S) == 143
+        for words, sentence in (
+            (
+                ("receive", "PART", *into(theirs)),
+                f"PART.nc is in {theirs} already; choose another name, or allow --overwrite",
+            ),
+            (("receive", "NONE", *into(theirs)), "NONE.nc: the peripheral says: NO SUCH FILE"),
+            (("receive", "tab.nc", *into(theirs)), "tab.nc: the peripheral says: ERROR IN FILE"),
+            (
+                ("send", str(theirs / "PART.nc"), "--name", "part.nc"),
+                "part.nc: the peripheral says: FILE EXISTS",
+            ),
+        ):
+            ended = cable.run(*words, *at)
+            assert (ended.status, ended.sentences) == (1, [sentence])
+        assert cable.run("send", str(theirs / "PART.nc"), "--name", "NEW", *at).status == 0
+        cable.time.sleep(1)  # the control has said its last word, and does not wait for the file to be kept
+        assert server.stop().status == 143
     assert (ours / "NEW.nc").read_bytes() == PROGRAM
     assert sorted(p.name for p in theirs.iterdir()) == ["PART.nc"]
 
 
-def test_a_bad_cable(folders: tuple[Path, Path]) -> None:
+@pytest.mark.parametrize("seed", range(5))
+def test_a_bad_cable(folders: tuple[Path, Path], seed: int) -> None:
     """Flipped bits and lost characters: the same file, or none and a sentence."""
     ours, theirs = folders
-    chance = random.Random(5)
+    chance = random.Random(seed)
+    damaged = 0
 
     def damage(_: int, data: bytes) -> bytes:
+        nonlocal damaged
         if len(data) > 6 and chance.random() < 0.2:
+            damaged += 1
             at = chance.randrange(1, len(data))
             data = data[:at] + (b"" if chance.random() < 0.5 else bytes([data[at] ^ 8])) + data[at + 1 :]
         return data
 
-    with (
-        Cable(change=damage) as cable,
-        started("receive", "-p", cable.names[1], *FAST, "--silence", "0.02", folder=theirs) as receiver,
-    ):
-        run("send", "part.nc", "-p", cable.names[0], *FAST, "--silence", "0.02", folder=ours)
-        _, err = receiver.communicate(timeout=PATIENCE_S)
-        assert receiver.returncode in (0, 1)
-    if receiver.returncode:
-        assert err.startswith("canductor: part.nc: ")
+    cable = VirtualCable(damage)
+    with cable.started("receive", "-p", "1", *FAST, *into(theirs)) as receiver:
+        cable.run("send", str(ours / "part.nc"), "-p", "0", *FAST)
+        took = receiver.end()
+    assert damaged
+    if took.status:
+        assert took.sentences[-1].startswith("part.nc: ")
         assert list(theirs.iterdir()) == []
     else:
         assert (theirs / "part.nc").read_bytes() == PROGRAM
@@ -143,23 +112,20 @@ def test_a_bad_cable(folders: tuple[Path, Path]) -> None:
 
 def test_a_cut_cable_leaves_nothing(folders: tuple[Path, Path]) -> None:
     ours, theirs = folders
-    cut = threading.Event()
+    is_cut = False
 
-    def once_cut(who: int, data: bytes) -> bytes:
-        if b"N30 " in data:
-            cut.set()
-        return b"" if cut.is_set() else data
+    def once_cut(_: int, data: bytes) -> bytes:
+        nonlocal is_cut
+        is_cut = is_cut or b"N30 " in data
+        return b"" if is_cut else data
 
-    short = ("--answer-timeout", "4")
-    with (
-        Cable(change=once_cut) as cable,
-        started("receive", "-p", cable.names[1], *FAST, *short, folder=theirs) as receiver,
-    ):
-        sent = run("send", "part.nc", "-p", cable.names[0], *FAST, *short, folder=ours)
-        assert sent.returncode == 1
-        assert "nothing came after line 31 in time; check the cable" in sent.stderr
-        _, err = receiver.communicate(timeout=PATIENCE_S)
-        assert "nothing came after line 30, the last one that came in time" in err
+    cable = VirtualCable(once_cut)
+    with cable.started("receive", "-p", "1", *FAST, *into(theirs)) as receiver:
+        sent = cable.run("send", str(ours / "part.nc"), "-p", "0", *FAST)
+        assert sent.status == 1
+        assert "nothing came after line 31 in time; check the cable" in sent.sentences[-1]
+        sentence = receiver.end().sentences[-1]
+        assert "nothing came after line 30, the last one that came in time" in sentence
     assert list(theirs.iterdir()) == []
 
 
@@ -167,103 +133,101 @@ def test_drip_from_a_pipe(folders: tuple[Path, Path]) -> None:
     """The control gets lines as they come; whoever writes them waits for the control."""
     _, theirs = folders
     reader, writer = os.pipe()
-    with Cable() as cable:
-        words = ("drip", "-", "-p", cable.names[0], *FAST)
-        with started(*words, folder=theirs, stdin=reader) as feeder, os.fdopen(writer, "wb") as pipe:
-            os.close(reader)
+    cable = VirtualCable()
+    with os.fdopen(reader, "rb") as typed, os.fdopen(writer, "wb") as pipe:
+        drip = ("drip", "-", "-p", "0", *FAST, *PATIENT)
+        with cable.started(*drip, typed=typed) as feeder:
             pipe.write(PROGRAM)
             pipe.flush()
-            fetching = threading.Thread(target=run, args=("receive", "JOB", "-p", cable.names[1], *FAST),
-                                        kwargs={"folder": theirs})  # fmt: skip
-            fetching.start()
-            until_s = time.monotonic() + PATIENCE_S
-            while cable.carried[0] < len(PROGRAM) and time.monotonic() < until_s:
-                fetching.join(0.01)
+            words = ("receive", "JOB", "-p", "1", *FAST, *PATIENT, *into(theirs))
+            fetching = cable.time.start(lambda: cable.run(*words))
+            cable.time.wait(lambda: 0.0 if cable.carried[0] >= len(PROGRAM) else math.inf)
             assert not (theirs / "JOB.nc").exists()
             pipe.write(b"M30")
             pipe.close()
-            fetching.join(PATIENCE_S)
-            out, _ = feeder.communicate(timeout=PATIENCE_S)
-            assert (feeder.returncode, out) == (0, "61 lines were fed to the control\n")
+            assert fetching.join().status == 0
+            assert feeder.end().text == "61 lines were fed to the control"
     assert (theirs / "JOB.nc").read_bytes() == PROGRAM + b"M30\n"
 
 
+# ---------------------------------------------------------------------------------------------- over TCP
+
+
+@pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # of pyserial
 @pytest.mark.parametrize("scheme", ["socket", "rfc2217"])
-def test_over_tcp(folders: tuple[Path, Path], scheme: str) -> None:
+def test_over_tcp(folders: tuple[Path, Path], scheme: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """In real time: it is pyserial that is tested, and sockets."""
     ours, theirs = folders
-    bridge_of = {"socket": _bridge, "rfc2217": _rfc2217_server}
-    with socket.create_server(("127.0.0.1", 0)) as listener, Cable() as cable:
-        port = listener.getsockname()[1]
-        bridge = threading.Thread(target=bridge_of[scheme], args=(listener, cable.names[1]))
-        bridge.start()
-        frame = ("--frame", "8N1")  # all that a pseudo-terminal lets a serial server set
-        with started("serve", ".", "-p", cable.names[0], *FAST, *frame, folder=ours):
-            url = f"{scheme}://127.0.0.1:{port}"
-            fetched = run("receive", "PART", "-p", url, *FAST, *frame, folder=theirs)
-            assert (fetched.returncode, fetched.stderr) == (0, "")
-        bridge.join(PATIENCE_S)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as ours_at,
+        socket.create_server(("127.0.0.1", 0)) as theirs_at,
+    ):
+        at = [f"127.0.0.1:{listener.getsockname()[1]}" for listener in (ours_at, theirs_at)]
+        joining = threading.Thread(target=_join, args=(ours_at, theirs_at, scheme == "rfc2217"))
+        joining.start()
+        serving = threading.Thread(target=_serve, args=(f"socket://{at[0]}", ours))
+        serving.start()
+        words = ["dnc", "receive", "PART", "-p", f"{scheme}://{at[1]}", *FAST, *into(theirs)]
+        assert main(words) == 0, capsys.readouterr()
+        joining.join()
+        serving.join()
     assert (theirs / "PART.nc").read_bytes() == PROGRAM
 
 
-def _bridge(listener: socket.socket, name: str) -> None:
-    """A TCP serial server of one client."""
-    connection, _ = listener.accept()
-    line = os.open(name, os.O_RDWR | os.O_NOCTTY)
-    with connection, os.fdopen(line, "r+b", buffering=0) as tty:
-
-        def back() -> None:
-            with contextlib.suppress(OSError):
-                while data := tty.read(4096):
-                    connection.sendall(data)
-
-        backward = threading.Thread(target=back, daemon=True)
-        backward.start()
-        while data := connection.recv(4096):
-            tty.write(data)
+def _serve(url: str, folder: Path) -> Report | None:
+    with contextlib.suppress(PortError):  # the other side has gone
+        return read_words(["dnc", "serve", str(folder), "-p", url, *FAST])()
+    return None
 
 
-class _PseudoTerminal(serial.Serial):  # type: ignore[misc]
-    """A port without modem lines."""
+def _join(ours_at: socket.socket, theirs_at: socket.socket, speaks_rfc2217: bool) -> None:
+    """Be a serial server: hand on what comes from one connection to the other, until theirs ends."""
+    ours, theirs = ours_at.accept()[0], theirs_at.accept()[0]
+    client = _Client(theirs)
+    manager: Any = rfc2217.PortManager(_SerialLine(), client) if speaks_rfc2217 else None
 
-    cts = dsr = ri = cd = False
+    def back() -> None:
+        with contextlib.suppress(OSError):
+            while data := ours.recv(4096):
+                client.write(data if manager is None else b"".join(manager.escape(data)))
 
-    def _update_dtr_state(self) -> None:
-        pass
-
-    def _update_rts_state(self) -> None:
-        pass
-
-
-def _rfc2217_server(listener: socket.socket, name: str) -> None:
-    """A serial server that takes baud rate and frame from its client, made of pyserial's own parts."""
-    connection, _ = listener.accept()
-
-    class Locked:
-        """What the port manager answers with."""
-
-        lock = threading.Lock()
-
-        def write(self, data: bytes) -> None:
-            with self.lock, contextlib.suppress(OSError):
-                connection.sendall(data)
-
-    with connection, _PseudoTerminal(name, timeout=0.02) as port:
-        client = Locked()
-        manager = rfc2217.PortManager(port, client)
-        ended = threading.Event()
-
-        def back() -> None:
-            while not ended.is_set():
-                if data := port.read(max(port.in_waiting, 1)):
-                    client.write(b"".join(manager.escape(data)))
-
+    with ours, theirs:
         backward = threading.Thread(target=back)
         backward.start()
         with contextlib.suppress(OSError):
-            while data := connection.recv(4096):
-                port.write(b"".join(manager.filter(data)))
-        ended.set()
+            while data := theirs.recv(4096):
+                ours.sendall(data if manager is None else b"".join(manager.filter(data)))
+        ours.shutdown(socket.SHUT_WR)
         backward.join()
+
+
+class _Client:
+    """What a port manager answers with."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self._connection = connection
+        self._lock = threading.Lock()
+
+    def write(self, data: bytes) -> None:
+        with self._lock, contextlib.suppress(OSError):
+            self._connection.sendall(data)
+
+
+class _SerialLine:
+    """What a port manager sets and looks at; it has no modem lines."""
+
+    baudrate, bytesize, parity, stopbits = 9600, 8, "N", 1
+    xonxoff = rtscts = dtr = rts = break_condition = False
+    cts = dsr = ri = cd = False
+
+    def reset_input_buffer(self) -> None:
+        pass
+
+    def reset_output_buffer(self) -> None:
+        pass
+
+
+# -------------------------------------------------------------------------------------------------- sentences
 
 
 @pytest.mark.parametrize(
@@ -322,20 +286,31 @@ def test_sentences(
     assert said.startswith("canductor: ")
 
 
-def test_nobody_answers_and_a_port_that_is_in_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nobody_answers(tmp_path: Path) -> None:
     (tmp_path / "ok.nc").write_bytes(b"ok\n")
-    at = ("--header-timeout", "0.2", "--answer-timeout", "0.4")
-    with Cable() as cable:
-        for words, what in (
-            (("list",), "the request for the directory"),
-            (("receive", "A", "--folder", str(tmp_path)), "the header"),
-            (("send", str(tmp_path / "ok.nc")), "the header"),
-        ):
-            assert main(["dnc", *words, "-p", cable.names[0], *at]) == 1
-            assert f"nothing came after {what} in time; check the cable" in capsys.readouterr().err
-        with started("serve", ".", "-p", cable.names[0], folder=tmp_path):
-            assert main(["dnc", "list", "-p", cable.names[0]]) == 1
-            assert "is in use by another program; close that first" in capsys.readouterr().err
+    cable = VirtualCable()
+    for words, what in (
+        (("list",), "the request for the directory"),
+        (("receive", "A", *into(tmp_path)), "the header"),
+        (("send", str(tmp_path / "ok.nc")), "the header"),
+    ):
+        ended = cable.run(*words, "-p", "0")
+        assert ended.status == 1
+        assert f"nothing came after {what} in time; check the cable" in ended.sentences[-1]
+
+
+def test_a_port_that_is_in_use(capsys: pytest.CaptureFixture[str]) -> None:
+    """A real one: it is the system that says so."""
+    ours, theirs = os.openpty()
+    name = os.ttyname(theirs)
+    try:
+        with contextlib.closing(Port(name, DncOptions())) as port:
+            assert not port.is_paced
+            assert main(["dnc", "list", "-p", name]) == 1
+        assert "is in use by another program; close that first" in capsys.readouterr().err
+    finally:
+        os.close(ours)
+        os.close(theirs)
 
 
 def test_the_wrong_baud_rate(tmp_path: Path) -> None:
@@ -344,19 +319,15 @@ def test_the_wrong_baud_rate(tmp_path: Path) -> None:
     def garble(_: int, data: bytes) -> bytes:
         return bytes(c * 7 + 3 & 0x7F | 0x40 for c in data)
 
-    with (
-        Cable(change=garble) as cable,
-        started("serve", ".", "-p", cable.names[0], folder=tmp_path) as server,
-    ):
+    cable = VirtualCable(garble)
+    with cable.started("serve", str(tmp_path), "-p", "0") as server:
         long = "A" * 30  # a NAK comes back
-        asked = run("receive", long, "-p", cable.names[1], "--header-timeout", "3", folder=tmp_path)
-        assert asked.stderr == (
-            f"canductor: {long}.nc: what the other side answers cannot be read; check baud rate, parity and"
-            " the cable\n"
-        )
-        server.terminate()
-        _, told = server.communicate(timeout=PATIENCE_S)
-        assert told.startswith("what comes cannot be read; are baud rate and frame those of the control?\n")
+        asked = cable.run("receive", long, "-p", "1", *into(tmp_path))
+        assert asked.sentences == [
+            f"{long}.nc: what the other side answers cannot be read; check baud rate, parity and the cable"
+        ]
+        told = server.stop().sentences
+    assert told[1] == "what comes cannot be read; are baud rate and frame those of the control?"
 
 
 def test_a_line_to_oneself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,10 +1,10 @@
 """A received program becomes a job of a machine that runs; a dripped one is a job while it comes."""
 
 import asyncio
-import os
-import subprocess
-from collections.abc import Awaitable, Callable, Mapping
+import contextlib
+from collections.abc import AsyncIterator, Iterator, Mapping
 from concurrent.futures import Future
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,9 @@ from coordinator.dnc.machine import LINES_MAX, MachineSink
 from coordinator.dnc.options import DncOptions
 from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
 from coordinator.ipc.uploads import upload_method
-from tests.coordinator.dnc.cable import Cable
-from tests.coordinator.dnc.test_commands import CANDUCTOR, FAST, PROGRAM, started
+from tests.coordinator.dnc.virtual_cable import PROGRAM, Ended, VirtualCable
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, serving
+from tests.stages.loop_thread import in_thread
 
 
 class Job:
@@ -56,107 +56,111 @@ class Job:
         self.over.set()
 
 
-def run_with_machine(
-    folder: Path, body: Callable[[Served, list[str], Job], Awaitable[None]], **settings: Any
-) -> None:
-    """Serve an interface with a job folder that notes what is started, and a job that is fed."""
+@dataclass
+class AtWork:
+    """A machine that is served, and what it was asked for."""
 
-    async def main() -> None:
-        (folder / "canductor").mkdir()
-        begun: list[str] = []
-        async with asyncio.timeout(60), serving(folder / "canductor", **settings) as served:
-            registry = served.server._common.registry
-            (folder / "jobs").mkdir()
-            registry.add(upload_method(folder / "jobs"))
-            job = Job()
+    served: Served
+    job: Job = field(default_factory=Job)
+    begun: list[str] = field(default_factory=list)
+
+
+@contextlib.contextmanager
+def machine(folder: Path, **settings: Any) -> Iterator[AtWork]:
+    """Serve, on a thread of its own, an interface with a job folder, and a job that is fed."""
+    (folder / "canductor").mkdir()
+    (folder / "jobs").mkdir()
+
+    @contextlib.asynccontextmanager
+    async def serve() -> AsyncIterator[AtWork]:
+        async with serving(folder / "canductor", **settings) as served:
+            at_work = AtWork(served)
 
             def start(_: Caller, params: dict[str, Any]) -> Value:
-                if begun:
+                if at_work.begun:
                     raise ApiError("busy", "the machine is busy")
-                begun.append(params["file"])
+                at_work.begun.append(params["file"])
                 return {}
 
-            registry.add(Method("job.start", Scope.OPERATE, "", start, (Param("file", Kind.STR),)))
             name, text = Param("name", Kind.STR), Param("text", Kind.STR)
-            first_line = Param("first_line", Kind.INT)
             end = Param("end", Kind.BOOL, required=False, default=False)
             failure = Param("failure", Kind.STR, required=False)
-            registry.add(Method("job.stream", Scope.OPERATE, "", job.stream, (name,)))
-            params = (name, first_line, text, end, failure)
-            registry.add(Method("job.feed", Scope.OPERATE, "", job.feed, params))
-            await body(served, begun, job)
+            params = (name, Param("first_line", Kind.INT), text, end, failure)
+            registry = served.server._common.registry
+            registry.add(upload_method(folder / "jobs"))
+            registry.add(Method("job.start", Scope.OPERATE, "", start, (Param("file", Kind.STR),)))
+            registry.add(Method("job.stream", Scope.OPERATE, "", at_work.job.stream, (name,)))
+            registry.add(Method("job.feed", Scope.OPERATE, "", at_work.job.feed, params))
+            yield at_work
 
-    asyncio.run(main())
+    with in_thread(serve) as at_work:
+        yield at_work
 
 
-async def command(*words: str, folder: Path) -> tuple[int, str]:
-    process = await asyncio.create_subprocess_exec(
-        CANDUCTOR,
-        "dnc",
-        *words,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        cwd=folder,
-        env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
-    )
-    _, err = await process.communicate()
-    assert process.returncode is not None
-    return process.returncode, err.decode()
+def token_file(path: Path, token: str) -> str:
+    path.write_text(token + "\n")
+    path.chmod(0o600)
+    return str(path)
 
 
 @pytest.mark.parametrize("tcp", [False, True])
-def test_receive_and_start(tmp_path: Path, tcp: bool) -> None:
+def test_receive_and_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tcp: bool) -> None:
     """Over a Unix socket, and over TCP with a token; when it cannot be started, it is there all the same."""
-    (tmp_path / "part.nc").write_bytes(PROGRAM)
-    for name, token in (("right", TOKENS[Scope.OPERATE]), ("weak", TOKENS[Scope.WATCH]), ("wrong", "x" * 40)):
-        (tmp_path / name).write_text(token + "\n")
-        (tmp_path / name).chmod(0o600)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    inbox, outbox = tmp_path / "inbox", tmp_path / "outbox"
+    inbox.mkdir()
+    outbox.mkdir()
+    (outbox / "part.nc").write_bytes(PROGRAM)
+    cable = VirtualCable()
+    with (
+        machine(tmp_path, **({"tcp": plain_tcp(tmp_path)} if tcp else {})) as at_work,
+        cable.started("serve", str(outbox), "-p", "0"),
+    ):
 
-    async def body(served: Served, begun: list[str], _: Job) -> None:
-        (tmp_path / "inbox").mkdir()
-        at = ("--at", f"tcp://127.0.0.1:{served.server.tcp_port}", "--token-file") if tcp else ()
-        with Cable() as cable, started("serve", ".", "-p", cable.names[0], *FAST, folder=tmp_path):
-            words = ("--folder", "inbox", "--start", "-p", cable.names[1], *FAST, *at)
-            right = ("right",) if tcp else ()
-            assert await command("receive", "PART", *words, *right, folder=tmp_path) == (0, "")
-            assert begun == ["PART.nc"]
-            assert (tmp_path / "jobs" / "PART.nc").read_bytes() == PROGRAM
-            came = "{}.nc: 60 lines are in inbox, but not printed: {}\n"
-            for file, token, why in (
-                ("pArt", right, "the machine is busy"),
-                *((("paRt", ("weak",), "job.upload needs the scope operate"),) if tcp else ()),
-                *((("parT", ("wrong",), "the token is not known here"),) if tcp else ()),
-            ):
-                status, err = await command("receive", file, *words, *token, folder=tmp_path)
-                assert status == 1
-                assert err.startswith("canductor: " + came.format(file, why).rstrip())
-                assert err.count("\n") == 1
-                assert (tmp_path / "inbox" / f"{file}.nc").read_bytes() == PROGRAM
+        def fetch(name: str, token: str) -> Ended:
+            words = ["receive", name, "--folder", str(inbox), "--start", "-p", "1"]
+            if tcp:
+                words += ["--at", f"tcp://127.0.0.1:{at_work.served.server.tcp_port}"]
+                words += ["--token-file", token_file(tmp_path / "token", token)]
+            return cable.run(*words)
 
-    run_with_machine(tmp_path, body, **({"tcp": plain_tcp(tmp_path)} if tcp else {}))
+        right = TOKENS[Scope.OPERATE]
+        assert fetch("PART", right).status == 0
+        assert at_work.begun == ["PART.nc"]
+        assert (tmp_path / "jobs" / "PART.nc").read_bytes() == PROGRAM
+        refusals = [("pArt", right, "the machine is busy")]
+        if tcp:
+            refusals.append(("paRt", TOKENS[Scope.WATCH], "job.upload needs the scope operate"))
+            refusals.append(("parT", "x" * 40, "the token is not known here"))
+        for file, token, why in refusals:
+            ended = fetch(file, token)
+            assert ended.status == 1
+            came = f"{file}.nc: 60 lines are in {inbox}, but not printed: {why}"
+            assert ended.sentences[-1].startswith(came)
+            assert (inbox / f"{file}.nc").read_bytes() == PROGRAM
 
 
 @pytest.mark.parametrize("bad", [False, True])
 def test_drip_to_the_machine(tmp_path: Path, bad: bool) -> None:
     lines = ["%", "G1 X1", "", "G99" if bad else "G1 X2", *(f"G1 X{i}" for i in range(100))]
     (tmp_path / "job.nc").write_text("\n".join(lines) + "\n")
-    (tmp_path / "token").write_text(TOKENS[Scope.OPERATE])
-    (tmp_path / "token").chmod(0o600)
-
-    async def body(served: Served, _: list[str], job: Job) -> None:
-        at = ("--at", f"tcp://127.0.0.1:{served.server.tcp_port}", "--token-file", "token")
-        with Cable() as cable, started("serve", ".", "-p", cable.names[0], *FAST, folder=tmp_path):
-            words = ("drip", "--from", "JOB", "-p", cable.names[1], *FAST, *at)
-            status, err = await command(*words, folder=tmp_path)
-        assert job.name == "JOB"
-        if bad:
-            assert (status, err) == (1, "canductor: JOB:4: G99 is not known\n")
-            assert job.lines[:4] == lines[:4]
-        else:
-            assert (status, err) == (0, "JOB: all 104 lines came; waiting for the machine\n")
-            assert job.lines == lines
-
-    run_with_machine(tmp_path, body, tcp=plain_tcp(tmp_path))
+    token = token_file(tmp_path / "token", TOKENS[Scope.OPERATE])
+    patient = ("--answer-timeout", "86400")  # the machine is outside of virtual time
+    cable = VirtualCable()
+    with (
+        machine(tmp_path, tcp=plain_tcp(tmp_path)) as at_work,
+        cable.started("serve", str(tmp_path), "-p", "0", *patient),
+    ):
+        at = ("--at", f"tcp://127.0.0.1:{at_work.served.server.tcp_port}", "--token-file", token)
+        ended = cable.run("drip", "--from", "JOB", "-p", "1", *patient, *at)
+    job = at_work.job
+    assert job.name == "JOB"
+    if bad:
+        assert (ended.status, ended.sentences) == (1, ["JOB:4: G99 is not known"])
+        assert job.lines[:4] == lines[:4]
+    else:
+        assert (ended.status, ended.sentences) == (0, ["JOB: all 104 lines came; waiting for the machine"])
+        assert job.lines == lines
 
 
 class Machine:

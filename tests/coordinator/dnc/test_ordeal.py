@@ -2,7 +2,6 @@
 
 import pytest
 
-from tests.coordinator.dnc import pty_ordeal
 from tests.coordinator.dnc.ordeal import judge, make_case
 
 BLOCKS = 5
@@ -22,10 +21,3 @@ def test_transfers_end_whole_or_not_at_all(block: int) -> None:
 def test_damage_that_no_check_sees_is_damage_within_lines() -> None:
     for number in range(60):
         judge(make_case(number, visible=False))
-
-
-def test_over_pseudo_terminals() -> None:
-    """Some of them in real time; ``python -m tests.coordinator.dnc.pty_ordeal`` plays more."""
-    verdicts = [pty_ordeal.judge(number) for number in range(40, 45)]
-    assert any(verdict.kept for verdict in verdicts)
-    assert sum(verdict.repeats for verdict in verdicts)

@@ -1,6 +1,5 @@
 """Files that have to come twice: whatever the block check lets pass is no file."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -8,9 +7,8 @@ import pytest
 from coordinator.dnc.blocks import Header
 from coordinator.dnc.files import FileRefused, Folder
 from coordinator.dnc.verify import Compare, Twice
-from tests.coordinator.dnc.cable import Cable
 from tests.coordinator.dnc.ordeal import judge_twice, make_case
-from tests.coordinator.dnc.test_commands import FAST, PATIENCE_S, PROGRAM, run, started
+from tests.coordinator.dnc.virtual_cable import PROGRAM, VirtualCable
 
 HEADER = Header("D", "PART", "A")
 LINES = [b"G28", b"", b"G1 X1"]
@@ -102,15 +100,14 @@ def test_asked_for_twice(tmp_path: Path) -> None:
         times[0] += b"X77.5" in data
         return unseen(who, data) if times[0] == 1 else data
 
-    quick = (*FAST, "--silence", "0.05")
-    with Cable(change=change) as cable, started("serve", ".", "-p", cable.names[0], *quick, folder=ours):
-        words = ("receive", "PART", "-p", cable.names[1], *quick, "--verify")
-        bad = run(*words, folder=theirs)
-        assert bad.returncode == 1
-        assert "line 12 of PART.nc is not the same twice: one of them came damaged" in bad.stderr
+    cable = VirtualCable(change)
+    with cable.started("serve", str(ours), "-p", "0"):
+        words = ("receive", "PART", "-p", "1", "--verify", "--folder", str(theirs))
+        bad = cable.run(*words)
+        assert bad.status == 1
+        assert "line 12 of PART.nc is not the same twice: one of them came damaged" in bad.sentences[-1]
         assert names(theirs) == []
-        good = run(*words, folder=theirs)
-        assert good.stdout == "PART.nc: 60 lines are in ., the same twice\n"
+        assert cable.run(*words).text == f"PART.nc: 60 lines are in {theirs}, the same twice"
     assert (theirs / "PART.nc").read_bytes() == PROGRAM
     assert names(ours) == ["part.nc"]
 
@@ -119,21 +116,22 @@ def test_what_a_control_sends_twice(tmp_path: Path) -> None:
     """At once, and something else in between."""
     (tmp_path / "part.nc").write_bytes(PROGRAM)
     (tmp_path / "other.nc").write_bytes(b"M30\n")
-    (tmp_path / "there").mkdir()
-    with (
-        Cable() as cable,
-        started(
-            "receive", "-p", cable.names[0], *FAST, "--verify", "--folder", "there", folder=tmp_path
-        ) as taking,
-    ):
+    there = tmp_path / "there"
+    there.mkdir()
+    cable = VirtualCable()
+    with cable.started("receive", "-p", "0", "--verify", "--folder", str(there)) as taking:
         for name in ("part.nc", "other.nc", "part.nc", "part.nc"):
-            assert list((tmp_path / "there").glob("*.nc")) == []
-            assert run("send", name, "-p", cable.names[1], *FAST, folder=tmp_path).returncode == 0
-        out, err = taking.communicate(timeout=PATIENCE_S)
-        assert (taking.returncode, out) == (0, "part.nc: 60 lines are in there, the same twice\n")
-        once = "came once, {} lines; send it once more, to compare\n"
-        assert err == f"part.nc {once.format(60)}other.nc {once.format(1)}part.nc {once.format(60)}"
-    assert (tmp_path / "there" / "part.nc").read_bytes() == PROGRAM
+            assert list(there.glob("*.nc")) == []
+            assert cable.run("send", str(tmp_path / name), "-p", "1").status == 0
+        took = taking.end()
+    assert (took.status, took.text) == (0, f"part.nc: 60 lines are in {there}, the same twice")
+    once = "came once, {} lines; send it once more, to compare"
+    assert took.sentences[1:] == [
+        f"part.nc {once.format(60)}",
+        f"other.nc {once.format(1)}",
+        f"part.nc {once.format(60)}",
+    ]
+    assert (there / "part.nc").read_bytes() == PROGRAM
 
 
 def test_sent_and_fetched_back(tmp_path: Path) -> None:
@@ -144,18 +142,16 @@ def test_sent_and_fetched_back(tmp_path: Path) -> None:
         times[0] += who == 1 and b"X77.5" in data
         return unseen(who, data) if times[0] == 2 and who == 1 else data
 
-    (tmp_path / "there").mkdir()
-    quick = (*FAST, "--silence", "0.05")
-    with (
-        Cable(change=change) as cable,
-        started("serve", "there", "-p", cable.names[0], *quick, folder=tmp_path),
-    ):
-        words = ("send", "part.nc", "-p", cable.names[1], *quick, "--verify", "--json")
-        good = run(*words, "--name", "GOOD", folder=tmp_path)
-        bad = run(*words, "--name", "BAD", folder=tmp_path)
-    assert json.loads(good.stdout.splitlines()[-1])["confirmed"] is True
-    assert bad.stderr.splitlines()[-1] == (
-        "canductor: BAD was sent, but is not confirmed: line 12 of BAD is not the same twice:"
+    there = tmp_path / "there"
+    there.mkdir()
+    cable = VirtualCable(change)
+    with cable.started("serve", str(there), "-p", "0"):
+        words = ("send", str(tmp_path / "part.nc"), "-p", "1", "--verify")
+        good = cable.run(*words, "--name", "GOOD")
+        bad = cable.run(*words, "--name", "BAD")
+    assert good.figures["confirmed"] is True
+    assert bad.sentences[-1] == (
+        "BAD was sent, but is not confirmed: line 12 of BAD is not the same twice:"
         " delete it at the other side"
     )
 

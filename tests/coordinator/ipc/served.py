@@ -122,14 +122,16 @@ async def serving(folder: Path, **settings: Any) -> AsyncIterator[Served]:
         await asyncio.sleep(0)
 
 
-def run(folder: Path, body: Callable[[Served], Awaitable[None]], **settings: Any) -> None:
-    """Serve at FOLDER/m.sock and let BODY test what is served."""
+def run(
+    folder: Path, body: Callable[[Served], Awaitable[None]], *, look_s: float = 0.0, **settings: Any
+) -> None:
+    """Serve at FOLDER/m.sock and let BODY test what is served, in virtual time; LOOK_S as of JumpLoop."""
 
     async def main() -> None:
         async with serving(folder, **settings) as served:
             await body(served)
 
-    jump_loop.run(main())
+    jump_loop.run(main(), look_s=look_s)
 
 
 def tokens_file(folder: Path, mode: int = 0o600) -> Path:

@@ -1,9 +1,7 @@
 import asyncio
 import ssl
-from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,15 +15,8 @@ from coordinator.ipc.settings import TcpSettings
 from coordinator.ipc.wire import Encoding
 from nodes.errors import CanductorError
 from tests.coordinator.certificates import make_certificate
-from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, registry_of, serving
-
-
-def run(folder: Path, body: Callable[[Served], Awaitable[None]], **settings: Any) -> None:
-    async def main() -> None:
-        async with asyncio.timeout(60), serving(folder, **settings) as served:
-            await body(served)
-
-    asyncio.run(main())
+from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, registry_of, run, serving
+from tests.stages.loop_thread import in_thread
 
 
 @pytest.mark.parametrize("encoding", Encoding)
@@ -152,23 +143,17 @@ def test_who_is_not_there_or_refuses(tmp_path: Path) -> None:
 
 
 def test_the_blocking_face(tmp_path: Path) -> None:
-    async def body(served: Served) -> None:
+    with in_thread(lambda: serving(tmp_path)) as served:
         served.state.set("a", 1)
-
-        def use() -> None:
-            with BlockingClient(served.at, name="script") as client:
-                assert client.call("move.to", {"x_mm": 3}) == {"to": 3}
-                updates = client.watch()
-                assert next(updates).values == {"a": 1}
-                updates.close()
-                with pytest.raises(ApiError, match="no method"):
-                    client.call("nothing")
-
-        await asyncio.to_thread(use)
-        with pytest.raises(ConnectionLost):
-            await asyncio.to_thread(BlockingClient("/none").__enter__)
-
-    run(tmp_path, body)
+        with BlockingClient(served.at, name="script") as client:
+            assert client.call("move.to", {"x_mm": 3}) == {"to": 3}
+            updates = client.watch()
+            assert next(updates).values == {"a": 1}
+            updates.close()
+            with pytest.raises(ApiError, match="no method"):
+                client.call("nothing")
+    with pytest.raises(ConnectionLost):
+        BlockingClient("/none").__enter__()
 
 
 def test_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

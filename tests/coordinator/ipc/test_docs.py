@@ -1,7 +1,6 @@
 """The examples of docs/ipc.md, byte for byte."""
 
 import ast
-import asyncio
 import re
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from coordinator.ipc.session_methods import RATE_HZ_MAX, RATE_HZ_MIN
 from coordinator.ipc.settings import IpcSettings, Limits
 from coordinator.ipc.wire import Encoder, Encoding, WireReader
 from tests.coordinator.ipc.served import Served, serving
+from tests.stages import jump_loop
 
 DOC = (Path(__file__).parents[3] / "docs" / "ipc.md").read_text()
 
@@ -55,10 +55,10 @@ def test_the_lines(tmp_path: Path) -> None:
         assert (await reader.readline()).decode() == update[0][2:] + "\n"
 
     async def main() -> None:
-        async with asyncio.timeout(60), serving(tmp_path) as served:
+        async with serving(tmp_path) as served:
             await body(served)
 
-    asyncio.run(main())
+    jump_loop.run(main())
 
 
 def codes_of(path: Path) -> set[str]:

@@ -4,12 +4,13 @@ import json
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.ipc.json_values import has_more_items
 from coordinator.ipc.settings import Limits
 from coordinator.ipc.wire import Fault, WireReader
+from tests.profiles import examples
 
 text = st.text(alphabet='\\",[]{}ab', max_size=12)
 values = st.recursive(
@@ -23,6 +24,7 @@ def items_of(value: Any) -> int:
     return len(value) + sum(map(items_of, value.values() if isinstance(value, dict) else value))
 
 
+@settings(max_examples=examples(40))
 @given(st.dictionaries(text, values, min_size=1, max_size=5))
 def test_what_has_no_more_is_never_refused_and_twice_as_many_always_are(message: dict[str, Any]) -> None:
     body, count = json.dumps(message).encode(), items_of(message)

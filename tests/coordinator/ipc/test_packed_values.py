@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.ipc.packed_values import has_more_values
+from tests.profiles import examples
 
 plain = (
     st.none()
@@ -18,7 +19,7 @@ plain = (
 values = st.recursive(
     plain,
     lambda v: st.lists(v, max_size=40) | st.dictionaries(st.text(max_size=40), v, max_size=20),
-    max_leaves=60,
+    max_leaves=30,
 )
 
 
@@ -28,7 +29,7 @@ def count(value: Any) -> int:
     return 1 + (sum(map(count, value)) if isinstance(value, list) else 0)
 
 
-@settings(derandomize=True, deadline=None)
+@settings(max_examples=examples(40))
 @given(values)
 def test_it_counts_what_a_message_has(value: Any) -> None:
     body, has = msgpack.packb(value), count(value)
@@ -50,7 +51,7 @@ def test_long_ones() -> None:
         assert has_more_values(body, has - 1)
 
 
-@settings(derandomize=True, deadline=None)
+@settings(max_examples=examples(60))
 @given(st.binary(max_size=100), st.integers(0, 50))
 def test_any_bytes(body: bytes, most: int) -> None:
     assert has_more_values(body, most) in (True, False)

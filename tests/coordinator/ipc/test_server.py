@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc import turns as turns_module
 from coordinator.ipc.connection import UNREAD_BYTES
 from coordinator.ipc.settings import Limits
+from coordinator.ipc.turns import TURN_S
 from tests.coordinator.ipc.served import (
     Script,
     Served,
@@ -57,9 +57,6 @@ ATTACKS = {
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_what_is_wrong_ends_that_client_only_with_a_clear_error(tmp_path: Path, attack: str) -> None:
     data, code = ATTACKS[attack]
-    limits = Limits()
-    if code == "timeout":
-        limits = Limits(message_timeout_s=1.0)  # of every client: a busy computer takes its time, too
 
     async def body(served: Served) -> None:
         bystander = await served.script()
@@ -72,14 +69,10 @@ def test_what_is_wrong_ends_that_client_only_with_a_clear_error(tmp_path: Path, 
         assert not served.stops
         writer.close()
 
-    run(tmp_path, body, limits=limits)
+    run(tmp_path, body)
 
 
-def test_however_many_are_sent_at_once_what_is_answered_at_once_is_never_too_much(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(turns_module, "TURN_S", 0.0)  # time for one request, on the slowest of computers
-
+def test_however_many_are_sent_at_once_what_is_answered_at_once_is_never_too_much(tmp_path: Path) -> None:
     async def body(served: Served) -> None:
         script = await served.script()
         count = 4 * served.settings.limits.pending_requests
@@ -89,13 +82,10 @@ def test_however_many_are_sent_at_once_what_is_answered_at_once_is_never_too_muc
             answer = await script.receive()
             assert (answer.get("id"), "result" in answer) == (number, True), answer
 
-    run(tmp_path, body)
+    run(tmp_path, body, look_s=TURN_S)  # one request takes a whole turn
 
 
-def test_of_a_client_that_waits_for_its_turn_no_more_than_a_bounded_part_is_taken_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(turns_module, "TURN_S", 0.0)
+def test_of_a_client_that_waits_for_its_turn_no_more_than_a_bounded_part_is_taken_in(tmp_path: Path) -> None:
     read_at_once = 256 * 1024  # by asyncio
     requests = [b'{"id":%d,"method":"machine.info"}%s\n' % (n, b" " * 8000) for n in range(200)]
 
@@ -112,7 +102,7 @@ def test_of_a_client_that_waits_for_its_turn_no_more_than_a_bounded_part_is_take
         received = [first.result()] + [await script.receive() for _ in requests[1:]]
         assert [answer["id"] for answer in received] == list(range(len(requests)))
 
-    run(tmp_path, body)
+    run(tmp_path, body, look_s=TURN_S)
 
 
 @pytest.mark.filterwarnings("error")

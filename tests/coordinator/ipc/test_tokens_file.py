@@ -6,16 +6,12 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc import server as server_module
+from coordinator.ipc.server import TOKENS_LOOK_S
 from coordinator.ipc.settings import TcpSettings
 from tests.coordinator.ipc.served import Script, Served, serving
+from tests.stages import jump_loop
 
 OLD, NEW, THIRD = "o" * 32, "n" * 32, "t" * 32
-
-
-@pytest.fixture(autouse=True)
-def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server_module, "TOKENS_LOOK_S", 0.01)
 
 
 def write(path: Path, text: str, mode: int = 0o600) -> None:
@@ -31,7 +27,7 @@ async def hello(served: Served, token: str) -> tuple[Script, dict[str, Any]]:
 
 
 async def notice(served: Served) -> str:
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(2 * TOKENS_LOOK_S):
         return await served.notices.get()
 
 
@@ -57,7 +53,7 @@ def test_tokens_come_and_go_without_a_restart(tmp_path: Path) -> None:
             assert (await desk.rest())[-1]["error"]["code"] == "bad_token"
             assert "result" in await tablet.ask("machine.info")
 
-    asyncio.run(body())
+    jump_loop.run(body())
 
 
 @pytest.mark.parametrize(
@@ -92,4 +88,4 @@ def test_while_the_file_cannot_be_read_nobody_new_comes_in(
             assert "read again" in await notice(served)
             assert "result" in (await hello(served, OLD))[1]
 
-    asyncio.run(body())
+    jump_loop.run(body())

@@ -1,26 +1,27 @@
 """Files that clients begin to send and do not end."""
 
 import asyncio
+import shutil
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from coordinator.ipc import uploads
-from coordinator.ipc.uploads import PARTS_MAX, upload_method
+from coordinator.ipc.uploads import FREE_MIN, PARTS_MAX, upload_method
 from tests.coordinator.ipc.served import Script, Served, serving
+from tests.stages import jump_loop
 
 
 def run(folder: Path, body: Callable[[Served, Path], Awaitable[None]]) -> None:
     async def main() -> None:
-        async with asyncio.timeout(60), serving(folder) as served:
+        async with serving(folder) as served:
             jobs = folder / "jobs"
             jobs.mkdir(exist_ok=True)
             served.server._common.registry.add(upload_method(jobs))
             await body(served, jobs)
 
-    asyncio.run(main())
+    jump_loop.run(main())
 
 
 async def upload(script: Script, file: str, offset: int, text: str, **more: Any) -> Any:
@@ -84,7 +85,8 @@ def test_the_disk_is_never_filled(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     async def body(served: Served, jobs: Path) -> None:
         script = await served.script()
         assert await upload(script, "a.gcode", 0, "x") == 1
-        monkeypatch.setattr(uploads, "FREE_MIN", 2**70)
+        full = shutil.disk_usage(tmp_path)._replace(free=FREE_MIN)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
         refused = await upload(script, "a.gcode", 1, "x")
         assert (refused["code"], "MiB left" in refused["message"]) == ("failed", True)
         await until(jobs, [])

@@ -135,7 +135,7 @@ def test_of_a_machine_that_has_not_started_there_is_little() -> None:
     assert {name for name, _ in read({})} == {"canductor_machine_waiting", "canductor_metrics_left_out"}
 
 
-@settings(max_examples=examples(50))
+@settings(max_examples=examples(20))
 @given(
     st.dictionaries(
         st.sampled_from(

@@ -1,13 +1,32 @@
-"""The live page in Chromium, used as a person would: by looking at it, clicking, typing."""
+"""The live page in Chromium, used as a person would: by looking at it, clicking, typing.
 
+One browser for all. What the page does by itself is tested in front of a server whose methods only take
+notes; one test takes a machine of virtual nodes through a print.
+"""
+
+import asyncio
 import re
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import Final
 from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import Browser, WebSocketRoute
 
-from tests.coordinator.web.browser import PATIENCE_MS, PHONE, Demo, Visitor, chromium, demo
+from coordinator.ipc.methods import Scope
+from tests.coordinator.ipc.served import TOKENS, tokens_file
+from tests.coordinator.web.browser import PATIENCE_MS, Demo, Visitor, chromium, demo
+from tests.coordinator.web.paged import LOOPBACK, Paged, paging
+from tests.stages.loop_thread import in_thread
+
+NOT_SIGNED_IN: Final = "status of 401"
+FORBIDDEN: Final = "status of 403"
+WEBSOCKET_REFUSED: Final = "WebSocket connection to "
+UNREACHED: Final = "ERR_CONNECTION"
+NO_METHOD: Final = "there is no method"
+"""Words that the browser, and the server without a machine, have for what is meant to fail."""
 
 
 @pytest.fixture(scope="module")
@@ -17,9 +36,33 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="module")
-def machine(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Demo]:
-    """One machine for all; each test leaves it ready, or printing."""
+def paged(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Paged]:
+    """A server without a machine, on a thread of its own: the browser's driver has this one."""
     del browser  # without one there is nothing to serve
+    folder = tmp_path_factory.mktemp("paged")
+
+    @asynccontextmanager
+    async def serve() -> AsyncIterator[Paged]:
+        settings = replace(LOOPBACK, sessions=folder / "sessions.json")
+        async with paging(folder, settings, tokens=tokens_file(folder)) as there:
+            yield there
+
+    with in_thread(serve) as served:
+        yield served
+
+
+def link(paged: Paged, scope: Scope = Scope.OPERATE) -> str:
+    """Return a one-time link; the server's loop makes it."""
+
+    async def make() -> str:
+        return paged.page.new_link(scope)
+
+    return asyncio.run_coroutine_threadsafe(make(), paged.loop).result()
+
+
+@pytest.fixture(scope="module")
+def machine(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Demo]:
+    del browser
     folder = tmp_path_factory.mktemp("page")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(folder / "state"))
@@ -27,249 +70,61 @@ def machine(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Itera
             yield served
 
 
-@pytest.fixture
-def visitor(browser: Browser, machine: Demo) -> Iterator[Visitor]:
-    tab = Visitor(browser, machine.link()).visit()
-    try:
-        yield tab
-        assert tab.wrong == []
-    finally:
-        tab.close()
+# ----------------------------------------------------------------------------------------------- getting in
 
 
-@pytest.fixture
-def printing(machine: Demo) -> None:
-    """The machine prints, and may go on with it."""
-    assert machine.ask("machine.state")["cause"] == ""
-    state = machine.ask("job.status")["state"]
-    if state == "paused":
-        machine.ask("job.resume")
-    elif state != "printing":
-        machine.ask("job.start", file="part.gcode")
+def test_getting_in(browser: Browser, paged: Paged) -> None:
+    """By a link that works once, or a token; what the browser may do is what that gives."""
+    one_time = link(paged, Scope.WATCH)
+    tab = Visitor(browser)
+    tab.page.goto(f"{paged.at}/#{'x' * 43}")
+    tab.page.get_by_text("This link or token is not known.").wait_for()
+    assert tab.page.url == f"{paged.at}/", "the code is of no use any more"
+    tab.page.get_by_label("Link or token").fill(one_time)
+    tab.page.get_by_role("button", name="Let me in").click()
+    tab.until("document.body.dataset.offline === 'false'")
+    tab.until("document.getElementById('login').hidden")
+    tab.until("document.getElementById('stop').getAttribute('aria-disabled') === 'true'")
+    assert tab.page.get_by_role("button", name="Send").is_disabled()
+    tab.page.locator("#stop").click(force=True)  # it looks as if one could not; who tries is told why
+    tab.page.get_by_text("This browser may only watch: the stop was not sent.").wait_for()
+    assert paged.served.stops == []
+
+    tab.page.goto(one_time)  # from the history: it does no harm to who is in
+    tab.until("document.body.dataset.offline === 'false'")
+    second = tab.context.new_page()
+    second.goto(paged.at)
+    second.wait_for_function("() => document.body.dataset.offline === 'false'")
+    second.close()
+    (cookie,) = tab.context.cookies()
+    assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
+    assert not tab.page.evaluate("document.cookie")
+    code = one_time.partition("#")[2]
+    assert not [url for url in tab.asked if code in url.partition("#")[0] or TOKENS[Scope.WATCH] in url]
+
+    other = Visitor(browser)
+    other.page.goto(paged.at)
+    other.page.get_by_text("Open the link that canductor prints").wait_for()
+    other.page.get_by_label("Link or token").fill(TOKENS[Scope.OPERATE])
+    other.page.get_by_label("Link or token").press("Enter")
+    other.until("document.getElementById('stop').dataset.line === 'up'")
+    other.page.locator("#stop").click()
+    other.page.get_by_text("All nodes were told to stop").wait_for()
+    assert set(paged.served.stops) == {"the live page (127.0.0.1, token of-operate)"}
+    asyncio.run_coroutine_threadsafe(paged.page.sign_all_out(), paged.loop).result()
+    for visitor in (tab, other):
+        visitor.page.get_by_text("Open the link that canductor prints").wait_for()
+    tab.close(FORBIDDEN, NOT_SIGNED_IN, WEBSOCKET_REFUSED, NO_METHOD)
+    other.close(NOT_SIGNED_IN, WEBSOCKET_REFUSED, NO_METHOD)
 
 
-TABLE = {"axis": "x", "positions": [0, 100], "forward": [0, 0.01], "reverse": [-0.02, -0.01]}
+# -------------------------------------------------------------------------------------------------- the stop
 
 
-def start_again(tab: Visitor) -> None:
-    tab.page.get_by_role("button", name="Start the machine again").click()
-    tab.until_text("state", "ready")
-
-
-# --------------------------------------------------------------------------------------------- what it shows
-
-
-def test_axis_tables_come_and_go(visitor: Visitor, machine: Demo) -> None:
-    tab = visitor
-    tab.until_text("state", "ready")
-    tab.until("!document.getElementById('tables-part').hidden")
-    tab.until("document.querySelector('[data-axis=x]').textContent.includes('no table')")
-    machine.ask("table.send", **TABLE)
-    tab.until("document.querySelector('[data-axis=x]').textContent.includes('2 of 2 ok, 2 in use')")
-    tab.until(
-        "document.querySelector('[data-axis=x] .pill').textContent === 'waits for homing and standstill'"
-    )
-    machine.ask("gcode.run", script="G28 X\nG1 X50 F6000")
-    tab.until("document.querySelector('[data-axis=x] .pill').textContent === 'corrected'")
-    tab.until("document.querySelector('[data-axis=x]').textContent.includes('5.0 µm')")
-    tab.until("document.querySelector('[data-axis=x]').textContent.includes('forward')")
-    machine.ask("table.remove", axis="x")
-    tab.until("document.querySelector('[data-axis=x]').textContent.includes('no table')")
-
-
-def test_a_print_from_start_to_cancel(visitor: Visitor, machine: Demo) -> None:
-    tab = visitor
-    tab.until_text("state", "ready")
-    assert tab.text("about").startswith("canductor ")
-    tab.page.get_by_role("button", name="Print").click()
-    tab.until_text("state", "printing")
-    places: set[str] = set()
-    while len(places) < 3:  # the head moves on
-        places.add(tab.text("pos-x"))
-        tab.until(f"document.getElementById('pos-x').textContent !== '{tab.text('pos-x')}'")
-    tab.until("document.getElementById('speed').textContent > '0.0'")
-    before = tab.page.locator("#job-progress").evaluate("(progress) => progress.value")
-    tab.until(f"document.getElementById('job-progress').value > {before}")
-    assert tab.text("job-file") == "part.gcode" == tab.text("top-file")
-    tab.until("document.getElementById('job-row').textContent.match(/^[1-9]/)")
-    assert tab.page.get_by_role("button", name="Print", exact=True).is_disabled()
-
-    tab.page.get_by_role("button", name="Pause").click()
-    tab.until_text("state", "paused")
-    assert machine.ask("job.status")["state"] == "paused"
-    tab.until_text("speed", "0.0")
-    tab.page.get_by_role("button", name="Resume").click()
-    tab.until_text("state", "printing")
-
-    tab.page.get_by_role("button", name="Cancel").click()
-    assert machine.ask("job.status")["state"] == "printing", "one click alone cancels nothing"
-    tab.page.get_by_role("button", name="Really cancel?").click()
-    tab.until_text("job-state", "cancelled")
-    tab.until_text("state", "ready")
-
-
-@pytest.mark.usefixtures("printing")
-def test_every_node_and_bus_is_there_with_its_figures(visitor: Visitor) -> None:
-    tab = visitor
-    cards = tab.page.locator(".node")
-    tab.until("document.querySelectorAll('.node').length === 3")
-    assert cards.locator("h3").all_text_contents() == ["mcu", "toolhead", "zboard"]
-    tab.until("[...document.querySelectorAll('.node .pill')].every((e) => e.textContent === 'ready')")
-    tab.until(  # every figure of the boards that print has a value
-        "[...document.querySelectorAll('.node[data-node=mcu] dd, .node[data-node=toolhead] dd')]"
-        ".every((e) => e.textContent !== '\\u2013')"
-    )
-    for name in ("Drift, ppm", "Offset gained, ms", "Queue", "Load, %", "Lead of commands, ms"):
-        chart = tab.page.locator(".node[data-node=mcu]").get_by_role("img", name=re.compile(f"^{name}: "))
-        chart.scroll_into_view_if_needed()
-        tab.page.wait_for_function(TOLD, arg=chart.element_handle(), timeout=PATIENCE_MS)
-        tab.page.wait_for_function(PAINTED, arg=chart.element_handle(), timeout=PATIENCE_MS)
-    bus = tab.page.locator(".bus").filter(has=tab.page.get_by_role("heading", name="can0.bus"))
-    load = bus.get_by_role("img")
-    load.scroll_into_view_if_needed()
-    tab.page.wait_for_function(PAINTED, arg=load.element_handle(), timeout=PATIENCE_MS)
-    tab.until("document.querySelector('.bus .keys b').textContent > '0.0 %'")
-
-
-TOLD = """(chart) => !chart.getAttribute("aria-label").includes("\u2013")"""
-"""Whether a chart has a value: a dash stands for none."""
-PAINTED = """(canvas) => {
-  const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
-  const seen = new Set();
-  for (let i = 0; i < data.length; i += 4) {
-    if (data[i + 3]) seen.add((data[i] << 16) | (data[i + 1] << 8) | data[i + 2]);
-  }
-  return seen.size > 3;
-}"""
-
-
-@pytest.mark.usefixtures("printing")
-def test_the_toolpath_from_above_and_turned(browser: Browser, machine: Demo, visitor: Visitor) -> None:
-    tab = visitor
-    tab.until("document.getElementById('speed').textContent > '0.0'")  # homed, and hot
-    # Far enough that a travel is behind the head: its picture without it is another one.
-    tab.until("Number(document.getElementById('job-row').textContent.replace(',', '')) > 16")
-    canvas = tab.page.locator("#path")
-    tab.page.wait_for_function(PAINTED, arg=canvas.element_handle(), timeout=PATIENCE_MS)
-    tab.page.get_by_role("button", name="Pause").click()
-    tab.until_text("state", "paused")
-
-    def picture() -> str:
-        tab.page.evaluate(
-            "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
-        )
-        return str(canvas.evaluate("(c) => c.toDataURL()"))
-
-    seen = [picture()]
-
-    def changed() -> None:
-        seen.append(picture())
-        assert seen[-1] not in seen[:-1]
-
-    box = canvas.bounding_box()
-    assert box is not None
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    tab.page.mouse.move(x, y)
-    tab.page.mouse.down()
-    tab.page.mouse.move(x + 120, y + 20, steps=4)
-    tab.page.mouse.up()
-    changed()  # turned
-    canvas.focus()
-    tab.page.keyboard.press("+")
-    changed()  # closer
-    tab.page.keyboard.press("ArrowLeft")
-    changed()
-    tab.page.keyboard.press("0")
-    tab.page.get_by_role("button", name="Bed").click()
-    changed()
-    tab.page.get_by_role("button", name="2D").click()
-    assert tab.page.get_by_role("button", name="2D").get_attribute("aria-pressed") == "true"
-    changed()
-    tab.page.get_by_role("button", name="Travels").click()
-    changed()
-
-    # A page that is opened now knows what was done before.
-    late = Visitor(browser, machine.link())
-    points: list[int] = []
-    late.page.on("websocket", lambda s: s.on("framereceived", lambda data: points.extend(path_points(data))))
-    late.visit()
-    late.wait_for(lambda: bool(points), "the path")
-    assert points[0] > 5
-    late.close()
-    tab.page.get_by_role("button", name="Resume").click()
-    tab.until_text("state", "printing")
-
-
-def path_points(data: str | bytes) -> list[int]:
-    return [int(n) for n in re.findall(r'"generation":\d+,"first":0,"count":(\d+)', str(data))]
-
-
-@pytest.mark.usefixtures("printing")
-def test_console(visitor: Visitor) -> None:
-    tab = visitor
-    line = tab.page.get_by_label("G-code", exact=True)
-    line.fill("M114")
-    line.press("Enter")
-    tab.page.locator("#log [data-kind=reply]", has_text="X:").last.wait_for()
-    line.fill("G1 X9999")
-    tab.page.get_by_role("button", name="Send").click()
-    tab.page.locator("#log [data-kind=bad]").last.wait_for()
-    line.press("ArrowUp")
-    assert line.input_value() == "G1 X9999"
-    line.press("ArrowUp")
-    assert line.input_value() == "M114"
-    assert tab.page.locator("#log [data-kind=sent]").all_text_contents()[-2].endswith("> M114")
-
-
-def test_a_reply_is_shown_once(visitor: Visitor, machine: Demo) -> None:
-    """It comes in the log, and with the answer."""
-    tab = visitor
-    if machine.ask("job.status")["state"] in ("printing", "paused"):
-        machine.ask("job.cancel")
-    tab.until_text("state", "ready")
-    line = tab.page.get_by_label("G-code", exact=True)
-    replies = tab.page.locator("#log [data-kind=reply]")
-    before = replies.count()
-    for number in (1, 2):
-        line.fill("M114")
-        line.press("Enter")
-        tab.page.wait_for_function(
-            "(n) => document.querySelectorAll('#log [data-kind=reply]').length >= n", arg=before + number
-        )
-    line.fill("G1 X9999")
-    line.press("Enter")
-    tab.page.locator("#log [data-kind=bad]").last.wait_for()
-    assert replies.count() == before + 2
-
-
-# --------------------------------------------------------------------------------------------------- stopping
-
-
-@pytest.mark.usefixtures("printing")
-def test_emergency_stop_stops(visitor: Visitor, machine: Demo) -> None:
-    tab = visitor
-    tab.until("document.getElementById('speed').textContent !== '0.0'")
-    tab.page.get_by_role("button", name="Emergency stop").click()
-    tab.until_text("state", "shutdown")
-    told = machine.ask("machine.state")
-    assert told == {"state": "shutdown", "cause": "emergency stop by 'the live page (127.0.0.1)'"}
-    tab.page.get_by_text("All nodes were told to stop").wait_for()
-    assert "Emergency stop by 'the live page (127.0.0.1)'." in tab.text("stopped")
-    tab.until_text("job-state", "stopped")
-    assert tab.page.get_by_role("button", name="Print", exact=True).is_disabled()
-
-    def confirmed() -> set[str]:
-        told = machine.ask("state.get", fields=["machine.stop_confirmed_ms"])["values"]
-        return set(told.get("machine.stop_confirmed_ms") or ())
-
-    tab.wait_for(lambda: confirmed() == {"mcu", "toolhead", "zboard"}, "all confirmations")
-    start_again(tab)
-    assert machine.ask("machine.state")["state"] == "ready"
-
-
-def test_the_stop_has_a_way_of_its_own(browser: Browser, machine: Demo) -> None:
+def test_the_stop_has_a_way_of_its_own(browser: Browser, paged: Paged) -> None:
     """The connection that carries everything else is stuck: nothing comes or goes. The stop gets through."""
-    tab = Visitor(browser, machine.link())
+    paged.served.stops.clear()
+    tab = Visitor(browser)
     opened: list[WebSocketRoute] = []
 
     def route(socket: WebSocketRoute) -> None:
@@ -278,21 +133,19 @@ def test_the_stop_has_a_way_of_its_own(browser: Browser, machine: Demo) -> None:
             socket.connect_to_server()
 
     tab.page.route_web_socket(re.compile("/socket$"), route)
-    tab.page.goto(tab.url)
+    tab.page.goto(link(paged))
     tab.until("document.getElementById('stop').dataset.line === 'up'")
     assert tab.text("state") in ("connecting", "no connection")
     tab.page.keyboard.press("Control+Shift+.")
     tab.page.get_by_text("All nodes were told to stop").wait_for()
-    assert machine.ask("machine.state")["state"] == "shutdown"
-    tab.close()
-    other = Visitor(browser, machine.link()).visit()
-    start_again(other)
-    other.close()
+    assert paged.served.stops == ["the live page (127.0.0.1)"]
+    tab.close(NO_METHOD)
 
 
-def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, machine: Demo) -> None:
+def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, paged: Paged) -> None:
     """It says so at once, goes on trying for 10 s, and then leaves the next life of the machine alone."""
-    tab = Visitor(browser, machine.link())
+    paged.served.stops.clear()
+    tab = Visitor(browser)
     way_is_open = False
     sent: list[str] = []
 
@@ -310,16 +163,14 @@ def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, 
 
     tab.page.route_web_socket(re.compile("/socket$"), route)
     tab.page.clock.install()
-    tab.page.goto(tab.url)
+    tab.page.goto(link(paged))
     stop = tab.page.get_by_role("button", name="Emergency stop")
     stop.click()
     tab.page.get_by_text("NOT stopped: the machine cannot be reached").wait_for()
     tab.page.clock.fast_forward(11_000)
     way_is_open = True
-    tab.until_text("state", "ready")
     tab.until("document.getElementById('stop').dataset.line === 'up'")
     assert "machine.emergency_stop" not in "".join(sent)
-    assert machine.ask("machine.state")["state"] == "ready"
 
     way_is_open = False
     tab.page.reload()
@@ -327,99 +178,265 @@ def test_a_stop_that_could_not_be_sent_is_not_sent_much_later(browser: Browser, 
     tab.page.keyboard.press("Tab")
     tab.page.keyboard.press("Enter")
     tab.page.get_by_text("NOT stopped: the machine cannot be reached").wait_for()
+    assert paged.served.stops == []
     way_is_open = True
     tab.page.get_by_text("All nodes were told to stop").wait_for()
-    assert machine.ask("machine.state")["state"] == "shutdown"
-    start_again(tab)
-    tab.close()
+    assert set(paged.served.stops) == {"the live page (127.0.0.1)"}
+    tab.close(NO_METHOD)
 
 
-# ---------------------------------------------------------------------------------------- coming and going
+# --------------------------------------------------------------------------------------------------- a print
 
-
-def test_it_comes_back_when_the_coordinator_does(visitor: Visitor, machine: Demo) -> None:
-    tab = visitor
-    tab.until_text("state", "ready")
-    machine.end()
-    tab.until("!document.getElementById('offline').hidden")
-    assert "No connection to the machine since" in tab.text("offline")
-    tab.until_text("state", "no connection")
-    assert tab.page.get_by_role("button", name="Print", exact=True).is_disabled()
-    machine.start()
-    tab.until("document.getElementById('offline').hidden")
-    tab.until_text("state", "ready")
-    tab.page.get_by_text("the coordinator was started again").wait_for()
-    assert tab.page.get_by_role("button", name="Print", exact=True).is_enabled()
-    # Nobody listens meanwhile, or whoever did just ends: the browser has many words for it.
-    tab.wrong = [
-        text
-        for text in tab.wrong
-        if "ERR_CONNECTION" not in text and not text.startswith("WebSocket connection to ")
-    ]
-
-
-def test_a_hidden_tab_is_told_nothing(browser: Browser, machine: Demo) -> None:
-    tab = Visitor(browser, machine.link())
-    sent: list[str] = []
-    tab.page.on("websocket", lambda s: s.on("framesent", lambda data: sent.append(str(data))))
-
-    def twice(method: str) -> None:
-        tab.wait_for(lambda: [watches(text) for text in sent].count(method) == 2, f"{method} twice")
-
-    tab.visit()
-    twice("api.watch")
-    sent.clear()
-    tab.page.evaluate(HIDE, True)
-    twice("api.unwatch")
-    assert "motion.path" not in "".join(sent[-2:])
-    sent.clear()
-    tab.page.evaluate(HIDE, False)
-    twice("api.watch")
-    assert tab.wrong == []
-    tab.close()
-
-
-HIDE = """(hidden) => {
+TABLE: Final = {"axis": "x", "positions": [0, 100], "forward": [0, 0.01], "reverse": [-0.02, -0.01]}
+TOLD: Final = """(chart) => !chart.getAttribute("aria-label").includes("\u2013")"""
+"""Whether a chart has a value: a dash stands for none."""
+PAINTED: Final = """(canvas) => {
+  const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  const seen = new Set();
+  for (let i = 0; i < data.length; i += 4) {
+    if (data[i + 3]) seen.add((data[i] << 16) | (data[i + 1] << 8) | data[i + 2]);
+  }
+  return seen.size > 3;
+}"""
+HIDE: Final = """(hidden) => {
   Object.defineProperty(document, "hidden", { value: hidden, configurable: true });
   document.dispatchEvent(new Event("visibilitychange"));
 }"""
 
 
-def watches(text: str) -> str:
-    found = re.search(r'"method":"(api\.(?:un)?watch)"', text)
-    return found[1] if found else ""
+class Printing:
+    """A person at the page of a machine; each method leaves the machine as its name says."""
+
+    def __init__(self, tab: Visitor, machine: Demo) -> None:
+        self.tab = tab
+        self.machine = machine
+        self.page = tab.page
+
+    def shows_a_machine_that_is_ready(self) -> None:
+        tab = self.tab
+        tab.until_text("name", "demo")
+        tab.until_text("state", "ready")
+        assert tab.text("about").startswith("canductor ")
+        tab.until("document.querySelectorAll('.node').length === 3")
+        assert self.page.locator(".node h3").all_text_contents() == ["mcu", "toolhead", "zboard"]
+        tab.until("[...document.querySelectorAll('.node .pill')].every((e) => e.textContent === 'ready')")
+        self.page.get_by_label("File").select_option("part.gcode")
+
+    def takes_a_table(self) -> None:
+        tab, x = self.tab, "document.querySelector('[data-axis=x]')"
+        tab.until(f"{x}.textContent.includes('no table')")
+        self.machine.ask("table.send", **TABLE)
+        tab.until(f"{x}.textContent.includes('2 of 2 ok, 2 in use')")
+        tab.until(f"{x}.querySelector('.pill').textContent === 'waits for homing and standstill'")
+
+    def prints(self) -> None:
+        tab = self.tab
+        self.page.get_by_role("button", name="Print").click()
+        tab.until_text("state", "printing")
+        assert tab.text("job-file") == "part.gcode" == tab.text("top-file")
+        assert self.page.get_by_role("button", name="Print", exact=True).is_disabled()
+        for _ in range(2):  # the head moves on
+            tab.until(f"document.getElementById('pos-x').textContent !== '{tab.text('pos-x')}'")
+        tab.until("document.getElementById('speed').textContent > '0.0'")
+        # Far enough that a travel is behind the head: its picture without it is another one.
+        tab.until("Number(document.getElementById('job-row').textContent.replace(',', '')) > 16")
+        before = self.page.locator("#job-progress").evaluate("(progress) => progress.value")
+        tab.until(f"document.getElementById('job-progress').value > {before}")
+        tab.until("document.querySelector('[data-axis=x] .pill').textContent === 'corrected'")
+        tab.until("document.querySelector('[data-axis=x]').textContent.includes('forward')")
+
+    def shows_figures_of_nodes_and_buses(self) -> None:
+        tab = self.tab
+        tab.until(  # every figure of the boards that print has a value
+            "[...document.querySelectorAll('.node[data-node=mcu] dd, .node[data-node=toolhead] dd')]"
+            ".every((e) => e.textContent !== '\\u2013')"
+        )
+        mcu = self.page.locator(".node[data-node=mcu]")
+        for name in ("Drift, ppm", "Offset gained, ms", "Queue", "Load, %", "Lead of commands, ms"):
+            chart = mcu.get_by_role("img", name=re.compile(f"^{name}: "))
+            chart.scroll_into_view_if_needed()
+            for condition in (TOLD, PAINTED):
+                self.page.wait_for_function(condition, arg=chart.element_handle(), timeout=PATIENCE_MS)
+        bus = self.page.locator(".bus").filter(has=self.page.get_by_role("heading", name="can0.bus"))
+        load = bus.get_by_role("img")
+        load.scroll_into_view_if_needed()
+        self.page.wait_for_function(PAINTED, arg=load.element_handle(), timeout=PATIENCE_MS)
+        tab.until("document.querySelector('.bus .keys b').textContent > '0.0 %'")
+
+    def runs_typed_lines(self) -> None:
+        line = self.page.get_by_label("G-code", exact=True)
+        replies = self.page.locator("#log [data-kind=reply]")
+        before = replies.count()
+        for number in (1, 2):
+            line.fill("M114")
+            line.press("Enter")
+            self.page.wait_for_function(
+                "(n) => document.querySelectorAll('#log [data-kind=reply]').length >= n", arg=before + number
+            )
+        line.fill("G1 X9999")
+        self.page.get_by_role("button", name="Send").click()
+        self.page.locator("#log [data-kind=bad]").last.wait_for()
+        assert replies.count() == before + 2, "it comes in the log, and with the answer, and is shown once"
+        line.press("ArrowUp")
+        assert line.input_value() == "G1 X9999"
+        line.press("ArrowUp")
+        assert line.input_value() == "M114"
+        assert self.page.locator("#log [data-kind=sent]").all_text_contents()[-2].endswith("> M114")
+
+    def pauses(self) -> None:
+        self.page.get_by_role("button", name="Pause").click()
+        self.tab.until_text("state", "paused")
+        assert self.machine.ask("job.status")["state"] == "paused"
+        self.tab.until_text("speed", "0.0")
+
+    def turns_the_picture_of_the_path(self) -> None:
+        canvas = self.page.locator("#path")
+        canvas.scroll_into_view_if_needed()
+        self.page.wait_for_function(PAINTED, arg=canvas.element_handle(), timeout=PATIENCE_MS)
+        seen: list[str] = []
+
+        def changed() -> None:
+            frames = "requestAnimationFrame(() => requestAnimationFrame(done))"
+            self.page.evaluate(f"() => new Promise((done) => {frames})")
+            picture = str(canvas.evaluate("(c) => c.toDataURL()"))
+            assert picture not in seen
+            seen.append(picture)
+
+        changed()
+        box = canvas.bounding_box()
+        assert box is not None
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        self.page.mouse.move(x, y)
+        self.page.mouse.down()
+        self.page.mouse.move(x + 120, y + 20, steps=4)
+        self.page.mouse.up()
+        changed()  # turned
+        canvas.focus()
+        self.page.keyboard.press("+")
+        changed()  # closer
+        self.page.keyboard.press("ArrowLeft")
+        changed()
+        self.page.keyboard.press("0")
+        self.page.get_by_role("button", name="Bed").click()
+        changed()
+        self.page.get_by_role("button", name="2D").click()
+        assert self.page.get_by_role("button", name="2D").get_attribute("aria-pressed") == "true"
+        changed()
+        self.page.get_by_role("button", name="Travels").click()
+        changed()
+
+    def knows_what_was_done_before_it_was_opened(self) -> None:
+        points: list[int] = []
+        late = self.tab.context.new_page()
+        late.on("websocket", lambda s: s.on("framereceived", lambda data: points.extend(path_points(data))))
+        late.goto(f"http://127.0.0.1:{self.machine.port}/")
+        self.tab.wait_for(lambda: bool(points), "the path")
+        assert points[0] > 5
+        late.close()
+
+    def cancels_when_asked_twice(self) -> None:
+        self.page.get_by_role("button", name="Resume").click()
+        self.tab.until_text("state", "printing")
+        self.page.get_by_role("button", name="Cancel").click()
+        assert self.machine.ask("job.status")["state"] == "printing", "one click alone cancels nothing"
+        self.page.get_by_role("button", name="Really cancel?").click()
+        self.tab.until_text("job-state", "cancelled")
+        self.tab.until_text("state", "ready")
+
+    def stops_at_once(self) -> None:
+        tab = self.tab
+        self.page.get_by_label("File").select_option("again.gcode")
+        self.page.get_by_role("button", name="Print").click()
+        tab.until("document.getElementById('speed').textContent > '0.0'")
+        self.page.get_by_role("button", name="Emergency stop").click()
+        tab.until_text("state", "shutdown")
+        cause = "emergency stop by 'the live page (127.0.0.1)'"
+        assert self.machine.ask("machine.state") == {"state": "shutdown", "cause": cause}
+        self.page.get_by_text("All nodes were told to stop").wait_for()
+        assert f"{cause[0].upper()}{cause[1:]}." in tab.text("stopped")
+        tab.until_text("job-state", "stopped")
+        assert self.page.get_by_role("button", name="Print", exact=True).is_disabled()
+
+        def confirmed() -> set[str]:
+            told = self.machine.ask("state.get", fields=["machine.stop_confirmed_ms"])["values"]
+            return set(told.get("machine.stop_confirmed_ms") or ())
+
+        tab.wait_for(lambda: confirmed() == {"mcu", "toolhead", "zboard"}, "all confirmations")
+        self.page.get_by_role("button", name="Start the machine again").click()
+        tab.until_text("state", "ready")
+        assert self.machine.ask("machine.state")["state"] == "ready"
+
+    def comes_back_when_the_coordinator_does(self) -> None:
+        tab = self.tab
+        self.machine.end()
+        tab.until("!document.getElementById('offline').hidden")
+        assert "No connection to the machine since" in tab.text("offline")
+        tab.until_text("state", "no connection")
+        assert self.page.get_by_role("button", name="Print", exact=True).is_disabled()
+        self.machine.start()
+        tab.until("document.getElementById('offline').hidden")
+        tab.until_text("state", "ready")
+        self.page.get_by_text("the coordinator was started again").wait_for()
+        assert self.page.get_by_role("button", name="Print", exact=True).is_enabled()
 
 
-# ------------------------------------------------------------------------------------------------------ frame
+def path_points(data: str | bytes) -> list[int]:
+    return [int(n) for n in re.findall(r'"generation":\d+,"first":0,"count":(\d+)', str(data))]
 
 
-def test_nothing_is_asked_of_anybody_else(browser: Browser, machine: Demo) -> None:
-    tab = Visitor(browser, machine.link()).visit()
-    tab.until("document.querySelectorAll('.node').length === 3")
-    tab.wait_for(lambda: sum(url.endswith("/socket") for url in tab.asked) >= 2, "two connections")
+@pytest.mark.timeout(600)  # a minute of the machine's time, and it shares the computer
+def test_a_print_from_start_to_stop(browser: Browser, machine: Demo) -> None:
+    tab = Visitor(browser)
+    tab.page.goto(machine.printed_link)
+    person = Printing(tab, machine)
+    person.shows_a_machine_that_is_ready()
+    person.takes_a_table()
+    person.prints()
+    person.shows_figures_of_nodes_and_buses()
+    person.pauses()
+    person.turns_the_picture_of_the_path()
+    person.knows_what_was_done_before_it_was_opened()
+    person.cancels_when_asked_twice()
+    person.runs_typed_lines()
+    person.stops_at_once()
+    person.comes_back_when_the_coordinator_does()
     hosts = {urlsplit(url).netloc for url in tab.asked}
-    assert hosts == {f"127.0.0.1:{machine.port}"}
-    assert len([url for url in tab.asked if url.endswith("/socket")]) == 2
-    stopped = tab.page.evaluate(
-        "() => fetch('https://example.com/').then(() => 'sent', (error) => String(error))"
-    )
-    assert "TypeError" in stopped
-    tab.wait_for(lambda: any("Content Security Policy" in text for text in tab.wrong), "the refusal")
-    tab.close()
+    assert hosts == {f"127.0.0.1:{machine.port}"}, "nothing is asked of anybody else"
+    # Nobody listens meanwhile, or whoever did just ends: the browser has many words for it.
+    tab.close(UNREACHED, WEBSOCKET_REFUSED)
 
 
-def test_layout(browser: Browser, machine: Demo) -> None:
-    tab = Visitor(browser, machine.link(), PHONE, touch=True).visit()
+# --------------------------------------------------------------------------------------------- how it looks
+
+
+def test_layout_names_and_colours(browser: Browser, machine: Demo) -> None:
+    tab = Visitor(browser)
+    sent: list[str] = []
+    tab.page.on("websocket", lambda s: s.on("framesent", lambda data: sent.append(str(data))))
+    tab.page.goto(machine.ask("page.link")["url"])
     tab.until("document.querySelectorAll('.node').length === 3")
     tab.until("[...document.querySelectorAll('.node dd')].every((e) => e.textContent !== '')")
+    check_layout(tab)
+    check_names(tab)
+    for colours in ("auto", "light", "dark", "night"):
+        check_colours(tab, colours)
+    tab.until_text("state", "ready")
+    check_hiding(tab, sent)
+    stopped = tab.page.evaluate("fetch('https://example.com/').then(() => 'sent', (error) => String(error))")
+    assert "TypeError" in stopped
+    tab.wait_for(lambda: any("Content Security Policy" in text for text in tab.wrong), "the refusal")
+    tab.close("Content Security Policy", "Fetch API cannot load")
+
+
+def check_layout(tab: Visitor) -> None:
     for width, height in (
         (390, 844),
         (844, 390),
         (320, 640),
         (768, 1024),
         (1024, 768),
-        (1440, 900),
         (2560, 1300),
+        (1440, 900),
     ):
         tab.page.set_viewport_size({"width": width, "height": height})
         assert tab.page.evaluate("document.documentElement.scrollWidth") <= width
@@ -437,18 +454,16 @@ def test_layout(browser: Browser, machine: Demo) -> None:
             assert tab.page.evaluate(
                 "([x, y]) => document.elementFromPoint(x, y).closest('#stop') !== null", middle
             )
-    assert tab.wrong == []
-    tab.close()
 
 
-OVERFLOWING = """() => [...document.querySelectorAll("main *, header *")]
+OVERFLOWING: Final = """() => [...document.querySelectorAll("main *, header *")]
   .filter((e) => !e.closest("#log, .unseen, svg") && e.clientWidth && e.scrollWidth > e.clientWidth + 1
     && !["ellipsis"].includes(getComputedStyle(e).textOverflow) && getComputedStyle(e).display !== "inline")
   .map((e) => `${e.tagName}#${e.id}.${e.className}: ${e.textContent.slice(0, 30)}`)"""
 
 
-def test_everything_has_a_name(visitor: Visitor) -> None:
-    nameless = visitor.page.evaluate(
+def check_names(tab: Visitor) -> None:
+    nameless = tab.page.evaluate(
         """() => [...document.querySelectorAll("button, input, select, canvas")].filter((e) => {
           const labels = [...(e.labels ?? [])].map((l) => l.textContent).join("");
           const name = (e.getAttribute("aria-label") || labels || e.textContent).trim();
@@ -456,14 +471,27 @@ def test_everything_has_a_name(visitor: Visitor) -> None:
         }).map((e) => e.outerHTML)"""
     )
     assert nameless == []
-    assert visitor.page.locator("#path").get_attribute("aria-describedby") == "path-keys"
+    assert tab.page.locator("#path").get_attribute("aria-describedby") == "path-keys"
 
 
-def test_colours_can_be_read(browser: Browser, machine: Demo) -> None:
-    tab = Visitor(browser, machine.link(), color_scheme="light").visit()
-    for colours in ("auto", "light", "dark", "night"):
-        check_colours(tab, colours)
-    tab.close()
+def check_hiding(tab: Visitor, sent: list[str]) -> None:
+    """A hidden tab is told nothing until it is seen again."""
+
+    def twice(method: str) -> None:
+        tab.wait_for(lambda: [watches(text) for text in sent].count(method) == 2, f"{method} twice")
+
+    sent.clear()
+    tab.page.evaluate(HIDE, True)
+    twice("api.unwatch")
+    assert "motion.path" not in "".join(sent[-2:])
+    sent.clear()
+    tab.page.evaluate(HIDE, False)
+    twice("api.watch")
+
+
+def watches(text: str) -> str:
+    found = re.search(r'"method":"(api\.(?:un)?watch)"', text)
+    return found[1] if found else ""
 
 
 def check_colours(tab: Visitor, colours: str) -> None:
