@@ -2,8 +2,8 @@
 
 Three nets, each without the one before it: the controller and the watch over the heater here; the node's own
 limits of what its sensor may read; and the node's max_duration, within which it has to hear from the host.
-The host renews the output with every measurement and with nothing else: no measurements, no heat. It ends the
-heat a moment before the node would have to stop for the lack of renewal, as what else the node does may go on.
+The host renews the output with every measurement and with nothing else: no measurements, no heat. Without
+them it ends the heat a moment before the node would have to stop, since the node may have other tasks.
 """
 
 import contextlib
@@ -196,7 +196,7 @@ class HeaterUnit:
             await self._next()
 
     async def _next(self) -> None:
-        """Wait for the next measurement; raises CanductorError when the heater went off for want of a node."""
+        """Wait for the next measurement; raises CanductorError when a node went away meanwhile."""
         await self.input.next()
         if self._gone is not None:
             raise CanductorError(self._gone)

@@ -73,6 +73,7 @@ class TimedOutput:
     # ---------------------------------------------------------------------------------------------- slots
 
     def _send(self, node: "Node", clock: int, value: int) -> None:
+        assert self.oid is not None
         values = {self.value_parameter: value}
         node.send(self.command, req_clock=clock, oid=self.oid, clock=clock % 2**32, **values)
         self._held.append(clock)

@@ -94,7 +94,9 @@ def test_behind_a_long_silence_the_rate_is_learned_again(settled: Node) -> None:
 
 
 @pytest.mark.parametrize("wrong_s", [0.02, -0.02])
-def test_wrong_answers_far_apart_do_not_overrule_the_right_ones_between(settled: Node, wrong_s: float) -> None:
+def test_wrong_answers_far_apart_do_not_overrule_the_right_ones_between(
+    settled: Node, wrong_s: float
+) -> None:
     for _ in range(4 * CONTRADICTIONS):
         settled.sample(wrong_s=wrong_s)
         assert abs(settled.error_s) < abs(wrong_s) / 10

@@ -1,4 +1,4 @@
-"""When an endstop is said to have switched: at the first look that found it so, not at the one planned behind."""
+"""When an endstop is said to have switched: at the first look that found it so, not at the next one."""
 
 import asyncio
 from pathlib import Path

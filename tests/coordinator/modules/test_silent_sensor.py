@@ -1,4 +1,4 @@
-"""A sensor that says nothing more while its heater is held or calibrated: the heat ends, and it is told why."""
+"""A sensor that falls silent while its heater is held or calibrated: the heat ends, and it is told why."""
 
 import asyncio
 from collections.abc import Awaitable, Callable

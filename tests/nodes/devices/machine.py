@@ -24,7 +24,9 @@ class Device(Protocol):
 class DeviceMachine:
     """DEVICES on a node whose clock rolls over ROLLS_OVER_S after it has power (ready after some 2.5)."""
 
-    def __init__(self, *devices: Device, rolls_over_s: float = 3.0, seed: int = 1, move_count: int = 0) -> None:
+    def __init__(
+        self, *devices: Device, rolls_over_s: float = 3.0, seed: int = 1, move_count: int = 0
+    ) -> None:
         self.devices = devices
         self.world = World(seed)
         wire = self.world.add_can(bitrate=1_000_000)
