@@ -9,7 +9,7 @@ import pytest
 from coordinator.simulate import scenario
 from coordinator.simulate.checker import Ending, OutputTruth, check_output
 from coordinator.simulate.play import play
-from coordinator.simulate.run import run_one
+
 from coordinator.simulate.values import ScenarioError
 
 MS = 1_000_000
@@ -54,13 +54,6 @@ def test_behind_a_stop_an_output_keeps_its_shutdown_value(truth: OutputTruth, ok
 def test_a_heater_is_off_while_its_sensor_is_not_sound(changes_ms: tuple[int, ...], ok: bool) -> None:
     truth = replace(output(*changes_ms), cold_ns=[(200 * MS, 300 * MS)])
     assert [violation.rule for violation in check_output(truth, Ending())] == ([] if ok else ["heat"])
-
-
-@pytest.mark.parametrize("name", ["fan", "bad_readings", "outputs_stop"])
-def test_a_machine_with_outputs_passes(name: str) -> None:
-    result = run_one(scenario.find(name), 1)
-    assert result.violations == ()
-    assert (result.cause is not None) == (name == "outputs_stop")
 
 
 HEAD = 'about = "A test."\nmachine = "heated"\n'
