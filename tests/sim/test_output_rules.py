@@ -9,7 +9,6 @@ import pytest
 from coordinator.simulate import scenario
 from coordinator.simulate.checker import Ending, OutputTruth, check_output
 from coordinator.simulate.play import play
-
 from coordinator.simulate.values import ScenarioError
 
 MS = 1_000_000
