@@ -106,6 +106,8 @@ class _Leg:
     by_group: bool
     """Whether the nodes can stop each other: all on one bus, all with trigger groups."""
     triggered: asyncio.Event
+    triggered_s: float | None = None
+    """Print time at which the host heard of it."""
 
     @property
     def name(self) -> str:
@@ -273,6 +275,7 @@ class HomingMove:
             self._heard_s[leg.slot, node.name] = move.print_time_now()
             if state.armed or leg.triggered.is_set():
                 return
+            leg.triggered_s = move.print_time_now()
             leg.triggered.set()
             self._changed.set()
             for other, other_sync in leg.syncs:
@@ -350,10 +353,14 @@ class HomingMove:
 
     @staticmethod
     async def _trigger_time(leg: _Leg, move: SingleMove) -> float:
-        """Return the print time of the first of the looks that found the endstop pressed."""
+        """Return the print time of the first of the looks that found the endstop pressed.
+
+        Its clock has 32 bits. Now may be too late to tell which: other rails may have moved on for long.
+        """
         state = await leg.endstop.state(leg.endstop_node)
         name = leg.endstop_node.name
-        near = Ticks(move.ticks_at(name, move.print_time_now()))
+        heard_s = move.print_time_now() if leg.triggered_s is None else leg.triggered_s
+        near = Ticks(move.ticks_at(name, heard_s))
         return move.print_time_of(name, extend32(state.next_clock32, near) - leg.rest_ticks)
 
 

@@ -69,11 +69,17 @@ class HeaterCheck:
         return self._approach(now_s, measured_c, target_c)
 
     def _begin(self, now_s: float, measured_c: float, target_c: float) -> None:
-        """Take a new target: one above has to be approached anew, one below is reached."""
+        """Take a new target: one above has to be approached, one below is reached.
+
+        What has not been reached yet goes on being watched from where it was: a program that changes the
+        target more often than the temperature is looked at must not put the watch off again and again.
+        """
+        approaching = self._target_c > 0 and not self._reached
         self._target_c = target_c
         self._reached = measured_c >= target_c - self.options.hysteresis_k
         self.error_ks = 0.0
-        self._set_goal(now_s, measured_c)
+        if not approaching:
+            self._set_goal(now_s, measured_c)
 
     def _set_goal(self, now_s: float, measured_c: float) -> None:
         self._goal_c = measured_c + self.options.heating_gain_k

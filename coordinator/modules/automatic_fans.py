@@ -107,7 +107,7 @@ class HeaterFan(FanModule):
 
     def _look(self) -> None:
         wanted = any(
-            unit.target_c > 0 or (unit.input.celsius is not None and unit.input.celsius > self._hot_c)
+            unit.target_c > 0 or (unit.input.sound_c is not None and unit.input.sound_c > self._hot_c)
             for unit in self._heaters
         )
         self.unit.set_speed(self._speed if wanted else 0.0)

@@ -2,8 +2,8 @@
 
 Three nets, each without the one before it: the controller and the watch over the heater here; the node's own
 limits of what its sensor may read; and the node's max_duration, within which it has to hear from the host.
-The host renews the output with every measurement and with nothing else: no measurements, no heat. It ends the
-heat a moment before the node would have to stop for the lack of renewal, as what else the node does may go on.
+The host renews the output with every measurement and with nothing else: no measurements, no heat. Without
+them it ends the heat a moment before the node would have to stop, since the node may have other tasks.
 """
 
 import contextlib
@@ -177,9 +177,14 @@ class HeaterUnit:
             )
 
     def set_target(self, celsius: float) -> None:
-        """Heat to CELSIUS, 0: not at all. Off at once, on with the next measurement."""
+        """Heat to CELSIUS, 0: not at all. Off at once, on with the next measurement.
+
+        A calibration ends when its heater is switched off.
+        """
         self.target_c, self._gone = celsius, None
         if celsius <= 0:
+            if self._tuning is not None:
+                self._end_tuning("it was switched off")
             self._apply(0.0)
 
     @property
@@ -196,7 +201,7 @@ class HeaterUnit:
             await self._next()
 
     async def _next(self) -> None:
-        """Wait for the next measurement; raises CanductorError when the heater went off for want of a node."""
+        """Wait for the next measurement; raises CanductorError when a node went away meanwhile."""
         await self.input.next()
         if self._gone is not None:
             raise CanductorError(self._gone)
@@ -213,8 +218,13 @@ class HeaterUnit:
                 if self._tuning_failure is not None:
                     raise self._tuning_failure
         finally:
-            self._tuning = None
+            self._tuning = self._tuning_failure = None
             self.set_target(0.0)
+
+    def _end_tuning(self, why: str) -> None:
+        """Have the calibration fail, and heat no more."""
+        self._tuning_failure = CanductorError(f"the calibration of [{self.name}] ended: {why}")
+        self.input.wake()
 
     def use(self, controller: Controller) -> None:
         """Be controlled by another controller from now on."""
@@ -254,6 +264,8 @@ class HeaterUnit:
             )
 
     def _wanted(self, at_s: float, celsius: float) -> float:
+        if self._gone is not None or self._tuning_failure is not None:
+            return 0.0
         if self._tuning is not None:
             try:
                 return self._tuning.power(at_s, celsius)

@@ -1,4 +1,7 @@
-"""[temperature_fan NAME]: a fan that holds a temperature down."""
+"""[temperature_fan NAME]: a fan that holds a temperature down.
+
+While its sensor says nothing, or what cannot be, it runs at its highest speed: nobody knows how hot it is.
+"""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Final
@@ -12,6 +15,7 @@ from coordinator.machine.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.modules.base import Build, Module, Modules, Value
 from coordinator.modules.fan_unit import FanModule, FanUnit, fan_options, shutdown_speed
 from coordinator.modules.free_temperatures import find_source
+from coordinator.modules.heater import LOOK_S, SILENT_LOOKS
 from coordinator.modules.heater_options import MAX_DELTA, PID_KD, PID_KI, PID_KP, SMOOTH_TIME
 from coordinator.modules.heaters import Heaters
 from coordinator.modules.sensor_module import GCODE_ID
@@ -112,6 +116,7 @@ class TemperatureFan(FanModule):
         self.input = find_source(build, limits_needed=True)
         self.input.on_measured = self._measured
         self.usual_target_c = self.target_c = build.get(TARGET_TEMP)
+        self._silent = False
         self.min_speed, self.max_speed = build.get(MIN_SPEED), build.get(MAX_SPEED)
         if self.min_speed > self.max_speed:
             raise build.reader.bad(MIN_SPEED, f"more than max_speed ({self.max_speed:g})")
@@ -127,6 +132,7 @@ class TemperatureFan(FanModule):
         """Begin to act."""
         await super().connect(live)
         await self.input.connect(live)
+        live.every(LOOK_S, lambda: self._look(live))
 
     def stopped(self, cause: str) -> None:
         """Act no more."""
@@ -139,11 +145,26 @@ class TemperatureFan(FanModule):
         self.input.end("the machine was closed")
 
     def _measured(self, at_s: float, celsius: float) -> None:
+        self._silent = False
         if self.target_c <= 0:
             self.unit.set_speed(0.0)
             return
+        if not self.input.is_sound:
+            self.unit.set_speed(self.max_speed)
+            return
         wanted = self._controller.power(at_s, MIRROR_C - celsius, MIRROR_C - self.target_c)
         self.unit.set_speed(min(max(wanted, self.min_speed), self.max_speed))
+
+    def _look(self, live: "Live") -> None:
+        """Notice that there are no measurements any more."""
+        if self.input.missed() <= SILENT_LOOKS:
+            return
+        self.unit.set_speed(self.max_speed if self.target_c > 0 else 0.0)
+        if self._silent or self.target_c <= 0:
+            return
+        self._silent = True
+        where = f"check node {self.input.node} and its wires" if self.input.node else "find out why"
+        live.say(f"[{self.name}] runs at its highest speed: its sensor says nothing any more; {where}")
 
     def status(self) -> Mapping[str, Value]:
         """Tell the fan and the temperature."""

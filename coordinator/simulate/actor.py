@@ -9,6 +9,9 @@ from coordinator.simulate.faults import NS, Fault
 from coordinator.simulate.scenario import HOST
 from coordinator.simulate.script import ScriptedWorld
 from coordinator.simulate.values import ScenarioError
+from nodes.virtual.plant_page import Fault as State
+from nodes.virtual.plant_page import Kind
+from nodes.virtual.sim_plant import SimPlant
 from nodes.virtual.world import CanController, CanPort, CanWire, Uart, UartPort
 
 FRAME_BITS: Final = 110
@@ -31,12 +34,15 @@ class SimActor:
         boards: Mapping[str, Board],
         wires: Mapping[str, CanWire | Uart],
         ports: Mapping[str, CanPort | UartPort],
+        *,
+        plants: Mapping[str, SimPlant],
     ) -> None:
         self._name = name
         self._world = world
         self._boards = boards
         self._wires = wires
         self._ports = ports
+        self._plants = plants
         self._acts: dict[str, Callable[[Fault, bool], None]] = {
             "cut": self._cut,
             "reset": self._reset,
@@ -46,6 +52,7 @@ class SimActor:
             "loss": self._rate,
             "corruption": self._rate,
             "errors": self._disturb,
+            "sensor": self._open_sensors,
         }
 
     def now_ns(self) -> int:
@@ -107,6 +114,13 @@ class SimActor:
             raise ScenarioError(f"{self._name}: the node '{fault.node}' is on a UART and cannot babble")
         if begins:
             controller.babble(fault.can_id, BABBLE, (fault.end_ns - fault.begin_ns) / NS)
+
+    def _open_sensors(self, fault: Fault, begins: bool) -> None:
+        if fault.node not in self._plants:
+            raise ScenarioError(f"{self._name}: a fault names the node '{fault.node}', which has no sensor")
+        page = self._plants[fault.node].page
+        for name in page.names(Kind.SENSOR):
+            page.set_fault(Kind.SENSOR, name, State.OPEN if begins else State.SOUND)
 
     def _disturb(self, fault: Fault, begins: bool) -> None:
         wire = self._wires[fault.bus]

@@ -73,6 +73,29 @@ class Ending:
     """How long after a stop a node that could be reached may go on."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputTruth:
+    """One output that is no stepper's, and what its pin did."""
+
+    name: str
+    node: str
+    at_ns: Ints
+    """True times of its changes."""
+    level: NDArray[np.uint8]
+    """To what it changed."""
+    stopped: int
+    """The level that it has to have after a stop."""
+    reachable: bool
+    """Whether a stop could reach its node when it was declared."""
+    cold_ns: Sequence[tuple[int, int]] = ()
+    """From when to when it must not be on."""
+
+    def level_at(self, at_ns: int) -> int:
+        """Return the level behind all that happened up to AT_NS."""
+        before = int(np.searchsorted(self.at_ns, at_ns, side="right"))
+        return int(self.level[before - 1]) if before else 0
+
+
 @dataclass(frozen=True, slots=True)
 class QueueDepth:
     """The deepest a queue ever was."""
@@ -164,6 +187,31 @@ def _check_counter(truth: StepperTruth, ending: Ending, wrong: Wrong) -> None:
     planned = int(truth.planned.direction.sum(dtype=np.int64))
     if ending.cause is None and truth.counted != planned:
         wrong("counter", f"the node counts {truth.counted:+d} steps, planned were {planned:+d}")
+
+
+def check_output(truth: OutputTruth, ending: Ending) -> list[Violation]:
+    """Return what is wrong with one output; nothing when all is right."""
+    found = []
+    where = f"{truth.name} on node {truth.node}"
+    for begin_ns, end_ns in truth.cold_ns:
+        if truth.level_at(begin_ns) or ((truth.at_ns > begin_ns) & (truth.at_ns < end_ns)).any():
+            found.append(
+                Violation(
+                    "heat", f"{where} is on {(end_ns - begin_ns) * 1e-9:.3f} s before its sensor is sound"
+                )
+            )
+    if ending.stopped_ns is not None and truth.reachable:
+        limit_ns = ending.stopped_ns + round(ending.stop_s * 1e9)
+        level, later = truth.level_at(limit_ns), int(np.count_nonzero(truth.at_ns > limit_ns))
+        if level != truth.stopped or later:
+            found.append(
+                Violation(
+                    "output",
+                    f"{where} has level {level} {ending.stop_s} s after the stop and {later} changes later;"
+                    f" it has to keep {truth.stopped}",
+                )
+            )
+    return found
 
 
 def check_queues(depths: Sequence[QueueDepth]) -> list[Violation]:

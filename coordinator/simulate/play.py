@@ -13,10 +13,10 @@ from coordinator.machine.description import StepperDescription
 from coordinator.pipeline import PlanRecord
 from coordinator.session import Outcome, run_job
 from coordinator.simulate import checker, truth
-from coordinator.simulate.checker import Ending, QueueDepth, StepperTruth, Violation
+from coordinator.simulate.checker import Ending, OutputTruth, QueueDepth, StepperTruth, Violation
 from coordinator.simulate.program import make_program
 from coordinator.simulate.result import Result
-from coordinator.simulate.scenario import Scenario
+from coordinator.simulate.scenario import OutputSetting, Scenario
 from coordinator.simulate.stage import Stage
 from coordinator.simulate.values import ScenarioError
 from nodes.errors import CanductorError
@@ -139,6 +139,8 @@ def _judge(stage: Stage, run: _Run, began_s: float) -> Result:
     steppers = [_stepper(stage, run, ending, stepper) for stepper in stage.description.steppers]
     for stepper in steppers:
         found += checker.check_stepper(stepper, stage.print_time, ending)
+    for name, setting in scenario.outputs.items():
+        found += checker.check_output(_output(stage, ending, name, setting), ending)
     found += checker.check_queues([*_link_queues(run), *stage.queues()])
     errors_us = {s.stepper: checker.worst_error_s(s, stage.print_time) * 1e6 for s in steppers}
     primary = stage.description.nodes[0].name
@@ -183,9 +185,6 @@ def _stepper(stage: Stage, run: _Run, ending: Ending, stepper: StepperDescriptio
         both_edges=run.both_edges.get(stepper.name, False),
         since_ns=run.job_ns,
     )
-    reachable = ending.stopped_ns is None or stage.faults.can_reach(
-        node, ending.stopped_ns, ending.stopped_ns + round(ending.stop_s * 1e9)
-    )
     return StepperTruth(
         stepper=stepper.name,
         node=node,
@@ -193,7 +192,37 @@ def _stepper(stage: Stage, run: _Run, ending: Ending, stepper: StepperDescriptio
         executed=executed,
         allowed_s=allowed_s if primary else allowed_s + bounds.clock_error_us * 1e-6,
         counted=None if run.outcome is None else run.outcome.positions[stepper.name],
-        reachable=reachable,
+        reachable=_can_reach(stage, ending, node),
+    )
+
+
+def _can_reach(stage: Stage, ending: Ending, node: str) -> bool:
+    """Return whether nothing kept a stop from NODE."""
+    return ending.stopped_ns is None or stage.faults.can_reach(
+        node, ending.stopped_ns, ending.stopped_ns + round(ending.stop_s * 1e9)
+    )
+
+
+def _output(stage: Stage, ending: Ending, name: str, setting: OutputSetting) -> OutputTruth:
+    pins = stage.pins(setting.node)
+    if setting.pin not in pins:
+        raise ScenarioError(f"{stage.scenario.name}: [outputs.{name}]: node '{setting.node}' has no such pin")
+    board = stage.board(setting.node)
+    own = board.pin == pins[setting.pin]
+    end_ns = stage.now_ns() if ending.stopped_ns is None else ending.stopped_ns
+    cold = [
+        (fault.begin_ns + round(setting.cold_s * 1e9), min(fault.end_ns, end_ns))
+        for fault in stage.faults.begun
+        if fault.kind == "sensor" and fault.node == setting.node and setting.cold_s
+    ]
+    return OutputTruth(
+        name=name,
+        node=setting.node,
+        at_ns=board.at_ns[own],
+        level=board.level[own],
+        stopped=setting.stopped,
+        reachable=_can_reach(stage, ending, setting.node),
+        cold_ns=[(begin_ns, until_ns) for begin_ns, until_ns in cold if begin_ns < until_ns],
     )
 
 

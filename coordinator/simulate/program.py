@@ -6,7 +6,7 @@ segments, zigzags that turn at once, dashes at full speed, hops with retraction,
 
 import math
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
 from coordinator.simulate.scenario import Program
@@ -29,7 +29,17 @@ def make_program(program: Program, dice: Dice) -> str:
     for _ in range(round(dice.draw(program.strokes, "strokes"))):
         lines += pen.stroke()
     lines += pen.to_and_fro(dice.draw(program.long_s, "long"))
-    return "\n".join([*lines, program.end, ""])
+    if program.fan:
+        lines = list(_with_fan(lines, program.fan, dice.stream("fan")))
+    return "\n".join([program.begin, *lines, program.end, ""])
+
+
+def _with_fan(lines: Iterable[str], share: float, rng: random.Random) -> Iterator[str]:
+    """Yield LINES, behind a SHARE of them another speed of the fan."""
+    for line in lines:
+        yield line
+        if rng.random() < share:
+            yield f"M106 S{rng.randrange(256)}"
 
 
 class _Pen:

@@ -18,6 +18,7 @@ TABLES: dict[str, type[Any]] = {
     "[buses.NAME]": scenario.BusSetting,
     "[[faults]]": scenario.FaultSetting,
     "[program]": scenario.Program,
+    "[outputs.NAME]": scenario.OutputSetting,
     "[bounds]": scenario.Bounds,
 }
 

@@ -96,6 +96,7 @@ FAULT_KINDS: Final = {
     "corruption": "a share of the bus's frames changes without anybody noticing",
     "errors": "a share of the bus's frames becomes error frames; all of them: who sends goes bus-off",
     "interrupt": "the user presses Ctrl-C",
+    "sensor": "the wires of the node's temperature sensors are open; the scenario needs a plant",
 }
 HOST: Final = "host"
 
@@ -127,6 +128,21 @@ class FaultSetting:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OutputSetting:
+    """What is right for one output of a node that is no stepper's."""
+
+    node: str = option(text)
+    """Its node."""
+    pin: str = option(text)
+    """Its pin, as the board calls it."""
+    stopped: int = option(whole(0, 1), 0)
+    """The level that it has to have ``stop_s`` after a stop that reaches its node, and keeps."""
+    cold_s: float = option(number(0, 10, "s"), 0.0)
+    """Of a heater: so long after a ``sensor`` fault of its node it has to be off, until that ends; 0: it is
+    not looked at."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Program:
     """What is printed: lines of the scenario, or strokes made from the seed."""
 
@@ -140,6 +156,10 @@ class Program:
     """The square in which they lie."""
     long_s: Range = option(span(0, 60, "s"), Range(0, 0))
     """Adds moves to and fro that take about so long."""
+    fan: float = option(number(0, 1), 0.0)
+    """The share of lines that are followed by another speed of the fan."""
+    begin: str = option(text, "")
+    """Lines in front of all that."""
     end: str = option(text, "")
     """Lines behind all that."""
 
@@ -163,6 +183,7 @@ class _Head:
     expect: str = option(choice("completes", "may_stop", "stops"), "completes")
     causes: tuple[str, ...] = option(patterns, ())
     weight: float = option(number(0, 20), 1.0)
+    plant: bool = option(flag, default=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,6 +203,8 @@ class Scenario:
     """Regular expressions; the sentence of a stop must contain one."""
     weight: float
     """How large its share of the seeds is, beside others with 1; 0: only when it is named."""
+    plant: bool = False
+    """Whether there is something to heat and to measure at the boards' pins."""
     nodes: Mapping[str, NodeSetting] = field(default_factory=dict)
     """By name; those not named are as NodeSetting is by default. Names that the configuration does not have
     are nodes the host does not know of."""
@@ -189,10 +212,12 @@ class Scenario:
     """By interface or device file."""
     program: Program = field(default_factory=Program)
     faults: tuple[FaultSetting, ...] = ()
+    outputs: Mapping[str, OutputSetting] = field(default_factory=dict)
+    """By a name of the scenario's own."""
     bounds: Bounds = field(default_factory=Bounds)
 
 
-_TABLES: Final = ("nodes", "buses", "program", "faults", "bounds")
+_TABLES: Final = ("nodes", "buses", "program", "faults", "outputs", "bounds")
 
 
 def load(path: Path) -> Scenario:
@@ -215,12 +240,16 @@ def load(path: Path) -> Scenario:
         expect=head.expect,
         causes=head.causes,
         weight=head.weight,
+        plant=head.plant,
         nodes=_named(NodeSetting, values, "nodes", where),
         buses=_named(BusSetting, values, "buses", where),
         program=read(Program, values.get("program", {}), f"{where}: [program]"),
         faults=_faults(values.get("faults", []), where),
+        outputs=_named(OutputSetting, values, "outputs", where),
         bounds=read(Bounds, values.get("bounds", {}), f"{where}: [bounds]"),
     )
+    if not scenario.plant and any(fault.kind == "sensor" for fault in scenario.faults):
+        raise ScenarioError(f"{where}: a fault of kind sensor needs plant = true")
     if bool(scenario.causes) == (scenario.expect == "completes"):
         rule = "needs causes" if scenario.expect != "completes" else "takes no causes"
         raise ScenarioError(f"{where}: expect is '{scenario.expect}' and {rule}")
@@ -273,7 +302,7 @@ def _faults(entries: object, where: str) -> tuple[FaultSetting, ...]:
 
 
 def _needs_node(fault: FaultSetting) -> bool:
-    return not fault.node and fault.kind in ("cut", "reset", "power", "stall", "babble")
+    return not fault.node and fault.kind in ("cut", "reset", "power", "stall", "babble", "sensor")
 
 
 # ---------------------------------------------------------------------------------------------- finding

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coordinator.demo.expected import Floats, Ints
+from coordinator.demo.plant import PlantSettings, machine_plants
 from coordinator.host import Port as HostPort
 from coordinator.machine.description import (
     CanConnection,
@@ -77,10 +78,15 @@ class Stage:
                 self._add_stranger(name, setting)
         self.host = SimHost(self._world, self._ports)
         bus_of = {name: board.wire.name for name, board in self._boards.items()}
-        actor = SimActor(scenario.name, self._world, self._boards, self._wires, self._ports)
+        self._plants: dict[str, SimPlant] = {}
+        actor = SimActor(
+            scenario.name, self._world, self._boards, self._wires, self._ports, plants=self._plants
+        )
         self.faults = Faults(scenario, self.dice, actor, bus_of)
         for name, bus in scenario.buses.items():
             self._burden(name, bus)
+        if scenario.plant:
+            self.start_plants(machine_plants(self.description, PlantSettings(seed=seed)).values())
 
     # ------------------------------------------------------------------------------------------ assembly
 
@@ -196,6 +202,7 @@ class Stage:
         """Connect the pins of boards with PLANTS from now on; return them by node. CanductorError."""
         started = {plant.node: self._boards[plant.node].node.start_plant(plant) for plant in plants}
         connect_plants(started)
+        self._plants.update(started)
         return started
 
     # ------------------------------------------------------------------------------------------ performance

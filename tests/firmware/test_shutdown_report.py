@@ -21,7 +21,7 @@ ANSWER_SIZE = 50
 
 
 def drain(host: Host) -> list[Answer]:
-    """Take all that the node has to say, as often as there is more; return what is no answer to a question."""
+    """Take all that the node has to say; return what is no answer to a question."""
     stream = bytearray()
     while more := host.node.take_bytes():
         stream += more

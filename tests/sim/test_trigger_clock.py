@@ -1,4 +1,4 @@
-"""When an endstop is said to have switched: at the first look that found it so, not at the one planned behind."""
+"""When an endstop is said to have switched: at the first look that found it so, not at the next one."""
 
 import asyncio
 from pathlib import Path
@@ -36,8 +36,8 @@ position_max: 250
 homing_speed: 50
 
 [stepper_y]
-step_pin: PB3
-dir_pin: PB4
+step_pin: PB8
+dir_pin: PB9
 microsteps: 16
 rotation_distance: 40
 position_max: 250
@@ -49,19 +49,30 @@ microsteps: 16
 rotation_distance: 8
 position_max: 250
 """
+SECOND_SIDE = """
+[stepper_x1]
+step_pin: PB3
+dir_pin: PB4
+microsteps: 16
+rotation_distance: 40
+endstop_pin: ^PC6
+"""
+STEP_PINS = {"stepper_x": "PB0", "stepper_x1": "PB3"}
+HALF_A_ROLLOVER_S = (1 << 31) / 168e6
 CLOCKS_S = 10e-6
 """What the host may have a secondary node's clock wrong by, on a quiet bus."""
 STEP_S = 2e-6
 """From a step to what the node's pins show of it, and the rounding to ticks."""
 
 
-class Switch:
-    """A homing of X whose switch closes with a step that is known."""
+class Switches:
+    """A homing of X, with a second side where that has a switch; each closes with a step that is known."""
 
-    def __init__(self, folder: Path, endstop: str, at: int) -> None:
-        (folder / "home.cfg").write_text(MACHINE.format(endstop=endstop))
+    def __init__(self, folder: Path, endstop: str, at: int, second_at: int | None = None) -> None:
+        second = "" if second_at is None else SECOND_SIDE
+        (folder / "home.cfg").write_text(MACHINE.format(endstop=endstop) + second)
         (folder / "home.toml").write_text('about = "Homing."\nmachine = "home.cfg"\n')
-        self.at = at
+        self.at = {"stepper_x": at} if second_at is None else {"stepper_x": at, "stepper_x1": second_at}
         self.stage = Stage(scenarios.find(str(folder / "home.toml")), 0)
         mcu, toolhead = (self.stage._boards[name].node for name in ("mcu", "toolhead"))
         pins = self.stage.pins("mcu")
@@ -73,31 +84,32 @@ class Switch:
             at=-at,
             direction=-1,
         )
+        if second_at is not None:
+            second_pins = (pins["PB3"], pins["PB4"])
+            mcu.add_axis(*second_pins, target=mcu, target_pin=pins["PC6"], at=-second_at, direction=-1)
 
-    def run(self, speed: float) -> HomingResult:
+    def run(self, speed: float) -> tuple[HomingResult, ...]:
         """Home at SPEED, mm/s."""
 
-        async def main() -> HomingResult:
+        async def main() -> tuple[HomingResult, ...]:
             machine = Machine(self.stage.description, self.stage.host, on_notice=lambda _: None)
             await machine.start()
             try:
-                rail = self.stage.description.rails[0]
-                move = HomingMove(
-                    machine, [rail], axis="x", direction=-1, way_mm=40.0, speed=speed, accel=3000.0
-                )
-                (result,) = await move.run()
-                return result
+                rails, ways = self.stage.description.stops, dict.fromkeys(self.at, -1.0)
+                return await HomingMove(
+                    machine, rails, ways=ways, way_mm=45.0, speed=speed, accel=3000.0
+                ).run()
             finally:
                 await machine.close()
 
         with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
             return runner.run(main())
 
-    def closed_at_s(self) -> float:
-        """Return the print time at which the switch closed in truth."""
-        truth, pin = self.stage.board("mcu"), self.stage.pins("mcu")["PB0"]
+    def closed_at_s(self, stepper: str = "stepper_x") -> float:
+        """Return the print time at which a switch closed in truth."""
+        truth, pin = self.stage.board("mcu"), self.stage.pins("mcu")[STEP_PINS[stepper]]
         steps = truth.at_ns[(truth.pin == pin) & (truth.level == 1)]
-        return float(self.stage.print_time(np.array([steps[self.at - 1]]))[0])
+        return float(self.stage.print_time(np.array([steps[self.at[stepper] - 1]]))[0])
 
 
 @pytest.mark.parametrize("at", [1600, 1607])
@@ -105,7 +117,18 @@ class Switch:
 def test_the_trigger_is_the_first_look_that_found_it_closed(
     tmp_path: Path, endstop: str, allowed_s: float, at: int
 ) -> None:
-    switch = Switch(tmp_path, endstop, at)
-    result = switch.run(47.0)
+    switch = Switches(tmp_path, endstop, at)
+    (result,) = switch.run(47.0)
     after_s = result.triggered_at_s - switch.closed_at_s()
     assert -allowed_s <= after_s <= LOOK_S + allowed_s
+
+
+def test_a_trigger_long_before_that_of_the_last_rail_is_not_taken_for_one_to_come(tmp_path: Path) -> None:
+    """A node's clock has 32 bits, half of which pass between the two switches."""
+    switches = Switches(tmp_path, "PC5", 160, second_at=3200)
+    found = switches.run(2.6)
+    first_s, second_s = map(switches.closed_at_s, STEP_PINS)
+    assert second_s - first_s > HALF_A_ROLLOVER_S
+    for result, (stepper, at) in zip(found, switches.at.items(), strict=True):
+        assert -STEP_S <= result.triggered_at_s - switches.closed_at_s(stepper) <= LOOK_S + STEP_S
+        assert result.way_to_trigger_mm == pytest.approx(at / 80, abs=0.02)

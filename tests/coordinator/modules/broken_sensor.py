@@ -1,4 +1,4 @@
-"""A heater's sensor in a simulated machine, whose wire breaks for some measurements, or which falls silent."""
+"""A heater's sensor in a simulated machine: its wire breaks for some measurements, or it falls silent."""
 
 from coordinator.modules.heaters import Heaters
 from coordinator.modules.temperature_input import TemperatureInput

@@ -1,4 +1,4 @@
-"""A sensor that says nothing more while its heater is held or calibrated: the heat ends, and it is told why."""
+"""A sensor that falls silent while its heater is held or calibrated: the heat ends, and it is told why."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
@@ -133,5 +133,33 @@ def test_who_waits_for_a_target_learns_that_it_was_forgotten(tmp_path: Path) -> 
         assert stage.status("heater_generic chamber")["target"] == 0
         assert stage.machine.stopped is None
         assert stage.heater_off_after(since_s, "PC3", "mcu") < LIMIT_S
+
+    stage.run(main)
+
+
+@pytest.mark.parametrize("calibration", CALIBRATIONS)
+@pytest.mark.parametrize("line", ["TURN_OFF_HEATERS", "SET_HEATER_TEMPERATURE HEATER=extruder TARGET=0"])
+def test_a_heater_that_is_switched_off_is_calibrated_no_more(
+    tmp_path: Path, line: str, calibration: str
+) -> None:
+    """As by a user beside the program: off is off."""
+    stage = HeatMachine(tmp_path, HOTEND_PID + "heater_power: 40\n", hurry=10)
+
+    async def main() -> None:
+        sensor = Sensor(stage)
+        running = asyncio.ensure_future(stage.do(calibration.format("extruder", 200)))
+        await is_on(sensor)
+        off_s = stage.now_s()
+        await stage.do(line)
+        with pytest.raises(
+            CanductorError, match=r"the calibration of \[extruder\] ended: it was switched off"
+        ):
+            await running
+        assert stage.now_s() == off_s, "who waits for the calibration learns it at once"
+        await asyncio.sleep(3.0)
+        assert stage.heater_off_after(off_s) < 1.0
+        assert stage.machine.stopped is None
+        await stage.do("M104 S100")
+        await is_on(sensor)
 
     stage.run(main)
