@@ -164,7 +164,7 @@ def _start(words: list[str], variables: dict[str, str], *, check: bool = False, 
 
 
 def c_sources() -> dict[str, Source]:
-    """Return the C files of the tree that have code, as gcov knows them."""
+    """Return the C files of the product that have code, as gcov knows them; not what cffi writes."""
     counts: dict[str, dict[int, int]] = defaultdict(lambda: defaultdict(int))
     notes = sorted(str(path) for path in TREE.rglob("*.gcno"))
     for start in range(0, len(notes), BATCH):
@@ -178,7 +178,7 @@ def c_sources() -> dict[str, Source]:
     return {
         name: Source({n for n in lines if lines[n]}, {n for n in lines if not lines[n]})
         for name, lines in counts.items()
-        if not name.startswith(("tests/", "build/", "bench/"))
+        if not name.startswith(("tests/", "build/", "bench/")) and not Path(name).name.startswith("_")
     }
 
 
