@@ -18,7 +18,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 BASE: Final = ROOT / "build" / "coverage"
@@ -46,7 +46,9 @@ PYTHON_BOUND: Final = 92.0
 PACKAGES: Final = ("coordinator", "nodes", "canbus_tools")
 LEAST: Final = 15
 """Files named in the table."""
-COMPILER: Final = '#!/bin/sh\nexec {compiler} "$@" -O1 --coverage -fprofile-update=prefer-atomic -frandom-seed=coverage\n'
+COMPILER: Final = (
+    '#!/bin/sh\nexec {compiler} "$@" -O1 --coverage -fprofile-update=prefer-atomic -frandom-seed=coverage\n'
+)
 """Stands for gcc on the PATH of what is measured; the last -O counts. Several modules have the same source: with
 the same seed their objects count into the same file."""
 SITE: Final = "import coverage\ncoverage.process_startup()\n"
@@ -182,7 +184,7 @@ def c_sources() -> dict[str, Source]:
     }
 
 
-def _gcov(notes: list[str]) -> Iterator[dict[str, list[dict[str, list[dict[str, int]]]]]]:
+def _gcov(notes: list[str]) -> Iterator[dict[str, Any]]:
     words = ["gcov", "--json-format", "--stdout", *notes]
     printed = subprocess.run(words, cwd=TREE, check=True, capture_output=True, text=True).stdout
     yield from (json.loads(line) for line in printed.splitlines() if line.startswith("{"))
@@ -301,8 +303,8 @@ def main() -> int:
                 path.unlink()
         failed = measure(options.paths or everything())
     kept = table(c_sources(), python_sources(), verbose=options.verbose)
-    for path in failed:
-        print(f"coverage: tests failed in {path}", file=sys.stderr)
+    for tests in failed:
+        print(f"coverage: tests failed in {tests}", file=sys.stderr)
     if not kept:
         print("coverage: below the bounds", file=sys.stderr)
     return 0 if kept and not failed else 1
