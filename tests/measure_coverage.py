@@ -46,11 +46,10 @@ PYTHON_BOUND: Final = 92.0
 PACKAGES: Final = ("coordinator", "nodes", "canbus_tools")
 LEAST: Final = 15
 """Files named in the table."""
-COMPILER: Final = (
-    '#!/bin/sh\nexec {compiler} "$@" -O1 --coverage -fprofile-update=prefer-atomic -frandom-seed=coverage\n'
-)
-"""Stands for gcc on the PATH of what is measured; the last -O counts. Several modules have the same source: with
-the same seed their objects count into the same file."""
+COUNTED: Final = "-O1 --coverage -fprofile-update=prefer-atomic -frandom-seed=coverage"
+COMPILER: Final = f'#!/bin/sh\nexec {{compiler}} "$@" {COUNTED}\n'
+"""Stands for gcc on the PATH of what is measured; the last -O counts. Several modules have the same source:
+with one seed for all, their objects count into the same file."""
 SITE: Final = "import coverage\ncoverage.process_startup()\n"
 """Runs in each Python process that has this folder on its path."""
 SETTINGS: Final = f"""\
