@@ -223,7 +223,7 @@ async def _open_page(server: IpcServer, options: ServeOptions) -> "WebServer | N
             from coordinator.web.server import WebServer  # noqa: PLC0415 (the extra web)
         except ModuleNotFoundError as error:
             raise CanductorError(
-                f"the live page needs {error.name}, which is not installed; run: pip install 'canductor[web]'"
+                f"the live page needs {error.name}, which is not installed; run: pip install {error.name}"
             ) from None
         settings = WebSettings(host=host, port=port)
         if not settings.on_loopback and not options.web_without_tls:
