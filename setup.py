@@ -3,6 +3,7 @@
 A cffi module is found by its build script: any ``build_*.py`` in a package that defines ``ffibuilder``.
 """
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +31,11 @@ class BuildPython(build_py):
         ]
 
     def run(self) -> None:
+        if (
+            not self.editable_mode
+        ):  # what an earlier build left, such as a module that is gone, would be shipped
+            for package in PACKAGES:
+                shutil.rmtree(Path(self.build_lib) / package, ignore_errors=True)
         super().run()
         if not self.editable_mode:
             for source, target in self._example_machines().items():

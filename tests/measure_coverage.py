@@ -3,7 +3,7 @@
 Usage: python -m tests.measure_coverage [--verbose] [--add] [PATH...]
 
 In a copy of the tree (build/coverage/tree) all C is compiled for gcov; there the C tests run, then pytest on
-each PATH in turn (default: every folder of tests/) under coverage.py, which follows processes that tests
+the PATHs (default: every folder of tests/ in turn) under coverage.py, which follows processes that tests
 start. With --add what was measured before stays: folders can be measured one at a time. A line counts as run
 when any process ran it and ended in order. --report measures nothing and prints what is there.
 """
@@ -46,11 +46,10 @@ PYTHON_BOUND: Final = 92.0
 PACKAGES: Final = ("coordinator", "nodes", "canbus_tools")
 LEAST: Final = 15
 """Files named in the table."""
-COMPILER: Final = (
-    '#!/bin/sh\nexec {compiler} "$@" -O1 --coverage -fprofile-update=prefer-atomic -frandom-seed=coverage\n'
-)
-"""Stands for gcc on the PATH of what is measured; the last -O counts. Several modules have the same source: with
-the same seed their objects count into the same file."""
+COUNTED: Final = "-O1 --coverage -fprofile-update=prefer-atomic -frandom-seed=coverage"
+COMPILER: Final = f'#!/bin/sh\nexec {{compiler}} "$@" {COUNTED}\n'
+"""Stands for gcc on the PATH of what is measured; the last -O counts. Several modules have the same source:
+with one seed for all, their objects count into the same file."""
 SITE: Final = "import coverage\ncoverage.process_startup()\n"
 """Runs in each Python process that has this folder on its path."""
 SETTINGS: Final = f"""\
@@ -140,22 +139,22 @@ def environment() -> dict[str, str]:
     }
 
 
-def measure(paths: Iterable[str]) -> list[str]:
-    """Compile, run the C tests and pytest on PATHS; return what failed."""
+def measure(groups: Iterable[list[str]]) -> list[str]:
+    """Compile; run pytest on each of GROUPS, which are paths, or the C tests for C; return what failed."""
     variables = environment()
     copy_tree()
     build = {name: value for name, value in variables.items() if name != "COVERAGE_PROCESS_START"}
     build_words = [sys.executable, "setup.py", "-q", "build_ext", "--inplace"]
     _start(build_words, build, check=True, quiet=True)
     failed = []
-    for path in paths:
-        if path == "C":
-            status = _start(["make", "-s", "-k", "-C", "tests", f"PYTHON={sys.executable}"], build)
+    for group in groups:
+        if group == ["C"]:
+            words, with_variables = ["make", "-s", "-k", "-C", "tests", f"PYTHON={sys.executable}"], build
         else:
-            words = ["pytest", "-q", "-x", "--maxfail=20", "--timeout=900", "-p", "no:cacheprovider", path]
-            status = _start([sys.executable, "-m", *words], variables)
-        if status:
-            failed.append(path)
+            pytest = [sys.executable, "-m", "pytest", "-q", "--timeout=900", "-p", "no:cacheprovider"]
+            words, with_variables = [*pytest, *group], variables
+        if _start(words, with_variables):
+            failed.append(" ".join(group))
     return failed
 
 
@@ -166,7 +165,7 @@ def _start(words: list[str], variables: dict[str, str], *, check: bool = False, 
 
 
 def c_sources() -> dict[str, Source]:
-    """Return the C files of the tree that have code, as gcov knows them."""
+    """Return the C files of the product that have code, as gcov knows them; not what cffi writes."""
     counts: dict[str, dict[int, int]] = defaultdict(lambda: defaultdict(int))
     notes = sorted(str(path) for path in TREE.rglob("*.gcno"))
     for start in range(0, len(notes), BATCH):
@@ -180,7 +179,7 @@ def c_sources() -> dict[str, Source]:
     return {
         name: Source({n for n in lines if lines[n]}, {n for n in lines if not lines[n]})
         for name, lines in counts.items()
-        if not name.startswith(("tests/", "build/", "bench/"))
+        if not name.startswith(("tests/", "build/", "bench/")) and not Path(name).name.startswith("_")
     }
 
 
@@ -228,10 +227,14 @@ def ranges(numbers: Iterable[int]) -> str:
     return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in spans)
 
 
-def rows(sources: Sources, folders: Iterable[str]) -> Iterator[str]:
-    """Yield a row of the table for each of FOLDERS."""
+def rows(sources: Sources, folders: Iterable[str], *, deep: bool = False) -> Iterator[str]:
+    """Yield a row of the table for each of FOLDERS; when DEEP with what is in folders inside."""
     for folder in folders:
-        inside = [source for name, source in sources.items() if name.startswith(f"{folder}/")]
+        inside = [
+            source
+            for name, source in sources.items()
+            if str(Path(name).parent) == folder or (deep and name.startswith(f"{folder}/"))
+        ]
         yield row(folder, inside)
 
 
@@ -265,22 +268,21 @@ def table(c: Sources, python: Sources, *, verbose: bool) -> bool:
     print(*rows(c, C_FOLDERS), sep="\n")
     print(row("C of these", bounded.values(), C_BOUND))
     print(*rows(c, sorted(set(folders_of(c)) - set(C_FOLDERS))), sep="\n")
-    tops = {"/".join(name.split("/")[:2]) if name.count("/") > 1 else name.split("/")[0] for name in python}
-    if verbose:
-        print(*rows(python, sorted(tops - set(PACKAGES))), sep="\n")
-    print(*rows(python, PACKAGES), sep="\n")
+    folders = (folder for folder in folders_of(python) if verbose and folder not in PACKAGES)
+    print(*rows(python, folders), *rows(python, PACKAGES, deep=True), sep="\n")
     print(row("Python", python.values(), PYTHON_BOUND))
     print("C with the most lines not run:", *least(c, verbose=verbose), sep="\n")
     print("Python with the most lines not run:", *least(python, verbose=verbose), sep="\n")
     return percent(bounded.values()) >= C_BOUND and percent(python.values()) >= PYTHON_BOUND
 
 
-def everything() -> list[str]:
-    """Return what is measured by default: the C tests, then every folder and module of tests/ with tests."""
+def everything() -> list[list[str]]:
+    """Return what is measured by default: the C tests, every folder of tests/ by itself, then its modules."""
     named = [path for path in sorted((ROOT / "tests").iterdir()) if path.name not in {"package", "vcan"}]
     folders = [path for path in named if path.is_dir() and any(path.rglob("test_*.py"))]
     modules = [path for path in named if path.match("test_*.py")]
-    return ["C", *(str(path.relative_to(ROOT)) for path in folders + modules)]
+    grouped = [*([folder] for folder in folders), modules]
+    return [["C"], *([str(path.relative_to(ROOT)) for path in group] for group in grouped)]
 
 
 def main() -> int:
@@ -301,7 +303,9 @@ def main() -> int:
             shutil.rmtree(DATA, ignore_errors=True)
             for path in TREE.rglob("*.gcda"):
                 path.unlink()
-        failed = measure(options.paths or everything())
+        named = [["C"]] if "C" in options.paths else []
+        tests = [path for path in options.paths if path != "C"]
+        failed = measure([*named, *([tests] if tests else [])] or everything())
     kept = table(c_sources(), python_sources(), verbose=options.verbose)
     for failure in failed:
         print(f"coverage: tests failed in {failure}", file=sys.stderr)

@@ -84,6 +84,6 @@ def test_the_library_is_named_when_it_is_missing(
     path = tmp_path / "x.sock"
     err = refused(capsys, "--ipc", str(path), "--web", "8080")
     assert err == (
-        "canductor: the live page needs aiohttp, which is not installed; run: pip install 'canductor[web]'\n"
+        "canductor: the live page needs aiohttp, which is not installed; run: pip install aiohttp\n"
     )
     assert not path.exists()

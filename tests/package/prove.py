@@ -2,10 +2,10 @@
 
 Usage: python -m tests.package.prove [--keep FOLDER] [PYTHON...]
 
-For each PYTHON (default: this one, and every newer one found on the PATH or below pyenv) a new virtual
-environment in a temporary folder gets the wheel that pip builds from the source distribution, with its
-dependencies from pip's index. There the demo prints a small program and has to end with its proof. Exit
-status 1 when anything fails; the last words say what.
+For each PYTHON (default: this one, and one of every other version found on the PATH or below pyenv; what
+cannot build is named and skipped) a new virtual environment in a temporary folder gets the wheel that pip
+builds from the source distribution, with its dependencies from pip's index. There the demo prints a small
+program and has to end with its proof. Exit status 1 when anything fails; the last words say what.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from tests.package.build import setup
+from tests.package.build import ROOT, setup
 
 NAMES: Final = tuple(f"python3.{minor}" for minor in range(11, 20))
 PROGRAM: Final = """\
@@ -91,6 +91,12 @@ def _installed() -> Iterator[str]:
     yield from (str(path) for name in NAMES for path in sorted(versions.glob(f"*/bin/{name}")))
 
 
+def missing(python: str) -> str:
+    """Return in a sentence what PYTHON lacks to build the project; empty when it has all."""
+    words = ["sh", str(ROOT / ".ci" / "prerequisites"), python]
+    return subprocess.run(words, capture_output=True, text=True, check=False).stderr.strip()
+
+
 def prove(archive: Path, python: str, folder: Path) -> str:
     """Return in a sentence what was proved of the source distribution ARCHIVE, with PYTHON, in FOLDER."""
     folder.mkdir()
@@ -130,7 +136,9 @@ def main() -> int:
             setup(folder, "sdist", "--formats=gztar", f"--dist-dir={folder}")
             (archive,) = folder.glob("*.tar.gz")
             for version, python in interpreters(options.pythons):
-                print(f"python {version}: {prove(archive, python, folder / version)}", flush=True)
+                lacking = python != sys.executable and not options.pythons and missing(python)
+                shown = f"skipped: {lacking}" if lacking else prove(archive, python, folder / version)
+                print(f"python {version}: {shown}", flush=True)
         except (ProofError, subprocess.SubprocessError) as error:
             print(f"package: {error}", file=sys.stderr)
             return 1

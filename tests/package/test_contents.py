@@ -34,6 +34,9 @@ class Built:
 def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
     folder = tmp_path_factory.mktemp("built")
     library = folder / "library"
+    left = library / "coordinator" / "left_by_an_earlier_build.py"
+    left.parent.mkdir(parents=True)
+    left.touch()
     setup(folder, "sdist", "--formats=tar", f"--dist-dir={folder}", "build_py", f"--build-lib={library}")
     (archive,) = folder.glob("canductor-*.tar")
     return Built(unpack(archive), library)
