@@ -71,7 +71,9 @@ class SafeZHome(Module):
     """What G28 does in its place."""
 
     SPEC = SectionSpec(
-        "G28 homes Z at one place of the bed, behind X and Y", (PLACE, SPEED, Z_HOP, Z_HOP_SPEED, BACK)
+        "G28 homes Z at one place of the bed, behind X and Y",
+        (PLACE, SPEED, Z_HOP, Z_HOP_SPEED, BACK),
+        later=("home_y_before_x",),
     )
 
     def __init__(self, build: Build) -> None:
