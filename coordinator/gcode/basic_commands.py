@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from coordinator.gcode import machine_commands, state_commands
 from coordinator.gcode.commands import AtRest, Done
 from coordinator.gcode.events import Emergency, Reply, Wait
-from coordinator.gcode.words import Command, WordError, number, quoted
+from coordinator.gcode.words import Command, WordError, number
 from coordinator.motion.language import ARC_LETTERS, Plane
 from coordinator.motion.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus
 
@@ -24,11 +24,8 @@ MAX_DWELL_S = 86400.0
 
 
 def _numbers(command: Command, allowed: str) -> dict[str, float]:
-    """Read COMMAND's words, all with numbers, and no others than ALLOWED."""
-    words = command.words()
-    for letter in words:
-        if letter not in allowed:
-            raise WordError(f"{command.name} has the word {letter}; it takes {' '.join(allowed)}")
+    """Read COMMAND's words of ALLOWED, all with numbers; others are ignored."""
+    words = command.only_words(allowed)
     return {letter: number(command.name, words, letter) for letter in words}
 
 
@@ -108,6 +105,8 @@ def _home(job: Job, command: Command) -> bool:
 
 def _set_origin(job: Job, command: Command) -> bool:
     words = _numbers(command, AXIS_LETTERS)
+    if command.text and not words:
+        return True  # only what has no meaning: that is not the bare G92
     job.planner.set_gcode_position(words or dict.fromkeys(AXIS_LETTERS, 0.0))
     return True
 
@@ -134,12 +133,7 @@ def _cap(job: Job, what: str, asked: float, limit: float) -> None:
 
 def _set_velocity_limit(job: Job, command: Command) -> bool:
     planner, limits = job.planner, job.planner.limits
-    values = command.parameters()
-    known = {"VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"}
-    for key in values.keys() - known:
-        raise WordError(
-            f"SET_VELOCITY_LIMIT has no parameter {quoted(key)}; it takes {' '.join(sorted(known))}"
-        )
+    values = command.only_parameters(("VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"))
     numbers = {key: number(command.name, values, key) for key in values}
     for key, value in numbers.items():
         low = 0.0 if key in {"SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"} else 1e-3

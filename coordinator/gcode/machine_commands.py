@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 MAX_FREQUENCY_HZ = 1000.0
 MAX_ADVANCE_S = 10.0
 MAX_SMOOTH_S = 0.2
+NO_TOOLS_FROM = 100
+"""Numbers of tools from here on stand for none in what slicers write: T255, T1000."""
 _TOOL = re.compile(r"T\d{1,9}")
 
 
@@ -69,11 +71,8 @@ def home_carriages(job: Job, axes: str, second_mm: float | None = None) -> None:
 
 
 def _parameters(command: Command, known: Collection[str]) -> Mapping[str, str]:
-    """Read NAME=VALUE parameters, of which KNOWN are the names."""
-    values = command.parameters()
-    for key in values.keys() - set(known):
-        raise WordError(f"{command.name} has no parameter {quoted(key)}; it takes {' '.join(sorted(known))}")
-    return values
+    """Read NAME=VALUE parameters, of which KNOWN are the names; others are ignored."""
+    return command.only_parameters(known)
 
 
 def _needed(command: Command, values: Mapping[str, str], key: str) -> str:
@@ -154,7 +153,11 @@ def select_tool(job: Job, command: Command) -> bool:
     extruders = job.machine.extruders
     if not extruders and command.name == "T0":
         return True
-    tool = job.machine.tool(int(command.name[1:]))
+    number_of_tool = int(command.name[1:])
+    tool = job.machine.tool(number_of_tool)
+    if tool is None and number_of_tool >= NO_TOOLS_FROM:
+        job.notice(command.name, "means no tool, as slicers write it, and is ignored")
+        return True
     if tool is None:
         last = max(len(extruders) - 1, 0)
         has = f"T0 to T{last}" if last else "only T0"
