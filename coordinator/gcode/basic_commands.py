@@ -126,6 +126,27 @@ def _set_accel(job: Job, command: Command) -> bool:
     return True
 
 
+def _limit_axes(what: str) -> Handler:
+    def handle(job: Job, command: Command) -> bool:
+        """M201, M203: what slicers write as the machine's limits; those of the configuration hold, too."""
+        words = _numbers(command, AXIS_LETTERS)
+        _positive(command, words)
+        job.planner.limit_axes(what, words)
+        return True
+
+    return handle
+
+
+def _set_jerk(job: Job, command: Command) -> bool:
+    """M205: the lesser of X and Y is the speed at a right-angled corner; the rest means nothing here."""
+    words = _numbers(command, "XYZEBSTJ")
+    corner = [words[letter] for letter in "XY" if letter in words]
+    if corner:
+        _positive(command, {"X or Y": min(corner)})
+        job.planner.square_corner_velocity = min(*corner, job.planner.limits.square_corner_velocity)
+    return True
+
+
 def _cap(job: Job, what: str, asked: float, limit: float) -> None:
     if asked > limit:
         job.notice(f"{what} {asked:g} is above the configured {limit:g}", f"{limit:g} is used")
@@ -283,7 +304,10 @@ HANDLERS: Mapping[str, Handler] = {
     **dict.fromkeys(("M104", "M105", "M106", "M107", "M109", "M140", "M190"), _heat),
     "M112": _emergency,
     "M114": _tell_position,
+    "M201": _limit_axes("accel"),
+    "M203": _limit_axes("velocity"),
     "M204": _set_accel,
+    "M205": _set_jerk,
     **dict.fromkeys(("M220", "M221"), _factor),
     "M400": _wait_for_moves,
     "SET_VELOCITY_LIMIT": _set_velocity_limit,

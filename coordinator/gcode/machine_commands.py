@@ -111,7 +111,15 @@ def set_pressure_advance(job: Job, command: Command) -> bool:
     So does the first ADVANCE above 0, which needs the window.
     """
     values = _parameters(command, ("ADVANCE", "SMOOTH_TIME", "EXTRUDER"))
-    extruder = _extruder(job, command, values.get("EXTRUDER"))
+    name = values.get("EXTRUDER")
+    filament = job.machine.filament
+    if name is not None and name not in job.machine.extruders and filament is not None:
+        # One motion has one advance: a stepper that follows an extruder has that of the extruder.
+        name = filament.followed.get(name, name)
+        if not name:
+            job.notice(f"{command.name} of {values['EXTRUDER']}", "it follows no extruder: without effect")
+            return True
+    extruder = _extruder(job, command, name)
     advance = _number(command, values, "ADVANCE", MAX_ADVANCE_S)
     smooth = _number(command, values, "SMOOTH_TIME", MAX_SMOOTH_S)
     needed = smooth if smooth is not None else extruder.smooth_s
@@ -287,6 +295,44 @@ def set_dual_carriage(job: Job, command: Command) -> bool:
     return True
 
 
+def save_dual_carriage_state(job: Job, command: Command) -> bool:
+    """NAME: keep what both carriages do."""
+    carriages, state, name = _dual(job, command)
+    position = job.planner.toolhead_position[carriages.axis]
+    job.machine.saved_carriages[name] = replace(state, positions=state.at(position))
+    return True
+
+
+def restore_dual_carriage_state(job: Job, command: Command) -> bool:
+    """NAME: let both carriages do what they did then; with MOVE=0 only, they stay where they are."""
+    carriages, state, name = _dual(job, command)
+    values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
+    saved = job.machine.saved_carriages.get(name)
+    if saved is None:
+        raise WordError(f"{command.name} names the state {quoted(name)}, which is not saved")
+    if values.get("MOVE", "1") != "0":
+        raise WordError(f"{command.name} cannot move the carriages back; give MOVE=0, and move them by G1")
+    if "XYZ"[carriages.axis] not in job.planner.homed:
+        raise WordError(f"{command.name} comes before {'XYZ'[carriages.axis]} is homed; home with G28 first")
+    if not come_to_rest(job):
+        return False
+    position = job.planner.toolhead_position[carriages.axis]
+    after = carriages.set_mode(state, position, saved.primary, CarriageMode.PRIMARY)
+    other = saved.modes[1 - saved.primary]
+    if other in {CarriageMode.COPY, CarriageMode.MIRROR}:
+        after = carriages.set_mode(after, after.position, 1 - saved.primary, other)
+    _take_carriages(job, carriages, after)
+    return True
+
+
+def _dual(job: Job, command: Command) -> tuple[DualCarriage, CarriageState, str]:
+    values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
+    carriages, state = job.machine.carriages, job.machine.carriage_state
+    if carriages is None or state is None:
+        raise WordError(f"{command.name} needs a second carriage; this machine has no [dual_carriage]")
+    return carriages, state, values.get("NAME", "default")
+
+
 def _take_carriages(job: Job, carriages: DualCarriage, after: CarriageState) -> None:
     planner, axis = job.planner, carriages.axis
     job.machine.carriage_state = after
@@ -307,6 +353,8 @@ def _keep_apart(job: Job) -> None:
 
 HANDLERS = {
     "ACTIVATE_EXTRUDER": activate_extruder,
+    "RESTORE_DUAL_CARRIAGE_STATE": restore_dual_carriage_state,
+    "SAVE_DUAL_CARRIAGE_STATE": save_dual_carriage_state,
     "SET_DUAL_CARRIAGE": set_dual_carriage,
     "SET_INPUT_SHAPER": set_input_shaper,
     "SET_PRESSURE_ADVANCE": set_pressure_advance,

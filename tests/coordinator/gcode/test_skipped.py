@@ -126,3 +126,29 @@ def test_numbers_with_a_plus_are_numbers() -> None:
         reply = job.step()
     assert reply.text.startswith("X:10.000 Y:0.500")
     assert notices("SET_VELOCITY_LIMIT ACCEL=+500") == []
+
+
+def planner_after(*lines: str) -> Planner:
+    planner = Planner(LIMITS)
+    job = Job(Program.from_lines(lines, "part.gcode"), planner, HOME, strict=True)
+    while not isinstance(job.step(), End):
+        pass
+    return planner
+
+
+def test_limits_that_slicers_write_hold_up_to_the_configured_ones() -> None:
+    core = planner_after(
+        "M201 X500 Y100000000 Z20 E900", "M203 X90 Y100000000 Z4 E30", "M205 X3 Y2 Z1 E5"
+    )._core
+    assert (core.limits.max_x_accel, core.limits.max_z_accel) == (500, min(20, LIMITS.max_z_accel))
+    assert core.limits.max_y_accel == LIMITS.max_accel
+    assert (core.limits.max_x_velocity, core.limits.max_y_velocity) == (90, LIMITS.max_velocity)
+    assert core.limits.max_z_velocity == min(4, LIMITS.max_z_velocity)
+    assert core.limits.max_extrude_only_velocity == min(30, LIMITS.max_extrude_only_velocity)
+    assert core.limits.square_corner_velocity == min(2, LIMITS.square_corner_velocity)
+
+
+@pytest.mark.parametrize("line", ["M201 X0", "M203 Z-1", "M205 X0"])
+def test_limits_are_above_0(line: str) -> None:
+    with pytest.raises(GCodeError, match="must be above 0"):
+        planner_after(line)
