@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from coordinator.gcode import machine_commands, state_commands
 from coordinator.gcode.commands import AtRest, Done
 from coordinator.gcode.events import Emergency, Reply, Wait
-from coordinator.gcode.words import Command, WordError, number, quoted
+from coordinator.gcode.words import Command, WordError, number
 from coordinator.motion.language import ARC_LETTERS, Plane
 from coordinator.motion.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus
 
@@ -24,11 +24,8 @@ MAX_DWELL_S = 86400.0
 
 
 def _numbers(command: Command, allowed: str) -> dict[str, float]:
-    """Read COMMAND's words, all with numbers, and no others than ALLOWED."""
-    words = command.words()
-    for letter in words:
-        if letter not in allowed:
-            raise WordError(f"{command.name} has the word {letter}; it takes {' '.join(allowed)}")
+    """Read COMMAND's words of ALLOWED, all with numbers; others are ignored."""
+    words = command.only_words(allowed)
     return {letter: number(command.name, words, letter) for letter in words}
 
 
@@ -108,6 +105,8 @@ def _home(job: Job, command: Command) -> bool:
 
 def _set_origin(job: Job, command: Command) -> bool:
     words = _numbers(command, AXIS_LETTERS)
+    if command.text and not words:
+        return True  # only what has no meaning: that is not the bare G92
     job.planner.set_gcode_position(words or dict.fromkeys(AXIS_LETTERS, 0.0))
     return True
 
@@ -127,6 +126,27 @@ def _set_accel(job: Job, command: Command) -> bool:
     return True
 
 
+def _limit_axes(what: str) -> Handler:
+    def handle(job: Job, command: Command) -> bool:
+        """M201, M203: what slicers write as the machine's limits; those of the configuration hold, too."""
+        words = _numbers(command, AXIS_LETTERS)
+        _positive(command, words)
+        job.planner.limit_axes(what, words)
+        return True
+
+    return handle
+
+
+def _set_jerk(job: Job, command: Command) -> bool:
+    """M205: the lesser of X and Y is the speed at a right-angled corner; the rest means nothing here."""
+    words = _numbers(command, "XYZEBSTJ")
+    corner = [words[letter] for letter in "XY" if letter in words]
+    if corner:
+        _positive(command, {"X or Y": min(corner)})
+        job.planner.square_corner_velocity = min(*corner, job.planner.limits.square_corner_velocity)
+    return True
+
+
 def _cap(job: Job, what: str, asked: float, limit: float) -> None:
     if asked > limit:
         job.notice(f"{what} {asked:g} is above the configured {limit:g}", f"{limit:g} is used")
@@ -134,12 +154,7 @@ def _cap(job: Job, what: str, asked: float, limit: float) -> None:
 
 def _set_velocity_limit(job: Job, command: Command) -> bool:
     planner, limits = job.planner, job.planner.limits
-    values = command.parameters()
-    known = {"VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"}
-    for key in values.keys() - known:
-        raise WordError(
-            f"SET_VELOCITY_LIMIT has no parameter {quoted(key)}; it takes {' '.join(sorted(known))}"
-        )
+    values = command.only_parameters(("VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"))
     numbers = {key: number(command.name, values, key) for key in values}
     for key, value in numbers.items():
         low = 0.0 if key in {"SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"} else 1e-3
@@ -289,7 +304,10 @@ HANDLERS: Mapping[str, Handler] = {
     **dict.fromkeys(("M104", "M105", "M106", "M107", "M109", "M140", "M190"), _heat),
     "M112": _emergency,
     "M114": _tell_position,
+    "M201": _limit_axes("accel"),
+    "M203": _limit_axes("velocity"),
     "M204": _set_accel,
+    "M205": _set_jerk,
     **dict.fromkeys(("M220", "M221"), _factor),
     "M400": _wait_for_moves,
     "SET_VELOCITY_LIMIT": _set_velocity_limit,

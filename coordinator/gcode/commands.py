@@ -17,7 +17,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import field, replace
 from typing import TYPE_CHECKING
 
-from coordinator.gcode.words import Command, WordError, quoted
+from coordinator.gcode.words import Command
 from nodes.records import record
 
 if TYPE_CHECKING:
@@ -48,12 +48,8 @@ class Call:
     """Whether a client gives it while a job prints, which must not wait for it."""
 
     def parameters(self, *known: str) -> dict[str, str]:
-        """Read NAME=VALUE parameters, of which KNOWN are the names; raises WordError."""
-        values = self.command.parameters()
-        for key in values.keys() - set(known):
-            takes = f"it takes {' '.join(known)}" if known else "it takes none"
-            raise WordError(f"{self.command.name} has no parameter {quoted(key)}; {takes}")
-        return values
+        """Read NAME=VALUE parameters, of which KNOWN are the names, others are ignored; raises WordError."""
+        return self.command.only_parameters(known)
 
 
 @record
@@ -150,7 +146,7 @@ def renamed(command: GCodeCommand | None, name: str, rename: str, *, beside: boo
         return GCodeCommand(rename, f"What {name} is by itself", lambda _: BuiltIn(name), beside=beside)
 
     def read(call: Call) -> Reading:
-        return command.read(replace(call, command=Command(name, call.command.text)))
+        return command.read(replace(call, command=call.command.called(name)))
 
     return GCodeCommand(rename, command.help, read, beside=command.beside)
 

@@ -6,6 +6,7 @@ real-time streamer drive the same ``step`` and act on its events (events.py).
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 
 from coordinator.gcode import basic_commands, machine_commands
@@ -45,6 +46,7 @@ from coordinator.motion.language import READ_IN_C
 from coordinator.motion.planner import Feed, FeedStatus, Planner
 from nodes.records import record
 
+QUOTE = "'"
 MAX_NOTICES = 100
 """Different notices a job gives; a file of garbage must not flood the screen."""
 MAX_DEPTH = 30
@@ -268,9 +270,19 @@ class Job:
         """Carry out a line that is no move; False: the planner has to be emptied first."""
         try:
             command = parse(line)
-            return command is None or self._act(command)
+            return command is None or self._act_noting(command)
         except (WordError, ValueError) as problem:
             raise self._error(f"{problem}{hint}") from None
+
+    def _act_noting(self, command: Command) -> bool:
+        """Act on COMMAND, and tell what of it was ignored."""
+        ignored: list[str] = []
+        done = self._act(replace(command, ignored=ignored))
+        for key in ignored:
+            self.notice(
+                f"{quoted(key).strip(QUOTE)} of {command.name}", "it has no meaning here and is ignored"
+            )
+        return done
 
     def _act(self, command: Command) -> bool:
         known = self.vocabulary.commands.get(command.written) if command.written else None
@@ -293,7 +305,7 @@ class Job:
 
     def _skip(self, command: Command) -> None:
         """Tell about a command that nobody knows; raises WordError for one that a job must not go without."""
-        what = quoted(command.name).strip("'")
+        what = quoted(command.name).strip(QUOTE)
         why = self.vocabulary.not_acting.get(command.name, "")
         absent = ABSENT.get(command.name)
         if absent is None or absent.harmless:
@@ -305,7 +317,7 @@ class Job:
         """Raise WordError as COMMAND, of which WHY says what it does, must not be skipped; told in a plan."""
         if self.strict:
             raise WordError(f"{command.name} {why}; remove the line, or what asks for it")
-        self.notice(f"{quoted(command.name).strip(chr(39))} {why}", "a job would end here")
+        self.notice(f"{quoted(command.name).strip(QUOTE)} {why}", "a job would end here")
 
     def _check_beside(self, command: Command, *, allowed: bool) -> None:
         if self.beside and not allowed:
@@ -348,7 +360,7 @@ class Job:
             case ToProgram():
                 return reading.act(self)
             case BuiltIn():
-                return self._act_built_in(Command(reading.name, command.text))
+                return self._act_built_in(command.called(reading.name))
         return True
 
     def _rested(self, event: Resting) -> None:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 MAX_FREQUENCY_HZ = 1000.0
 MAX_ADVANCE_S = 10.0
 MAX_SMOOTH_S = 0.2
+NO_TOOLS_FROM = 100
+"""Numbers of tools from here on stand for none in what slicers write: T255, T1000."""
 _TOOL = re.compile(r"T\d{1,9}")
 
 
@@ -69,11 +71,8 @@ def home_carriages(job: Job, axes: str, second_mm: float | None = None) -> None:
 
 
 def _parameters(command: Command, known: Collection[str]) -> Mapping[str, str]:
-    """Read NAME=VALUE parameters, of which KNOWN are the names."""
-    values = command.parameters()
-    for key in values.keys() - set(known):
-        raise WordError(f"{command.name} has no parameter {quoted(key)}; it takes {' '.join(sorted(known))}")
-    return values
+    """Read NAME=VALUE parameters, of which KNOWN are the names; others are ignored."""
+    return command.only_parameters(known)
 
 
 def _needed(command: Command, values: Mapping[str, str], key: str) -> str:
@@ -112,7 +111,15 @@ def set_pressure_advance(job: Job, command: Command) -> bool:
     So does the first ADVANCE above 0, which needs the window.
     """
     values = _parameters(command, ("ADVANCE", "SMOOTH_TIME", "EXTRUDER"))
-    extruder = _extruder(job, command, values.get("EXTRUDER"))
+    name = values.get("EXTRUDER")
+    filament = job.machine.filament
+    if name is not None and name not in job.machine.extruders and filament is not None:
+        # One motion has one advance: a stepper that follows an extruder has that of the extruder.
+        name = filament.followed.get(name, name)
+        if not name:
+            job.notice(f"{command.name} of {values['EXTRUDER']}", "it follows no extruder: without effect")
+            return True
+    extruder = _extruder(job, command, name)
     advance = _number(command, values, "ADVANCE", MAX_ADVANCE_S)
     smooth = _number(command, values, "SMOOTH_TIME", MAX_SMOOTH_S)
     needed = smooth if smooth is not None else extruder.smooth_s
@@ -154,7 +161,11 @@ def select_tool(job: Job, command: Command) -> bool:
     extruders = job.machine.extruders
     if not extruders and command.name == "T0":
         return True
-    tool = job.machine.tool(int(command.name[1:]))
+    number_of_tool = int(command.name[1:])
+    tool = job.machine.tool(number_of_tool)
+    if tool is None and number_of_tool >= NO_TOOLS_FROM:
+        job.notice(command.name, "means no tool, as slicers write it, and is ignored")
+        return True
     if tool is None:
         last = max(len(extruders) - 1, 0)
         has = f"T0 to T{last}" if last else "only T0"
@@ -284,6 +295,44 @@ def set_dual_carriage(job: Job, command: Command) -> bool:
     return True
 
 
+def save_dual_carriage_state(job: Job, command: Command) -> bool:
+    """NAME: keep what both carriages do."""
+    carriages, state, name = _dual(job, command)
+    position = job.planner.toolhead_position[carriages.axis]
+    job.machine.saved_carriages[name] = replace(state, positions=state.at(position))
+    return True
+
+
+def restore_dual_carriage_state(job: Job, command: Command) -> bool:
+    """NAME: let both carriages do what they did then; with MOVE=0 only, they stay where they are."""
+    carriages, state, name = _dual(job, command)
+    values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
+    saved = job.machine.saved_carriages.get(name)
+    if saved is None:
+        raise WordError(f"{command.name} names the state {quoted(name)}, which is not saved")
+    if values.get("MOVE", "1") != "0":
+        raise WordError(f"{command.name} cannot move the carriages back; give MOVE=0, and move them by G1")
+    if "XYZ"[carriages.axis] not in job.planner.homed:
+        raise WordError(f"{command.name} comes before {'XYZ'[carriages.axis]} is homed; home with G28 first")
+    if not come_to_rest(job):
+        return False
+    position = job.planner.toolhead_position[carriages.axis]
+    after = carriages.set_mode(state, position, saved.primary, CarriageMode.PRIMARY)
+    other = saved.modes[1 - saved.primary]
+    if other in {CarriageMode.COPY, CarriageMode.MIRROR}:
+        after = carriages.set_mode(after, after.position, 1 - saved.primary, other)
+    _take_carriages(job, carriages, after)
+    return True
+
+
+def _dual(job: Job, command: Command) -> tuple[DualCarriage, CarriageState, str]:
+    values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
+    carriages, state = job.machine.carriages, job.machine.carriage_state
+    if carriages is None or state is None:
+        raise WordError(f"{command.name} needs a second carriage; this machine has no [dual_carriage]")
+    return carriages, state, values.get("NAME", "default")
+
+
 def _take_carriages(job: Job, carriages: DualCarriage, after: CarriageState) -> None:
     planner, axis = job.planner, carriages.axis
     job.machine.carriage_state = after
@@ -304,6 +353,8 @@ def _keep_apart(job: Job) -> None:
 
 HANDLERS = {
     "ACTIVATE_EXTRUDER": activate_extruder,
+    "RESTORE_DUAL_CARRIAGE_STATE": restore_dual_carriage_state,
+    "SAVE_DUAL_CARRIAGE_STATE": save_dual_carriage_state,
     "SET_DUAL_CARRIAGE": set_dual_carriage,
     "SET_INPUT_SHAPER": set_input_shaper,
     "SET_PRESSURE_ADVANCE": set_pressure_advance,

@@ -85,6 +85,8 @@ class MachineState:
     """By axis letter."""
     saved: dict[str, SavedState] = field(default_factory=dict)
     """By name."""
+    saved_carriages: dict[str, CarriageState] = field(default_factory=dict)
+    """By name."""
     follows: Mapping[str, Weights] = field(default_factory=dict)
     """What motors (by name) follow whose axes are corrected; others follow what they are described to."""
 

@@ -24,10 +24,7 @@ _DEFAULT_STATE: Final = "default"
 
 
 def _parameters(command: Command, known: Collection[str]) -> Mapping[str, str]:
-    values = command.parameters()
-    for key in values.keys() - set(known):
-        raise WordError(f"{command.name} has no parameter {quoted(key)}; it takes {' '.join(sorted(known))}")
-    return values
+    return command.only_parameters(known)
 
 
 def _flag(command: Command, values: Mapping[str, str], key: str) -> bool:

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Iterable, Mapping
 from functools import lru_cache, reduce
 from operator import xor
 
@@ -31,6 +31,25 @@ class Command:
     text: str
     written: str = ""
     """In capitals as it stands in the line, where that is not NAME: ``G00``, ``M104.0``."""
+    ignored: list[str] | None = None
+    """Takes in the parameters that had no meaning for who read them, for a notice; None: nobody asks."""
+
+    def called(self, name: str) -> "Command":
+        """Return the same command under another NAME."""
+        return Command(name, self.text, ignored=self.ignored)
+
+    def only_words(self, known: str) -> dict[str, str]:
+        """Read the parameters as letters with numbers; what is none of KNOWN is ignored."""
+        return self._only(self.words(), known)
+
+    def only_parameters(self, known: Iterable[str]) -> dict[str, str]:
+        """Read the parameters as NAME=VALUE; what is none of KNOWN is ignored."""
+        return self._only(self.parameters(), tuple(known))
+
+    def _only(self, found: dict[str, str], known: Container[str]) -> dict[str, str]:
+        if self.ignored is not None:
+            self.ignored.extend(key for key in found if key not in known)
+        return {key: text for key, text in found.items() if key in known}
 
     def words(self) -> dict[str, str]:
         """Read the parameters as letters with numbers (or without: ``G28 X``)."""

@@ -25,7 +25,7 @@ MAX_CROSS_SECTION = FloatOption(
     help="largest area of an extruded line, by default 4 nozzle_diameter²; moves above it are refused",
     unit="mm²",
     above=0,
-    maximum=10_000,
+    maximum=1e9,
 )
 MAX_ONLY_DISTANCE = FloatOption(
     name="max_extrude_only_distance",

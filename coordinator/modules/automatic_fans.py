@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 from coordinator.machine.options import FloatOption, IntOption, ListOption, SectionSpec
 from coordinator.machine.problem import ConfigError, nearest, shown
 from coordinator.modules.base import Build, Modules
-from coordinator.modules.fan_unit import FanModule, FanUnit, fan_options, shutdown_speed
+from coordinator.modules.fan_unit import LATER_FAN_OPTIONS, FanModule, FanUnit, fan_options, shutdown_speed
 from coordinator.modules.heater import HeaterUnit
 from coordinator.modules.heaters import Heaters
 from coordinator.modules.motor_power import MotorPower
@@ -39,7 +39,7 @@ IDLE_TIMEOUT: Final = IntOption(
     default=30,
     unit="s",
     minimum=0,
-    maximum=86400,
+    maximum=1_000_000_000,
 )
 IDLE_SPEED: Final = FloatOption(
     name="idle_speed", help="how fast it runs then; by default fan_speed", minimum=0, maximum=1
@@ -84,6 +84,7 @@ class HeaterFan(FanModule):
     SPEC: ClassVar = SectionSpec(
         help="A fan that runs while a heater is hot or is to be, as that of a hot end",
         options=(*fan_options(FULL), HEATER, HEATER_TEMP, FAN_SPEED),
+        later=LATER_FAN_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:
@@ -128,6 +129,7 @@ class ControllerFan(FanModule):
             IDLE_TIMEOUT,
             IDLE_SPEED,
         ),
+        later=LATER_FAN_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:

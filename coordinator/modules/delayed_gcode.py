@@ -21,7 +21,7 @@ INITIAL = FloatOption(
     default=0.0,
     unit="s",
     minimum=0.0,
-    maximum=1e6,
+    maximum=1e9,
 )
 DURATION_MAX_S: Final = 1e6
 SHORTEST_S: Final = 0.05
@@ -32,7 +32,7 @@ _COMMAND: Final = "_RUN_DELAYED_GCODE"
 class DelayedGCode(Module):
     """One of them; a service runs its lines as those of a client."""
 
-    SPEC = SectionSpec("G-code that runs by itself after a while", (GCODE, INITIAL))
+    SPEC = SectionSpec("G-code that runs by itself after a while", (GCODE, INITIAL), later=("description",))
     NAMED = True
 
     def __init__(self, build: Build) -> None:

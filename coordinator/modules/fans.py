@@ -6,7 +6,7 @@ from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
 from coordinator.gcode.words import WordError
 from coordinator.machine.options import SectionSpec
 from coordinator.modules.base import Build, Module
-from coordinator.modules.fan_unit import FanModule, FanUnit, fan_options, shutdown_speed
+from coordinator.modules.fan_unit import LATER_FAN_OPTIONS, FanModule, FanUnit, fan_options, shutdown_speed
 from coordinator.modules.words import numbers, one, parameters, value
 
 OFF: Final = shutdown_speed(0.0)
@@ -17,7 +17,9 @@ FULL: Final = 255.0
 class Fan(FanModule):
     """The fan that cools the part."""
 
-    SPEC: ClassVar = SectionSpec(help="The fan that cools the part: M106, M107", options=fan_options(OFF))
+    SPEC: ClassVar = SectionSpec(
+        help="The fan that cools the part: M106, M107", options=fan_options(OFF), later=LATER_FAN_OPTIONS
+    )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -68,7 +70,9 @@ class FanGeneric(FanModule):
 
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
-        help="A fan that programs set: SET_FAN_SPEED FAN=NAME SPEED=", options=fan_options(OFF)
+        help="A fan that programs set: SET_FAN_SPEED FAN=NAME SPEED=",
+        options=fan_options(OFF),
+        later=LATER_FAN_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:

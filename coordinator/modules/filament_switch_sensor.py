@@ -39,7 +39,15 @@ EVENT_DELAY: Final = FloatOption(
     minimum=0.0,
     maximum=1e4,
 )
-LATER: Final = ("pause_delay", "debounce_delay", "immediate_runout_gcode", "smart")
+LATER: Final = (
+    "pause_delay",
+    "debounce_delay",
+    "immediate_runout_gcode",
+    "smart",
+    "runout_distance",
+    "always_fire_events",
+    "check_on_print_start",
+)
 _RUNOUT: Final = "_FILAMENT_RUNOUT"
 _INSERT: Final = "_FILAMENT_INSERT"
 

@@ -50,7 +50,9 @@ class _Settings:
 class FirmwareRetraction(Module):
     """Its commands; how far the filament is drawn back is what G10 did, also when settings change."""
 
-    SPEC = SectionSpec("Retraction by G10 and G11", (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP))
+    SPEC = SectionSpec(
+        "Retraction by G10 and G11", (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP), later=("clear_zhop_on_z_moves",)
+    )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)

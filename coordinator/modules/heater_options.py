@@ -19,7 +19,7 @@ CYCLE_TIME: Final = FloatOption(
     help="time in which the heater is switched on and off once",
     default=0.1,
     unit="s",
-    minimum=0.01,
+    minimum=0.001,
     maximum=5,
 )
 MAX_DURATION: Final = FloatOption(
@@ -153,6 +153,7 @@ LATER_HEATER_OPTIONS: Final = (
     "pid_version",
     "pid_tolerance",
     "min_ambient_change",
+    "lost_update_tolerance",
 )
 MIN_EXTRUDE_TEMP: Final = FloatOption(
     name="min_extrude_temp",

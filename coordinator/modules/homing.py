@@ -22,6 +22,7 @@ from nodes.errors import CanductorError
 if TYPE_CHECKING:
     from coordinator.app import Machine
     from coordinator.homing import HomingResult
+    from coordinator.kinematics.base import Point
     from coordinator.machine.model import RailDescription
     from coordinator.modules.live import Live
 
@@ -29,6 +30,10 @@ AWAY_MM: Final = 5.0
 """How far a rail that stands on its endstop goes away first, where homing_retract_dist is 0."""
 
 
+STRAIGHT: Final = frozenset(
+    ("cartesian", "corexy", "corexz", "hybrid_corexy", "hybrid_corexz", "generic_cartesian")
+)
+"""Kinematics whose steppers' ways add up: the head may be moved before it is known where it is."""
 ReadHome = Callable[[Call, str], Reading]
 
 
@@ -142,6 +147,7 @@ class Homing(Module):
             else:
                 place = found
         letters = "".join(letter for letter in "XYZ" if letter in homed)
+        place = await self._come_within(place, letters)
         return Done(position=(*place, e), homed=letters, moved=True, second_carriage_mm=second_mm)
 
     async def _approach(self, approach: Approach) -> list[float]:
@@ -159,6 +165,35 @@ class Homing(Module):
         if rail.axis in AXES:
             await self._align(approach, beyond_mm)
         return beyond_mm
+
+    async def _come_within(self, place: "Point", letters: str) -> "Point":
+        """Move axes that stopped behind their endstop beyond their range back into it; return where they are.
+
+        By a step more than needed, as a way is made in whole steps. Towers and arms end within their space.
+        """
+        described = self._described
+        if self._live is None or not STRAIGHT & {described.kinematics.name}:
+            return place
+        from coordinator.straight_move import move_by  # noqa: PLC0415 (planning needs no asyncio)
+
+        for axis, letter in enumerate("XYZ"):
+            way_mm = self._way_within(axis, place[axis]) if letter in letters else 0.0
+            if not way_mm:
+                continue
+            x, y, z = (way_mm if number == axis else 0.0 for number in range(3))
+            rail = next(rail for rail in described.rails if rail.axis == letter.lower())
+            speed, accel = rail.homing.retract_speed, self._accel(rail.axis, rail)
+            made = await move_by(self._machine, (x, y, z), speed, accel)
+            place = (place[0] + made[0], place[1] + made[1], place[2] + made[2])
+        return place
+
+    def _way_within(self, axis: int, at_mm: float) -> float:
+        space, motors = self._described.kinematics.work_space, self._described.motors
+        low, high = space.low[axis], space.high[axis]
+        if low <= at_mm <= high:
+            return 0.0
+        step_mm = max(m.step_distance / abs(m.weights[axis]) for m in motors if m.weights[axis])
+        return low - at_mm + step_mm if at_mm < low else high - at_mm - step_mm
 
     async def _align(self, approach: Approach, beyond_mm: Sequence[float]) -> None:
         """Bring the sides of an axis as far beyond their endstops as its first one is."""

@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Final
 
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Lines, Reading
-from coordinator.gcode.words import Command
 from coordinator.machine.options import FloatOption, GCodeOption, SectionSpec, TextOption
 from coordinator.modules.base import Build, Module
 from coordinator.modules.gcode_macro import GCodeTemplate, parameters
@@ -59,7 +58,7 @@ class HomingOverride(Module):
         return self._read_lines(call)
 
     def _read_lines(self, call: Call) -> Reading:
-        homes = Command("G28", call.command.text)
+        homes = call.command.called("G28")
         values = {"params": parameters(homes), "rawparams": homes.text.strip()}
         return self._template.lines(call, values)
 

@@ -21,7 +21,7 @@ TIMEOUT = FloatOption(
     default=600.0,
     unit="s",
     above=0.0,
-    maximum=1e6,
+    maximum=1e9,
 )
 GCODE = GCodeOption(
     name="gcode",

@@ -16,11 +16,12 @@ PREFIX = TextOption(name="default_prefix", help="Stands before a line, instead o
 class Respond(Module):
     """Its commands."""
 
-    SPEC = SectionSpec("Lines that programs show to the user", (TYPE, PREFIX))
+    SPEC = SectionSpec("Lines that programs show to the user", (TYPE, PREFIX), later=("enable_respond",))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self._prefix = build.find(PREFIX) or PREFIXES[build.get(TYPE)]
+        usual = PREFIXES[build.get(TYPE)]
+        self._prefix = build.find(PREFIX) or usual
         build.add_command(GCodeCommand("M118", "Show a line", self._echo, beside=True))
         build.add_command(
             GCodeCommand("RESPOND", "Show MSG, after PREFIX or that of TYPE", self._respond, beside=True)

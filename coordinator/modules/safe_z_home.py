@@ -9,7 +9,7 @@ from coordinator.machine.options import BadValue, BoolOption, FloatOption, Optio
 from coordinator.machine.problem import ConfigError
 from coordinator.machine.read_printer import MAX_SPEED
 from coordinator.modules.base import Build, Module
-from coordinator.modules.homing import Homing
+from coordinator.modules.homing import STRAIGHT, Homing
 from nodes.errors import CanductorError
 from nodes.records import record
 
@@ -17,11 +17,6 @@ if TYPE_CHECKING:
     from coordinator.modules.live import Live
 
 HOP_MAX_MM: Final = 1000.0
-_STRAIGHT: Final = (
-    *("cartesian", "corexy", "corexz", "hybrid_corexy", "hybrid_corexz"),
-    "generic_cartesian",
-)
-"""Kinematics whose steppers' ways add up: the head may be moved before it is known where it is."""
 
 
 @record(kw_only=True)
@@ -71,7 +66,9 @@ class SafeZHome(Module):
     """What G28 does in its place."""
 
     SPEC = SectionSpec(
-        "G28 homes Z at one place of the bed, behind X and Y", (PLACE, SPEED, Z_HOP, Z_HOP_SPEED, BACK)
+        "G28 homes Z at one place of the bed, behind X and Y",
+        (PLACE, SPEED, Z_HOP, Z_HOP_SPEED, BACK),
+        later=("home_y_before_x",),
     )
 
     def __init__(self, build: Build) -> None:
@@ -82,7 +79,7 @@ class SafeZHome(Module):
         self._limits = build.machine.limits
         self._live: Live | None = None
         kinematics = build.machine.kinematics.name
-        if kinematics not in _STRAIGHT:
+        if kinematics not in STRAIGHT:
             raise ConfigError(
                 build.place, f"[{build.name}] has no use on a machine of kinematics {kinematics}; remove it"
             )

@@ -145,8 +145,12 @@ LATER_SENSOR_OPTIONS: Final = (
     *_words("rtd_reference_r rtd_num_of_wires rtd_use_50hz_filter spi_speed spi_bus"),
     *_words("spi_software_sclk_pin spi_software_mosi_pin spi_software_miso_pin"),
     *_words("i2c_address i2c_mcu i2c_bus i2c_speed i2c_software_scl_pin i2c_software_sda_pin"),
+    *_words("serial_no ds18_report_time bme280_report_time bme280_gas_target_temp bme280_gas_heat_duration"),
+    *_words("bme280_oversample_temp bme280_oversample_hum bme280_oversample_pressure bme280_iir_filter"),
+    *_words("aht10_report_time htu21d_hold_master htu21d_resolution htu21d_report_time sht3x_report_time"),
+    *_words("lm75_report_time"),
 )
-"""Of sensors on SPI and I2C, which are not built yet."""
+"""Of sensors on SPI, I2C and a single wire, which are not built yet."""
 LATER_SENSORS: Final = frozenset(
     (
         *_words("MAX6675 MAX31855 MAX31856 MAX31865 BME280 BMP280 BMP180 BMP388 BME680 AHT10 AHT20 AHT21"),

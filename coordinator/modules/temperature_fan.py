@@ -13,7 +13,7 @@ from coordinator.heat.pid import Pid, PidGains
 from coordinator.heat.watermark import Watermark
 from coordinator.machine.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.modules.base import Build, Module, Modules, Value
-from coordinator.modules.fan_unit import FanModule, FanUnit, fan_options, shutdown_speed
+from coordinator.modules.fan_unit import LATER_FAN_OPTIONS, FanModule, FanUnit, fan_options, shutdown_speed
 from coordinator.modules.free_temperatures import find_source
 from coordinator.modules.heater import LOOK_S, SILENT_LOOKS
 from coordinator.modules.heater_options import MAX_DELTA, PID_KD, PID_KI, PID_KP, SMOOTH_TIME
@@ -107,7 +107,7 @@ class TemperatureFan(FanModule):
             MAX_DELTA,
             GCODE_ID,
         ),
-        later=(*LATER_SENSOR_OPTIONS, "pid_deriv_time"),
+        later=(*LATER_SENSOR_OPTIONS, *LATER_FAN_OPTIONS, "pid_deriv_time", "reverse"),
     )
 
     def __init__(self, build: Build) -> None:

@@ -101,6 +101,7 @@ _DRIVER_FIELDS: Final = {
     "PWM_LIM": 12,
     "PWM_REG": 8,
     "PWM_FREQ": 1,
+    "FREEWHEEL": 0,
     "PWM_GRAD": 14,
     "PWM_OFS": 36,
 }
@@ -146,7 +147,10 @@ def driver_spec(chip: Chip) -> SectionSpec:
             *more,
             *field_options(chip).values(),
         ),
-        later=("select_pins",) if chip.has_stallguard else ("select_pins", "home_current"),
+        later=(
+            *("select_pins", "current_change_dwell_time"),
+            *(() if chip.has_stallguard else ("home_current",)),
+        ),
     )
 
 
@@ -159,7 +163,7 @@ class DriverSettings:
         self.sense_ohm = build.get(SENSE_RESISTOR)
         self.largest_a = largest_current(self.sense_ohm)
         self.run_a = self._current(build, RUN_CURRENT, build.get(RUN_CURRENT))
-        self.hold_a = build.find(HOLD_CURRENT) or self.run_a
+        self.hold_a = min(build.find(HOLD_CURRENT) or self.run_a, self.largest_a)
         home_a = build.find(HOME_CURRENT) if chip.has_stallguard else None
         self.home_a = None if home_a is None else self._current(build, HOME_CURRENT, home_a)
         """None: as it runs."""
@@ -178,12 +182,12 @@ class DriverSettings:
 
     def _current(self, build: Build, option: FloatOption, amperes: float) -> float:
         if amperes > self.largest_a:
-            raise build.reader.bad(
+            build.note(
                 option,
-                f"but with sense_resistor {self.sense_ohm:g} ohm the driver gives at most"
-                f" {self.largest_a:.3f} A",
+                f"is {amperes:g} A, but with sense_resistor {self.sense_ohm:g} ohm the driver gives at most"
+                f" {self.largest_a:.3f} A, which is used",
             )
-        return amperes
+        return min(amperes, self.largest_a)
 
     def tstep(self, speed: float) -> int:
         """Return the register for a speed of the axis, mm/s."""

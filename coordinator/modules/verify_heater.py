@@ -13,7 +13,7 @@ MAX_ERROR: Final = FloatOption(
     default=120.0,
     unit="K·s",
     minimum=0,
-    maximum=100_000,
+    maximum=1e9,
 )
 CHECK_GAIN_TIME: Final = FloatOption(
     name="check_gain_time",
@@ -21,7 +21,7 @@ CHECK_GAIN_TIME: Final = FloatOption(
     " and 60 s for heater_bed",
     unit="s",
     minimum=1,
-    maximum=3600,
+    maximum=1e9,
 )
 HYSTERESIS: Final = FloatOption(
     name="hysteresis",

@@ -10,23 +10,14 @@ T = TypeVar("T", float, None)
 
 
 def numbers(command: Command, allowed: str) -> dict[str, float]:
-    """Return COMMAND's letters, all with numbers and all of ALLOWED."""
-    words = command.words()
-    for letter in words:
-        if letter not in allowed:
-            raise WordError(f"{command.name} has the word {letter}; it takes {' '.join(allowed)}")
+    """Return COMMAND's letters of ALLOWED, all with numbers; others are ignored."""
+    words = command.only_words(allowed)
     return {letter: number(command.name, words, letter) for letter in words}
 
 
 def parameters(command: Command, allowed: Iterable[str]) -> dict[str, str]:
-    """Return COMMAND's NAME=VALUE, all of ALLOWED."""
-    allowed = tuple(allowed)
-    found = command.parameters()
-    for name in found:
-        if name not in allowed:
-            hint = nearest(name, allowed) or f"; it takes {', '.join(allowed) or 'none'}"
-            raise WordError(f"{command.name} has no parameter {quoted(name)}{hint}")
-    return found
+    """Return COMMAND's NAME=VALUE of ALLOWED; others are ignored."""
+    return command.only_parameters(allowed)
 
 
 def value(command: Command, given: Mapping[str, str], name: str, default: float | None = None) -> float:

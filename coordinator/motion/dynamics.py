@@ -84,8 +84,18 @@ class Dynamics:
 
     def set_range(self, axis: int, low: float, high: float) -> None:
         """AXIS (0 to 2) may go from LOW to HIGH, mm; nowhere when LOW is above HIGH."""
-        self._core.limits.position_min[axis] = check_number("position_min", low, -1e6, 1e6)
-        self._core.limits.position_max[axis] = check_number("position_max", high, -1e6, 1e6)
+        self._core.limits.position_min[axis] = check_number("position_min", low, -1e6, 1e9)
+        self._core.limits.position_max[axis] = check_number("position_max", high, -1e6, 1e9)
+
+    def limit_axes(self, what: str, values: Mapping[str, float]) -> None:
+        """Let X, Y, Z and filament alone (E) have at most VALUES of WHAT: ``velocity`` or ``accel``; mm, s.
+
+        Never more than is configured; raises ValueError.
+        """
+        for letter, asked in values.items():
+            name = f"max_extrude_only_{what}" if letter == "E" else f"max_{letter.lower()}_{what}"
+            most = getattr(self.limits, name) or getattr(self.limits, f"max_{what}")
+            setattr(self._core.limits, name, min(check_number(name, asked, 1e-3), most))
 
     @property
     def cold(self) -> bool:

@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from coordinator.app import Machine
-from coordinator.gcode.basic_commands import BESIDE
+from coordinator.gcode.basic_commands import BESIDE, HANDLERS
 from coordinator.gcode.errors import GCodeError
+from coordinator.gcode.machine_commands import is_tool
 from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
 from coordinator.modules.module_set import INTERRUPTING
 from coordinator.service.feeder import FeederFull, Ticket
@@ -223,6 +224,8 @@ def _check_beside(motion: Motion, names: list[str]) -> None:
     """Refuse commands that would disturb the job."""
     known = motion.feeder.vocabulary.commands
     for name in names:
+        if name not in known and name not in HANDLERS and not is_tool(name):
+            continue  # nobody knows it: that is said where it stands, not that the machine is busy
         if not (known[name].beside if name in known else name in BESIDE):
             raise ApiError(
                 "busy",

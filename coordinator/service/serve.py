@@ -164,7 +164,7 @@ class _Hall:
             from coordinator.web.server import WebServer  # noqa: PLC0415 (the extra web)
         except ModuleNotFoundError as error:
             raise CanductorError(
-                f"the live page needs {error.name}, which is not installed; run: pip install 'canductor[web]'"
+                f"the live page needs {error.name}, which is not installed; run: pip install {error.name}"
             ) from None
         host, port = options.web
         sessions = state_folder(options.name) / f"page-{port}.json"

@@ -220,3 +220,18 @@ def test_homing_keeps_to_its_own_acceleration(tmp_path: Path) -> None:
     first, later = x[0][0], x[99][0]
     expected_s = (2 * (99.5 / 80) / 50) ** 0.5 - (2 * (0.5 / 80) / 50) ** 0.5
     assert (later - first) * 1e-12 == pytest.approx(expected_s, rel=0.02)
+
+
+# ------------------------------------------------------------------------------------------ after homing
+
+
+def test_after_g28_the_head_is_within_its_limits_and_can_come_back_there(tmp_path: Path) -> None:
+    found = printer(tmp_path, "")
+    found.run(
+        "G28", "M114", "SAVE_GCODE_STATE", "G91", "G1 X5 Y-5 Z3 F3000", "G90", "RESTORE_GCODE_STATE MOVE=1"
+    )
+    x, y, z = (float(word[2:]) for word in found.told[-1].split()[:3])
+    assert 0 <= x < 2 / STEPS_PER_MM["x"]
+    assert 250 - 2 / STEPS_PER_MM["y"] < y <= 250
+    assert z >= -1
+    check_places(found, x, y, z)

@@ -213,9 +213,39 @@ def test_the_carriages_take_turns_copy_and_mirror() -> None:
     assert job.machine.carriage_state == IDEX.home
 
 
+def test_what_the_carriages_do_is_kept_and_taken_up_again() -> None:
+    _, _, job = run(
+        "G28", "G1 X100 F6000", "SET_DUAL_CARRIAGE CARRIAGE=1", "SET_DUAL_CARRIAGE CARRIAGE=0",
+        "SET_DUAL_CARRIAGE CARRIAGE=1 MODE=COPY", "SAVE_DUAL_CARRIAGE_STATE NAME=a",
+        "SET_DUAL_CARRIAGE CARRIAGE=1", "RESTORE_DUAL_CARRIAGE_STATE NAME=a MOVE=0",
+    )  # fmt: skip
+    state = job.machine.carriage_state
+    assert state is not None
+    assert state.modes == job.machine.saved_carriages["a"].modes
+    assert state.positions == (100, 250)
+
+
+def test_an_extruder_stepper_has_the_advance_of_whom_it_follows() -> None:
+    _, t, job = run(
+        "G28", "M83", "SET_PRESSURE_ADVANCE EXTRUDER=belted ADVANCE=0.3",
+        "SYNC_EXTRUDER_MOTION EXTRUDER=belted MOTION_QUEUE=extruder",
+        "SET_PRESSURE_ADVANCE EXTRUDER=belted ADVANCE=0.2", "G1 X20 E1 F6000",
+    )  # fmt: skip
+    assert t["pressure_advance"].tolist() == [0.2]
+    assert job.machine.extruders["extruder1"].pressure_advance_s == 0.02
+
+
 @pytest.mark.parametrize(
     ("lines", "sentence"),
     [
+        (
+            ["RESTORE_DUAL_CARRIAGE_STATE NAME=x"],
+            ":1: RESTORE_DUAL_CARRIAGE_STATE names the state 'x', which is not saved",
+        ),
+        (
+            ["SAVE_DUAL_CARRIAGE_STATE", "RESTORE_DUAL_CARRIAGE_STATE"],
+            ":2: RESTORE_DUAL_CARRIAGE_STATE cannot move the carriages back; give MOVE=0",
+        ),
         (["G28", "G1 X211"], ":2: the move goes to X 211 mm, outside 0 to 200 mm"),
         (
             ["G28", "G1 X180", "SET_DUAL_CARRIAGE CARRIAGE=1", "G1 X215"],
@@ -234,7 +264,6 @@ def test_the_carriages_take_turns_copy_and_mirror() -> None:
             ["SET_PRESSURE_ADVANCE ADVANCE=x"],
             ":1: ADVANCE of SET_PRESSURE_ADVANCE is 'x', which is",
         ),
-        (["SET_PRESSURE_ADVANCE K=1"], ":1: SET_PRESSURE_ADVANCE has no parameter 'K'; it takes ADVANCE"),
         (
             ["SET_PRESSURE_ADVANCE EXTRUDER=e ADVANCE=1"],
             ":1: SET_PRESSURE_ADVANCE names the extruder 'e'",

@@ -89,3 +89,66 @@ def test_a_move_under_another_name_is_a_move() -> None:
     }
     events = run("G00 F600", Vocabulary(commands), strict=True)
     assert not [event for event in events if isinstance(event, Reply | Notice)]
+
+
+@pytest.mark.parametrize(
+    ("line", "what"),
+    [
+        ("SET_VELOCITY_LIMIT ACCEL=500 ACCEL_TO_DECEL=250", "ACCEL_TO_DECEL of SET_VELOCITY_LIMIT"),
+        ("M220 S100 B", "B of M220"),
+        ("G4 P0 X1", "X of G4"),
+        ("G92 E0 A1", "A of G92"),
+        ("M204 S500 Q1", "Q of M204"),
+        ("SET_GCODE_OFFSET Z=0 FOO=1", "FOO of SET_GCODE_OFFSET"),
+    ],
+)
+def test_parameters_that_mean_nothing_are_ignored_with_one_notice(line: str, what: str) -> None:
+    assert notices(line) == [f"part.gcode:1: {what}: it has no meaning here and is ignored"]
+    assert notices(f"{line}\n{line}") == notices(line)
+
+
+@pytest.mark.parametrize("tool", ["T255", "T1000"])
+def test_a_tool_that_stands_for_none_is_ignored(tool: str) -> None:
+    assert len(notices(tool)) == 1
+
+
+def test_g92_of_nothing_that_it_knows_is_not_the_bare_one() -> None:
+    lines = "G92 X5 Y6 Z7\nG92 F1\nM114"
+    events = run(lines, Vocabulary({}), strict=True)
+    (place,) = [event.text for event in events if isinstance(event, Reply)]
+    assert place.startswith("X:5.000 Y:6.000 Z:7.000")
+
+
+def test_numbers_with_a_plus_are_numbers() -> None:
+    job = Job(Program.from_lines(["G92 X+10 Y+.5", "M114"], "part.gcode"), Planner(LIMITS), HOME)
+    reply = job.step()
+    while not isinstance(reply, Reply):
+        reply = job.step()
+    assert reply.text.startswith("X:10.000 Y:0.500")
+    assert notices("SET_VELOCITY_LIMIT ACCEL=+500") == []
+
+
+def planner_after(*lines: str) -> Planner:
+    planner = Planner(LIMITS)
+    job = Job(Program.from_lines(lines, "part.gcode"), planner, HOME, strict=True)
+    while not isinstance(job.step(), End):
+        pass
+    return planner
+
+
+def test_limits_that_slicers_write_hold_up_to_the_configured_ones() -> None:
+    core = planner_after(
+        "M201 X500 Y100000000 Z20 E900", "M203 X90 Y100000000 Z4 E30", "M205 X3 Y2 Z1 E5"
+    )._core
+    assert (core.limits.max_x_accel, core.limits.max_z_accel) == (500, min(20, LIMITS.max_z_accel))
+    assert core.limits.max_y_accel == LIMITS.max_accel
+    assert (core.limits.max_x_velocity, core.limits.max_y_velocity) == (90, LIMITS.max_velocity)
+    assert core.limits.max_z_velocity == min(4, LIMITS.max_z_velocity)
+    assert core.limits.max_extrude_only_velocity == min(30, LIMITS.max_extrude_only_velocity)
+    assert core.limits.square_corner_velocity == min(2, LIMITS.square_corner_velocity)
+
+
+@pytest.mark.parametrize("line", ["M201 X0", "M203 Z-1", "M205 X0"])
+def test_limits_are_above_0(line: str) -> None:
+    with pytest.raises(GCodeError, match="must be above 0"):
+        planner_after(line)

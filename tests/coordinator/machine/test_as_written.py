@@ -6,6 +6,7 @@ import pytest
 
 from coordinator.machine.description import ConfigError, MachineDescription, load_machine
 from coordinator.modules.idle_timeout import IdleTimeout
+from coordinator.modules.tmc_driver import Tmc2209
 from tests.stages.printer_text import PRINTER_CFG, changed, write
 
 DRIVER = "[tmc2209 stepper_x]\nuart_pin: PF0\nrun_current: 0.8\n"
@@ -162,6 +163,18 @@ def test_pwm_that_software_cannot_make_is_slowed_with_a_notice(tmp_path: Path) -
     assert (
         "'cycle_time' of [fan_generic a] is 5e-05 s, too short for PWM in software: 0.001 s is used" in note
     )
+
+
+def test_a_current_that_the_resistor_does_not_allow_is_cut_with_a_notice(tmp_path: Path) -> None:
+    machine = load(tmp_path, PRINTER_CFG + DRIVER.replace("0.8", "1.9"))
+    (note,) = machine.notes
+    assert (
+        "is 1.9 A, but with sense_resistor 0.11 ohm the driver gives at most 1.768 A, which is used" in note
+    )
+    driver = machine.modules.build(machine).find("tmc2209 stepper_x", Tmc2209)
+    assert driver is not None
+    assert driver.run_a == pytest.approx(1.768, abs=1e-3)
+    assert driver.hold_a == driver.run_a
 
 
 def test_a_fan_of_no_heater_is_told(tmp_path: Path) -> None:

@@ -112,7 +112,6 @@ def test_options_become_registers(tmp_path: Path) -> None:
         ),
         ("tmc2209_stepper_x:virtual_endstop", "!tmc2209_stepper_x:virtual_endstop", "takes no marks"),
         ("tmc2209_stepper_x:virtual_endstop", "tmc2208_stepper_z:virtual_endstop", "cannot feel the end"),
-        ("run_current: 0.8\nhold", "run_current: 1.9\nhold", "the driver gives at most 1.768 A"),
         ("run_current: 0.8\nhold", "run_current: 2.1\nhold", "must be a number in A, above 0 and at most 2"),
         ("hold_current: 0.5", "holdcurrent: 0.5", "did you mean 'hold_current'?"),
         ("uart_address: 1", "uart_address: 0", "have the same pins and uart_address 0; give each driver"),
