@@ -83,6 +83,9 @@ def test_extruders_that_there_are_not_and_those_without_heater(tmp_path: Path) -
             read(Call(command, 1, (0, 0, 0, 0), ""))
 
 
+LINES = len(BASE.splitlines())
+
+
 @pytest.mark.parametrize("name", THERMISTORS)
 def test_sensors_by_name(tmp_path: Path, name: str) -> None:
     (bed,) = build(tmp_path, HOTEND_PID + BED.replace("Generic 3950", name)).of(HeaterBed)
@@ -130,7 +133,7 @@ def test_an_extruder_without_heater_is_never_cold(tmp_path: Path) -> None:
     [
         (
             "control: pdi\n",
-            f"printer.cfg:{len(BASE.splitlines()) + 1}: option 'control' of [extruder] is 'pdi', must be pid, ",
+            f"printer.cfg:{LINES + 1}: option 'control' of [extruder] is 'pdi', must be pid, ",
         ),
         ("control: pid\npid_kp: 1\n", "[extruder] lacks option 'pid_ki'"),
         ("control: mpc\n", "[extruder] lacks option 'heater_power', a number in W"),
