@@ -8,7 +8,7 @@ NATIVE_INPUTS := $(C_SOURCES) $(wildcard firmware/Makefile firmware/tools/*.py) 
 
 C_WARNINGS := -std=gnu11 -Wall -Wextra -Wconversion -Wno-psabi -Werror -I. -Ifirmware
 
-.PHONY: demo test check pytest live computed ctest fuzz vcan bench clean setup format
+.PHONY: demo test check pytest ctest fuzz vcan bench clean setup format
 .DEFAULT_GOAL := test
 
 setup: $(VENV)/.installed
@@ -45,23 +45,13 @@ ctest: setup
 	$(MAKE) -C tests PYTHON=$(abspath $(BIN)/python)
 	$(MAKE) -C tests/fuzz short
 
-# Tests that only compute. All others talk to processes in real time: they mostly wait, and want to be on time.
-COMPUTING := $(addprefix tests/,sim canbus_tools/test_decoder.py firmware $(addprefix coordinator/,\
-	motion kinematics machine gcode heat modules table demo test_plan.py test_cli.py))
-
+# A file's tests run in one process, in order: what they share is set up once.
 pytest: setup
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile
 
-live: setup
-	$(BIN)/pytest -n 2 --dist loadfile $(addprefix --ignore=,$(COMPUTING))
-
-computed: setup
-	nice -n 19 $(MAKE) ctest
-	nice -n 19 $(BIN)/pytest -n 2 --dist worksteal $(COMPUTING)
-
-# Side by side: what only computes takes the time that the others leave.
-test: check
-	$(MAKE) -j2 --output-sync=target live computed
+# All of it side by side. Nothing but a dozen smoke tests takes real time (docs/testing.md).
+test: setup
+	$(MAKE) -j2 --output-sync=target pytest check ctest
 
 # Ten minutes of hostile G-code through the motion engine, under the sanitizers; ctest has a short run of it.
 FUZZ_SECONDS ?= 600
