@@ -130,7 +130,7 @@ def test_an_extruder_without_heater_is_never_cold(tmp_path: Path) -> None:
     [
         (
             "control: pdi\n",
-            f"printer.cfg:{len(BASE.splitlines()) + 1}: option 'control' of [extruder] is 'pdi', must be pid, ",
+            f"printer.cfg:{len(BASE.splitlines()) + 1}: option 'control' of [extruder] is 'pdi', must",
         ),
         ("control: pid\npid_kp: 1\n", "[extruder] lacks option 'pid_ki'"),
         ("control: mpc\n", "[extruder] lacks option 'heater_power', a number in W"),
