@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from tests.fuzz.live import fuzz_a_print
-from tests.stages.processes import SQUARE, write_gcode
+from tests.stages.demo_machine import SQUARE
+from tests.stages.processes import write_gcode
 
 FUZZ_S = 1.0
 """One print under fuzzers, of a few seconds, and then a quiet one."""
