@@ -89,7 +89,7 @@ def test_commands_that_neither_move_nor_wait(tmp_path: Path) -> None:
         await stage.until_job("done")
         assert stage.planned[2] == pytest.approx(0.33)
 
-    printer.run(go)
+    printer.serve(go)
 
 
 def test_the_page_names_all_of_them(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_commands_that_move_or_wait_are_refused(tmp_path: Path) -> None:
         await stage.call("job.cancel")
         await stage.until_job("cancelled")
 
-    printer.run(go)
+    printer.serve(go)
 
 
 def test_a_job_that_waits_for_heat_takes_another_target(tmp_path: Path) -> None:
@@ -160,4 +160,4 @@ def test_a_job_that_waits_for_heat_takes_another_target(tmp_path: Path) -> None:
         await stage.until_job("done")
         assert printer.status("extruder")["target"] == 60
 
-    printer.run(go)
+    printer.serve(go)

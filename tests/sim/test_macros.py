@@ -96,4 +96,4 @@ def test_a_print_with_all_of_them(tmp_path: Path) -> None:
         with pytest.raises(ApiError, match="client:1: EXTRUDER_TEMP=295 is too close to the limit of 300"):
             await gcode(stage, "PRINT_START EXTRUDER_TEMP=295")
 
-    printer.run(go)
+    printer.serve(go)

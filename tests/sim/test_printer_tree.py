@@ -119,7 +119,7 @@ def test_the_page_tells_all_that_there_is(tmp_path: Path) -> None:
             seen.add(kind)
         assert fields.keys() - seen == {"gcode_macro", "extruder1", "tmc2208"}, "told by the page only"
 
-    printer.run(go)
+    printer.serve(go)
 
 
 def test_the_page_that_compares_knows_every_command(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_the_page_that_compares_knows_every_command(tmp_path: Path) -> None:
         assert len(known) > 60
         assert sorted(known - rows - macros) == []
 
-    printer.run(go)
+    printer.serve(go)
 
 
 VALUES = (
@@ -153,4 +153,4 @@ def test_what_macros_read_is_how_it_is(tmp_path: Path) -> None:
         _, *told = await gcode(stage, "VALUES")
         assert tuple(told) == VALUES
 
-    printer.run(go)
+    printer.serve(go)

@@ -123,7 +123,7 @@ def test_it_heats_homes_above_the_part_and_goes_on(tmp_path: Path) -> None:
         with pytest.raises(ApiError, match="no job was interrupted"):
             await stage.call("job.recover")
 
-    printer.run(first, second)
+    printer.serve(first, second)
 
 
 def test_where_z_is_not_known_it_asks(tmp_path: Path) -> None:
@@ -148,4 +148,4 @@ def test_where_z_is_not_known_it_asks(tmp_path: Path) -> None:
         assert min(z for _, _, z, _ in seen) > 0.34
         assert printer.true_mm("z") == pytest.approx(LAYERS * LAYER_MM + 0.05, abs=0.01)
 
-    printer.run(first, second)
+    printer.serve(first, second)

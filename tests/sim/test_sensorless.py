@@ -2,23 +2,22 @@
 
 import asyncio
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
 from coordinator.app import Machine, MachineStopped
-from coordinator.demo.plant import PlantSettings, machine_plants
+from coordinator.demo.plant import PlantSettings
 from coordinator.gcode.errors import GCodeError
-from coordinator.gcode.program import Program
 from coordinator.modules.tmc_driver import TmcDriver
 from coordinator.move_source import Told
-from coordinator.session import Outcome, run_job
-from coordinator.simulate import scenario as scenarios
-from coordinator.simulate.stage import Stage
+from coordinator.session import Outcome
+from coordinator.simulate.scenario import BusSetting
+from coordinator.simulate.values import Range
 from nodes.errors import CanductorError
 from nodes.virtual.plant_page import Fault, Kind, PlantPage
+from tests.stages.machine_stage import MachineStage
 from tests.stages.printer_text import SENSORLESS_CFG
 
 if TYPE_CHECKING:
@@ -28,39 +27,29 @@ EXAMPLE = Path(__file__).parents[2] / "config" / "sensorless.cfg"
 FULL_STEP_MM = 40 / 200
 
 
-@dataclass
-class Printer:
-    """The machine, with its head at START."""
+class Printer(MachineStage):
+    """The machine of the text MACHINE, with its head at START; SETTINGS are of its buses."""
 
-    folder: Path
-    start: tuple[float, float, float] = (31.0, 214.0, 20.0)
-    machine: str = SENSORLESS_CFG
-    settings: str = ""
-    seed: int = 0
-    told: list[str] = field(default_factory=list)
-    places: list[tuple[float, float]] = field(default_factory=list)
-    """Where the head truly stood at each M119."""
-    on_ready: Callable[["Printer", Machine], None] = lambda printer, machine: None
+    def __init__(
+        self,
+        folder: Path,
+        start: tuple[float, float, float] = (31.0, 214.0, 20.0),
+        machine: str = SENSORLESS_CFG,
+        *,
+        buses: Mapping[str, BusSetting] | None = None,
+        on_ready: Callable[["Printer", Machine], None] = lambda printer, machine: None,
+    ) -> None:
+        config = folder / "home.cfg"
+        config.write_text(machine)
+        super().__init__(config, buses=buses, plant=PlantSettings(start=start))
+        self.told: list[str] = []
+        self.places: list[tuple[float, float]] = []
+        """Where the head truly stood at each M119."""
+        self._on_ready = on_ready
 
-    def __post_init__(self) -> None:
-        (self.folder / "home.cfg").write_text(self.machine)
-        (self.folder / "home.toml").write_text(f'about = "G28."\nmachine = "home.cfg"\n{self.settings}')
-        self.stage = Stage(scenarios.find(str(self.folder / "home.toml")), self.seed)
-        plants = machine_plants(self.stage.description, PlantSettings(start=self.start))
-        self.plants = self.stage.start_plants(plants.values())
-
-    def run(self, *lines: str) -> Outcome:
-        with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
-            return runner.run(self._main(lines))
-
-    async def _main(self, lines: tuple[str, ...]) -> Outcome:
-        return await run_job(
-            self.stage.description,
-            Program.from_lines(lines, "part.gcode"),
-            lambda _: None,
-            on_told=self._tell,
-            on_ready=lambda machine: self.on_ready(self, machine),
-            host=self.stage.host,
+    def print(self, *lines: str) -> Outcome:
+        return self.print_lines(
+            lines, on_told=self._tell, on_ready=lambda machine: self._on_ready(self, machine)
         )
 
     def _tell(self, told: Told) -> None:
@@ -69,25 +58,19 @@ class Printer:
             self.places.append((self.true_mm("x"), self.true_mm("y")))
 
     @property
-    def page(self) -> PlantPage:
-        return self.plants["mcu"].page
-
-    def true_mm(self, axis: str) -> float:
-        """Return where the carriage of an axis truly stands."""
-        found = next(a for a in self.plants["mcu"].description.axes if a.name == axis)
-        motors = self.page.motors
-        return found.origin + sum(t.mm_per_step * motors[t.stepper].count for t in found.terms)
+    def mcu(self) -> PlantPage:
+        return self.page("mcu")
 
     def break_driver(self, fault: Fault, name: str = "stepper_x") -> None:
-        self.page.set_fault(Kind.TMC, name, fault)
-        assert self.page.item(Kind.TMC, name).fault is fault  # it is looked at: the driver knows
+        self.mcu.set_fault(Kind.TMC, name, fault)
+        assert self.mcu.item(Kind.TMC, name).fault is fault  # it is looked at: the driver knows
 
 
 def test_axes_are_homed_by_what_their_drivers_feel_the_same_from_anywhere(tmp_path: Path) -> None:
-    printer = Printer(tmp_path, settings="[buses.can0]\nloss = 0.01\n")
+    printer = Printer(tmp_path, buses={"can0": BusSetting(loss=Range(0.01, 0.01))})
     spot = ("G1 X30 Y200 F9000", "M119")
     others = (("G1 X41.33 Y190.07",), ("G1 X3 Y247.123",))
-    printer.run("G28 X Y", *spot, *(line for go in others for line in (*go, "G28 Y X", *spot)), "M114")
+    printer.print("G28 X Y", *spot, *(line for go in others for line in (*go, "G28 Y X", *spot)), "M114")
     assert printer.told == ["x:open y:open"] * 3 + ["X:30.000 Y:200.000 Z:0.000 E:0.000"]
     # The motor counts as stalled when its field is up to two full steps ahead: so far from the stop.
     x, y = printer.places[0]
@@ -96,8 +79,8 @@ def test_axes_are_homed_by_what_their_drivers_feel_the_same_from_anywhere(tmp_pa
     assert len(printer.places) == 3
     for places, microstep in zip(zip(*printer.places, strict=True), (40 / 3200, 40 / 6400), strict=True):
         assert max(places) - min(places) < 1.01 * microstep
-    assert printer.page.motors["stepper_x"].lost == 0
-    assert printer.page.motors["stepper_y"].lost == 0
+    assert printer.mcu.motors["stepper_x"].lost == 0
+    assert printer.mcu.motors["stepper_y"].lost == 0
 
 
 def test_towers_go_up_until_each_feels_its_end(tmp_path: Path) -> None:
@@ -108,22 +91,22 @@ def test_towers_go_up_until_each_feels_its_end(tmp_path: Path) -> None:
         wires = f"uart_pin: PD0\nuart_address: {number}\ndiag_pin: PG{number}\n"
         text += f"\n[tmc2209 stepper_{tower}]\n{wires}run_current: 0.8\ndriver_SGTHRS: 70\n"
     printer = Printer(tmp_path, (5.0, 3.0, 380.0), text)
-    printer.run("G28", "G1 X20 Y10 Z350 F6000", "M114")
+    printer.print("G28", "G1 X20 Y10 Z350 F6000", "M114")
     assert printer.told == ["X:20.000 Y:10.000 Z:350.000 E:0.000"]
-    inverse = printer.stage.description.kinematics.inverse
+    inverse = printer.description.kinematics.inverse
     for tower, end, begin in zip("abc", inverse((20, 10, 350)), inverse((5.0, 3.0, 380.0)), strict=True):
-        motor = printer.page.motors[f"stepper_{tower}"]
+        motor = printer.mcu.motors[f"stepper_{tower}"]
         assert motor.lost == 0
         assert motor.count * 40 / 3200 == pytest.approx(end - begin + FULL_STEP_MM, abs=0.7 * FULL_STEP_MM)
 
 
 def test_the_example_homes_its_corexy(tmp_path: Path) -> None:
     printer = Printer(tmp_path, machine=EXAMPLE.read_text(encoding="utf-8"))
-    printer.run("G28", "G1 X30 Y200 F6000", "M119", "G28 X Y", "G1 X30 Y200 F6000", "M119")
+    printer.print("G28", "G1 X30 Y200 F6000", "M119", "G28 X Y", "G1 X30 Y200 F6000", "M119")
     first, again = printer.places
     assert first == pytest.approx((30 - FULL_STEP_MM, 200 + FULL_STEP_MM), abs=0.12)
     assert again == pytest.approx(first, abs=0.007)
-    assert all(motor.lost == 0 for motor in printer.page.motors.values())
+    assert all(motor.lost == 0 for motor in printer.mcu.motors.values())
 
 
 def test_a_driver_is_set_anew_when_its_node_comes_back(tmp_path: Path) -> None:
@@ -138,7 +121,7 @@ def test_a_driver_is_set_anew_when_its_node_comes_back(tmp_path: Path) -> None:
         asyncio.get_running_loop().call_later(1, lambda: status.append(driver.status()))
 
     printer = Printer(tmp_path, on_ready=come_back)
-    printer.run("G4 P3000", "DUMP_TMC STEPPER=stepper_x REGISTER=CHOPCONF")
+    printer.print("G4 P3000", "DUMP_TMC STEPPER=stepper_x REGISTER=CHOPCONF")
     assert printer.told == ["CHOPCONF: 14030053 toff=3 hstrt=5 tbl=2 vsense=1 mres=4 intpol=1"]
     (found,) = status
     assert (found["run_current"], found["hold_current"]) == (0.8, 0.5)
@@ -148,7 +131,7 @@ def test_a_driver_is_set_anew_when_its_node_comes_back(tmp_path: Path) -> None:
 def test_afterwards_the_drivers_are_as_they_were(tmp_path: Path) -> None:
     printer = Printer(tmp_path)
     dump = "DUMP_TMC STEPPER=stepper_{} REGISTER={}"
-    printer.run(
+    printer.print(
         "G28 X Y",
         dump.format("x", "gconf"),
         dump.format("y", "GCONF"),
@@ -193,7 +176,7 @@ def test_a_driver_that_cannot_be_set_ends_the_start(tmp_path: Path, fault: Fault
     printer = Printer(tmp_path)
     printer.break_driver(fault)
     with pytest.raises(CanductorError) as error:
-        printer.run("G28 X")
+        printer.print("G28 X")
     assert str(error.value).startswith(f"the driver of stepper_x ([tmc2209 stepper_x]) {sentence}")
 
 
@@ -214,7 +197,7 @@ def test_a_driver_that_fails_stops_the_machine(
 
     printer = Printer(tmp_path, on_ready=fail)
     with pytest.raises(MachineStopped) as error:
-        printer.run("G28 X Y", *("G1 X100 F2000", "G1 X30") * 9)
+        printer.print("G28 X Y", *("G1 X100 F2000", "G1 X30") * 9)
     assert str(error.value).startswith(f"the driver of stepper_x ([tmc2209 stepper_x]) {sentence}")
 
 
@@ -223,7 +206,7 @@ def test_a_driver_that_gets_warm_is_told_of_once(tmp_path: Path) -> None:
         asyncio.get_running_loop().call_later(2, printer.break_driver, Fault.WARM, "stepper_y")
 
     printer = Printer(tmp_path, on_ready=warm)
-    printer.run("G4 P6000")
+    printer.print("G4 P6000")
     (told,) = printer.told
     assert told.startswith("the driver of stepper_y ([tmc2209 stepper_y]) is getting too hot; lower")
 
@@ -234,11 +217,11 @@ def test_a_driver_that_falls_silent_while_an_axis_homes(tmp_path: Path) -> None:
 
     printer = Printer(tmp_path, start=(60.0, 214.0, 20.0), on_ready=cut)
     with pytest.raises(GCodeError, match=r"^part\.gcode:1: the driver of stepper_x .* does not answer"):
-        printer.run("G28 X", "G1 X5 F6000")
+        printer.print("G28 X", "G1 X5 F6000")
     assert printer.true_mm("x") == 0.0  # it had found the end
 
 
 def test_one_that_feels_nothing_at_that_speed(tmp_path: Path) -> None:
     text = SENSORLESS_CFG.replace("hold_current: 0.5\n", "coolstep_threshold: 41\n")
     with pytest.raises(GCodeError, match=r"^part\.gcode:1: .* cannot feel the end of the axis at 40 mm/s"):
-        Printer(tmp_path, machine=text).run("G28 X")
+        Printer(tmp_path, machine=text).print("G28 X")

@@ -22,7 +22,7 @@ def test_a_machine_runs_unchanged(tmp_path: Path, name: str) -> None:
     stage = PlantStage(tmp_path, path, None, heat=HeatSettings(warm_c=WARM_C))
 
     def true_c(body: str) -> float:
-        pages = {node.name: stage.plants[node.name].page for node in stage.stage.description.nodes}
+        pages = {node.name: stage.plants[node.name].page for node in stage.description.nodes}
         pin = "toolhead" if body == "extruder" and "toolhead" in pages else "mcu"
         return pages[pin].temperature(body)
 
@@ -40,7 +40,7 @@ def test_a_machine_runs_unchanged(tmp_path: Path, name: str) -> None:
             await stage.check_all()
             told = await stage.served.call("position.get", ask_nodes=True)
             assert told["rails"]["extruder"] == pytest.approx(12, abs=0.01)
-            node = next(s.node for s in stage.stage.description.steppers if s.name == "extruder")
+            node = next(s.node for s in stage.description.steppers if s.name == "extruder")
             turned = stage.plants[node].page.motors["extruder"]  # only while its driver is on
             assert abs(turned.count) == told["nodes_steps"]["extruder"]
             assert turned.lost == 0

@@ -39,4 +39,4 @@ def test_the_head_is_where_leaning_axes_have_to_bring_it(tmp_path: Path) -> None
             "skew_correction warm": {"xy_skew": "0.010000", "xz_skew": "-0.002000", "yz_skew": "0.003000"}
         }
 
-    printer.run(go)
+    printer.serve(go)

@@ -58,7 +58,7 @@ PINS = {"runout": ("toolhead", "PC4", 1), "second": ("mcu", "PC6", 0), "door": (
 
 def put(printer: Printer, name: str, *, there: bool) -> None:
     node, pin, level = PINS[name]
-    printer.world._boards[node].node.set_input(printer.world.pins(node)[pin], level if there else 1 - level)
+    printer.node(node).set_input(printer.stage.pins(node)[pin], level if there else 1 - level)
 
 
 def told(stage: Served, text: str) -> int:
@@ -105,7 +105,7 @@ def test_a_job_that_runs_out_of_filament_pauses_and_parks(tmp_path: Path) -> Non
         await stage.until_job("done")
         assert printer.status("filament_switch_sensor runout")["enabled"] is False
 
-    printer.run(go)
+    printer.serve(go)
 
 
 def test_what_only_acts_lets_the_job_go_on(tmp_path: Path) -> None:
@@ -135,4 +135,4 @@ def test_what_only_acts_lets_the_job_go_on(tmp_path: Path) -> None:
         await stage.until_job("done")
         assert stage.planned[2] == 1
 
-    printer.run(go)
+    printer.serve(go)

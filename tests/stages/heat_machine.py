@@ -5,21 +5,19 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from coordinator.app import Machine, MachineStopped
-from coordinator.demo.plant import PlantSettings, machine_plants
+from coordinator.demo.plant import PlantSettings
 from coordinator.demo.plant_heat import HeatSettings
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, InTime, Reading
-from coordinator.gcode.program import Program
 from coordinator.gcode.words import parse
 from coordinator.machine.description import load_machine
 from coordinator.modules.base import Value
 from coordinator.modules.module_set import ModuleSet
-from coordinator.session import run_job
-from coordinator.simulate.scenario import BusSetting, Scenario
-from coordinator.simulate.stage import Stage
+from coordinator.simulate.scenario import BusSetting
 from coordinator.simulate.values import Range
 from nodes.node_config import NodeConfig
 from nodes.virtual.firmware import firmware_dictionary
 from nodes.virtual.plant_page import Fault, Kind, PlantPage
+from tests.stages.machine_stage import MachineStage
 from tests.stages.printer_text import printer_section, section, stepper_section
 
 BASE = (
@@ -72,7 +70,7 @@ def configured(modules: ModuleSet, node: str) -> list[str]:
     return [*config.config_commands, *config.init_commands]
 
 
-class HeatMachine:
+class HeatMachine(MachineStage):
     """The machine of TEXT, which follows BASE. HURRY: how many times faster all gets hot and cold."""
 
     def __init__(
@@ -87,50 +85,27 @@ class HeatMachine:
     ) -> None:
         path = folder / "printer.cfg"
         path.write_text(base + text)
-        scenario = Scenario(
-            name=f"heat of {folder.name}",
-            given="heat",
-            about="Heating.",
-            machine=path,
-            expect="completes",
-            causes=(),
-            weight=0.0,
-            buses={"can0": BusSetting(loss=Range(loss, loss))},
-        )
-        self.stage = Stage(scenario, seed)
-        self.world = self.stage._world
-        settings = PlantSettings(seed=seed, heat=HeatSettings(hurry=hurry))
-        self.plants = self.stage.start_plants(machine_plants(self.stage.description, settings).values())
+        plant = PlantSettings(seed=seed, heat=HeatSettings(hurry=hurry))
+        super().__init__(path, seed=seed, buses={"can0": BusSetting(loss=Range(loss, loss))}, plant=plant)
         self.notices: list[str] = []
         self.machine: Machine
 
-    def run(self, main: Callable[[], Awaitable[None]]) -> None:
+    def connected(self, main: Callable[[], Awaitable[None]]) -> None:
+        """Run MAIN with the machine connected."""
+
         async def whole() -> None:
-            self.machine = Machine(self.stage.description, self.stage.host, on_notice=self.notices.append)
+            self.machine = Machine(self.description, self.host, on_notice=self.notices.append)
             await self.machine.start()
             try:
                 await main()
             finally:
                 await self.machine.close()
 
-        with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
-            runner.run(whole())
+        self.run(whole)
 
     def print(self, *lines: str, ready: Callable[[Machine], None] | None = None) -> None:
         """Run a program to its end, as a job; READY gets the machine when it begins."""
-
-        async def whole() -> None:
-            await run_job(
-                self.stage.description,
-                Program.from_lines(lines, "part.gcode"),
-                lambda _: None,
-                on_told=lambda told: self.notices.append(str(told)),
-                on_ready=ready,
-                host=self.stage.host,
-            )
-
-        with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
-            runner.run(whole())
+        self.print_lines(lines, on_told=lambda told: self.notices.append(str(told)), on_ready=ready)
 
     # ------------------------------------------------------------------------------------------ commands
 
@@ -163,23 +138,16 @@ class HeatMachine:
     # --------------------------------------------------------------------------------------------- truth
 
     def page(self, node: str = "toolhead") -> PlantPage:
-        return self.plants[node].page
+        return super().page(node)
 
     def true_c(self, body: str = "extruder", node: str = "toolhead") -> float:
         return self.page(node).temperature(body)
 
+    def edges(self, pin: str, node: str = "toolhead") -> list[tuple[float, int]]:
+        return super().edges(pin, node)
+
     def fault(self, kind: Kind, fault: Fault, name: str = "extruder", node: str = "toolhead") -> None:
         self.page(node).set_fault(kind, name, fault)
-
-    def edges(self, pin: str, node: str = "toolhead") -> list[tuple[float, int]]:
-        """Return the changes of an output: true time (s) and level."""
-        truth, number = self.stage.board(node), self.stage.pins(node)[pin]
-        chosen = truth.pin == number
-        times, levels = truth.at_ns[chosen], truth.level[chosen]
-        return [(at * 1e-9, int(level)) for at, level in zip(times.tolist(), levels.tolist(), strict=True)]
-
-    def now_s(self) -> float:
-        return self.world.now_ns * 1e-9
 
     async def true_range(
         self, seconds: float, body: str = "extruder", node: str = "toolhead"

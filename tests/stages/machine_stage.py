@@ -1,11 +1,15 @@
 """A machine on simulated boards in virtual time, with a plant around their pins: the base of other stages."""
 
 import asyncio
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from coordinator.app import Machine
 from coordinator.demo.plant import PlantSettings, machine_plants
+from coordinator.gcode.program import Program
+from coordinator.move_source import Told
+from coordinator.session import Outcome, run_job
 from coordinator.simulate.scenario import BusSetting, NodeSetting, Scenario
 from coordinator.simulate.stage import Stage
 from nodes.virtual.plant_page import Kind, PlantPage
@@ -64,6 +68,25 @@ class MachineStage:
         """Call WHAT in AFTER_S of true time, also while a command runs."""
         self.stage.call_at(self.stage.now_ns() + round(after_s * 1e9), what)
 
+    def print_lines(
+        self,
+        lines: Iterable[str],
+        *,
+        on_told: Callable[[Told], None] = lambda _: None,
+        on_ready: Callable[[Machine], None] | None = None,
+    ) -> Outcome:
+        """Run a program to its end, as a job; ON_TOLD gets what it says, ON_READY the connected machine."""
+        return self.run(
+            lambda: run_job(
+                self.description,
+                Program.from_lines(lines, "part.gcode"),
+                lambda _: None,
+                on_told=on_told,
+                on_ready=on_ready,
+                host=self.host,
+            )
+        )
+
     # ------------------------------------------------------------------------------------------------ boards
 
     def node(self, name: str) -> WorldNode:
@@ -79,7 +102,7 @@ class MachineStage:
         """Names of the boards that have shut themselves down."""
         return {node.name for node in self.description.nodes if self.is_shut_down(node.name)}
 
-    def edges(self, pin: str, node: str = "toolhead") -> list[tuple[float, int]]:
+    def edges(self, pin: str, node: str) -> list[tuple[float, int]]:
         """Return the changes of an output: true time (s) and level."""
         truth, number = self.stage.board(node), self.stage.pins(node)[pin]
         chosen = truth.pin == number
@@ -88,7 +111,7 @@ class MachineStage:
 
     # ------------------------------------------------------------------------------------------------- plant
 
-    def page(self, node: str = "toolhead") -> PlantPage:
+    def page(self, node: str) -> PlantPage:
         """Return the truth about NODE's plant, in which faults can be switched."""
         return self.plants[node].page
 
@@ -99,7 +122,7 @@ class MachineStage:
             term.mm_per_step * motors[term.node][term.stepper].count for term in self.axes[axis].terms
         )
 
-    def true_c(self, body: str = "extruder") -> float:
+    def true_c(self, body: str) -> float:
         """Return how warm something truly is."""
         pages = (plant.page for plant in self.plants.values())
         return next(page.temperature(body) for page in pages if body in page.names(Kind.BODY))

@@ -1,23 +1,23 @@
 """A service in virtual time on a machine whose plant counts the motors' steps and knows where all is."""
 
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 
 import pytest
 
-from coordinator.demo.plant import PlantSettings, machine_plants
+from coordinator.demo.plant import PlantSettings
 from coordinator.demo.plant_heat import HeatSettings
 from coordinator.kinematics.base import Point
 from coordinator.simulate.safety_rig import MACHINE, START
-from coordinator.simulate.scenario import NodeSetting, Scenario
-from coordinator.simulate.stage import Stage
-from tests.stages.served import Served
+from coordinator.simulate.scenario import NodeSetting
+from tests.stages.machine_stage import MachineStage
+from tests.stages.served import Served, running
 
 STEP_MM = 40 / 200 / 16
 
 
-class PlantStage:
-    """A service on a machine whose plant tells where the head truly is."""
+class PlantStage(MachineStage):
+    """A service on a machine whose plant knows where the head truly is."""
 
     def __init__(
         self,
@@ -29,32 +29,19 @@ class PlantStage:
         heat: HeatSettings | None = None,
         **skew_mm: float,
     ) -> None:
-        scenario = Scenario(
-            name="plant",
-            given="plant",
-            about="A plant tells.",
-            machine=machine,
-            expect="completes",
-            causes=(),
-            weight=0.0,
-            nodes=dict(nodes or {}),
-        )
-        self.stage = Stage(scenario, 3)
-        described = machine_plants(
-            self.stage.description,
-            PlantSettings(start=start, skew_mm=skew_mm, heat=heat or HeatSettings()),
-        )
-        self.plants = self.stage.start_plants(described.values())
-        self.axes = {axis.name: axis for plant in described.values() for axis in plant.axes}
+        plant = PlantSettings(start=start, skew_mm=skew_mm, heat=heat or HeatSettings())
+        super().__init__(machine, seed=3, nodes=nodes, plant=plant)
         self._highest_mm = 0.0
-        self.served = Served(folder, lambda: self.stage.description, self.stage.host)
+        self.served = Served(folder, lambda: self.description, self.host)
 
-    def true_mm(self, axis: str) -> float:
-        """Return where an axis is, or a rail by the name of its first motor (rad where it turns)."""
-        return self.axes[axis].origin + sum(
-            term.mm_per_step * self.plants[term.node].page.motors[term.stepper].count
-            for term in self.axes[axis].terms
-        )
+    def serve(self, main: Callable[[], Awaitable[None]]) -> None:
+        """Run MAIN while the service runs."""
+
+        async def whole() -> None:
+            async with running(self.served):
+                await main()
+
+        self.run(whole)
 
     @property
     def second_approach(self) -> bool:
@@ -75,10 +62,10 @@ class PlantStage:
         lost = {n: m.lost for plant in self.plants.values() for n, m in plant.page.motors.items() if m.lost}
         assert not lost, "drivers are on and axes within their stops whenever a step comes"
         told = await self.served.call("position.get", ask_nodes=True)
-        dual = self.stage.description.dual_carriage
+        dual = self.description.dual_carriage
         shared = "" if dual is None else "xyz"[dual.carriages.axis]
         planned = {a: at for a, at in zip("xyz", self.served.planned, strict=False) if a != shared}
-        steps = {s.name: s.step_distance for s in self.stage.description.steppers}
+        steps = {s.name: s.step_distance for s in self.description.steppers}
         off = {}
         for name, axis in self.axes.items():
             at = planned[name] if name in planned else told["rails"][_motor(name)]

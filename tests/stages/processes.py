@@ -21,21 +21,6 @@ MCU_UUID, TOOLHEAD_UUID = "90a4ae022dfc", "5e1ec7ab1e02"
 END_S = 60.0
 """No command of these tests may take longer; on a busy machine they take a third of it."""
 
-SQUARE = """\
-G28
-G90
-M82
-G92 E0
-G1 Z0.3 F600
-G1 X20 Y20 F9000
-G1 X40 Y20 E1 F3000
-G1 X40 Y40 E2
-G1 X20 Y40 E3
-G1 X20 Y30 E4
-G1 Z0.6 F600
-"""
-"""Every stepper of the demo machine moves, both ways where it can; two seconds."""
-
 SLOW = """\
 G28
 G4 P1500

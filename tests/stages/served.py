@@ -1,24 +1,22 @@
-"""A machine service in this process, on virtual nodes in processes of their own, called as a client would."""
+"""A machine service in virtual time, called as a client would."""
 
 import asyncio
 import inspect
 import random
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from coordinator.host import Host, LinuxHost
+from coordinator.host import Host
 from coordinator.ipc.methods import Caller, Registry, Scope
 from coordinator.ipc.state import StateTree
 from coordinator.ipc.uploads import upload_method
-from coordinator.machine.description import MachineDescription, load_machine
+from coordinator.machine.description import MachineDescription
 from coordinator.motion.planner import Position
 from coordinator.motion.steps import resting_step
 from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
-from tests.stages.processes import Hardware
 
 LIMIT_S = 60.0
 """Nothing here may take longer, in virtual time."""
@@ -134,17 +132,6 @@ class Served:
         sent = {name: stepper["steps_sent"] for name, stepper in told["steppers"].items()}
         assert counted == sent == expected
         return dict(counted)
-
-
-@asynccontextmanager
-async def served(
-    hardware: Hardware, *, node_commands: bool = False, own_process: bool = False
-) -> AsyncIterator[Served]:
-    """Run a service on HARDWARE; READY when the block begins."""
-    load = partial(load_machine, str(hardware.config))
-    stage = Served(hardware.folder, load, LinuxHost(), node_commands=node_commands, own_process=own_process)
-    async with running(stage):
-        yield stage
 
 
 @asynccontextmanager

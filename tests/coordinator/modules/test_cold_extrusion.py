@@ -20,7 +20,7 @@ HEATER = "control: pid\npid_kp: 10\npid_ki: 1\npid_kd: 15\nmin_extrude_temp: 120
 
 
 def job(stage: HeatMachine, vocabulary: Vocabulary, *lines: str) -> Job:
-    described = stage.stage.description
+    described = stage.description
     program = Program.from_lines(lines, "part.gcode")
     home = described.homed_position
     return Job(program, Planner(described.limits), home, machine_state(described), vocabulary)
@@ -41,7 +41,7 @@ def test_a_cold_extruder_refuses_filament(tmp_path: Path, line: str) -> None:
             await play(stage, "G28", "G1 X5 F3000", line)
         assert stage.machine.stopped is None
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_hot_one_takes_it_in_the_same_program(tmp_path: Path) -> None:
@@ -61,12 +61,12 @@ def test_a_hot_one_takes_it_in_the_same_program(tmp_path: Path) -> None:
         with pytest.raises(GCodeError, match="min_extrude_temp"):
             await play(stage, "G28", "G1 X10 E0.5 F3000")
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_plan_is_never_cold(tmp_path: Path) -> None:
     stage = HeatMachine(tmp_path, HEATER)
-    described = stage.stage.description
+    described = stage.description
     vocabulary = described.modules.build(described).vocabulary
     work = job(stage, vocabulary, "G28", "M109 S200", "G1 X10 E0.5 F3000")
     events_of(work, lambda: drain(work.planner))

@@ -43,7 +43,7 @@ def test_the_part_fan(tmp_path: Path) -> None:
         with pytest.raises(WordError, match="must be 0 to 255"):
             stage.read("M106 S-1")
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_fan_starts_with_a_kick(tmp_path: Path) -> None:
@@ -59,7 +59,7 @@ def test_a_fan_starts_with_a_kick(tmp_path: Path) -> None:
         await asyncio.sleep(0.5)
         assert len(stage.edges("PB5")) - before == pytest.approx(100, abs=4), "no kick: nothing changed"
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_tachometer_tells_a_fan_that_fails(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_a_tachometer_tells_a_fan_that_fails(tmp_path: Path) -> None:
         status = stage.status("fan")
         assert (status["speed"], status["rpm"]) == (1.0, 0.0)
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_heater_goes_on_when_the_part_fan_fails_and_comes_back(tmp_path: Path) -> None:
@@ -93,7 +93,7 @@ def test_a_heater_goes_on_when_the_part_fan_fails_and_comes_back(tmp_path: Path)
         assert stage.machine.stopped is None
         assert 170 < stage.true_c() < 190
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_heater_fan_runs_while_its_heater_is_or_is_to_be_hot(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_a_heater_fan_runs_while_its_heater_is_or_is_to_be_hot(tmp_path: Path) -
         await asyncio.sleep(1)
         assert stage.edges("PB7")[-1][1] == 1, "when all stops it runs: the hot end may be hot"
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_controller_fan_runs_while_there_is_work_and_a_time_after(tmp_path: Path) -> None:
@@ -136,7 +136,7 @@ def test_a_controller_fan_runs_while_there_is_work_and_a_time_after(tmp_path: Pa
         await asyncio.sleep(5)
         assert on_part(stage, "PC5", 1, "mcu") == 0
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_controller_fan_runs_while_its_steppers_are_on(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_a_controller_fan_runs_while_its_steppers_are_on(tmp_path: Path) -> None
         await asyncio.sleep(5)
         assert running() == [0, 0, 0]
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_fan_by_its_name_and_by_hardware(tmp_path: Path) -> None:
@@ -184,7 +184,7 @@ def test_a_fan_by_its_name_and_by_hardware(tmp_path: Path) -> None:
         await asyncio.sleep(1)
         assert stage.page("mcu").item(Kind.FAN, "fan_generic_Chamber").value == pytest.approx(0.3, abs=0.01)
 
-    stage.run(main)
+    stage.connected(main)
 
 
 @pytest.mark.parametrize("control", ["watermark\nmax_delta: 2", "pid\npid_kp: 20\npid_ki: 0.5\npid_kd: 5"])
@@ -214,7 +214,7 @@ def test_a_temperature_fan_follows_its_sensor(tmp_path: Path, control: str) -> N
         with pytest.raises(WordError, match="outside what"):
             stage.read("SET_TEMPERATURE_FAN_TARGET TEMPERATURE_FAN=bed_side TARGET=200")
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_fans_enable_pin(tmp_path: Path) -> None:
@@ -231,4 +231,4 @@ def test_a_fans_enable_pin(tmp_path: Path) -> None:
         await asyncio.sleep(1)
         assert [level for _, level in stage.edges("PC6", "mcu")] == [1, 0, 1]
 
-    stage.run(main)
+    stage.connected(main)

@@ -31,7 +31,7 @@ def test_a_boards_chip_is_measured(tmp_path: Path) -> None:
         assert "C:35" in (await stage.do("M105"))[0]
         await stage.do('TEMPERATURE_WAIT SENSOR="temperature_sensor board" MINIMUM=30')
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_two_points_of_ones_own_correct_it(tmp_path: Path) -> None:
@@ -42,7 +42,7 @@ def test_two_points_of_ones_own_correct_it(tmp_path: Path) -> None:
         expected = 20 + (859 / 4095 - 0.2) / 0.02 * 40
         assert stage.status("temperature_sensor board")["temperature"] == pytest.approx(expected, abs=0.1)
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_the_host_is_looked_at_again_and_again(tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_the_host_is_looked_at_again_and_again(tmp_path: Path) -> None:
         assert told() == 40
         assert stage.status("temperature_sensor computer")["measured_max_temp"] == 51
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_host_without_the_file_is_told_so(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_a_host_without_the_file_is_told_so(tmp_path: Path) -> None:
         pytest.fail("it started")
 
     with pytest.raises(CanductorError, match=r"none cannot be read: No such file.*correct sensor_path"):
-        stage.run(main)
+        stage.connected(main)
 
 
 def test_a_host_that_is_too_hot_stops_the_machine(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_host_that_is_too_hot_stops_the_machine(tmp_path: Path) -> None:
         (tmp_path / "temp").write_text("81000")
         assert "tells 81 °C, outside its min_temp" in await stage.stopped(20)
 
-    stage.run(main)
+    stage.connected(main)
 
 
 @pytest.mark.parametrize(("method", "expected"), [("min", 25), ("max", 41), ("mean", 33)])
@@ -101,7 +101,7 @@ def test_several_sensors_become_one(tmp_path: Path, method: str, expected: float
         assert isinstance(found, float)
         assert found == pytest.approx(expected, abs=3)
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_sensors_that_are_too_far_apart_stop_the_machine(tmp_path: Path) -> None:
@@ -114,7 +114,7 @@ def test_sensors_that_are_too_far_apart_stop_the_machine(tmp_path: Path) -> None
         stopped = await stage.stopped(60)
         assert "K apart, more than maximum_deviation (8 K): extruder 25" in stopped
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_combined_sensor_waits_for_all_of_them(tmp_path: Path) -> None:
@@ -135,7 +135,7 @@ def test_a_combined_sensor_waits_for_all_of_them(tmp_path: Path) -> None:
         await asyncio.sleep(3)
         assert stage.status("temperature_sensor both")["temperature"] is None
 
-    stage.run(main)
+    stage.connected(main)
 
 
 @pytest.mark.parametrize(

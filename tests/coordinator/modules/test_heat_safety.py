@@ -47,7 +47,7 @@ def test_a_sensor_whose_wire_is_broken(tmp_path: Path, fault: Fault, hot: bool) 
         assert 0 < stage.heater_off_after(broken_s) < 1.8
         assert stage.status("extruder")["target"] == 0
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_sensor_that_fell_out(tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ def test_a_sensor_that_fell_out(tmp_path: Path) -> None:
         assert stage.heater_off_after(told_s) < 0.1
         assert stage.true_c() < 230, "before anything burns"
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_heater_that_does_nothing(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_a_heater_that_does_nothing(tmp_path: Path) -> None:
         await asyncio.sleep(1)
         assert stage.heater_off_after(told_s) < 0.1
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_switch_that_is_stuck_on_while_it_is_off(tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_a_switch_that_is_stuck_on_while_it_is_off(tmp_path: Path) -> None:
         assert "heats though it is off" in text
         assert stage.true_c() < 100, "long before the node would stop at max_temp"
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_switch_that_is_stuck_on_while_it_holds_ends_at_the_nodes_own_limit(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_a_switch_that_is_stuck_on_while_it_holds_ends_at_the_nodes_own_limit(tm
         await asyncio.sleep(1)
         assert stage.heater_off_after(stage.now_s()) < 0, "the pin says off; the switch does not obey"
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_more_cooling_than_the_heater_can_give(tmp_path: Path) -> None:
@@ -118,7 +118,7 @@ def test_more_cooling_than_the_heater_can_give(tmp_path: Path) -> None:
         text = await stage.stopped()
         assert "did not get 2 K nearer to 290 °C" in text
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_the_wires_to_a_node_are_cut(tmp_path: Path) -> None:
@@ -128,7 +128,7 @@ def test_the_wires_to_a_node_are_cut(tmp_path: Path) -> None:
     async def main() -> None:
         await stage.do("M140 S100")
         await hold(stage, 200)
-        board = stage.stage._boards["toolhead"].node
+        board = stage.node("toolhead")
         assert board.controller is not None
         board.controller.cut(1)
         cut_s = stage.now_s()
@@ -138,7 +138,7 @@ def test_the_wires_to_a_node_are_cut(tmp_path: Path) -> None:
         assert stage.heater_off_after(cut_s) <= LIMIT_S
         assert stage.heater_off_after(cut_s, "PC1", "mcu") <= NOTICE_S
 
-    stage.run(main)
+    stage.connected(main)
 
 
 @pytest.mark.parametrize("frozen", ["python", "all"])
@@ -148,14 +148,14 @@ def test_the_host_stands_still_for_two_seconds(tmp_path: Path, frozen: str) -> N
     async def main() -> None:
         await hold(stage, 200)
         stalled_s = stage.now_s()
-        stage.world.stall(2.0, io=frozen == "all")
+        stage.stage.stall(2.0, io=frozen == "all")
         text = await stage.stopped()
         assert "node toolhead shut down" in text
         await asyncio.sleep(1)
         off_s = stage.heater_off_after(stalled_s)
         assert 0 < off_s <= LIMIT_S
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_host_that_is_slow_does_not_end_the_heat(tmp_path: Path) -> None:
@@ -164,13 +164,13 @@ def test_a_host_that_is_slow_does_not_end_the_heat(tmp_path: Path) -> None:
     async def main() -> None:
         await hold(stage, 200)
         for _ in range(5):
-            stage.world.stall(0.7)
+            stage.stage.stall(0.7)
             await asyncio.sleep(3)
         assert stage.machine.stopped is None
         low, high = await stage.true_range(5)
         assert 190 < low <= high < 210
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_the_host_is_gone(tmp_path: Path) -> None:
@@ -180,9 +180,9 @@ def test_the_host_is_gone(tmp_path: Path) -> None:
     async def main() -> None:
         await hold(stage, 200)
 
-    stage.run(main)
+    stage.connected(main)
     gone_s = stage.now_s()
-    stage.world.run_for(10)
+    stage.run(lambda: asyncio.sleep(10))
     assert 0 < stage.heater_off_after(gone_s) <= LIMIT_S
 
 
@@ -199,7 +199,7 @@ def test_an_emergency_stop(tmp_path: Path) -> None:
         assert stage.heater_off_after(stopped_s, "PC1", "mcu") < 0.05
         assert stage.status("heater_bed")["target"] == 0
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_who_waits_for_a_temperature_learns_that_it_will_not_come(tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_who_waits_for_a_temperature_learns_that_it_will_not_come(tmp_path: Path
         await asyncio.wait((waiting,), timeout=10)
         assert "did not get 2 K nearer" in str(waiting.exception())
 
-    stage.run(main)
+    stage.connected(main)
 
 
 BOX = (
@@ -228,7 +228,7 @@ def test_a_node_that_may_be_away_takes_its_heater_along(tmp_path: Path) -> None:
     async def main() -> None:
         await stage.do("SET_HEATER_TEMPERATURE HEATER=chamber TARGET=60")
         await asyncio.sleep(3)
-        board = stage.stage._boards["box"].node
+        board = stage.node("box")
         assert board.controller is not None
         cut_s = stage.now_s()
         board.controller.cut(1)
@@ -246,4 +246,4 @@ def test_a_node_that_may_be_away_takes_its_heater_along(tmp_path: Path) -> None:
         await asyncio.sleep(3)
         assert stage.edges("PA1", "box")[-1][1] == 1
 
-    stage.run(main)
+    stage.connected(main)

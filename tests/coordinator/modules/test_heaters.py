@@ -38,7 +38,7 @@ def test_a_hot_end_is_held_within_a_kelvin_of_the_truth(tmp_path: Path, control:
         await asyncio.sleep(2)
         assert stage.heater_off_after(stage.now_s()) < 0
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_bed_by_watermark_and_lost_frames(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_a_bed_by_watermark_and_lost_frames(tmp_path: Path) -> None:
         assert 58.5 < low <= high < 62, "it swings by max_delta and what the delay adds"
         assert "B:" in (await stage.do("M105"))[0]
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_pid_calibration_gives_constants_that_hold(tmp_path: Path) -> None:
@@ -76,7 +76,7 @@ def test_pid_calibration_gives_constants_that_hold(tmp_path: Path) -> None:
         low, high = await stage.true_range(10)
         assert 209 < low <= high < 211
 
-    stage.run(main)
+    stage.connected(main)
     assert "\n#*# [extruder]\n#*# control = pid\n#*# pid_kp = " in Path(saved[0]).read_text()
     assert not check_config(saved[0])
 
@@ -100,7 +100,7 @@ def test_mpc_calibration_finds_the_plant(tmp_path: Path) -> None:
         low, high = await stage.true_range(10)
         assert 219 < low <= high < 221
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_wait_can_be_cancelled_and_the_heater_goes_on(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_a_wait_can_be_cancelled_and_the_heater_goes_on(tmp_path: Path) -> None:
             "can_extrude": False,
         }
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_calibration_that_is_cancelled_leaves_the_heater_off(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_a_calibration_that_is_cancelled_leaves_the_heater_off(tmp_path: Path) -
         assert stage.heater_off_after(stage.now_s()) < 0
         assert stage.status("extruder")["power"] == 0
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_temperature_wait_in_both_directions(tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_temperature_wait_in_both_directions(tmp_path: Path) -> None:
         air = stage.status("temperature_sensor air")
         assert air["temperature"] == pytest.approx(25, abs=1)
 
-    stage.run(main)
+    stage.connected(main)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def calm(tmp_path_factory: pytest.TempPathFactory) -> HeatMachine:
     async def main() -> None:
         await stage.do("M105")
 
-    stage.run(main)
+    stage.connected(main)
     return stage
 
 

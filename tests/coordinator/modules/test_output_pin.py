@@ -43,7 +43,7 @@ def test_a_digital_output_has_its_values(tmp_path: Path) -> None:
             with pytest.raises(WordError, match=why):
                 stage.read(line)
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_pwm_by_software_begins_where_it_is_told_to_and_ends_at_its_shutdown(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_pwm_by_software_begins_where_it_is_told_to_and_ends_at_its_shutdown(tmp
         await asyncio.sleep(1)
         assert stage.edges("PC6", "mcu")[-1][1] == 1
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_pwm_by_hardware(tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_static_outputs_are_switched_at_the_start(tmp_path: Path) -> None:
         await asyncio.sleep(1)
         assert [level for _, level in stage.edges("PC5", "mcu")] == [1], "it stays so"
 
-    stage.run(main)
+    stage.connected(main)
 
 
 @pytest.mark.parametrize(
@@ -128,4 +128,4 @@ def test_query_adc_tells_what_converters_read(tmp_path: Path) -> None:
         with pytest.raises(WordError, match="there is no 'x'"):
             stage.read("QUERY_ADC NAME=x")
 
-    stage.run(main)
+    stage.connected(main)

@@ -44,7 +44,7 @@ def test_a_profile_is_loaded_and_left_again(tmp_path: Path) -> None:
             with pytest.raises(WordError, match=re.escape(why)):
                 stage.read(line)
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_target_is_kept_without_a_jump_where_that_is_wanted(tmp_path: Path) -> None:
@@ -61,7 +61,7 @@ def test_a_target_is_kept_without_a_jump_where_that_is_wanted(tmp_path: Path) ->
         assert isinstance(power, float)
         assert power == pytest.approx(before, abs=0.1)
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_profile_is_saved_and_there_at_the_next_start(tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_a_profile_is_saved_and_there_at_the_next_start(tmp_path: Path) -> None:
         assert any("profile mine of extruder is there" in notice for notice in stage.notices)
         await stage.do("SAVE_CONFIG")
 
-    stage.run(main)
+    stage.connected(main)
     path = tmp_path / "printer.cfg"
     assert "\n#*# [pid_profile extruder mine]\n#*# control = pid\n#*# pid_kp = 25\n" in path.read_text()
     (tmp_path / "again").mkdir()
@@ -85,7 +85,7 @@ def test_a_profile_is_saved_and_there_at_the_next_start(tmp_path: Path) -> None:
         assert heaters.units["extruder"].controller is not None
         assert (await again.do("PID_PROFILE GET_VALUES=1 HEATER=extruder"))[0] == told("mine", "25 1.5 99")
 
-    again.run(then)
+    again.connected(then)
 
 
 @pytest.mark.parametrize("name", ["extruder", "hotend fast", "extruder default"])
