@@ -229,6 +229,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--file", default="", help="only this file")
     parser.add_argument("--lines", default="", help="only these lines of it, A:B")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--measure", action="store_true", help="measure the coverage of all tests again")
     parser.add_argument("--list", action="store_true", help="only print the sample")
     options = parser.parse_args(arguments)
     chosen = [options.file] if options.file else areas.files(options.area)
@@ -241,7 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.list:
         say(*map(str, sample))
         return 0
-    covered = coverage_map.collect()
+    covered = coverage_map.collect(everything=options.measure)
     if covered.failed:
         say(f"not counted, since they do not pass: {len(covered.failed)} tests", *covered.failed)
     verdicts = []
