@@ -226,7 +226,7 @@ def test_hardware_pwm_within_its_limit_is_renewed_to_the_tick() -> None:
     assert host.dies(run=1) == "Missed scheduling of next hard pwm event"
 
 
-# ------------------------------------------------------------------------------------------------- stop groups
+# ------------------------------------------------------------------------------------------------ stop groups
 
 
 def stepping(interval: int = 1000) -> Host:
