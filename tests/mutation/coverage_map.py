@@ -87,7 +87,7 @@ def collect(*, everything: bool = False) -> CoverageMap:
     for file, source in sources.items():
         firsts[file] = total
         total += len(c_source.statement_spans(source))
-    state = {"firsts": firsts, "digests": {file: _digest(ROOT / file) for file in files()}}
+    digests = {file: _digest(ROOT / file) for file in files()}
     stale = [file for file in _test_files() if everything or not _is_current(file)]
     if stale:
         sys.stdout.write(f"coverage: measuring {len(stale)} test files\n")
@@ -101,8 +101,10 @@ def collect(*, everything: bool = False) -> CoverageMap:
         _run_pytest(copy, [file for file in stale if file.endswith(".py")], total)
         _run_c_tests(copy, [file for file in stale if file.endswith(".c")])
         for file in stale:
-            _stamp(file).write_text(json.dumps({"test": _digest(ROOT / file), **state}))
-    return _read(state["digests"])
+            _stamp(file).write_text(
+                json.dumps({"test": _digest(ROOT / file), "firsts": firsts, "digests": digests})
+            )
+    return _read(digests)
 
 
 def _digest(*paths: Path) -> str:

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import PurePath
 from queue import SimpleQueue
 from typing import Final
 
@@ -85,16 +86,20 @@ def in_order(
 ) -> list[CoveringTest]:
     """Return which of TESTS are run for a mutant of FILE, and in what order; test files stay together.
 
-    First those that have killed mutants of FILE, then those in the folder that mirrors it, then the quick.
+    First the C programs of FILE's own folder, then what has killed mutants of FILE, then what is in the folder
+    that mirrors it, then the quick.
     """
     by_file: dict[str, list[CoveringTest]] = {}
     for test in sorted(tests, key=lambda t: (t.seconds, t.name)):
         by_file.setdefault(test.file, []).append(test)
     room = file.split("/", maxsplit=1)[0]
 
-    def rank(name: str) -> tuple[int, bool, float]:
+    folder = f"tests/{PurePath(file).parent}/"
+
+    def rank(name: str) -> tuple[bool, int, bool, float]:
+        is_near = name.startswith(folder) and name.endswith(".c")
         mirrors = name.startswith(f"tests/{room}/")
-        return -history[name], not mirrors, sum(test.seconds for test in by_file[name])
+        return not is_near, -history[name], not mirrors, sum(test.seconds for test in by_file[name])
 
     chosen: list[CoveringTest] = []
     spent_s = 0.0
