@@ -30,9 +30,7 @@ static void stop_members(struct node *node, struct trsync *trsync) {
     trsync->members = NULL;
     while (member) {
         struct trsync_member *next = member->next;
-        void (*stop)(struct node *, struct trsync_member *) = member->stop;
-        member->stop = NULL;
-        stop(node, member);
+        member->stop(node, member);
         member = next;
     }
 }
@@ -64,15 +62,13 @@ void trsync_trigger_group(struct node *node, uint8_t group, uint8_t reason) {
 }
 
 void trsync_join(struct node *node, struct trsync *trsync, struct trsync_member *member) {
-    void (*stop)(struct node *, struct trsync_member *) = member->stop;
     for (const struct trsync_member *other = trsync->members; other; other = other->next)
         if (other == member) {
             node_shutdown(node, STRING(already_joined));
             return;
         }
     if (!trsync->can_trigger) {
-        member->stop = NULL;
-        stop(node, member);
+        member->stop(node, member);
         return;
     }
     member->next = trsync->members;

@@ -1,4 +1,7 @@
-"""Which tests execute a mutated line: collected once, kept, renewed where tests or sources changed."""
+"""Which tests execute a mutated line: measured once, kept, and measured again for test files that changed.
+
+Of a source file that changed since, all tests count that executed anything in it: too many, but none less.
+"""
 
 import hashlib
 import json
@@ -50,11 +53,17 @@ class CoverageMap:
     by_file: dict[str, set[CoveringTest]] = field(default_factory=lambda: defaultdict(set))
     imported: set[tuple[str, int]] = field(default_factory=set)
     """Python lines executed when the file is imported."""
+    changed: set[tuple[str, str]] = field(default_factory=set)
+    """Test file and source file that changed after the former was measured."""
     failed: list[str] = field(default_factory=list)
     """Tests that do not pass on the unchanged project; they do not count."""
 
     def tests(self, mutation: Mutation, source: bytes) -> set[CoveringTest]:
         """Return the tests that execute what MUTATION changes in SOURCE, the unchanged file."""
+        changed = {test for test in self.by_file[mutation.file] if (test.file, mutation.file) in self.changed}
+        return changed | self._tests(mutation, source)
+
+    def _tests(self, mutation: Mutation, source: bytes) -> set[CoveringTest]:
         if mutation.is_c:
             spans = list(enumerate(c_source.statement_spans(source)))
             around = [(end - start, k) for k, (start, end) in spans if start <= mutation.start < end]
@@ -70,16 +79,16 @@ class CoverageMap:
         return set()
 
 
-def collect() -> CoverageMap:
-    """Return the map, with what is out of date measured again: minutes when all is."""
+def collect(*, everything: bool = False) -> CoverageMap:
+    """Return the map, with what is out of date measured again; EVERYTHING takes minutes."""
     copy = ProjectCopy("instrumented")
     sources = {file: (ROOT / file).read_bytes() for file in files() if file.endswith((".c", ".h"))}
     firsts, total = {}, 0
     for file, source in sources.items():
         firsts[file] = total
         total += len(c_source.statement_spans(source))
-    state = _digest(*(ROOT / file for file in files()))
-    stale = [file for file in _test_files() if not _is_current(file, state)]
+    digests = {file: _digest(ROOT / file) for file in files()}
+    stale = [file for file in _test_files() if everything or not _is_current(file)]
     if stale:
         sys.stdout.write(f"coverage: measuring {len(stale)} test files\n")
         sys.stdout.flush()
@@ -92,8 +101,10 @@ def collect() -> CoverageMap:
         _run_pytest(copy, [file for file in stale if file.endswith(".py")], total)
         _run_c_tests(copy, [file for file in stale if file.endswith(".c")])
         for file in stale:
-            _stamp(file).write_text(_digest(ROOT / file) + state)
-    return _read(firsts)
+            _stamp(file).write_text(
+                json.dumps({"test": _digest(ROOT / file), "firsts": firsts, "digests": digests})
+            )
+    return _read(digests)
 
 
 def _digest(*paths: Path) -> str:
@@ -124,8 +135,8 @@ def _stamp(file: str) -> Path:
     return _result(file).with_suffix(".stamp")
 
 
-def _is_current(file: str, state: str) -> bool:
-    return _stamp(file).exists() and _stamp(file).read_text() == _digest(ROOT / file) + state
+def _is_current(file: str) -> bool:
+    return _stamp(file).exists() and json.loads(_stamp(file).read_text())["test"] == _digest(ROOT / file)
 
 
 def _run_pytest(copy: ProjectCopy, tests: list[str], total: int) -> None:
@@ -164,30 +175,37 @@ def _run_c_tests(copy: ProjectCopy, tests: list[str]) -> None:
         _result(program.name).write_text(json.dumps({"imported": {}, "tests": {program.name: test}}))
 
 
-def _read(firsts: dict[str, int]) -> CoverageMap:
-    """Return what is stored, with numbers of statements made relative to their file."""
-    bounds = sorted((first, file) for file, first in firsts.items())
+def _read(digests: dict[str, str]) -> CoverageMap:
+    """Return what is stored; DIGESTS are those of the sources as they are."""
     found = CoverageMap()
     for name in _test_files():
         if not _result(name).exists():
             continue
-        stored = json.loads(_result(name).read_text())
+        stored, stamp = json.loads(_result(name).read_text()), json.loads(_stamp(name).read_text())
+        bounds = sorted((first, file) for file, first in stamp["firsts"].items())
+        differs = {file for file, digest in digests.items() if stamp["digests"].get(file) != digest}
+        found.changed |= {(name, file) for file in differs}
         for file, lines in stored["imported"].items():
-            found.imported |= {(file, line) for line in lines}
+            found.imported |= {(file, line) for line in lines if file not in differs}
         for node_id, entry in stored["tests"].items():
-            test = CoveringTest(node_id, entry["seconds"])
             if not entry["passed"]:
                 found.failed.append(node_id)
                 continue
-            at = 0
-            for number in entry["c"]:
-                while at + 1 < len(bounds) and bounds[at + 1][0] <= number:
-                    at += 1
-                first, file = bounds[at]
-                found.by_statement[file, number - first].add(test)
+            test = CoveringTest(node_id, entry["seconds"])
+            for file, number in _in_files(entry["c"], bounds):
+                found.by_statement[file, number].add(test)
                 found.by_file[file].add(test)
             for file, lines in entry["python"].items():
                 found.by_file[file].add(test)
                 for line in lines:
                     found.by_line[file, line].add(test)
     return found
+
+
+def _in_files(numbers: list[int], bounds: list[tuple[int, str]]) -> Iterator[tuple[str, int]]:
+    """Yield file and number in it of each of NUMBERS, which rise and go through all files."""
+    at = 0
+    for number in numbers:
+        while at + 1 < len(bounds) and bounds[at + 1][0] <= number:
+            at += 1
+        yield bounds[at][1], number - bounds[at][0]

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import PurePath
 from queue import SimpleQueue
 from typing import Final
 
@@ -85,16 +86,20 @@ def in_order(
 ) -> list[CoveringTest]:
     """Return which of TESTS are run for a mutant of FILE, and in what order; test files stay together.
 
-    First those that have killed mutants of FILE, then those in the folder that mirrors it, then the quick.
+    First the C programs of FILE's own folder, then what has killed mutants of FILE, then what is in the folder
+    that mirrors it, then the quick.
     """
     by_file: dict[str, list[CoveringTest]] = {}
     for test in sorted(tests, key=lambda t: (t.seconds, t.name)):
         by_file.setdefault(test.file, []).append(test)
     room = file.split("/", maxsplit=1)[0]
 
-    def rank(name: str) -> tuple[int, bool, float]:
+    folder = f"tests/{PurePath(file).parent}/"
+
+    def rank(name: str) -> tuple[bool, int, bool, float]:
+        is_near = name.startswith(folder) and name.endswith(".c")
         mirrors = name.startswith(f"tests/{room}/")
-        return -history[name], not mirrors, sum(test.seconds for test in by_file[name])
+        return not is_near, -history[name], not mirrors, sum(test.seconds for test in by_file[name])
 
     chosen: list[CoveringTest] = []
     spent_s = 0.0
@@ -229,6 +234,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--file", default="", help="only this file")
     parser.add_argument("--lines", default="", help="only these lines of it, A:B")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--measure", action="store_true", help="measure the coverage of all tests again")
     parser.add_argument("--list", action="store_true", help="only print the sample")
     options = parser.parse_args(arguments)
     chosen = [options.file] if options.file else areas.files(options.area)
@@ -241,7 +247,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.list:
         say(*map(str, sample))
         return 0
-    covered = coverage_map.collect()
+    covered = coverage_map.collect(everything=options.measure)
     if covered.failed:
         say(f"not counted, since they do not pass: {len(covered.failed)} tests", *covered.failed)
     verdicts = []

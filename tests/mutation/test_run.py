@@ -51,11 +51,12 @@ def test_a_sample_depends_on_its_seed_alone() -> None:
 def test_tests_run_in_the_order_in_which_they_promise_to_fail() -> None:
     tests = [CoveringTest("tests/nodes/test_a.py::x", 0.1), CoveringTest("tests/firmware/test_b.py::y", 1.0)]
     tests += [CoveringTest("tests/firmware/test_b.py::z", 0.5), CoveringTest("tests/sim/test_c.py::w", 50.0)]
-    names = [test.name[-1] for test in run.in_order(set(tests), SCHED, Counter())]
+    names = [test.name[-1] for test in run.in_order(set(tests), SCHED, Counter(), 99.0)]
     assert names == ["z", "y", "x", "w"], "what mirrors the file first, then what is quick"
-    names = [test.name[-1] for test in run.in_order(set(tests), SCHED, Counter({"tests/sim/test_c.py": 1}))]
+    history = Counter({"tests/sim/test_c.py": 1})
+    names = [test.name[-1] for test in run.in_order(set(tests), SCHED, history, 99.0)]
     assert names == ["w", "z", "y", "x"], "what has killed before comes first"
-    short = run.in_order(set(tests), SCHED, Counter(), budget_s=3.0)
+    short = run.in_order(set(tests), SCHED, Counter(), 3.0)
     assert [test.name[-1] for test in short] == ["z", "y", "x"], "what is too slow is left out"
 
 
