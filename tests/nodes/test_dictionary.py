@@ -123,9 +123,8 @@ def test_every_format_round_trips(name: str) -> None:
 def any_message(draw: st.DrawFn) -> tuple[Dictionary, MessageFormat, dict[str, Value]]:
     dictionary = draw(st.sampled_from(list(DICTIONARIES.values())))
     message = draw(st.sampled_from(messages_of(dictionary)))
-    texts: st.SearchStrategy[Value] = st.binary(max_size=LONGEST)
-    values = {
-        name: draw(st.integers(*bounds(code)) if code in twin.CODES else texts)
+    values: dict[str, Value] = {
+        name: draw(st.integers(*bounds(code))) if code in twin.CODES else draw(st.binary(max_size=LONGEST))
         for name, code in zip(message.names, message.code_texts, strict=True)
     }
     return dictionary, message, values
