@@ -1,13 +1,76 @@
 // SPDX-License-Identifier: Apache-2.0
-// What programs ask of a bus and its links, whatever drives it (io_core.h).
+// What programs ask of a bus and its links, whatever drives it. This comment is the manual of nodes/link; the
+// headers below describe one function each.
 //
-// The driver's lock guards everything of one bus, and nothing blocks under it. What is for Python (responses,
-// raw frames, notices) waits in bounded rings; the driver tells when there is something, and io_take() hands
-// it over in batches. Functions may be called from any thread when the driver's lock is one.
+// LAYERS. Each knows only those below it. A program includes this header, and io_thread.h for a thread.
 //
-// When Python is slow: reading goes on, because the acknowledgements in the stream carry the motion, and a
-// full ring drops its oldest entry and counts it. Answers may get lost on the wire too; who asked asks again.
-// Notices (link lost, drained, transport closed) are flags and never dropped.
+//     io_thread.h   a thread that drives a bus over a file descriptor; a simulation takes its place
+//     io_api.h      for programs: open links, send, take what arrived, read counters
+//     io_core.h     for drivers: bytes and time in, bytes and a deadline out
+//     schedule.h    one bus's budget and order: who sends next, how much may sit in the kernel
+//     link.h        one node's link: blocks, window, acknowledgements, repeats (states: docs/link-states.md)
+//     queue.h       a bounded queue of commands, in the format of batch.h
+//
+// io_bus.h and link_core.h are the insides of the core and of the link, and for nobody else.
+//
+// TIME. NOW is the host's CLOCK_MONOTONIC, or a simulation's time, in ns; it never steps back. Clocks are a
+// node's ticks in 64 bits, which io_set_clock relates to ns. Nothing here reads a clock but by way of the
+// driver's now(). Two ways to be told of time: io_deadline() says when the core has something to do, and a
+// core called later than that is late, but not wrong.
+//
+// OWNERSHIP. io_new() and io_start() give the caller a bus, which io_free() or io_stop() takes back. Links
+// belong to their bus and are named by numbers, which are never used again, so that a stale one is harmless:
+// IO_GONE. Whatever is passed in (content, batches, settings, the driver's struct) is copied before the call
+// returns; whatever is passed out is written to the caller's memory. No pointer into the core leaves it. The
+// file descriptor and the driver's context stay the caller's and outlive the bus.
+//
+// LIFETIME. A bus works from io_new() until its transport ends: io_end(), which the thread calls at an end of
+// file or an error. Then every call that would send returns IO_CLOSED, one IO_ENDED waits for io_take(), and
+// counters, io_take() and io_close_link() go on working until the bus is freed. A link works from
+// io_open_link() until it is lost (one IO_LOST) or closed. Both are final, and its node id is free for
+// another link once it is closed. When a bus is freed or stopped nobody may be inside a call on it, nor come
+// later.
+//
+// THREADS. One lock of the driver guards everything of one bus; different buses share nothing. With the I/O
+// thread, all functions of this header may be called from any thread at any time between io_start() and
+// io_stop(). Functions of io_core.h want the lock held; link.h, schedule.h and queue.h have no lock at all
+// and belong to whoever holds their bus's. Counters are the exception: io_get_stats() and io_get_link_stats()
+// take no lock and wait for nobody; they are never older than what io_take() has handed over.
+//
+// RE-ENTRY. The core calls the driver's kick, notify and quiet under the lock, from within the call that
+// caused them: they must not call functions of this header for the same bus, and must not block. (The
+// thread's kick writes what can go at once to the descriptor, which is non-blocking.) Nothing else is called
+// back: what programs want to know waits until they take it.
+//
+// COST. Memory is allocated when a bus is made and when a link is opened (some IO_MOTION_BYTES +
+// IO_CONTROL_BYTES + IO_BULK_BYTES), nowhere else. Bounds, with L links of a bus:
+//
+//     io_send, io_send_urgent     the command's size, L, and what the driver's kick sends at once
+//     io_send_batch               the batch's size (it is checked, copied, noted for the forecast), L, and
+//                                 what the kick sends
+//     io_take                     the room given
+//     io_received                 the bytes moved
+//     io_next                     for each frame written a look at all L links, each of which looks at no
+//                                 more commands than a block holds
+//     io_handle_time, io_deadline L
+//     io_forecast                 L times 512 stretches of queued motion, and 1024 bins of 10 ms: once per
+//                                 batch, not per command
+//     io_get_stats, io_get_link_stats
+//                                 a copy of the struct
+//
+// FULL QUEUES. Nothing is taken in part and nothing waits: a command, batch or frame that has no room is
+// refused with IO_FULL, and the caller tries later. Delivery to the node is reliable and in order within a
+// class (LINK_MOTION, LINK_CONTROL, LINK_BULK) from IO_OK on, unless the link is lost or io_send_urgent drops
+// what is queued. Answers of nodes are checked, but not repeated: they may get lost, and who asked asks
+// again.
+//
+// SLOW PROGRAMS. Reading goes on when nobody takes what arrived, because the acknowledgements in the stream
+// carry the motion; a full ring drops its oldest entry and counts it. Notices (link lost, drained, transport
+// ended) are flags, and are never dropped.
+//
+// GARBAGE. Bytes off a wire never fail a call: what is no sound block or frame is dropped and counted
+// (bytes_invalid, frames_malformed, acks_never_sent). Arguments out of range give IO_INVALID, and nothing is
+// done.
 #ifndef LINK_IO_API_H
 #define LINK_IO_API_H
 
@@ -125,7 +188,7 @@ enum io_status io_get_link_stats(const struct io_bus *bus, uint32_t number, stru
 void io_get_stats(const struct io_bus *bus, struct io_stats *out);
 
 // Whether the queued motion of all links will be in time, if the bus goes on as in the last second. Looks
-// ahead over FORECAST_NS; what is due later counts once it comes near.
+// ahead over some 10 s; what is due later counts once it comes near.
 struct io_forecast {
     uint64_t now_ns;
     double worst_ratio; // highest demand of any stretch of time relative to what the bus can carry in it

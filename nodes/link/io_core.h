@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The sans-IO core of one bus, as its driver sees it: bytes and time in, bytes and a deadline out.
+// The sans-IO core of one bus, as its driver sees it: bytes and time in, bytes and a deadline out. The manual
+// is in io_api.h.
 //
 // A driver moves the bytes: the I/O thread (io_thread.h), or a simulation under virtual time. The core reads
 // no clock, sleeps never and touches no descriptor. What programs ask of a bus is in io_api.h, and works on

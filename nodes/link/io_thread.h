@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The I/O thread of a bus: drives its core (io_core.h) over a transport's file descriptor.
+// The I/O thread of a bus: drives its core (io_core.h) over a transport's file descriptor. The manual is in
+// io_api.h.
 //
 // One mutex guards everything of one bus; the thread holds it while it works and never while it sleeps, and
 // nothing blocks under it. The file descriptor io_notice_fd() becomes readable when io_take() has something.

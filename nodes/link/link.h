@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// One node's link, host side, sans-IO: commands in, message blocks out; bytes in, responses out.
+// One node's link, host side, sans-IO: commands in, message blocks out; bytes in, responses out. How the
+// headers of this folder belong together: io_api.h.
 //
 // Delivery to the node is reliable and in order, answers are checked but not repeated (they may get lost; who
 // asked asks again). The owner provides memory and time: NOW is the host's CLOCK_MONOTONIC in ns and never
