@@ -462,9 +462,10 @@ def test_another_user_who_sends_and_closes_gets_nothing(tmp_path: Path, *, pings
 def test_another_user_at_the_unix_socket_gets_nothing(tmp_path: Path) -> None:
     """The kernel notes who connects (SO_PEERCRED), and keeps that when the socket is closed."""
 
+    tmp_path.chmod(0o711)
+
     async def go(paged: Paged) -> None:
         paged.served.path.chmod(0o666)
-        tmp_path.chmod(0o711)
         folder = os.open(tmp_path, os.O_RDONLY | os.O_DIRECTORY)
         requests = [
             {"id": 1, "method": "api.hello", "params": {"version": 1}},
