@@ -208,7 +208,7 @@ def test_the_cookie_is_for_this_page_and_not_for_scripts(tmp_path: Path) -> None
             async with posted as answer:
                 (cookie,) = answer.cookies.values()
                 told = await answer.text()
-                assert answer.headers["Cache-Control"] == "no-cache"
+                assert answer.headers["Cache-Control"] == "no-store"
             assert cookie.key == f"canductor-{paged.page.port}"
             assert cookie["httponly"]
             assert (cookie["samesite"], cookie["path"], cookie["domain"]) == ("Strict", "/", "")
