@@ -240,7 +240,8 @@ class WebServer:
             self._access.sign_out(former)
         signed_in = self._access.sign_in(_host(request), scope, digest, time.time())
         await self._save_sessions()
-        answer = web.json_response({"key": signed_in.key, "scope": scope.word}, headers=HEADERS)
+        headers = {**HEADERS, "Cache-Control": "no-store"}
+        answer = web.json_response({"key": signed_in.key, "scope": scope.word}, headers=headers)
         answer.set_cookie(
             self._cookie_name,
             signed_in.cookie,

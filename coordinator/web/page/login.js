@@ -29,6 +29,15 @@ export class Login {
     else this.ask();
   }
 
+  /** The key was refused: use the one of another tab that signed in meanwhile, or ask. */
+  refused() {
+    const key = read();
+    if (key && key !== this.#key) {
+      this.#key = key;
+      this.#on_key(key);
+    } else this.ask();
+  }
+
   /** Show the form; FAULT says why, if something was wrong. */
   ask(fault) {
     put($("login-told"), fault?.message ?? "Open the link that canductor prints, or give it here.");

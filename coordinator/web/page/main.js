@@ -67,7 +67,7 @@ link.addEventListener("down", (event) => {
 link.addEventListener("refused", () => {
   terminal.may = false;
   mark(document.body, "offline", "true");
-  login.ask();
+  login.refused();
 });
 
 function watch() {

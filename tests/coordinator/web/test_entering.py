@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import socket
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
@@ -207,7 +208,7 @@ def test_the_cookie_is_for_this_page_and_not_for_scripts(tmp_path: Path) -> None
             async with posted as answer:
                 (cookie,) = answer.cookies.values()
                 told = await answer.text()
-                assert answer.headers["Cache-Control"] == "no-cache"
+                assert answer.headers["Cache-Control"] == "no-store"
             assert cookie.key == f"canductor-{paged.page.port}"
             assert cookie["httponly"]
             assert (cookie["samesite"], cookie["path"], cookie["domain"]) == ("Strict", "/", "")
@@ -461,20 +462,26 @@ def test_another_user_who_sends_and_closes_gets_nothing(tmp_path: Path, *, pings
 def test_another_user_at_the_unix_socket_gets_nothing(tmp_path: Path) -> None:
     """The kernel notes who connects (SO_PEERCRED), and keeps that when the socket is closed."""
 
+    tmp_path.chmod(0o711)
+
     async def go(paged: Paged) -> None:
-        path = paged.served.path
-        for folder in (*reversed(path.relative_to("/").parents),):
-            opened = Path("/") / folder
-            if not opened.stat().st_mode & 0o001:
-                opened.chmod(opened.stat().st_mode | 0o001)
-        path.chmod(0o666)
+        paged.served.path.chmod(0o666)
+        folder = os.open(tmp_path, os.O_RDONLY | os.O_DIRECTORY)
         requests = [
             {"id": 1, "method": "api.hello", "params": {"version": 1}},
             {"id": 2, "method": "move.to", "params": {"x_mm": 1.0}},
             {"id": 3, "method": "machine.emergency_stop"},
         ]
         lines = "".join(json.dumps(request) + "\n" for request in requests).encode()
-        as_stranger(lambda: send_and_close(socket.AF_UNIX, str(path), lines))
+
+        def send() -> None:
+            os.fchdir(folder)  # whoever may look into the folders above it
+            send_and_close(socket.AF_UNIX, paged.served.path.name, lines)
+
+        try:
+            as_stranger(send)
+        finally:
+            os.close(folder)
         await asyncio.sleep(1)
         assert paged.served.order == []
         assert paged.served.server.figures()["refused_connections"] == 1

@@ -51,6 +51,12 @@ def paged(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterato
         yield served
 
 
+def cut_all(paged: Paged) -> None:
+    """End all connections of the page."""
+    for connection in list(paged.page._clients):
+        connection.transport.close()
+
+
 def link(paged: Paged, scope: Scope = Scope.OPERATE) -> str:
     """Return a one-time link; the server's loop makes it."""
 
@@ -93,9 +99,12 @@ def test_getting_in(browser: Browser, paged: Paged) -> None:
     tab.page.goto(one_time)  # from the history: it does no harm to who is in
     tab.until("document.body.dataset.offline === 'false'")
     second = tab.context.new_page()
-    second.goto(paged.at)
+    second.goto(link(paged, Scope.WATCH))  # signs this browser in again: its first session ends
     second.wait_for_function("() => document.body.dataset.offline === 'false'")
     second.close()
+    tab.page.evaluate("document.body.dataset.offline = 'not known'")
+    paged.loop.call_soon_threadsafe(cut_all, paged)
+    tab.until("document.body.dataset.offline === 'false'")  # it comes back, with the key of the other tab
     (cookie,) = tab.context.cookies()
     assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
     assert not tab.page.evaluate("document.cookie")
