@@ -53,10 +53,8 @@ def test_a_fan_whose_sensor_is_silent_runs_at_its_highest_speed(stage: HeatMachi
         await asyncio.sleep((SILENT_LOOKS + 2) * LOOK_S)
         assert stage.status(SIDE)["speed"] == 0.9
         await asyncio.sleep(5.0)
-        assert [text for text in stage.notices if "highest speed" in text] == [
-            f"[{SIDE}] runs at its highest speed: its sensor says nothing any more; check node mcu and its"
-            " wires"
-        ]
+        (told,) = [text for text in stage.notices if "highest speed" in text]
+        assert told.startswith(f"[{SIDE}] runs at its highest speed: its sensor says nothing any more; check")
         await stage.do("SET_TEMPERATURE_FAN_TARGET TEMPERATURE_FAN=bed_side TARGET=0")
         await asyncio.sleep(2.0)
         assert stage.status(SIDE)["speed"] == 0
