@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.devices import analog_in
+from nodes.devices.ticks import start_clock
 from nodes.node import Node
 from tests.coordinator.modules.heat_stage import HOTEND_PID, HeatMachine
 
@@ -16,7 +16,6 @@ STALL_S = 0.7
 def ready_at_ns(folder: Path, monkeypatch: pytest.MonkeyPatch) -> int:
     """Return when the node of the hotend's sensor is ready, on a host that has nothing else to do."""
     stage, ready_ns = HeatMachine(folder, HOTEND_PID), list[int]()
-    start_clock = analog_in.start_clock
 
     def note(node: Node) -> int:
         ready_ns.append(stage.world.now_ns)
@@ -26,7 +25,7 @@ def ready_at_ns(folder: Path, monkeypatch: pytest.MonkeyPatch) -> int:
         await asyncio.sleep(0)
 
     with monkeypatch.context() as patch:
-        patch.setattr(analog_in, "start_clock", note)
+        patch.setattr("nodes.devices.analog_in.start_clock", note)
         stage.run(main)
     return ready_ns[0]
 
