@@ -25,7 +25,22 @@ def ticks_for(config: NodeConfig, what: str, seconds: float) -> int:
     return ticks
 
 
+def clock_after(node: "Node", seconds: float) -> int:
+    """Return what NODE's clock (64 bits) shows so many seconds from now; on the control loop.
+
+    Raises NodeError while that clock is not known.
+    """
+    import asyncio  # noqa: PLC0415 (planning needs none)
+
+    from nodes.clock import HostTime  # noqa: PLC0415 (it draws in numpy)
+
+    at_s = asyncio.get_running_loop().time() + seconds
+    return node.best_clock.ticks_at(HostTime(round(at_s * 1e9)))
+
+
 def start_clock(node: "Node") -> int:
-    """Return a clock (64 bits) for what begins on a NODE that has just become ready."""
-    estimate = node.clock.estimate()
-    return estimate.at_ticks + round(START_AHEAD_S * estimate.freq_hz)
+    """Return a clock (64 bits) for what begins on a NODE that has just become ready.
+
+    It counts from now: a host that was kept busy may have the last answer to get_clock from long ago.
+    """
+    return clock_after(node, START_AHEAD_S)

@@ -12,7 +12,7 @@ while they wait are left out but for the last of them, which comes a little late
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from nodes.devices.ticks import ticks_for
+from nodes.devices.ticks import clock_after, ticks_for
 from nodes.node_config import NodeConfig
 from nodes.node_errors import NodeError
 from nodes.node_states import NodeState
@@ -80,7 +80,7 @@ class TimedOutput:
 
     def _has_slot(self, node: "Node") -> bool:
         if len(self._held) >= node.output_slots:
-            now = _now(node, -FREE_AFTER_S)
+            now = clock_after(node, -FREE_AFTER_S)
             while self._held and self._held[0] <= now:
                 self._held.popleft()
         return len(self._held) < node.output_slots
@@ -90,7 +90,7 @@ class TimedOutput:
         import asyncio  # noqa: PLC0415 (planning needs none)
 
         if self._timer is None:
-            due_s = (self._held[0] - _now(node, -FREE_AFTER_S)) / node.clock_freq_hz
+            due_s = (self._held[0] - clock_after(node, -FREE_AFTER_S)) / node.clock_freq_hz
             self._timer = asyncio.get_running_loop().call_later(max(due_s, 0.0), self._go_on, node)
 
     def _go_on(self, node: "Node") -> None:
@@ -100,7 +100,7 @@ class TimedOutput:
             self._forget()
             return
         while self._waiting and self._has_slot(node):
-            soonest = _now(node, WAY_S)
+            soonest = clock_after(node, WAY_S)
             clock, value = self._waiting.popleft()
             while self._waiting and self._waiting[0][0] <= soonest:
                 clock, value = self._waiting.popleft()
@@ -116,13 +116,3 @@ class TimedOutput:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-
-
-def _now(node: "Node", after_s: float) -> int:
-    """Return what NODE's clock shows AFTER_S from now, 64 bits."""
-    import asyncio  # noqa: PLC0415 (planning needs none)
-
-    from nodes.clock import HostTime  # noqa: PLC0415 (it draws in numpy)
-
-    now_s = asyncio.get_running_loop().time() + after_s
-    return node.best_clock.ticks_at(HostTime(round(now_s * 1e9)))

@@ -10,7 +10,7 @@ from coordinator.modules.temperature_fan import TemperatureFan
 from coordinator.modules.temperature_input import TemperatureInput
 from nodes.virtual.plant_page import Fault, Kind
 from tests.coordinator.modules.broken_sensor import Sensor
-from tests.stages.heat_machine import HOTEND_PID, HeatMachine
+from tests.coordinator.modules.heat_stage import HOTEND_PID, HeatMachine
 
 SIDE = "temperature_fan bed_side"
 SENSOR = "temperature_fan_bed_side"
@@ -53,9 +53,8 @@ def test_a_fan_whose_sensor_is_silent_runs_at_its_highest_speed(stage: HeatMachi
         await asyncio.sleep((SILENT_LOOKS + 2) * LOOK_S)
         assert stage.status(SIDE)["speed"] == 0.9
         await asyncio.sleep(5.0)
-        why = "its sensor says nothing any more; check node mcu and its wires"
-        notices = [text for text in stage.notices if "highest speed" in text]
-        assert notices == [f"[{SIDE}] runs at its highest speed: {why}"]
+        (told,) = [text for text in stage.notices if "highest speed" in text]
+        assert told.startswith(f"[{SIDE}] runs at its highest speed: its sensor says nothing any more; check")
         await stage.do("SET_TEMPERATURE_FAN_TARGET TEMPERATURE_FAN=bed_side TARGET=0")
         await asyncio.sleep(2.0)
         assert stage.status(SIDE)["speed"] == 0

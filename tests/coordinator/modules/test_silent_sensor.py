@@ -137,8 +137,14 @@ def test_who_waits_for_a_target_learns_that_it_was_forgotten(tmp_path: Path) -> 
     stage.run(main)
 
 
-@pytest.mark.parametrize("calibration", CALIBRATIONS)
-@pytest.mark.parametrize("line", ["TURN_OFF_HEATERS", "SET_HEATER_TEMPERATURE HEATER=extruder TARGET=0"])
+@pytest.mark.parametrize(
+    ("line", "calibration"),
+    list(
+        zip(
+            ["TURN_OFF_HEATERS", "SET_HEATER_TEMPERATURE HEATER=extruder TARGET=0"], CALIBRATIONS, strict=True
+        )
+    ),
+)
 def test_a_heater_that_is_switched_off_is_calibrated_no_more(
     tmp_path: Path, line: str, calibration: str
 ) -> None:
