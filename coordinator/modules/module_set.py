@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", bound=Module)
 IDLE_TIMEOUT: Final = "idle_timeout"
+FREE_NAMES: Final = frozenset(("G2", "G3", "G5", "G17", "G18", "G19", "M118", "M201", "M203", "M205"))
+"""Commands of ours that other hosts do not have by themselves: macros take their names as they come."""
 INTERRUPTING: Final = frozenset(("PAUSE", "CANCEL_PRINT"))
 """Commands that pause or cancel a job, whatever macros they may be."""
 
@@ -234,7 +236,7 @@ class ModuleSet:
         """Let COMMAND have its name, and whoever had it before the name RENAME."""
         name = command.name
         before = self._commands.get(name)
-        if not rename and (before is not None or name in HELPS):
+        if not rename and name not in FREE_NAMES and (before is not None or name in HELPS):
             # What has no help does nothing by itself: M106 without a fan is a name that is free.
             section = build.reader.section
             if section.misspelt or "rename_existing" in section.set_aside:
