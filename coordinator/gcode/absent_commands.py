@@ -1,8 +1,8 @@
 """Commands that users of other hosts know and that nothing acts on here: whose they are, what they would do.
 
-A line that would move, heat or level something and is skipped leaves a print that is not what its file says,
-so in a job it is an error. What only shows, lights or measures is skipped with a notice, as is any command
-that nobody knows.
+A line that would move, heat or level something and is skipped leaves a print that is not what its file says:
+where the configuration has a section for it, it is an error in a job. What only shows, lights or measures is
+skipped with a notice, as is any command that nobody knows, and what a machine has nothing for.
 """
 
 from collections.abc import Mapping
@@ -74,7 +74,11 @@ _TABLE: Final[tuple[tuple[Effect, tuple[str, ...], str], ...]] = (
         ),
     ),
     (Effect.NONE, _PROBES, "QUERY_PROBE QUERY_DOCKABLE_PROBE"),
-    (Effect.LEVELS, (), "G29 G30 G31 G32 G33 G34 G38.2 G38.3"),
+    (
+        Effect.LEVELS,
+        ("bed_mesh", "z_tilt", "z_tilt_ng", "quad_gantry_level", "bed_tilt", "delta_calibrate"),
+        "G29 G32 G33 G34",
+    ),
     (Effect.MOVES, ("manual_stepper",), "MANUAL_STEPPER"),
     (Effect.MOVES, ("servo",), "SET_SERVO"),
     (Effect.MOVES, _SPI_DRIVERS, "SET_TMC_CURRENT SET_TMC_FIELD INIT_TMC"),

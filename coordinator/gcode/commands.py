@@ -164,6 +164,8 @@ class Vocabulary:
     thread. One that is only planned is never too cold."""
     interrupting: frozenset[str] = frozenset()
     """Commands that may pause or cancel a job: PAUSE, CANCEL_PRINT, and macros in which they come."""
+    disturbing: frozenset[str] = frozenset()
+    """Commands that a job has to stand still for between two of its lines, and macros in which they come."""
     not_acting: Mapping[str, str] = field(default_factory=dict)
     """Why, by the name of a command that a section of the configuration should bring, nothing acts on it:
     ``[bed_mesh] does not act yet``."""

@@ -35,6 +35,7 @@ def gcode_figures(job: "Job") -> Mapping[str, Mapping[str, object]]:
         "print_time": planner.print_time_end_s,
         "estimated_print_time": planner.print_time_end_s,
         "stalls": 0,
+        "extra_axes": {},
     }
     gcode_move = {
         "gcode_position": Place(*planner.gcode_position),
@@ -46,6 +47,7 @@ def gcode_figures(job: "Job") -> Mapping[str, Mapping[str, object]]:
         "extrude_factor": planner.extrude_factor,
         "absolute_coordinates": not planner.relative,
         "absolute_extrude": not planner.relative_extrusion,
+        "axis_map": {"X": 0, "Y": 1, "Z": 2, "E": 3},
     }
     machine = job.machine
     return {"toolhead": toolhead, "gcode_move": gcode_move, **_extruders(machine), **_carriages(machine)}

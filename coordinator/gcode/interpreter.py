@@ -308,10 +308,10 @@ class Job:
         what = quoted(command.name).strip(QUOTE)
         why = self.vocabulary.not_acting.get(command.name, "")
         absent = ABSENT.get(command.name)
-        if absent is None or absent.harmless:
+        if absent is None or absent.harmless or not why:
             self.notice(f"unknown command {what}", why or "unknown commands are skipped")
             return
-        self.refuse_skipping(command, f"{absent.effect.value}, but {why or 'nothing here knows it'}")
+        self.refuse_skipping(command, f"{absent.effect.value}, but {why}")
 
     def refuse_skipping(self, command: Command, why: str) -> None:
         """Raise WordError as COMMAND, of which WHY says what it does, must not be skipped; told in a plan."""

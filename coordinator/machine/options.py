@@ -53,6 +53,11 @@ class Option(Generic[T]):
         """Return any value that is allowed, to go on with after a mistake."""
         raise NotImplementedError
 
+    def setting(self, text: str, value: T) -> object:
+        """Return what macros see of VALUE, which TEXT was read as."""
+        del text
+        return value
+
 
 @record(kw_only=True)
 class _Bounded(Option[T]):
@@ -277,6 +282,11 @@ class GearRatioOption(Option[float]):
         """Return no gear."""
         return 1.0
 
+    def setting(self, text: str, value: float) -> object:
+        """Return the pairs of teeth."""
+        del value
+        return [[float(teeth) for teeth in pair.split(":")] for pair in text.split(",") if pair.strip()]
+
 
 def one_of(words: Sequence[str]) -> str:
     """Join words as in "a, b or c"."""
@@ -363,7 +373,8 @@ class SectionReader:
         if raw is None:
             return None
         try:
-            value = self.section.used[option.name] = option.parse(raw.value)
+            value = option.parse(raw.value)
+            self.section.used[option.name] = option.setting(raw.value, value)
         except NotBuilt:
             raise NotActing(
                 raw.place,
@@ -382,7 +393,8 @@ class SectionReader:
         """Return the value or the default; raises ConfigError when a required option is absent."""
         value = self.find(option)
         if value is None and option.default is not None:
-            value = self.section.used[option.name] = option.default
+            value = option.default
+            self.section.used[option.name] = option.setting("", value)
         if value is not None:
             return value
         if not (self.section.is_set_aside or option.name in self.section.set_aside):

@@ -94,6 +94,11 @@ class PinOption(Option[PinName]):
         """Return a pin that there is not."""
         return NO_PIN
 
+    def setting(self, text: str, value: PinName) -> object:
+        """Return the pin as it is written."""
+        del value
+        return text
+
 
 _ANY_PIN = PinOption(name="pin", help="any pin", pullable=True)
 

@@ -41,7 +41,7 @@ class ConfigView(Mapping[str, Any]):
 
     def _values(self, section: str) -> dict[str, object]:
         """Return values and defaults; what no reader knows stands as what it looks like."""
-        given = {option: _guess(text) for option, text in self._config[section].items()}
+        given = {option: _typed(section, option, text) for option, text in self._config[section].items()}
         used = {option: _plain(value) for option, value in self._settings.get(section, {}).items()}
         return given | {option: value for option, value in used.items() if value is not None}
 
@@ -56,6 +56,29 @@ def _plain(value: object) -> object:
         items = [_plain(item) for item in value]
         return None if None in items else items
     return None
+
+
+_LISTS: Final = frozenset(
+    (
+        *("mesh_min", "mesh_max", "mesh_origin", "probe_count", "mesh_pps", "zero_reference_position"),
+        *("gantry_corners", "points", "z_positions", "nozzle_xy_position", "switch_xy_position"),
+        *("bed_xy_position", "probe_points", "chips", "axes_map", "initial_red", "homing_position"),
+        *(f"screw{number}" for number in range(1, 10)),
+        *(f"faulty_region_{number}_{end}" for number in range(1, 100) for end in ("min", "max")),
+    )
+)
+"""Options of sections without a module that are lists of numbers, or of such lists over several lines."""
+
+
+def _typed(section: str, option: str, text: str) -> object:
+    """Return the value of an option that no reader knows, as the peer's users know it."""
+    if section.startswith("gcode_macro ") or option not in _LISTS:
+        return _guess(text)
+    lines = [[_guess(word) for word in line.split(",")] for line in text.split("\n") if line.strip()]
+    found: object = lines[0] if len(lines) == 1 else lines
+    if option == "probe_count" and isinstance(found, list) and len(found) == 1:
+        return found * 2
+    return found
 
 
 def _guess(text: str) -> object:

@@ -62,6 +62,10 @@ class GCodeTemplate:
         def fail(text: object) -> str:
             raise Asked(str(text))
 
+        def call_remote(method: object, **_values: object) -> str:
+            replies.append(f"the remote method {method} was not called: no client has registered one")
+            return ""
+
         def stop(text: object = "") -> str:
             raise Asked(str(text), emergency=True)
 
@@ -71,6 +75,7 @@ class GCodeTemplate:
                     **values,
                     "printer": self._status.view(call),
                     "action_respond_info": respond,
+                    "action_call_remote_method": call_remote,
                     "action_raise_error": fail,
                     "action_emergency_stop": stop,
                 }

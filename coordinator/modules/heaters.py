@@ -70,6 +70,7 @@ class Heaters(Module):
         return {
             "available_heaters": list(self.units),
             "available_sensors": list(self.sensors),
+            "available_monitors": [],
             "calibrated": calibrated,
         }
 

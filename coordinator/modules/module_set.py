@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import field
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", bound=Module)
 IDLE_TIMEOUT: Final = "idle_timeout"
+FREE_NAMES: Final = frozenset(("G2", "G3", "G5", "G17", "G18", "G19", "M118", "M201", "M203", "M205"))
+"""Commands of ours that other hosts do not have by themselves: macros take their names as they come."""
 INTERRUPTING: Final = frozenset(("PAUSE", "CANCEL_PRINT"))
 """Commands that pause or cancel a job, whatever macros they may be."""
 
@@ -234,7 +237,7 @@ class ModuleSet:
         """Let COMMAND have its name, and whoever had it before the name RENAME."""
         name = command.name
         before = self._commands.get(name)
-        if not rename and (before is not None or name in HELPS):
+        if not rename and name not in FREE_NAMES and (before is not None or name in HELPS):
             # What has no help does nothing by itself: M106 without a fan is a name that is free.
             section = build.reader.section
             if section.misspelt or "rename_existing" in section.set_aside:
@@ -321,14 +324,21 @@ class ModuleSet:
             self._commands,
             home if homing.acts else None,
             self._too_cold,
-            self._interrupting(),
+            self._containing(INTERRUPTING & self._commands.keys()),
+            self._containing(self._disturbing()),
             self.not_acting,
             set_ups=tuple(self._set_ups),
         )
 
-    def _interrupting(self) -> frozenset[str]:
+    def _disturbing(self) -> set[str]:
+        """Return the commands that move or wait, so that they cannot run while a job prints."""
+        own = {name for name in HANDLERS if name not in BESIDE and name not in self._commands}
+        return own | {name for name, command in self._commands.items() if not command.beside}
+
+    def _containing(self, commands: AbstractSet[str]) -> frozenset[str]:
+        """Return COMMANDS, and macros in whose lines they come, directly or by way of others."""
         words = {name: inner for module in self._modules for name, inner in module.stands_for().items()}
-        found = set(INTERRUPTING & self._commands.keys())
+        found = set(commands)
         while more := {name for name, inner in words.items() if inner & found} - found:
             found |= more
         return frozenset(found)

@@ -9,8 +9,11 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
+from jinja2 import ChainableUndefined
+
 from coordinator.gcode.commands import Call
 from coordinator.machine.options import SectionSpec
+from coordinator.modules.absent_status import absent_statuses
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.config_view import ConfigView
 from coordinator.modules.machine_view import Commands, machine_view
@@ -80,6 +83,7 @@ class PrinterStatus(Module):
     def _every(self, modules: Modules) -> Shown:
         told: dict[str, Mapping[str, object]] = {"gcode": Commands(modules), **machine_view(self._live)}
         # A section that has nothing to tell is there nevertheless: macros ask whether others are.
+        told.update(absent_statuses(modules.config))
         told.update((name, {}) for name in modules.names(Module) if name in modules.config)
         told.update((name, self._for_macros(status)) for name, status in modules.status().items())
         told["configfile"] = ConfigView(modules.config, modules.settings, told.get("configfile", {}))
@@ -118,8 +122,23 @@ class PrinterView(Mapping[str, Any]):
         if self._all is None:
             seen = {name: _copy(status) for name, status in self._look().items()}
             figures = self._figures()
-            self._all = {**seen, **{name: {**seen.get(name, {}), **told} for name, told in figures.items()}}
+            every = {**seen, **{name: {**seen.get(name, {}), **told} for name, told in figures.items()}}
+            self._all = {
+                name: Section(name, status) if isinstance(status, dict) else status
+                for name, status in every.items()
+            }
         return self._all
+
+
+class Section(dict[str, Any]):
+    """The status of a section: what it does not tell is undefined, and so is all of that."""
+
+    def __init__(self, name: str, status: Mapping[str, Any]) -> None:
+        super().__init__(status)
+        self._name = name
+
+    def __missing__(self, field: str) -> ChainableUndefined:
+        return ChainableUndefined(f"printer[{self._name!r}] has no {field!r}")
 
 
 def _copy(value: Any) -> Any:

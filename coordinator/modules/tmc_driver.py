@@ -118,6 +118,9 @@ class TmcDriver(StallEndstop):
             "run_current": self.run_a,
             "hold_current": self.hold_a,
             "drv_status": dict(self._drv_status) or None,
+            "temperature": None,
+            "mcu_phase_offset": None,
+            "phase_offset_position": None,
         }
 
     @property

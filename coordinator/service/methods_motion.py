@@ -72,7 +72,9 @@ async def _run(service: MachineService, params: dict[str, Any]) -> Value:
     job = service.active_job
     interrupting = motion.feeder.vocabulary.interrupting.intersection(names)
     stay = bool(interrupting & INTERRUPTING)
-    with service.programs.interrupted(stay=stay) if interrupting else contextlib.nullcontext():
+    between = job is not None and _disturbs(motion, names)
+    paused = service.programs.interrupted(stay=stay) if interrupting or between else contextlib.nullcontext()
+    with paused:
         if job is None or job.gives_way:  # they come between two lines of it, and may move
             return _answer(await _done(service, motion, work))
         work.beside = True
@@ -120,9 +122,10 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
     yield Method(
         "gcode.run",
         Scope.OPERATE,
-        "Run lines of g-code. While a job prints only such as neither move nor wait: "
+        "Run lines of g-code. While a job prints, those that neither move nor wait act at once: "
         + " ".join(sorted(BESIDE))
-        + ", and those of modules that say so. While a job is paused any.",
+        + ", and those of modules that say so; for others the job stands still between two of its lines, but"
+        " never for " + ", ".join(sorted(NEVER_BETWEEN)) + ". While a job is paused any.",
         run,
         params=(Param("script", Kind.STR, "lines", high=LINES_BYTES_MAX), _WAIT),
         returns=_TOLD,
@@ -218,6 +221,23 @@ def _commands(lines: list[str]) -> list[str]:
         return commands_in(lines)
     except WorkError as error:
         raise ApiError("bad_gcode", str(error)) from None
+
+
+NEVER_BETWEEN: Final = frozenset(
+    (
+        *("G28", "M84", "M18", "SAVE_CONFIG", "PID_CALIBRATE", "MPC_CALIBRATE", "Z_ENDSTOP_CALIBRATE"),
+        *("MANUAL_PROBE", "FORCE_MOVE", "SET_KINEMATIC_POSITION", "STEPPER_BUZZ", "INIT_TMC"),
+    )
+)
+"""Not while a job prints: they lose where the head is, or need the machine for long."""
+
+
+def _disturbs(motion: Motion, names: list[str]) -> bool:
+    """Tell whether a job has to stand still for NAMES, between two of its lines."""
+    disturbing = motion.feeder.vocabulary.disturbing
+    if NEVER_BETWEEN.intersection(names):
+        return False
+    return any(name in disturbing or is_tool(name) for name in names)
 
 
 def _check_beside(motion: Motion, names: list[str]) -> None:

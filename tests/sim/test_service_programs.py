@@ -74,8 +74,8 @@ def test_jobs_and_programs(tmp_path: Path) -> None:
         await stage.call("job.start", file="long.gcode")
         await stage.until(lambda: bool(stage.tree.get("job.line")), "a line being carried out")
         assert await run(stage, "LOOK") == ["echo: printing False"]
-        with pytest.raises(ApiError, match="G1 cannot run while a job prints") as error:
-            await run(stage, "G1 X1")
+        with pytest.raises(ApiError, match="G28 cannot run while a job prints") as error:
+            await run(stage, "G28")
         assert error.value.code == "busy"
         await run(stage, "PAUSE")
         await stage.until_job("paused")

@@ -52,6 +52,8 @@ def test_others_end_a_job_and_are_told_of_in_a_plan(name: str) -> None:
     assert "[it] does not act yet; remove the line" in str(error.value)
     (said,) = notices(line, because, strict=False)
     assert "a job would end here" in said
+    if name not in ("M104", "M109", "M140", "M190"):
+        assert notices(line) == [f"part.gcode:1: unknown command {name}: unknown commands are skipped"]
 
 
 def test_heat_for_what_a_machine_does_not_have_is_no_error() -> None:

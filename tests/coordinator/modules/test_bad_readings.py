@@ -48,7 +48,7 @@ def test_one_bad_measurement_ends_the_heat_until_the_next_good_one(tmp_path: Pat
             assert abs(off[1] - off[0] - REPORT_S) < SLACK_S
         assert stage.machine.stopped is None
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_bad_measurements_far_apart_do_not_add_up(tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_bad_measurements_far_apart_do_not_add_up(tmp_path: Path) -> None:
         assert sensor.unit.power > 0
         assert stage.status("extruder")["target"] == 250
 
-    stage.run(main)
+    stage.connected(main)
 
 
 @pytest.mark.parametrize("control", [HOTEND_PID, "control: watermark\n"])
@@ -85,7 +85,7 @@ def test_a_bad_measurement_ends_no_wait_and_allows_no_filament(tmp_path: Path, c
         for wait in waiting:
             wait.cancel()
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_bad_measurement_does_not_make_a_hot_nozzle_cold(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_a_bad_measurement_does_not_make_a_hot_nozzle_cold(tmp_path: Path) -> No
         await sensor.bad(1)
         assert stage.status("extruder")["can_extrude"]
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_sensor_that_no_node_watches_stops_the_machine_by_bad_ones_in_a_row_only(tmp_path: Path) -> None:
@@ -122,4 +122,4 @@ def test_a_sensor_that_no_node_watches_stops_the_machine_by_bad_ones_in_a_row_on
         with pytest.raises(CanductorError, match=r"\[temperature_sensor computer\] tells 140 °C"):
             await source.next()
 
-    stage.run(main)
+    stage.connected(main)

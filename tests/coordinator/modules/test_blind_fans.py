@@ -10,7 +10,7 @@ from coordinator.modules.temperature_fan import TemperatureFan
 from coordinator.modules.temperature_input import TemperatureInput
 from nodes.virtual.plant_page import Fault, Kind
 from tests.coordinator.modules.broken_sensor import Sensor
-from tests.coordinator.modules.heat_stage import HOTEND_PID, HeatMachine
+from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 
 SIDE = "temperature_fan bed_side"
 SENSOR = "temperature_fan_bed_side"
@@ -40,7 +40,7 @@ def test_a_bad_measurement_is_neither_hot_nor_cold(stage: HeatMachine, fault: Fa
         assert stage.status(SIDE)["speed"] == 0.2
         assert stage.machine.stopped is None
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_fan_whose_sensor_is_silent_runs_at_its_highest_speed(stage: HeatMachine) -> None:
@@ -59,7 +59,7 @@ def test_a_fan_whose_sensor_is_silent_runs_at_its_highest_speed(stage: HeatMachi
         await asyncio.sleep(2.0)
         assert stage.status(SIDE)["speed"] == 0
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_a_hotends_fan_is_not_stopped_by_a_torn_wire(stage: HeatMachine) -> None:
@@ -71,4 +71,4 @@ def test_a_hotends_fan_is_not_stopped_by_a_torn_wire(stage: HeatMachine) -> None
         await asyncio.sleep(0.1)
         assert stage.status("heater_fan hotend")["speed"] == 1
 
-    stage.run(main)
+    stage.connected(main)

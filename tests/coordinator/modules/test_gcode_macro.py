@@ -374,3 +374,54 @@ def test_a_loop_that_is_busy_is_not_waited_for(tmp_path: Path) -> None:
         assert told == ["False"]
 
     asyncio.run(main())
+
+
+ASKS = """
+[bed_mesh]
+mesh_min: 10, 20.5
+probe_count: 5
+faulty_region_1_min: 1, 2
+[quad_gantry_level]
+points:
+    50, 25
+    50, 225
+[neopixel light]
+pin: PA8
+[bltouch]
+sensor_pin: PA9
+[fan_generic mine]
+pin: sx1509_a:PIN_1
+[sx1509 a]
+i2c_address: 62
+[gcode_macro ask]
+gcode:
+    {% set s = printer.configfile.settings %}
+    {% set mesh = s.bed_mesh %}
+    {action_respond_info("%s|%s|%s" % (mesh.mesh_min, mesh.probe_count, mesh.faulty_region_1_min))}
+    {action_respond_info("%s|%s" % (s.quad_gantry_level.points, s.stepper_x.step_pin))}
+    {action_respond_info("%s|%s" % (s.stepper_x.gear_ratio, s.stepper_y.gear_ratio))}
+    {action_respond_info("%s|%s" % (printer.bed_mesh.profiles, printer.bed_mesh.mesh_min))}
+    {action_respond_info("%s|%s" % (printer.quad_gantry_level.applied, printer["neopixel light"].color_data))}
+    {action_respond_info("%s|%s" % (printer.probe.last_query, printer["fan_generic mine"].speed))}
+    {action_respond_info("[%s]" % printer.bed_mesh.nothing.of.that.kind|default("", true))}
+    {action_call_remote_method("notify", text="x")}
+"""
+
+
+def test_asking_for_what_a_section_that_exists_does_not_tell_ends_nothing(tmp_path: Path) -> None:
+    machine = stage(tmp_path, ASKS + "[stepper_y]\ngear_ratio: 50:17, 3:1\n")
+    told = machine.run("ASK")
+    assert told[:6] == [
+        "[10, 20.5]|[5, 5]|[1, 2]",
+        "[[50, 25], [50, 225]]|PA0",
+        "[]|[[50.0, 17.0], [3.0, 1.0]]",
+        "{}|[0.0, 0.0]",
+        "False|[[0.0, 0.0, 0.0, 0.0]]",
+        "False|0.0",
+    ]
+    assert told[-1] == "the remote method notify was not called: no client has registered one"
+
+
+def test_an_object_that_does_not_exist_is_still_a_mistake(tmp_path: Path) -> None:
+    machine = stage(tmp_path, "[gcode_macro ask]\ngcode:\n    M117 {printer.nothing.at_all}\n")
+    assert "nothing" in machine.error("ASK")

@@ -7,7 +7,7 @@ import pytest
 
 from nodes.devices.ticks import start_clock
 from nodes.node import Node
-from tests.coordinator.modules.heat_stage import HOTEND_PID, HeatMachine
+from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 
 STALL_S = 0.7
 """Longer than what begins is ahead of the last answer to get_clock, and shorter than a link's patience."""
@@ -18,7 +18,7 @@ def ready_at_ns(folder: Path, monkeypatch: pytest.MonkeyPatch) -> int:
     stage, ready_ns = HeatMachine(folder, HOTEND_PID), list[int]()
 
     def note(node: Node) -> int:
-        ready_ns.append(stage.world.now_ns)
+        ready_ns.append(stage.stage.now_ns())
         return start_clock(node)
 
     async def main() -> None:
@@ -26,7 +26,7 @@ def ready_at_ns(folder: Path, monkeypatch: pytest.MonkeyPatch) -> int:
 
     with monkeypatch.context() as patch:
         patch.setattr("nodes.devices.analog_in.start_clock", note)
-        stage.run(main)
+        stage.connected(main)
     return ready_ns[0]
 
 
@@ -37,11 +37,11 @@ def test_a_sensor_is_started_by_a_host_that_stood_still(
     """The answer that made the node ready has arrived by then, and waits for Python."""
     stall_ns = ready_at_ns(tmp_path, monkeypatch) - 1000 * before_us
     stage = HeatMachine(tmp_path, HOTEND_PID)
-    stage.world.at(stall_ns, lambda: stage.world.stall(STALL_S, io=False))
+    stage.stage.call_at(stall_ns, lambda: stage.stage.stall(STALL_S, io=False))
 
     async def main() -> None:
         await asyncio.sleep(2.0)
         assert stage.machine.stopped is None
         assert stage.status("extruder")["temperature"] == pytest.approx(25, abs=1)
 
-    stage.run(main)
+    stage.connected(main)

@@ -71,7 +71,7 @@ def test_the_machine_stops_when_the_sensor_falls_silent_during_a_calibration(
         edges = stage.edges("PB3")
         assert not edges or stage.heater_off_after(since_s) <= LIMIT_S
 
-    stage.run(main)
+    stage.connected(main)
 
 
 @pytest.mark.parametrize("calibration", CALIBRATIONS)
@@ -92,7 +92,7 @@ def test_a_calibration_ends_when_the_node_of_the_sensor_goes_away(tmp_path: Path
         assert stage.heater_off_after(since_s, "PC3", "mcu") < LIMIT_S
         assert stage.machine.stopped is None
 
-    stage.run(main)
+    stage.connected(main)
 
 
 @pytest.mark.parametrize("line", ["M109 S200", "M104 S200"])
@@ -113,7 +113,7 @@ def test_the_heat_ends_before_the_node_of_the_heater_would_have_to_stop(tmp_path
             with pytest.raises(CanductorError, match="has not said anything"):
                 await heating
 
-    stage.run(main)
+    stage.connected(main)
 
 
 def test_who_waits_for_a_target_learns_that_it_was_forgotten(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_who_waits_for_a_target_learns_that_it_was_forgotten(tmp_path: Path) -> 
         assert stage.machine.stopped is None
         assert stage.heater_off_after(since_s, "PC3", "mcu") < LIMIT_S
 
-    stage.run(main)
+    stage.connected(main)
 
 
 @pytest.mark.parametrize(
@@ -168,4 +168,4 @@ def test_a_heater_that_is_switched_off_is_calibrated_no_more(
         await stage.do("M104 S100")
         await is_on(sensor)
 
-    stage.run(main)
+    stage.connected(main)
