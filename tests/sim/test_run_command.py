@@ -151,7 +151,7 @@ def test_a_dwell_before_the_first_move_outlasts_links_that_stand_still(tmp_path:
         outcome = go()
         assert outcome.positions == outcome.issued
     else:
-        with pytest.raises(MachineStopped, match="in past|too close|late"):
+        with pytest.raises(MachineStopped, match=r"in past|too close|late"):
             go()
 
 
