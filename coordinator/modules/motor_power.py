@@ -95,7 +95,8 @@ class MotorPower(Module):
         live = self._live
         if live is None or not live.node(line.node).talks:
             return
-        line.set(live.node(line.node), live.ticks_at(line.node, live.soon()), on)
+        # Not at a time: a busy host might miss it, and nothing needs more than the order of the commands.
+        line.set_now(live.node(line.node), on)
         line.on = on
 
     # --------------------------------------------------------------------------------------------- commands

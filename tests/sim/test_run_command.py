@@ -9,6 +9,7 @@ import pytest
 from coordinator.app import MachineStopped
 from coordinator.commands import Terminated
 from coordinator.gcode.errors import GCodeError
+from coordinator.move_source import Told
 from coordinator.run import RunReport
 from coordinator.session import Outcome
 from nodes.errors import CanductorError
@@ -131,6 +132,27 @@ def test_a_new_job_works_after_an_emergency_stop(tmp_path: Path, stopped_by: str
             machine.print("G28\nG1 X50 F600\nM112\n")
     assert machine.shut_down == set(NODES)
     assert steps(machine.print(SQUARE))["stepper_x"] == 8000
+
+
+@pytest.mark.parametrize("dwells", [True, False])
+def test_a_dwell_before_the_first_move_outlasts_links_that_stand_still(tmp_path: Path, dwells: bool) -> None:
+    """Its commands are sent 1.2 s ahead, those of a move at once 0.25 s; tests/smoke relies on this."""
+    machine = DemoMachine(tmp_path)
+
+    def told(event: Told) -> None:
+        if "already home" in event.text:
+            machine.stage._world.stall(0.9, python=False)  # the threads of its links get no turn
+
+    def go() -> Outcome:
+        dwell = ("G4 P1500",) if dwells else ()
+        return machine.print_lines(("G28", *dwell, "G1 X5 F300"), on_told=told)
+
+    if dwells:
+        outcome = go()
+        assert outcome.positions == outcome.issued
+    else:
+        with pytest.raises(MachineStopped, match=r"in past|too close|late"):
+            go()
 
 
 # -------------------------------------------------------------------------------------------- what ends it
