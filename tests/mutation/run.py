@@ -86,8 +86,8 @@ def in_order(
 ) -> list[CoveringTest]:
     """Return which of TESTS are run for a mutant of FILE, and in what order; test files stay together.
 
-    First the C programs of FILE's own folder, then what has killed mutants of FILE, then what is in the folder
-    that mirrors it, then the quick.
+    First the C programs of FILE's own folder, then what has killed mutants of FILE, then what is in the
+    folder that mirrors it, then the quick.
     """
     by_file: dict[str, list[CoveringTest]] = {}
     for test in sorted(tests, key=lambda t: (t.seconds, t.name)):
