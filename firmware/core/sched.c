@@ -125,7 +125,6 @@ void node_start(struct node *node, const struct node_config *config) {
     memset(node, 0, sizeof(*node));
     node->config = *config;
     node->can = can;
-    node_forget_objects(node);
     for (unsigned i = 0; i < node_tables.init_count; i++)
         node_tables.inits[i](node);
     node_wake_tasks(node);

@@ -232,19 +232,19 @@ def test_hardware_pwm_within_its_limit_is_renewed_to_the_tick() -> None:
 def stepping(interval: int = 1000) -> Host:
     """Return a node whose stepper moves as a member of the trsync."""
     host = Host()
-    host.configure(STEPPER, "config_trsync oid=8", "config_endstop oid=2 pin=20 pull_up=1")
+    host.configure(STEPPER, "config_trsync oid=0", "config_endstop oid=2 pin=20 pull_up=1")
     start(host)
     move(host, interval)
     return host
 
 
-def start(host: Host, *, report_clock: int = 0, report_ticks: int = 0, reason: int = 2, oid: int = 8) -> None:
+def start(host: Host, *, report_clock: int = 0, report_ticks: int = 0, reason: int = 2, oid: int = 0) -> None:
     command = f"trsync_start oid={oid} report_clock={report_clock % ROLLOVER} report_ticks={report_ticks}"
     assert host.send(f"{command} expire_reason={reason}") == []
 
 
 def move(host: Host, interval: int = 1000) -> None:
-    commands = ["stepper_stop_on_trigger oid=1 trsync_oid=8", f"reset_step_clock oid=1 clock={host.now}"]
+    commands = ["stepper_stop_on_trigger oid=1 trsync_oid=0", f"reset_step_clock oid=1 clock={host.now}"]
     commands.append("set_next_step_dir oid=1 dir=1")
     commands.append(f"queue_step oid=1 interval={interval} count=9999 add=0")
     assert host.send(*commands) == []
@@ -269,12 +269,12 @@ def test_a_new_round_stops_what_moves_in_the_old_one() -> None:
 def test_a_member_that_joins_when_the_round_is_over_stops_at_once() -> None:
     host = stepping()
     host.run(2500)
-    host.ask("trsync_trigger oid=8 reason=3")
+    host.ask("trsync_trigger oid=0 reason=3")
     at = len(host.steps(3))
     host.send(f"reset_step_clock oid=1 clock={host.now}", "queue_step oid=1 interval=1000 count=99 add=0")
     host.run(3500)
     assert len(host.steps(3)) == at + 3
-    host.send("stepper_stop_on_trigger oid=1 trsync_oid=8")
+    host.send("stepper_stop_on_trigger oid=1 trsync_oid=0")
     host.run(20_000)
     assert len(host.steps(3)) == at + 3
 
@@ -282,7 +282,7 @@ def test_a_member_that_joins_when_the_round_is_over_stops_at_once() -> None:
 def test_joining_twice_is_a_shutdown_that_stops_the_member() -> None:
     host = stepping()
     host.run(2500)
-    assert "already active" in host.dies("stepper_stop_on_trigger oid=1 trsync_oid=8")
+    assert "already active" in host.dies("stepper_stop_on_trigger oid=1 trsync_oid=0")
     at = len(host.steps(3))
     host.run(20_000)
     assert len(host.steps(3)) == at
@@ -298,14 +298,14 @@ def test_reports_come_at_their_clocks_until_the_trigger() -> None:
         (begin + 3000, 1, 0),
         (begin + 5000, 1, 0),
     ]
-    answer = host.ask("trsync_trigger oid=8 reason=7")
+    answer = host.ask("trsync_trigger oid=0 reason=7")
     assert (answer["can_trigger"], answer["trigger_reason"], answer["clock"]) == (0, 7, begin + 6000)
     assert host.run(20_000) == []
 
 
 def test_a_round_that_begins_forgets_the_reason_and_the_report_of_the_one_before() -> None:
     host = stepping()
-    host.ask("trsync_trigger oid=8 reason=7")
+    host.ask("trsync_trigger oid=0 reason=7")
     start(host, report_clock=host.now + 10, report_ticks=1000)
     (answer,) = host.run(100)
     assert (answer["can_trigger"], answer["trigger_reason"]) == (1, 0)
@@ -314,9 +314,9 @@ def test_a_round_that_begins_forgets_the_reason_and_the_report_of_the_one_before
 def test_a_time_out_is_moved_on_and_expires_to_the_tick() -> None:
     host = stepping()
     begin = host.now
-    host.send(f"trsync_set_timeout oid=8 clock={begin + 3000}")
+    host.send(f"trsync_set_timeout oid=0 clock={begin + 3000}")
     host.run(2999)
-    host.send(f"trsync_set_timeout oid=8 clock={begin + 6500}")
+    host.send(f"trsync_set_timeout oid=0 clock={begin + 6500}")
     assert host.run(3500) == []
     (answer,) = host.run(1)
     assert (answer["can_trigger"], answer["trigger_reason"], answer["clock"]) == (0, 2, begin + 6500)
@@ -326,26 +326,26 @@ def test_a_time_out_is_moved_on_and_expires_to_the_tick() -> None:
 
 def test_a_time_out_that_nobody_waits_for_does_nothing() -> None:
     host = stepping()
-    host.ask("trsync_trigger oid=8 reason=7")
+    host.ask("trsync_trigger oid=0 reason=7")
     # Also one in the past, which would be too close.
-    assert host.send(f"trsync_set_timeout oid=8 clock={host.now - 1}") == []
+    assert host.send(f"trsync_set_timeout oid=0 clock={host.now - 1}") == []
     assert host.run(50_000) == []
 
 
 def test_the_command_ends_the_time_out_and_the_reports() -> None:
     host = stepping()
     start(host, report_clock=host.now + 500, report_ticks=500)
-    host.send(f"trsync_set_timeout oid=8 clock={host.now + 10_000}")
-    host.ask("trsync_trigger oid=8 reason=7")
+    host.send(f"trsync_set_timeout oid=0 clock={host.now + 10_000}")
+    host.ask("trsync_trigger oid=0 reason=7")
     start(host)  # neither of the old timers may act on the new round
     assert host.run(50_000) == []
-    assert host.ask("trsync_trigger oid=8 reason=9")["trigger_reason"] == 9
+    assert host.ask("trsync_trigger oid=0 reason=9")["trigger_reason"] == 9
 
 
 def test_a_new_round_forgets_the_old_time_out_and_its_reports() -> None:
     host = stepping()
     start(host, report_clock=host.now + 500, report_ticks=500)
-    host.send(f"trsync_set_timeout oid=8 clock={host.now + 10_000}")
+    host.send(f"trsync_set_timeout oid=0 clock={host.now + 10_000}")
     start(host)
     assert host.run(50_000) == []
 
@@ -358,20 +358,37 @@ def test_a_shutdown_ends_a_round_without_a_report() -> None:
     host.send("clear_shutdown")
     assert host.run(20_000) == []
     assert len(host.steps(3)) == at
-    answer = host.ask("trsync_trigger oid=8 reason=9")
+    answer = host.ask("trsync_trigger oid=0 reason=9")
     assert (answer["can_trigger"], answer["trigger_reason"]) == (0, 0), "it was no longer armed"
+    assert host.send("stepper_stop_on_trigger oid=1 trsync_oid=0") == [], "it is a member no more"
     start(host)
-    move(host)  # it is a member no more, and may join again
+    move(host)
     host.run(2500)
     assert len(host.steps(3)) == at + 2
+
+
+def test_all_stop_groups_of_a_node_that_belong_together_trigger_together() -> None:
+    host = Host()
+    host.configure(STEPPER, *(f"config_trsync oid={oid}" for oid in (0, 5, 6, 15)))
+    for oid, group in ((0, 3), (5, 4), (15, 3)):
+        host.send(f"trsync_set_group oid={oid} group={group}")
+    for oid in (0, 5, 6, 15):
+        start(host, oid=oid)
+    host.send(f"trsync_set_timeout oid=15 clock={host.now + 2500}")
+    move(host)
+    at = host.now + 2500
+    said = [(a["oid"], a["can_trigger"], a["trigger_reason"], a["clock"]) for a in host.run(20_000)]
+    assert said == [(0, 0, 2, at), (15, 0, 2, at)]
+    assert position(host) == 2
+    assert host.ask("trsync_trigger oid=5 reason=9")["trigger_reason"] == 9, "it was still armed"
 
 
 def test_groups_end_at_sixteen_and_none_is_255() -> None:
     host = stepping()
     for group in (0, 15, 255):
-        assert host.send(f"trsync_set_group oid=8 group={group}") == []
+        assert host.send(f"trsync_set_group oid=0 group={group}") == []
     for group in (16, 254):
-        assert host.dies(f"trsync_set_group oid=8 group={group}") == "Not a valid trigger group"
+        assert host.dies(f"trsync_set_group oid=0 group={group}") == "Not a valid trigger group"
         host.send("clear_shutdown")
 
 
@@ -379,7 +396,7 @@ def test_groups_end_at_sixteen_and_none_is_255() -> None:
 
 HOME = (
     "endstop_home oid=2 clock={clock} sample_ticks={ticks} sample_count={count} rest_ticks={rest}"
-    " pin_value={value} trsync_oid=8 trigger_reason=6"
+    " pin_value={value} trsync_oid=0 trigger_reason=6"
 )
 
 
@@ -452,7 +469,7 @@ def test_a_new_look_replaces_the_old_one() -> None:
 def test_an_endstop_that_would_stop_nothing_is_not_looked_at() -> None:
     host = stepping()
     command = HOME.format(clock=host.now + 10, ticks=1, count=1, rest=1, value=0)
-    assert host.dies(command.replace("trsync_oid=8", "trsync_oid=2")) == "Invalid oid type"
+    assert host.dies(command.replace("trsync_oid=0", "trsync_oid=2")) == "Invalid oid type"
     host.send("clear_shutdown")
     assert state(host)[0] == 0
 
@@ -466,3 +483,23 @@ def test_a_shutdown_ends_the_looking() -> None:
     start(host)
     host.node.set_input(20, 1)
     assert host.run(20_000) == []
+
+
+def test_a_shutdown_ends_the_looking_of_all_endstops() -> None:
+    host = Host()
+    host.configure(
+        "config_endstop oid=0 pin=20 pull_up=1",
+        "config_endstop oid=15 pin=21 pull_up=1",
+        "config_trsync oid=3",
+    )
+    start(host, oid=3)
+    for oid in (0, 15):
+        host.send(
+            f"endstop_home oid={oid} clock={host.now + 100} sample_ticks=10 sample_count=1 rest_ticks=100"
+            " pin_value=1 trsync_oid=3 trigger_reason=1"
+        )
+    host.run(500)
+    host.dies("emergency_stop")
+    host.send("clear_shutdown")
+    for oid in (0, 15):
+        assert host.ask(f"endstop_query_state oid={oid}")["homing"] == 0

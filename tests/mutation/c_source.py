@@ -105,10 +105,11 @@ def _literals(node: Node) -> Iterator[Place]:
         return
     if match := _INTEGER.fullmatch(text):
         number, suffix = int(match[1], 0), match[2].decode()
-        # A longer array holds what a shorter one does: there only one element less is a change.
+        # A longer array holds what a shorter one does: there only one element less is a change. 1 is mostly
+        # a flag, for which 2 says the same.
         in_array = node.parent is not None and node.parent.type == "array_declarator"
-        values = [number - 1] if in_array else [number + 1, 0] if number == 1 else [number + 1]
-        yield Place(node.start_byte, node.end_byte, tuple(f"{value}{suffix}" for value in values))
+        value = number - 1 if in_array else 0 if number == 1 else number + 1
+        yield Place(node.start_byte, node.end_byte, (f"{value}{suffix}",))
     elif match := _FLOAT.fullmatch(text):
         value = float(match[1])
         yield Place(node.start_byte, node.end_byte, (f"{value + 1!r}{match[2].decode()}",))

@@ -159,8 +159,7 @@ def _literals(parsed: _Source, node: ast.AST) -> Iterator[Place]:
     if isinstance(node.value, bool):
         yield Place(*span, (str(not node.value),))
     elif isinstance(node.value, int | float):
-        values = [node.value + 1, 0] if node.value == 1 else [node.value + 1]
-        yield Place(*span, tuple(map(repr, values)))
+        yield Place(*span, (repr(0 if node.value == 1 else node.value + 1),))
 
 
 def _conditions(parsed: _Source, node: ast.AST) -> Iterator[Place]:

@@ -74,7 +74,7 @@ def test_c_is_mutated_everywhere_but_in_what_is_read_as_text() -> None:
     }
     assert changes(found, 6) == {"0 -> 1", "return 0; -> ;"}
     assert changes(found, 7) == {"0 -> 1", "!= -> ==", "++ -> --"}
-    assert changes(found, 8) == {"+= -> -=", "<< -> >>", "1 -> 2", "1 -> 0", "b += a << 1; -> ;"}
+    assert changes(found, 8) == {"+= -> -=", "<< -> >>", "1 -> 0", "b += a << 1; -> ;"}
     assert changes(found, 12) == {"break; -> ;"}
     assert changes(found, 16) == {"> -> >=", "> -> <=", "9 -> 10"}
     assert changes(found, 22) == {"a -> !(a)", "0x10u -> 17u"}, "the last return is no early one"
@@ -93,7 +93,7 @@ def test_python_is_mutated_everywhere_but_in_annotations_and_sentences() -> None
     assert changes(found, 10) == {"== -> !="}
     assert changes(found, 13) == {'raise ValueError(f"{a + 1}") -> pass'}
     assert changes(found, 14) == {"// -> *", "2 -> 3", "self.x = a // 2 -> pass"}
-    assert {"+= -> -=", "1 -> 2", "1 -> 0", "not -> nothing", "or -> and"} <= changes(found, 15)
+    assert {"+= -> -=", "1 -> 0", "not -> nothing", "or -> and"} <= changes(found, 15)
     assert {"- -> nothing", "in -> not in", "k -> (not (k))"} <= changes(found, 17)
 
 
@@ -114,10 +114,8 @@ def test_equal_texts_in_a_line_are_numbered() -> None:
     found = c_source.find_mutations("x.c", b"int f(int a) { return a + 1 + 1; }\n")
     assert [m.change for m in found] == [
         "+ -> -",
-        "1 -> 2",
         "1 -> 0",
         "+ -> - (2)",
-        "1 -> 2 (2)",
         "1 -> 0 (2)",
     ]
 
