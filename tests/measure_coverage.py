@@ -312,8 +312,8 @@ def main() -> int:
         tests = [path for path in options.paths if path != "C"]
         failed = measure([*named, *([tests] if tests else [])] or everything())
     kept = table(c_sources(), python_sources(), verbose=options.verbose)
-    for failure in failed:
-        print(f"coverage: tests failed in {failure}", file=sys.stderr)
+    for group in failed:
+        print(f"coverage: tests failed in {group}", file=sys.stderr)
     if not kept:
         print("coverage: below the bounds", file=sys.stderr)
     return 0 if kept and not failed else 1
