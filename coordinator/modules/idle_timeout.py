@@ -40,8 +40,7 @@ class IdleTimeout(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._configured_s = self._timeout_s = build.get(TIMEOUT)
-        self._template = GCodeTemplate(build, GCODE)
-        self._own = build.find(GCODE) is not None
+        self._template = GCodeTemplate(build, GCODE) if build.find(GCODE) is not None else None
         self._default: tuple[str, ...] = ()
         self._live: Live | None = None
         self._state = "Idle"
@@ -104,17 +103,19 @@ class IdleTimeout(Module):
             self._state = "Ready"
         if self._state == "Ready" and now_s >= self._since_s + self._timeout_s:
             self._state = "Idle"
-            if not self._own and not self._default:
+            if self._template is None and not self._default:
                 return
             live.say(f"nothing happened for {self._timeout_s:g} s: {self._told()}")
             runner.run_lines("idle_timeout", ["_IDLE_TIMEOUT"])
             self._acting = True
 
     def _told(self) -> str:
-        return "the g-code of [idle_timeout] runs" if self._own else " and ".join(self._default)
+        return (
+            "the g-code of [idle_timeout] runs" if self._template is not None else " and ".join(self._default)
+        )
 
     def _lines(self, call: Call) -> Reading:
-        if self._own:
+        if self._template is not None:
             return self._template.lines(call, {})
         return Lines("\n".join(self._default))
 

@@ -9,8 +9,6 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from jinja2 import ChainableUndefined
-
 from coordinator.gcode.commands import Call
 from coordinator.machine.options import SectionSpec
 from coordinator.modules.absent_status import absent_statuses
@@ -21,6 +19,8 @@ from coordinator.modules.print_stats import PrintStats
 
 if TYPE_CHECKING:
     import asyncio
+
+    from jinja2 import ChainableUndefined
 
     from coordinator.modules.live import Live
 
@@ -137,7 +137,9 @@ class Section(dict[str, Any]):
         super().__init__(status)
         self._name = name
 
-    def __missing__(self, field: str) -> ChainableUndefined:
+    def __missing__(self, field: str) -> "ChainableUndefined":
+        from jinja2 import ChainableUndefined  # noqa: PLC0415 (planning without macros needs none)
+
         return ChainableUndefined(f"printer[{self._name!r}] has no {field!r}")
 
 

@@ -13,7 +13,7 @@ static const double ROUNDING_MM_S = 1e-6; // of speeds
 // ------------------------------------------------------------------------------------------------ memory
 
 static bool is_legal(const struct step_config *c) {
-    bool ok = c->stepper_count >= 0 && c->stepper_count <= STEP_MAX_STEPPERS && c->node_count >= 1 &&
+    bool ok = c->stepper_count >= 0 && c->stepper_count <= STEP_MAX_STEPPERS && c->node_count >= 0 &&
               c->node_count <= STEP_MAX_NODES && step_in_range(c->max_error_s, 0, 1);
     for (int i = 0; ok && i < AXES; i++)
         ok = fabs(c->start[i]) < LONGEST_S;

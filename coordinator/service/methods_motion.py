@@ -227,6 +227,7 @@ NEVER_BETWEEN: Final = frozenset(
     (
         *("G28", "M84", "M18", "SAVE_CONFIG", "PID_CALIBRATE", "MPC_CALIBRATE", "Z_ENDSTOP_CALIBRATE"),
         *("MANUAL_PROBE", "FORCE_MOVE", "SET_KINEMATIC_POSITION", "STEPPER_BUZZ", "INIT_TMC"),
+        *RESTARTS,
     )
 )
 """Not while a job prints: they lose where the head is, or need the machine for long."""
