@@ -136,8 +136,8 @@ def test_sockets_that_were_left_behind_stop_nobody(tmp_path: Path, canductor: Co
             assert err == (
                 f"canductor: several machines run here; name one with --at: {live}, {second_path}\n"
             )
-            # Once it answers, it has taken what looked whether it is there: asyncio loses a connection that is
-            # accepted while its server closes.
+            # Once it answers, it has taken what looked whether it is there: asyncio loses a connection that
+            # is accepted while its server closes.
             assert canductor("call", "machine.info", "--at", str(second_path))[0] == 0
             second_path.unlink()
         status, _, err = canductor("estop", "--at", old)
