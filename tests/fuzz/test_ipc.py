@@ -17,7 +17,7 @@ from tests.profiles import examples
 cuts = st.integers(0, 2**31 - 1)
 plain = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary()
 values = st.recursive(plain, lambda v: st.lists(v, max_size=4) | st.dictionaries(st.text(), v, max_size=4))
-short = settings(max_examples=examples(300), suppress_health_check=list(HealthCheck))
+short = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck))
 
 
 @short
@@ -33,7 +33,7 @@ def test_any_requests(requests: list[dict[str, object]], as_json: bool, cut: int
     run_session(b"".join(map(line if as_json else packed, [REQUESTS[1], *requests])), cut)
 
 
-@settings(short, max_examples=examples(80))
+@settings(short, max_examples=examples(50))
 @given(st.dictionaries(st.sampled_from(["id", "method", "params", "x"]), values), cuts)
 def test_any_values(message: dict[str, object], cut: int) -> None:
     run_session(packed(REQUESTS[1]) + packed({"method": "quick"} | message), cut)

@@ -7,7 +7,7 @@ from contextlib import AbstractAsyncContextManager, contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
-LAST_ROUNDS = 100
+LAST_ROUNDS = 10
 """Of the loop: asyncio takes some from accepting a connection to seeing that its client has left again."""
 
 

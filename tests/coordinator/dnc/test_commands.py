@@ -3,9 +3,11 @@
 import contextlib
 import math
 import os
+import queue
 import random
 import socket
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,9 @@ from serial import rfc2217
 
 from coordinator.cli import main
 from coordinator.command_line import read_words
-from coordinator.commands import Report
+from coordinator.dnc import commands
+from coordinator.dnc.command_line import DncCommand
+from coordinator.dnc.commands import Surroundings
 from coordinator.dnc.options import DncOptions
 from coordinator.dnc.port import Port, PortError
 from tests.coordinator.dnc.virtual_cable import PROGRAM, VirtualCable
@@ -165,8 +169,10 @@ def test_over_tcp(folders: tuple[Path, Path], scheme: str, capsys: pytest.Captur
         at = [f"127.0.0.1:{listener.getsockname()[1]}" for listener in (ours_at, theirs_at)]
         joining = threading.Thread(target=_join, args=(ours_at, theirs_at, scheme == "rfc2217"))
         joining.start()
-        serving = threading.Thread(target=_serve, args=(f"socket://{at[0]}", ours))
+        said: queue.Queue[str] = queue.Queue()
+        serving = threading.Thread(target=_serve, args=(f"socket://{at[0]}", ours, said.put))
         serving.start()
+        assert said.get().startswith("serving")
         words = ["dnc", "receive", "PART", "-p", f"{scheme}://{at[1]}", *FAST, *into(theirs)]
         assert main(words) == 0, capsys.readouterr()
         joining.join()
@@ -174,10 +180,11 @@ def test_over_tcp(folders: tuple[Path, Path], scheme: str, capsys: pytest.Captur
     assert (theirs / "PART.nc").read_bytes() == PROGRAM
 
 
-def _serve(url: str, folder: Path) -> Report | None:
+def _serve(url: str, folder: Path, say: Callable[[str], None]) -> None:
+    command = read_words(["dnc", "serve", str(folder), "-p", url, *FAST])
+    assert isinstance(command, DncCommand)
     with contextlib.suppress(PortError):  # the other side has gone
-        return read_words(["dnc", "serve", str(folder), "-p", url, *FAST])()
-    return None
+        commands.serve(command.job, around=Surroundings(say=say))
 
 
 def _join(ours_at: socket.socket, theirs_at: socket.socket, speaks_rfc2217: bool) -> None:
