@@ -7,8 +7,8 @@ import pytest
 
 from coordinator.demo.plant_heat import HeatSettings
 from nodes.errors import CanductorError
-from tests.sim.plant_stage import PlantStage
-from tests.system.service_stage import running
+from tests.stages.plant_stage import PlantStage
+from tests.stages.served import running
 
 
 def test_it_heats_and_a_job_is_done(tmp_path: Path) -> None:
