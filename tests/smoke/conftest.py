@@ -1,5 +1,6 @@
 """Hardware in processes of its own."""
 
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,11 +10,13 @@ from tests.stages.processes import Hardware, hardware
 
 
 @pytest.fixture(autouse=True)
-def own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep what commands write out of the user's home."""
-    for name in ("XDG_CACHE_HOME", "XDG_STATE_HOME", "XDG_RUNTIME_DIR"):
-        monkeypatch.setenv(name, str(tmp_path / name.lower()))
-        (tmp_path / name.lower()).mkdir(mode=0o700)
+def own_folders(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Keep what commands write out of the user's home; in a short path, as that of a socket has 107 bytes."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ("XDG_CACHE_HOME", "XDG_STATE_HOME", "XDG_RUNTIME_DIR"):
+            monkeypatch.setenv(name, f"{folder}/{name}")
+            Path(folder, name).mkdir(mode=0o700)
+        yield
 
 
 @pytest.fixture(scope="module")
