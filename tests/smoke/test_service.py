@@ -64,7 +64,7 @@ def as_planned(client: BlockingClient) -> None:
 
 def test_a_machine_is_served(machine: Hardware, tmp_path: Path) -> None:
     """By a client, by the commands of the command line, by the CAN tools, and to Prometheus."""
-    path, jobs = tmp_path / "xdg_runtime_dir" / "canductor" / "mine.sock", tmp_path / "jobs"
+    path, jobs = Path(os.environ["XDG_RUNTIME_DIR"]) / "canductor" / "mine.sock", tmp_path / "jobs"
     path.parent.mkdir(mode=0o700)
     jobs.mkdir()
     part = write_gcode(tmp_path, SLOW)
