@@ -1,7 +1,8 @@
 """equivalent.toml: survivors that no test can kill, each with the reason.
 
 An entry names the file, the text of the source line without the blanks around it, the change as the report
-prints it ("< -> <="), the reason, and the line above where several lines read the same; so it stays true when lines move, and is stale when the line changes.
+prints it ("< -> <="), the reason, and the line above where several lines read the same; so it stays true when
+lines move, and is stale when the line changes.
 """
 
 import tomllib
