@@ -79,7 +79,8 @@ def test_what_moves_or_heats_ends_with_a_shutdown(kind: str, oid: int) -> None:
         {
             "stepper": f"config_stepper oid={oid} step_pin=3 dir_pin=4 invert_step=255 step_pulse_ticks=0",
             "digital_out": f"config_digital_out oid={oid} pin=40 value=0 default_value=0 max_duration=0",
-            "pwm_out": f"config_pwm_out oid={oid} pin=41 cycle_ticks=9 value=0 default_value=0 max_duration=0",
+            "pwm_out": f"config_pwm_out oid={oid} pin=41 cycle_ticks=9 value=0 default_value=0"
+            " max_duration=0",
         }[kind],
         oids=COUNT,
     )
