@@ -18,6 +18,8 @@ class Mutation:
     """Counted from 1."""
     source_line: str
     """The text of this line, without the blanks around it."""
+    above: str = ""
+    """The text of the line above it, likewise."""
     occurrence: int = 1
     """Which of several equal texts in its line it replaces, counted from 1."""
 
@@ -73,6 +75,7 @@ def mutations(file: str, source: bytes, places: list[Place]) -> list[Mutation]:
                     original,
                     source.count(b"\n", 0, place.start) + 1,
                     source_line,
+                    source[:line_start].decode().rstrip("\n").rpartition("\n")[2].strip(),
                     before + 1,
                 )
     return list(found.values())

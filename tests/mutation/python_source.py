@@ -48,6 +48,7 @@ class _Source:
             self._line_starts.append(self._line_starts[-1] + len(line))
         self._tokens = list(self._code_tokens())
         self.skipped = set(self._not_code())
+        self.empty_ends = set(self._empty_ends())
 
     def _code_tokens(self) -> Iterator[tuple[int, int, str]]:
         text = self.source.decode().splitlines(keepends=True)
@@ -76,6 +77,16 @@ class _Source:
             if [token[2] for token in found] == words:
                 return found[0][0], found[-1][1]
         return None
+
+    def _empty_ends(self) -> Iterator[ast.stmt]:
+        """Yield returns of nothing at the end of a function, which would return nothing without them."""
+        for node in ast.walk(self.tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                last = node.body[-1]
+                if isinstance(last, ast.Return) and (
+                    last.value is None or (isinstance(last.value, ast.Constant) and last.value.value is None)
+                ):
+                    yield last
 
     def _not_code(self) -> Iterator[ast.AST]:
         """Yield annotations, decorators' flags and what only a type checker executes."""
@@ -183,5 +194,5 @@ def _deletions(parsed: _Source, node: ast.AST) -> Iterator[Place]:
     deletable = isinstance(
         node, ast.AugAssign | ast.Raise | ast.Break | ast.Continue | ast.Return | ast.Delete
     )
-    if is_attribute or is_call or deletable:
+    if (is_attribute or is_call or deletable) and node not in parsed.empty_ends:
         yield Place(*parsed.span(node), ("pass",))

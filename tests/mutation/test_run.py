@@ -1,6 +1,7 @@
 """Samples, the order of tests, the verdict, and the list of explained survivors."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,7 @@ def test_every_explanation_is_of_a_change_that_exists_once() -> None:
     possible = [m for file in sorted({entry.file for entry in entries}) for m in run.find_mutations(file)]
     stale = [entry for entry in entries if not any(entry.matches(m) for m in possible)]
     assert not stale, "the line or the change is no longer in the code"
-    assert len({(e.file, e.line, e.change) for e in entries}) == len(entries)
+    assert len({(e.file, e.line, e.change, e.above) for e in entries}) == len(entries)
 
 
 def test_an_explanation_follows_its_line(tmp_path: Path) -> None:
@@ -39,6 +40,10 @@ def test_an_explanation_follows_its_line(tmp_path: Path) -> None:
     entries = explained.read_list(path)
     assert explained.reason(mutation(line=7), entries) == "r"
     assert explained.reason(mutation("firmware/core/base.c"), entries) is None
+    path.write_text(path.read_text() + 'above = "x = 1"\n')
+    entries = explained.read_list(path)
+    assert explained.reason(mutation(line=7), entries) is None
+    assert explained.reason(replace(mutation(line=7), above="x = 1"), entries) == "r"
 
 
 def test_a_sample_depends_on_its_seed_alone() -> None:

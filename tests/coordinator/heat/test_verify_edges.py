@@ -62,13 +62,6 @@ def test_while_it_falls_the_gain_counts_from_the_bottom() -> None:
     assert found.check(140.0, 18.9, 200, ON) is not None
 
 
-def test_another_target_begins_a_new_time() -> None:
-    found = approaching()
-    assert found.check(119.0, 20.0, 210, ON) is None
-    assert found.check(138.9, 20.0, 210, ON) is None
-    assert found.check(139.0, 20.0, 210, ON) is not None
-
-
 def test_the_same_target_after_it_was_off_begins_a_new_time() -> None:
     found = approaching()
     assert found.check(110.0, 20.0, 0, ON) is None
@@ -119,6 +112,10 @@ def test_the_error_of_one_target_is_not_that_of_the_next() -> None:
         assert found.error_ks == 0.0
     assert found.check(107.0, 170.0, 180, ON) is None
     assert found.error_ks == 5.0, "180 °C were reached from above"
+    found = holding()
+    assert found.check(105.0, 185.0, 200, ON) is None
+    assert found.check(106.0, 185.0, 210, ON) is None
+    assert found.error_ks == 0.0
 
 
 def test_after_it_was_off_the_range_has_to_be_reached_again() -> None:
@@ -201,6 +198,29 @@ def test_power_between_begins_it_again() -> None:
     assert found.check(32.0, 46.0, 0, OFF) is None
     assert found.check(61.9, 60.0, 0, OFF) is None
     assert found.check(62.1, 66.0, 0, OFF) is not None
+
+
+def test_it_is_off_from_the_first_look_that_finds_it_off() -> None:
+    found = check()
+    assert found.check(0.0, 40.0, 0, ON) is None
+    for now_s, celsius in ((10.0, 40.0), (31.0, 40.0), (39.9, 90.0)):
+        assert found.check(now_s, celsius, 0, OFF) is None
+    assert found.check(40.0, 96.0, 0, OFF) is not None
+
+
+def test_a_heater_that_is_off_may_be_as_cold_as_it_likes() -> None:
+    found = check()
+    assert found.error_ks == 0.0
+    for second in range(60):
+        assert found.check(second, -20.0, 0, OFF) is None
+    assert found.check(60.0, -20.0, 1.0, ON) is None, "the lowest target there is has to be approached"
+    assert found.check(79.9, -20.0, 1.0, ON) is None
+    assert found.check(80.0, -20.0, 1.0, ON) is not None
+
+
+def test_a_first_target_is_approached_whatever_it_is() -> None:
+    found = check()
+    assert found.check(50.0, -20.0, 1.0, ON) is None
 
 
 def test_a_stuck_switch_is_found_above_a_target_too() -> None:

@@ -69,6 +69,10 @@ def test_values_out_of_range_stop_the_machine_once_when_there_are_six_in_a_row(c
     assert len(machine.causes) == 1
 
 
+def test_a_source_is_on_no_node_unless_it_says_so() -> None:
+    assert TemperatureSource("chamber", 5.0, 80.0).node == ""
+
+
 def test_looks_without_a_measurement_are_counted_from_the_last_one() -> None:
     source = Source()
     assert [source.missed() for _ in range(3)] == [0, 1, 2]
