@@ -111,8 +111,8 @@ def _literals(node: Node) -> Iterator[Place]:
         value = number - 1 if in_array else 0 if number == 1 else number + 1
         yield Place(node.start_byte, node.end_byte, (f"{value}{suffix}",))
     elif match := _FLOAT.fullmatch(text):
-        more = float(match[1]) + 1
-        yield Place(node.start_byte, node.end_byte, (f"{more!r}{match[2].decode()}",))
+        real = float(match[1])
+        yield Place(node.start_byte, node.end_byte, (f"{real + 1!r}{match[2].decode()}",))
 
 
 def _conditions(node: Node) -> Iterator[Place]:
