@@ -39,12 +39,22 @@ _ROOT: Final = Path(__file__).parent.parent.parent
 
 
 class Endpoints:
-    """Serves calls from SERVICE. SAY shows a line to all who listen to what g-code answers."""
+    """Serves calls from SERVICE.
 
-    def __init__(self, service: "MachineService", config: Path, say: Callable[[str], None]) -> None:
+    SAY shows a line to all who listen to what g-code answers; REGISTERED hears that remote methods changed.
+    """
+
+    def __init__(
+        self,
+        service: "MachineService",
+        config: Path,
+        say: Callable[[str], None],
+        registered: Callable[[], None],
+    ) -> None:
         self.status = StatusBuilder(service)
         self._service = service
         self._say = say
+        self._registered = registered
         self._about = {
             "hostname": platform.node(),
             "klipper_path": str(_ROOT),
@@ -197,6 +207,7 @@ class Endpoints:
         name, template = text_of(request, "remote_method"), template_of(request)
         if not client.register(name, template):
             raise RequestError(f"a client may register {REMOTE_METHODS_MAX} remote methods")
+        self._registered()
         return {}
 
     def _emergency_stop(self, _client: Client, _request: Request) -> Result:

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.ipc.turns import Turns
@@ -142,7 +142,8 @@ class Gateway:
 
     def __init__(self, service: "MachineService", config: Path, *, on_notice: Callable[[str], None]) -> None:
         self.notice = on_notice
-        self.endpoints = Endpoints(service, config, self.say)
+        self.endpoints = Endpoints(service, config, self.say, self.registered)
+        service.programs.on_remote = self._call_remote
         self._service = service
         self._connections: dict[Connection, None] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -199,6 +200,7 @@ class Gateway:
         for connection in list(self._connections):
             connection.transport.close()
         self._connections.clear()
+        self.registered()
 
     # ---------------------------------------------------------------------------------------- clients
 
@@ -213,6 +215,7 @@ class Gateway:
     def forget(self, connection: Connection) -> None:
         """Take note that CONNECTION is over."""
         self._connections.pop(connection, None)
+        self.registered()
 
     def call(self, connection: Connection, request: Request) -> None:
         """Begin REQUEST; it is answered when it is done."""
@@ -294,9 +297,13 @@ class Gateway:
             if connection.client.output is not None:
                 connection.send(event_message(connection.client.output, {"response": text}))
 
-    def call_remote(self, name: str, values: Mapping[str, Any]) -> bool:
-        """Call the remote method NAME of every client that has it; return whether any has."""
-        found = [c for c in self._connections if name in c.client.remote_methods]
-        for connection in found:
-            connection.send(event_message(connection.client.remote_methods[name], values))
-        return bool(found)
+    def registered(self) -> None:
+        """Take note that what clients have registered may have changed."""
+        names = (name for connection in self._connections for name in connection.client.remote_methods)
+        self._service.programs.remote_methods = frozenset(names)
+
+    def _call_remote(self, name: str, values: Mapping[str, object]) -> None:
+        for connection in list(self._connections):
+            template = connection.client.remote_methods.get(name)
+            if template is not None:
+                connection.send(event_message(template, values))

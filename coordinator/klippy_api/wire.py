@@ -89,11 +89,11 @@ def read_request(body: bytes) -> Request:
 
 
 def encode(message: Mapping[str, Any]) -> bytes:
-    """Return MESSAGE as it is sent; numbers that JSON does not have go out as null."""
+    """Return MESSAGE as it is sent; numbers that JSON does not have go out as null, other things as text."""
     try:
-        text = json.dumps(message, separators=(",", ":"), allow_nan=False)
+        text = json.dumps(message, separators=(",", ":"), allow_nan=False, default=str)
     except ValueError:
-        text = json.dumps(_finite(message), separators=(",", ":"), allow_nan=False)
+        text = json.dumps(_finite(message), separators=(",", ":"), allow_nan=False, default=str)
     return text.encode(errors="replace") + END
 
 

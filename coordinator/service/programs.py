@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.gcode.print_control import Recovering
@@ -47,6 +47,10 @@ class Programs:
         self._card: VirtualSdcard | None = None
         self._pauses: PauseResume | None = None
         self._told: tuple[JobRun, JobPhase] | None = None
+        self.remote_methods: frozenset[str] = frozenset()
+        """Names of what clients have registered; replaced, never changed."""
+        self.on_remote: Callable[[str, Mapping[str, object]], None] | None = None
+        """Calls one of these at those clients."""
 
     def begin(self, machine: "Machine") -> None:
         """Serve MACHINE, which has just been made ready."""
@@ -86,6 +90,11 @@ class Programs:
             self.run_paused(name, lines, stay=False)
         else:
             self._start(self._run(LinesWork(lines, name=name, rest=Rest.OPEN)))
+
+    def call_remote(self, name: str, values: Mapping[str, object]) -> None:
+        """Have every client that registered the method NAME called with VALUES."""
+        if self.on_remote is not None:
+            self.on_remote(name, values)
 
     def run_paused(self, name: str, lines: Sequence[str], *, stay: bool) -> None:
         """Have LINES done with the job paused."""

@@ -28,6 +28,8 @@ gcode:
     M114
     NONSENSE
     GET_POSITION
+    { action_call_remote_method("shutdown_machine", delay=3) }
+    { action_call_remote_method("nobody_has_it") }
 [gcode_macro QUIET]
 gcode:
     M117 quiet
@@ -146,6 +148,9 @@ async def _check_outputs(client: KlippyClient) -> None:
     assert any(line.startswith("X:120.000 Y:40.000") for line in said)
     assert any(line.startswith("// ") and "NONSENSE" in line for line in said), "unknown, and no error"
     assert any(line.startswith("// toolhead: X:120.000000") for line in said)
+    assert "// the remote method nobody_has_it was not called: no client has registered one" in said
+    calls = [event["params"] for event in client.events if event["method"] == "shutdown_machine"]
+    assert calls == [{"delay": 3}]
     assert "outside" in await client.error("gcode/script", {"script": "G1 X9999\nM117 not done"})
     assert [line for line in client.said() if line.startswith("!! ")]
     assert (await client.query("display_status"))["display_status"]["message"] is None
