@@ -70,6 +70,10 @@ class ServeOptions:
     """Announce the machine on the network; None: if its TCP port can be reached from there."""
     metrics: tuple[str, int] | None = None
     """IP address and port of the figures for Prometheus."""
+    config: Path = Path()
+    """The configuration file, for clients that show where it is."""
+    klippy_api: Path | None = None
+    """The Unix socket for Moonraker (docs/klippy-api.md); None: there is none."""
     metrics_open: bool = False
     """Whether others than this computer may read them."""
 

@@ -25,6 +25,7 @@ from coordinator.gcode.events import (
     Timed,
     Wait,
 )
+from coordinator.gcode.figures import motion_figures
 from coordinator.motion.planner import Planner
 from coordinator.motion.steps import StepGenerator
 from coordinator.move_source import MoveSource, Planned, Told, Witness
@@ -212,6 +213,8 @@ class MotionWorker:
             stands_from_s=self.pipeline.moved_until + self.steps.lag_s if stands else None,
             steps_sent=tuple(self._counts().values()),
             offset=planner.gcode_offset,
+            figures=motion_figures(planner, self._job.machine),
+            unit_mm=planner.unit_mm,
         )
 
     def _still_waiting(self, event: Event | None, now: float) -> bool:

@@ -1,5 +1,7 @@
 """What drives the pipeline: a source of moves, and who looks on while they go by."""
 
+from collections.abc import Mapping
+from dataclasses import field
 from typing import Any, Protocol
 
 from coordinator.gcode.events import Event, Notice, Reply
@@ -78,6 +80,10 @@ class Planned:
     """By stepper: steps from the start that its commands add up to."""
     offset: Position = (0.0, 0.0, 0.0, 0.0)
     """SET_GCODE_OFFSET."""
+    figures: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    """``toolhead``, ``gcode_move``, extruders and carriages as macros see them (gcode/figures.py)."""
+    unit_mm: float = 1.0
+    """Of the program: 25.4 after G20."""
 
 
 @record

@@ -17,6 +17,7 @@ def declare_serving(command: argparse.ArgumentParser) -> None:
     """Add the words to COMMAND."""
     add = command.add_argument_group("serving front ends").add_argument
     add("--ipc", type=Path, metavar="PATH", help="serve at this Unix socket; see docs/run.md")
+    add("--klippy-api", type=Path, metavar="PATH", help="serve Moonraker at this Unix socket, too")
     add("--name", metavar="NAME", help="of the machine; the configuration file's name if not given")
     add("--jobs", type=Path, metavar="DIR", help="folder of the files that front ends may print")
     add("--node-commands", action="store_true", help="let administrators send raw commands to nodes")
@@ -42,7 +43,9 @@ def declare_serving(command: argparse.ArgumentParser) -> None:
 
 def is_asked_to_serve(given: argparse.Namespace) -> bool:
     """Tell whether the words ask for a service that stays."""
-    return any(word is not None for word in (given.ipc, given.tcp, given.web, given.metrics))
+    return any(
+        word is not None for word in (given.ipc, given.klippy_api, given.tcp, given.web, given.metrics)
+    )
 
 
 def read_serving(given: argparse.Namespace, config: Path, announce: bool | None = None) -> ServeOptions:
@@ -57,6 +60,8 @@ def read_serving(given: argparse.Namespace, config: Path, announce: bool | None 
     return ServeOptions(
         name=name,
         path=given.ipc,
+        config=config,
+        klippy_api=given.klippy_api,
         jobs=given.jobs,
         node_commands=given.node_commands,
         tcp=None if given.tcp is None else _host_port("--tcp", given.tcp),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from coordinator.gcode import machine_commands, state_commands
 from coordinator.gcode.commands import AtRest, Done
 from coordinator.gcode.events import Emergency, Reply, Wait
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.gcode.words import Command, WordError, number
 from coordinator.motion.language import ARC_LETTERS, Plane
 from coordinator.motion.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus
@@ -199,7 +200,9 @@ def _wait_for_moves(job: Job, _command: Command) -> bool:
 
 def _tell_position(job: Job, _command: Command) -> bool:
     position = zip(AXIS_LETTERS, job.planner.gcode_position, strict=True)
-    job.emit(Reply(job.line, " ".join(f"{letter}:{value:.3f}" for letter, value in position)))
+    job.emit(
+        Reply(job.line, " ".join(f"{letter}:{value:.3f}" for letter, value in position), ReplyKind.PLAIN)
+    )
     return True
 
 
@@ -222,7 +225,7 @@ def _ignore(_job: Job, _command: Command) -> bool:
 
 
 def _say(job: Job, command: Command) -> bool:
-    job.emit(Reply(job.line, f"echo: {command.text.strip()}"))
+    job.emit(Reply(job.line, f"echo: {command.text.strip()}", ReplyKind.PLAIN))
     return True
 
 

@@ -17,6 +17,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import field, replace
 from typing import TYPE_CHECKING
 
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.gcode.words import Command
 from nodes.records import record
 
@@ -67,6 +68,8 @@ class Done:
     """Whether steppers were moved past the program's own moves."""
     second_carriage_mm: float | None = None
     """Where the second carriage was homed; None: where the configuration says."""
+    kind: ReplyKind = ReplyKind.INFORMATION
+    """Of the replies."""
 
 
 @record
@@ -76,6 +79,8 @@ class AtOnce:
     replies: tuple[str, ...] = ()
     act: Callable[[], None] | None = None
     """Quick, in the reader's thread, also when a program is only planned."""
+    kind: ReplyKind = ReplyKind.INFORMATION
+    """Of the replies."""
 
 
 @record

@@ -25,6 +25,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
 from coordinator.gcode.commands import Done
+from coordinator.gcode.reply_kinds import ReplyKind
 from nodes.records import record
 
 
@@ -142,6 +143,7 @@ class Reply:
 
     line: int
     text: str
+    kind: ReplyKind = ReplyKind.INFORMATION
 
 
 @record

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job
     from coordinator.gcode.machine_state import MachineState
+    from coordinator.motion.planner import Planner
 
 
 class Place(NamedTuple):
@@ -19,9 +20,13 @@ class Place(NamedTuple):
 
 def gcode_figures(job: "Job") -> Mapping[str, Mapping[str, object]]:
     """Return where the moves read so far lead to, and what holds for those to come; mm, mm/s, mm/s²."""
-    planner = job.planner
+    return motion_figures(job.planner, job.machine)
+
+
+def motion_figures(planner: "Planner", machine: "MachineState") -> Mapping[str, Mapping[str, object]]:
+    """Return the same of PLANNER and MACHINE; in the thread that reads programs."""
     limits = planner.limits
-    active = job.machine.active
+    active = machine.active
     toolhead = {
         "position": Place(*planner.toolhead_position),
         "homed_axes": planner.homed.lower(),
@@ -49,7 +54,6 @@ def gcode_figures(job: "Job") -> Mapping[str, Mapping[str, object]]:
         "absolute_extrude": not planner.relative_extrusion,
         "axis_map": {"X": 0, "Y": 1, "Z": 2, "E": 3},
     }
-    machine = job.machine
     return {"toolhead": toolhead, "gcode_move": gcode_move, **_extruders(machine), **_carriages(machine)}
 
 

@@ -41,6 +41,7 @@ from coordinator.gcode.figures import gcode_figures
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.print_control import PrintControl
 from coordinator.gcode.program import Program
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.gcode.words import Command, WordError, parse, quoted
 from coordinator.motion.language import READ_IN_C
 from coordinator.motion.planner import Feed, FeedStatus, Planner
@@ -342,7 +343,7 @@ class Job:
             case AtOnce():
                 if reading.act is not None:
                     reading.act()
-                self._reply(reading.replies)
+                self._reply(reading.replies, reading.kind)
             case InTime():
                 self._events.append(Timed(self.line, self.planner.moves, reading.act))
             case AtRest():
@@ -375,7 +376,7 @@ class Job:
     def take(self, done: Done) -> None:
         """Take over what was done at rest."""
         planner = self.planner
-        self._reply(done.replies)
+        self._reply(done.replies, done.kind)
         planner.homed = "".join(axis for axis in planner.homed if axis not in done.unhomed)
         if done.position is None:
             return
@@ -385,8 +386,8 @@ class Job:
         machine_commands.home_carriages(self, done.homed, done.second_carriage_mm)
         self._events.append(PositionSet(self.line, done.homed, done.position, planner.print_time_end_s))
 
-    def _reply(self, texts: tuple[str, ...]) -> None:
-        self._events.extend(Reply(self.line, text) for text in texts)
+    def _reply(self, texts: tuple[str, ...], kind: ReplyKind = ReplyKind.INFORMATION) -> None:
+        self._events.extend(Reply(self.line, text, kind) for text in texts)
 
     # ---- For the handlers ----
 

@@ -2,10 +2,7 @@
 
 import asyncio
 import contextlib
-import os
-import socket
 import ssl
-import struct
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from ipaddress import ip_address
@@ -14,7 +11,7 @@ from typing import Final
 
 from coordinator.ipc.auth import FailureBrake, Grant, Tokens, digest_of, stamp_of
 from coordinator.ipc.connection import Connection
-from coordinator.ipc.door import BACKLOG, HANDSHAKES_MAX, Door
+from coordinator.ipc.door import HANDSHAKES_MAX, Door
 from coordinator.ipc.methods import ApiError, Registry, Value
 from coordinator.ipc.publisher import Publisher
 from coordinator.ipc.session import Common, Session, SessionCounters
@@ -22,11 +19,10 @@ from coordinator.ipc.session_methods import add_session_methods
 from coordinator.ipc.settings import IpcSettings, Limits, TcpSettings
 from coordinator.ipc.state import StateTree
 from coordinator.ipc.turns import Turns
+from coordinator.ipc.unix_socket import BACKLOG, listen_at, may_use, peer_of
 from coordinator.ipc.wire import Encoder, Encoding, Fault
 from nodes.errors import CanductorError
 
-_PEER: Final = struct.Struct("3i")
-"""Of SO_PEERCRED: pid, uid, gid."""
 TOKENS_LOOK_S: Final = 1.0
 """Between looks at whether the tokens' file has changed."""
 REFUSALS_MAX: Final = 32
@@ -154,17 +150,10 @@ class IpcServer:
     # ---------------------------------------------------------------------------------------- sockets
 
     async def _open_unix(self, path: Path, turns: Turns) -> None:
-        await asyncio.to_thread(_make_way, path)
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            os.fchmod(listener.fileno(), 0o600)  # before there is a name, so that nobody can be faster
-            listener.bind(str(path))
-            server = await asyncio.get_running_loop().create_unix_server(
-                lambda: Connection(self._admit_unix, self._drop, turns), sock=listener, backlog=BACKLOG
-            )
-        except OSError as error:
-            listener.close()
-            raise CanductorError(f"the socket {path} cannot be opened: {error.strerror or error}") from None
+        listener = await listen_at(path)
+        server = await asyncio.get_running_loop().create_unix_server(
+            lambda: Connection(self._admit_unix, self._drop, turns), sock=listener, backlog=BACKLOG
+        )
         self._servers.append(server)
 
     async def _open_tcp(self, tcp: TcpSettings, turns: Turns) -> None:
@@ -274,11 +263,10 @@ class IpcServer:
         return self._brake.shut_out_s(address, asyncio.get_running_loop().time())
 
     def _admit_unix(self, transport: asyncio.Transport, connection: Connection) -> Session:
-        opened = transport.get_extra_info("socket")
-        pid, uid, _ = _PEER.unpack(opened.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
+        pid, uid = peer_of(transport.get_extra_info("socket"))
         session = self._session(connection, f"uid {uid}, pid {pid}", self._token_check(connection, ""))
         session.granted = self._settings.unix_scope
-        if uid not in (0, os.geteuid()):
+        if not may_use(uid):
             self._refuse(session, Fault("not_allowed", f"this socket is not for the user with uid {uid}"))
         return session
 
@@ -335,26 +323,6 @@ def _shut_out_sentence(address: str, wait_s: float) -> str:
 
 
 # ------------------------------------------------------------------------------------------------- opening
-
-
-def _make_way(path: Path) -> None:
-    """Make the folder of PATH, and remove a socket that a dead coordinator left there."""
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not path.is_socket():
-            if path.exists():
-                raise CanductorError(f"{path} is there and no socket; choose another path or remove it")
-            return
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-            probe.settimeout(1.0)
-            try:
-                probe.connect(str(path))
-            except ConnectionRefusedError:
-                path.unlink()
-                return
-    except OSError as error:
-        raise CanductorError(f"the socket {path} cannot be opened: {error.strerror or error}") from None
-    raise CanductorError(f"another coordinator serves at {path}; stop it, or choose another path")
 
 
 def _tls_of_tcp(tcp: TcpSettings) -> ssl.SSLContext | None:

@@ -3,6 +3,7 @@
 from typing import Final
 
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.machine.options import SectionSpec
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.print_stats import PrintStats
@@ -44,4 +45,4 @@ class Console(Module):
     def _identify(self, _call: Call) -> Reading:
         from importlib.metadata import version  # noqa: PLC0415 (start-up time: it draws in the mail parser)
 
-        return AtOnce((f"FIRMWARE_NAME:{NAME} FIRMWARE_VERSION:{version(NAME)}",))
+        return AtOnce((f"FIRMWARE_NAME:{NAME} FIRMWARE_VERSION:{version(NAME)}",), kind=ReplyKind.PLAIN)

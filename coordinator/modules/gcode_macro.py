@@ -62,8 +62,9 @@ class GCodeTemplate:
         def fail(text: object) -> str:
             raise Asked(str(text))
 
-        def call_remote(method: object, **_values: object) -> str:
-            replies.append(f"the remote method {method} was not called: no client has registered one")
+        def call_remote(method: object, **values: object) -> str:
+            if not self._status.call_remote(str(method), values):
+                replies.append(f"the remote method {method} was not called: no client has registered one")
             return ""
 
         def stop(text: object = "") -> str:

@@ -4,6 +4,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import ClassVar, Final
 
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, InTime, Reading
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.gcode.words import WordError
 from coordinator.machine.options import SectionSpec
 from coordinator.modules.base import Build, Module, Value
@@ -100,13 +101,13 @@ class Heaters(Module):
             unit.set_target(celsius)
             if celsius > 0:
                 await unit.reach()
-            return Done((self.temperatures(),))
+            return Done((self.temperatures(),), kind=ReplyKind.PLAIN)
 
         return AtRest(perform)
 
     def _tell(self, call: Call) -> Reading:
         numbers(call.command, "T")
-        return AtOnce((self.temperatures(),))
+        return AtOnce((self.temperatures(),), kind=ReplyKind.PLAIN)
 
     def _turn_off(self, call: Call) -> Reading:
         parameters(call.command, ())

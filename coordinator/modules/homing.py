@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.machine.options import SectionSpec
 from coordinator.machine.problem import ConfigError
 from coordinator.modules.base import Build, Module, Modules, Value
@@ -250,7 +251,7 @@ class Homing(Module):
         rails = self._described.stops
         self._last_query = {rail.axis: await self._pressed(rail) for rail in rails}
         told = [f"{axis}:{'pressed' if pressed else 'open'}" for axis, pressed in self._last_query.items()]
-        return Done((" ".join(told) or "this machine has no endstops on pins",))
+        return Done((" ".join(told) or "this machine has no endstops on pins",), kind=ReplyKind.PLAIN)
 
     async def _any_pressed(self, rails: Sequence["RailDescription"]) -> bool:
         return any([await self._pressed(rail) for rail in rails])

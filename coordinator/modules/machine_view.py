@@ -86,7 +86,7 @@ class _Computer(Mapping[str, Any]):
         if name == "cputime":
             return round(time.process_time(), 3)
         if name == "memavail":
-            return _available_kb()
+            return available_kb()
         raise KeyError(name)
 
     def __iter__(self) -> Iterator[str]:
@@ -96,7 +96,7 @@ class _Computer(Mapping[str, Any]):
         return 3
 
 
-def _available_kb() -> int:
+def available_kb() -> int:
     """Return how much memory programs may still get, kB; 0: not known."""
     try:
         with _MEMORY.open(encoding="ascii") as file:

@@ -12,7 +12,7 @@ from coordinator.modules.base import Build, Module, Value
 from coordinator.modules.words import bounded, parameters
 
 _LAYERS_MAX: Final = 1e6
-_NOTHING: Final[Mapping[str, Value]] = {
+NOTHING: Final[Mapping[str, Value]] = {
     "state": "standby",
     "filename": "",
     "total_duration": 0.0,
@@ -30,10 +30,10 @@ class PrintStats(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "print_stats"
-        self.told: Mapping[str, Value] = _NOTHING
+        self.told: Mapping[str, Value] = NOTHING
         """By the service; replaced, never changed."""
-        self._total: float | None = None
-        self._current: float | None = None
+        self._total: int | None = None
+        self._current: int | None = None
         build.add_command(
             GCodeCommand(
                 "SET_PRINT_STATS_INFO",
@@ -54,7 +54,7 @@ class PrintStats(Module):
 
     def forget(self) -> None:
         """Forget a job that has ended; one that has not, the service tells again."""
-        self.told = _NOTHING
+        self.told = NOTHING
         self.job_begins()
 
     def status(self) -> Mapping[str, Value]:
@@ -69,8 +69,9 @@ class PrintStats(Module):
 
         def act() -> None:
             if total is not None and total != self._total:
-                self._total, self._current = (int(total) or None), None
+                self._total = int(total) or None
+                self._current = None if self._total is None else 0
             if current is not None:
-                self._current = int(current)
+                self._current = int(current) if self._total is None else min(int(current), self._total)
 
         return AtOnce(act=act)

@@ -57,6 +57,15 @@ class PrinterStatus(Module):
         """Ask the loop no more."""
         self._loop = self._live = None
 
+    def call_remote(self, name: str, values: Mapping[str, object]) -> bool:
+        """Call clients that registered the method NAME; return whether there are any. From any thread."""
+        live = self._live
+        runner = None if live is None else live.machine.runner
+        if live is None or runner is None or name not in runner.remote_methods:
+            return False
+        live.soon_on_loop(lambda: runner.call_remote(name, values))
+        return True
+
     def view(self, call: Call) -> "PrinterView":
         """Return ``printer`` for a rendering of CALL."""
         return PrinterView(self._look, call.figures)

@@ -1,6 +1,7 @@
 """[respond]: RESPOND shows a line to the user, with a prefix that tells its kind; so does M118."""
 
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.reply_kinds import kind_of_line
 from coordinator.gcode.words import WordError, quoted
 from coordinator.machine.options import ChoiceOption, SectionSpec, TextOption
 from coordinator.modules.base import Build, Module
@@ -28,7 +29,7 @@ class Respond(Module):
         )
 
     def _echo(self, call: Call) -> Reading:
-        return AtOnce((f"{self._prefix} {call.command.text.strip()}",))
+        return _line(f"{self._prefix} {call.command.text.strip()}")
 
     def _respond(self, call: Call) -> Reading:
         values = parameters(call.command, ("TYPE", "PREFIX", "MSG"))
@@ -36,8 +37,12 @@ class Respond(Module):
         if "TYPE" in values:
             kind = values["TYPE"].lower()
             if kind == "echo_no_space":
-                return AtOnce((PREFIXES["echo"] + values.get("MSG", ""),))
+                return _line(PREFIXES["echo"] + values.get("MSG", ""))
             if kind not in PREFIXES:
                 raise WordError(f"TYPE of RESPOND is {quoted(kind)}; there are {' '.join(PREFIXES)}")
             prefix = PREFIXES[kind]
-        return AtOnce((f"{values.get('PREFIX', prefix)} {values.get('MSG', '')}",))
+        return _line(f"{values.get('PREFIX', prefix)} {values.get('MSG', '')}")
+
+
+def _line(line: str) -> AtOnce:
+    return AtOnce((line,), kind=kind_of_line(line))

@@ -1,6 +1,6 @@
 """What modules may have a service do. Without one (a file is run, a program is planned) there is none."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 
@@ -22,6 +22,14 @@ class Runner(Protocol):
 
         TEXT is what they stand for: a job is paused first if there are words in it that pause or cancel one.
         """
+
+    @property
+    def remote_methods(self) -> frozenset[str]:
+        """Names of the methods that clients have registered for programs to call; from any thread."""
+        ...
+
+    def call_remote(self, name: str, values: Mapping[str, object]) -> None:
+        """Have every client that registered the method NAME called with VALUES."""
 
     def run_paused(self, name: str, lines: Sequence[str], *, stay: bool) -> None:
         """Have LINES done with the job paused, if there is one: they may move.

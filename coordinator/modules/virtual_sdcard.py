@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, ToProgram
 from coordinator.gcode.print_control import Recovering
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.gcode.words import WordError
 from coordinator.machine.options import GCodeOption, SectionSpec, TextOption
 from coordinator.modules.base import Build, Module, Value
@@ -109,10 +110,10 @@ class VirtualSdcard(Module):
             files = [f"{name} {size}" for name, size in self.files()]
         except CanductorError as error:
             raise WordError(str(error)) from None
-        return AtOnce(("Begin file list", *files, "End file list"))
+        return AtOnce(("Begin file list", *files, "End file list"), kind=ReplyKind.PLAIN)
 
     def _init(self, _call: Call) -> Reading:
-        return AtOnce(("SD card ok",))
+        return AtOnce(("SD card ok",), kind=ReplyKind.PLAIN)
 
     def _select(self, call: Call) -> Reading:
         name = call.command.text.strip().lstrip("/")
@@ -123,7 +124,7 @@ class VirtualSdcard(Module):
         def act() -> None:
             self._selected = name
 
-        return AtOnce((f"File selected: {name}",), act)
+        return AtOnce((f"File selected: {name}",), act, kind=ReplyKind.PLAIN)
 
     def _start(self, _call: Call) -> Reading:
         def act(job: "Job") -> bool:
@@ -154,9 +155,11 @@ class VirtualSdcard(Module):
 
     def _tell(self, _call: Call) -> Reading:
         if self._stats.state not in ("printing", "paused"):
-            return AtOnce(("Not SD printing.",))
+            return AtOnce(("Not SD printing.",), kind=ReplyKind.PLAIN)
         place = self.place
-        return AtOnce((f"SD printing byte {place['file_position']}/{place['file_size']}",))
+        return AtOnce(
+            (f"SD printing byte {place['file_position']}/{place['file_size']}",), kind=ReplyKind.PLAIN
+        )
 
     def _recover(self, call: Call) -> Reading:
         values = parameters(call.command, ("LINE", "HOME", "Z"))

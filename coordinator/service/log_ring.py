@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from typing import Final
 
+from coordinator.gcode.reply_kinds import ReplyKind
+
 KEEP: Final = 1000
 TEXT_MAX: Final = 2000
 
@@ -20,11 +22,13 @@ class LogRing:
         self.count = 0
         """Lines so far: the number of the newest."""
 
-    def add(self, kind: str, text: str) -> None:
-        """Add a line of KIND: state, notice, reply or stop."""
+    def add(self, kind: str, text: str, output: ReplyKind | None = None) -> None:
+        """Add a line of KIND: state, notice, reply or stop; OUTPUT: it answers g-code, and how it reads."""
         self.count += 1
         at = datetime.now(UTC).isoformat(timespec="milliseconds")
         entry: Entry = {"number": self.count, "time": at, "kind": kind, "text": text[:TEXT_MAX]}
+        if output is not None:
+            entry = {**entry, "output": str(output)}
         self._lines.append(entry)
         self._on_line(entry)
 

@@ -14,6 +14,7 @@ from typing import Final
 
 from coordinator.app import Machine, MachineStopped
 from coordinator.gcode.events import Notice
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.host import Host
 from coordinator.ipc.methods import ApiError
 from coordinator.ipc.state import StateTree
@@ -194,7 +195,7 @@ class MachineService:
             compensation = self.tables.compensation_of(machine)
             self.motion = Motion(
                 machine,
-                on_told=self._told,
+                on_told=self.tell,
                 on_cycle=self.look,
                 record=self._record,
                 compensation=compensation,
@@ -362,8 +363,12 @@ class MachineService:
         self.log.add("state", f"{state}: {cause}" if cause else str(state))
         self._figures.show(self)
 
-    def _told(self, told: Told) -> None:
-        self.log.add("notice" if isinstance(told, Notice) else "reply", told.text)
+    def tell(self, told: Told) -> None:
+        """Log what a line of g-code answered."""
+        if isinstance(told, Notice):
+            self.log.add("notice", told.text, ReplyKind.INFORMATION)
+        else:
+            self.log.add("reply", told.text, told.kind)
 
     async def _refresh(self) -> None:
         while True:

@@ -2,7 +2,8 @@
 
 import asyncio
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from coordinator.app import Machine
@@ -11,6 +12,7 @@ from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.machine_commands import is_tool
 from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
 from coordinator.modules.module_set import INTERRUPTING
+from coordinator.move_source import Told
 from coordinator.service.feeder import FeederFull, Ticket
 from coordinator.service.figures import axes, position_figures
 from coordinator.service.machine_service import MachineService, ServiceState
@@ -59,15 +61,28 @@ _TOLD: Final = (
 )
 
 
-async def _run(service: MachineService, params: dict[str, Any]) -> Value:
-    lines = _lines(params["script"])
+@dataclass(frozen=True, slots=True)
+class ScriptOutcome:
+    """What lines of a client answered."""
+
+    told: Sequence[Told] = ()
+    logged: bool = True
+    """Whether the log has it already: not what is answered beside a job."""
+
+
+async def run_script(service: MachineService, script: str, *, wait: bool) -> ScriptOutcome:
+    """Have lines of g-code done; WAIT: until their moves are executed, too. Raises CanductorError.
+
+    While a job prints they are done beside it, or between two of its lines.
+    """
+    lines = _lines(script)
     names = _commands(lines)
     if EMERGENCY in names:
         service.emergency_stop(f"{EMERGENCY} of a client")
-        return {"replies": [], "notices": []}
+        return ScriptOutcome()
     if _restarted(service, names):
-        return {"replies": [], "notices": []}
-    work = LinesWork(lines, rest=Rest.STANDSTILL if params["wait"] else Rest.OPEN)
+        return ScriptOutcome()
+    work = LinesWork(lines, rest=Rest.STANDSTILL if wait else Rest.OPEN)
     motion = service.ready_motion()
     job = service.active_job
     interrupting = motion.feeder.vocabulary.interrupting.intersection(names)
@@ -76,10 +91,14 @@ async def _run(service: MachineService, params: dict[str, Any]) -> Value:
     paused = service.programs.interrupted(stay=stay) if interrupting or between else contextlib.nullcontext()
     with paused:
         if job is None or job.gives_way:  # they come between two lines of it, and may move
-            return _answer(await _done(service, motion, work))
+            return ScriptOutcome((await _done(service, motion, work)).told)
         work.beside = True
         _check_beside(motion, names)
-        return _answer(await _done(service, motion, work, aside=True))
+        return ScriptOutcome((await _done(service, motion, work, aside=True)).told, logged=False)
+
+
+async def _run(service: MachineService, params: dict[str, Any]) -> Value:
+    return _answer((await run_script(service, params["script"], wait=params["wait"])).told)
 
 
 def _restarted(service: MachineService, names: list[str]) -> bool:
@@ -108,7 +127,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         named = params["axes"].upper()
         _idle_motion(service)
         work = LinesWork([f"G28 {' '.join(named)}"], name="move.home")
-        return _answer(await _done(service, service.ready_motion(), work))
+        return _answer((await _done(service, service.ready_motion(), work)).told)
 
     async def position(_caller: Caller, params: dict[str, Any]) -> Value:
         motion = service.ready_motion()
@@ -200,8 +219,8 @@ async def _done(service: MachineService, motion: Motion, work: Work, *, aside: b
     return ticket
 
 
-def _answer(ticket: Ticket) -> Value:
-    replies, notices = texts(ticket.told)
+def _answer(told: Sequence[Told]) -> Value:
+    replies, notices = texts(told)
     return {"replies": list(replies), "notices": list(notices)}
 
 

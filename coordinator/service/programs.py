@@ -2,10 +2,11 @@
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.gcode.print_control import Recovering
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.ipc.methods import ApiError
 from coordinator.modules.base import Value
 from coordinator.modules.gcode_macro import words_in
@@ -15,7 +16,7 @@ from coordinator.modules.virtual_sdcard import VirtualSdcard
 from coordinator.service.feeder import FeederFull
 from coordinator.service.job_folder import JobFolder
 from coordinator.service.jobs import JobPhase, JobRun
-from coordinator.service.motion import MotionOver, texts
+from coordinator.service.motion import MotionOver
 from coordinator.service.work import FileWork, LinesWork, Rest
 from nodes.errors import CanductorError
 
@@ -46,6 +47,10 @@ class Programs:
         self._card: VirtualSdcard | None = None
         self._pauses: PauseResume | None = None
         self._told: tuple[JobRun, JobPhase] | None = None
+        self.remote_methods: frozenset[str] = frozenset()
+        """Names of what clients have registered; replaced, never changed."""
+        self.on_remote: Callable[[str, Mapping[str, object]], None] | None = None
+        """Calls one of these at those clients."""
 
     def begin(self, machine: "Machine") -> None:
         """Serve MACHINE, which has just been made ready."""
@@ -53,7 +58,9 @@ class Programs:
         self._stats = next(machine.modules.of(PrintStats), None)
         self._card = next(machine.modules.of(VirtualSdcard), None)
         self._pauses = next(machine.modules.of(PauseResume), None)
-        self._told = None
+        # A job of the machine before this one is over: it is told of no more.
+        last = self._service.job
+        self._told = None if last is None or last.active else (last, last.phase)
         if self._card is None:
             return
         if self._service.settings.jobs is None:
@@ -83,6 +90,11 @@ class Programs:
             self.run_paused(name, lines, stay=False)
         else:
             self._start(self._run(LinesWork(lines, name=name, rest=Rest.OPEN)))
+
+    def call_remote(self, name: str, values: Mapping[str, object]) -> None:
+        """Have every client that registered the method NAME called with VALUES."""
+        if self.on_remote is not None:
+            self.on_remote(name, values)
 
     def run_paused(self, name: str, lines: Sequence[str], *, stay: bool) -> None:
         """Have LINES done with the job paused."""
@@ -116,19 +128,17 @@ class Programs:
             if job is not None and not job.gives_way:
                 work.beside = True
                 ticket = await motion.do_aside(work)
-                replies, notices = texts(ticket.told)
-                for kind, told in (("reply", replies), ("notice", notices)):
-                    for text in told:
-                        log.add(kind, text)
+                for told in ticket.told:
+                    self._service.tell(told)
             else:
                 ticket = await motion.do(work)
         except FeederFull as error:
-            log.add("notice", f"{work.name} was left out: {error}")
+            log.add("notice", f"{work.name} was left out: {error}", ReplyKind.ERROR)
         except MotionOver:
             return
         else:
             if ticket.error is not None:
-                log.add("notice", str(ticket.error))
+                log.add("notice", str(ticket.error), ReplyKind.ERROR)
 
     # ------------------------------------------------------------------------------------ for the job
 
@@ -173,7 +183,9 @@ class Programs:
         service = self._service
         if service.folder is None:
             service.log.add(
-                "notice", f"{name} is not printed: there is no job folder; start with --jobs FOLDER"
+                "notice",
+                f"{name} is not printed: there is no job folder; start with --jobs FOLDER",
+                ReplyKind.ERROR,
             )
             return
         try:
@@ -184,13 +196,13 @@ class Programs:
                 program.close()
                 raise
         except (CanductorError, ApiError) as error:
-            service.log.add("notice", f"{name} is not printed: {error}")
+            service.log.add("notice", f"{name} is not printed: {error}", ReplyKind.ERROR)
 
     async def _recover(self, how: Recovering) -> None:
         try:
             await self._service.recovery.recover(how)
         except (CanductorError, MotionOver) as error:
-            self._service.log.add("notice", f"RESUME_INTERRUPTED: {error}")
+            self._service.log.add("notice", f"RESUME_INTERRUPTED: {error}", ReplyKind.ERROR)
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)

@@ -36,6 +36,7 @@ from nodes.host_sockets import socket_folder
 from nodes.state_folder import state_folder
 
 if TYPE_CHECKING:
+    from coordinator.klippy_api.gateway import Gateway
     from coordinator.metrics.server import MetricsServer
     from coordinator.web.server import WebServer
 
@@ -65,7 +66,8 @@ def serve_machine(options: RunOptions) -> ServeReport:
     """Serve the machine of OPTIONS.config. Raises CanductorError, KeyboardInterrupt if motion was cut off."""
     assert options.serve is not None
     path = str(options.config)
-    load_machine(path)  # a mistake in it ends here, not in a service without a machine
+    if options.serve.klippy_api is None:
+        load_machine(path)  # a mistake in it ends here, not in a service without a machine
     return serve(lambda: load_machine(path), options.serve, cache=DictionaryCache.of_user())
 
 
@@ -97,6 +99,7 @@ class _Hall:
         self._options = options
         self._cache = cache
         self._announcer: Announcer | None = None
+        self._gateway: Gateway | None = None
 
     async def serve(self) -> None:
         """Be there for front ends until cancelled."""
@@ -138,6 +141,7 @@ class _Hall:
                 " it works once, 'canductor page' prints another"
             )
         metrics = await self._open_metrics(tree)
+        await self._open_klippy_api(service)
         self._announcer = self._announce(service)
         typed = Typed(service, _say) if sys.stdin is not None and sys.stdin.isatty() else None
         try:
@@ -151,9 +155,28 @@ class _Hall:
                 await self._announcer.close()
             if metrics is not None:
                 await metrics.close()
+            if self._gateway is not None:
+                await self._gateway.close()
             await self._server.close()
             if page is not None:
                 await page.close()
+
+    async def _open_klippy_api(self, service: MachineService) -> None:
+        """Serve Moonraker if asked for; raises CanductorError with the server closed."""
+        path = self._options.klippy_api
+        if path is None:
+            return
+        from coordinator.klippy_api.gateway import Gateway  # noqa: PLC0415 (if needed)
+
+        self._gateway = Gateway(
+            service, self._options.config, on_notice=lambda text: service.log.add("notice", text)
+        )
+        try:
+            await self._gateway.start(path)
+        except BaseException:
+            await self._server.close()
+            raise
+        _say(f"serving Moonraker at {path}")
 
     def _page(self, registry: Registry, service: MachineService) -> "WebServer | None":
         """Return the live page if it is asked for, with its methods in REGISTRY; raises CanductorError."""
@@ -231,6 +254,8 @@ class _Hall:
     def _tell(self, service: MachineService, entry: Entry) -> None:
         self._server.notify("log", dict(entry))
         _say(str(entry["text"]))
+        if self._gateway is not None:
+            self._gateway.note(entry)
         if self._announcer is not None and entry["kind"] == "state":
             self._announcer.state(str(service.state))
 

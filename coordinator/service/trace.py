@@ -36,6 +36,8 @@ class Moment:
     line: int
     """Of the program; 0: none."""
     moving: bool
+    extruder_mm_s: float = 0.0
+    """Of the filament, as the program has it: without pressure advance; negative: it is drawn back."""
 
 
 class MotionTrace:
@@ -132,4 +134,6 @@ def _moment(move: Any, print_time: float) -> Moment:
     way = start_v * a + accel * a * a / 2 + cruise_v * c + cruise_v * d - accel * d * d / 2
     speed = start_v + accel * a if t < accel_s else cruise_v - accel * d
     x, y, z, e = (fields["start"] + fields["ratio"] * way).tolist()
-    return Moment((x, y, z, e), speed if moving else 0.0, fields["line"], moving)
+    if not moving:
+        speed = 0.0
+    return Moment((x, y, z, e), speed, fields["line"], moving, speed * float(fields["ratio"][3]))

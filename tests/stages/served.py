@@ -15,6 +15,7 @@ from coordinator.ipc.uploads import upload_method
 from coordinator.machine.description import MachineDescription
 from coordinator.motion.planner import Position
 from coordinator.motion.steps import resting_step
+from coordinator.service.log_ring import Entry
 from coordinator.service.machine_service import MachineService, ServiceSettings
 from coordinator.service.methods import add_methods
 
@@ -58,13 +59,18 @@ class Served:
             tables=tables,
             own_process=own_process,
         )
-        self.service = MachineService(
-            load, host, self.tree, settings, on_line=lambda entry: self.lines.append(str(entry["text"]))
-        )
+        self.listeners: list[Callable[[Entry], None]] = []
+        """Hear every line of the log, too."""
+        self.service = MachineService(load, host, self.tree, settings, on_line=self._hear)
         self.registry = Registry()
         self._homed: tuple[dict[str, int], Position] = ({}, (0.0,) * 4)
         add_methods(self.service, self.registry)
         self.registry.add(upload_method(self.jobs))
+
+    def _hear(self, entry: Entry) -> None:
+        self.lines.append(str(entry["text"]))
+        for listener in self.listeners:
+            listener(entry)
 
     async def call(self, name: str, /, **params: Any) -> dict[str, Any]:
         """Call a method as the server does."""

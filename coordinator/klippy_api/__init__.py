@@ -1,0 +1,1 @@
+"""The host API that Moonraker speaks, served from the machine service (docs/klippy-api.md)."""

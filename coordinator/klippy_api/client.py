@@ -1,0 +1,73 @@
+"""One client of the API: what it has sent and nobody has looked at yet, and what it listens to; no I/O."""
+
+from collections import deque
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from coordinator.klippy_api.wire import Framer, Request, TooLong, Unreadable, is_urgent, read_request
+
+if TYPE_CHECKING:
+    from coordinator.klippy_api.subscription import Subscription
+
+RUNNING_MAX: Final = 64
+"""Calls of one client that run; more are answered with an error."""
+REMOTE_METHODS_MAX: Final = 64
+
+
+class Client:
+    """A client that PEER names for the log."""
+
+    def __init__(self, peer: str) -> None:
+        self.peer = peer
+        self.subscription: Subscription | None = None
+        self.output: Mapping[str, Any] | None = None
+        """The template of lines that g-code answers; None: it does not listen to them."""
+        self.remote_methods: dict[str, Mapping[str, Any]] = {}
+        """Templates by name."""
+        self.running = 0
+        """Calls that are not answered yet."""
+        self.dropped = 0
+        """Messages that could not be understood."""
+        self.fault: TooLong | None = None
+        """Why the connection has to end."""
+        self._framer = Framer()
+        self._urgent: deque[bytes] = deque()
+        self._waiting: deque[bytes] = deque()
+
+    @property
+    def has_work(self) -> bool:
+        """Whether messages wait."""
+        return bool(self._urgent or self._waiting)
+
+    def receive(self, data: bytes | memoryview) -> None:
+        """Take what came; after a fault nothing is taken any more."""
+        if self.fault is not None:
+            return
+        try:
+            bodies = self._framer.feed(data)
+        except TooLong as fault:
+            self.fault = fault
+            return
+        for body in bodies:
+            (self._urgent if is_urgent(body) else self._waiting).append(body)
+
+    def next_request(self) -> Request | None:
+        """Return the call that is next, one that stops the machine first; None: there is none.
+
+        Raises Unreadable for a message that is dropped.
+        """
+        waiting = self._urgent or self._waiting
+        if not waiting:
+            return None
+        try:
+            return read_request(waiting.popleft())
+        except Unreadable:
+            self.dropped += 1
+            raise
+
+    def register(self, name: str, template: Mapping[str, Any]) -> bool:
+        """Remember a remote method; return whether there was room."""
+        if name not in self.remote_methods and len(self.remote_methods) >= REMOTE_METHODS_MAX:
+            return False
+        self.remote_methods[name] = template
+        return True

@@ -1,0 +1,222 @@
+"""The endpoints: what each takes, does and gives, on a machine service."""
+
+import os
+import platform
+import re
+import sys
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from coordinator.command_line import version
+from coordinator.gcode.commands import AtOnce, Call
+from coordinator.gcode.reply_kinds import ReplyKind, line_of
+from coordinator.gcode.words import WordError, parse
+from coordinator.klippy_api.client import REMOTE_METHODS_MAX, Client
+from coordinator.klippy_api.params import RequestError, template_of, text_of, wishes_of
+from coordinator.klippy_api.status import StatusBuilder, state_of
+from coordinator.klippy_api.subscription import Subscription, pick
+from coordinator.klippy_api.wire import Request
+from coordinator.modules.homing import Homing
+from coordinator.modules.pause_resume import PauseResume
+from coordinator.move_source import Told
+from coordinator.service.methods_motion import RESTARTS, run_script
+from coordinator.service.work import LINES_MAX
+from nodes.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.service.machine_service import MachineService
+
+Result = Mapping[str, Any]
+Endpoint = Callable[[Client, Request], Result | Awaitable[Result]]
+
+APP: Final = "canductor"
+WHO: Final = "a client of the Klippy API"
+ALWAYS: Final = frozenset(("M105", "M115", "STATUS", "HELP"))
+"""Commands that also a machine that stopped answers."""
+_EMERGENCY: Final = re.compile(r"^\s*(?:N\d+\s*)?M112\b", re.IGNORECASE | re.MULTILINE)
+_ROOT: Final = Path(__file__).parent.parent.parent
+
+
+class Endpoints:
+    """Serves calls from SERVICE.
+
+    SAY shows a line to all who listen to what g-code answers; REGISTERED hears that remote methods changed.
+    """
+
+    def __init__(
+        self,
+        service: "MachineService",
+        config: Path,
+        say: Callable[[str], None],
+        registered: Callable[[], None],
+    ) -> None:
+        self.status = StatusBuilder(service)
+        self._service = service
+        self._say = say
+        self._registered = registered
+        self._about = {
+            "hostname": platform.node(),
+            "klipper_path": str(_ROOT),
+            "python_path": sys.executable,
+            "process_id": os.getpid(),
+            "user_id": os.getuid(),
+            "group_id": os.getgid(),
+            "log_file": "",
+            "config_file": str(config.absolute()),
+            "software_version": f"{APP}-{version()}",
+            "cpu_info": f"{os.cpu_count() or 1} core {platform.machine()}",
+            "app": APP,
+        }
+        self._always: dict[str, Endpoint] = {
+            "info": self._info,
+            "list_endpoints": self._list_endpoints,
+            "objects/list": self._objects_list,
+            "objects/query": self._objects_query,
+            "objects/subscribe": self._objects_subscribe,
+            "gcode/help": self._help,
+            "gcode/script": self._script,
+            "gcode/restart": lambda _client, _request: self._lines("RESTART"),
+            "gcode/firmware_restart": lambda _client, _request: self._lines("FIRMWARE_RESTART"),
+            "gcode/subscribe_output": self._subscribe_output,
+            "register_remote_method": self._register_remote_method,
+            "emergency_stop": self._emergency_stop,
+        }
+        self._pausing: dict[str, Endpoint] = {
+            "pause_resume/pause": lambda _client, _request: self._lines("PAUSE"),
+            "pause_resume/resume": lambda _client, _request: self._lines("RESUME"),
+            "pause_resume/cancel": lambda _client, _request: self._lines("CANCEL_PRINT"),
+        }
+        self._homing: dict[str, Endpoint] = {"query_endstops/status": self._endstops}
+
+    def available(self) -> Mapping[str, Endpoint]:
+        """Return what the machine has now, by name."""
+        found = dict(self._always)
+        machine = self._service.machine
+        if machine is not None:
+            if next(machine.modules.of(PauseResume), None) is not None:
+                found |= self._pausing
+            if machine.description.stops:
+                found |= self._homing
+        return found
+
+    def begin(self, client: Client, request: Request) -> Result | Awaitable[Result]:
+        """Begin REQUEST of CLIENT; raises CanductorError, also when its result is awaited."""
+        endpoint = self.available().get(request.method)
+        if endpoint is None:
+            raise RequestError(f"there is no endpoint '{request.method[:80]}'")
+        return endpoint(client, request)
+
+    # ------------------------------------------------------------------------------------------ objects
+
+    def _info(self, _client: Client, _request: Request) -> Result:
+        state, message = state_of(self._service)
+        return {"state": state, "state_message": message, **self._about}
+
+    def _list_endpoints(self, _client: Client, _request: Request) -> Result:
+        return {"endpoints": list(self.available())}
+
+    def _objects_list(self, _client: Client, _request: Request) -> Result:
+        return {"objects": list(self.status.build())}
+
+    def _objects_query(self, _client: Client, request: Request) -> Result:
+        shown = pick(wishes_of(request), self.status.build())
+        return {"eventtime": self._service.now_s, "status": shown}
+
+    def _objects_subscribe(self, client: Client, request: Request) -> Result:
+        subscription = Subscription(template_of(request), wishes_of(request))
+        shown = subscription.begin(self.status.build())
+        client.subscription = subscription if subscription.wishes else None
+        return {"eventtime": self._service.now_s, "status": shown}
+
+    def _endstops(self, _client: Client, _request: Request) -> Awaitable[Result]:
+        job = self._service.active_job
+        if job is not None and not job.gives_way:
+            raise RequestError("endstops cannot be asked for while a job prints; pause it first")
+        return self._asked_endstops()
+
+    async def _asked_endstops(self) -> Result:
+        await self._lines("QUERY_ENDSTOPS")
+        homing = next(self._service.up_machine().modules.of(Homing))
+        found = homing.status()["last_query"]
+        assert isinstance(found, dict)
+        return {name: "TRIGGERED" if pressed else "open" for name, pressed in found.items()}
+
+    # ------------------------------------------------------------------------------------------- g-code
+
+    def _help(self, _client: Client, _request: Request) -> Result:
+        machine = self._service.machine
+        helps = {} if machine is None else machine.modules.helps
+        return {name: text for name, text in helps.items() if text}
+
+    def _script(self, _client: Client, request: Request) -> Awaitable[Result] | Result:
+        script = text_of(request, "script")
+        if _EMERGENCY.search(script):
+            self._service.emergency_stop(f"M112 of {WHO}")
+            return {}
+        return self._lines(script)
+
+    async def _lines(self, script: str) -> Result:
+        """Have SCRIPT done; what fails is told to all who listen to g-code, too."""
+        lines = [line for line in script.splitlines() if line.strip()]
+        try:
+            for first in range(0, len(lines), LINES_MAX):
+                await self._piece(lines[first : first + LINES_MAX])
+        except CanductorError as error:
+            self._say(line_of(ReplyKind.ERROR, str(error)))
+            raise
+        return {}
+
+    async def _piece(self, lines: Sequence[str]) -> None:
+        service = self._service
+        state, message = state_of(service)
+        if state != "ready":
+            names = {line.split(maxsplit=1)[0].upper() for line in lines}
+            if names <= ALWAYS and service.machine is not None:
+                self._answer(lines)
+                return
+            if state == "startup" or not names <= RESTARTS.keys():
+                raise RequestError(message)
+            lines = lines[:1]
+        outcome = await run_script(service, "\n".join(lines), wait=False)
+        if not outcome.logged:
+            for told in outcome.told:
+                self._say(line_of(kind_of(told), told.text))
+
+    def _answer(self, lines: Sequence[str]) -> None:
+        """Answer what a machine that stopped still knows."""
+        machine = self._service.up_machine()
+        known = machine.modules.vocabulary.commands
+        for line in lines:
+            command = parse(line.encode(errors="replace"))
+            reader = None if command is None else known.get(command.name)
+            if command is None or reader is None:
+                raise WordError(f"this machine does not know {line.strip()[:40]}")
+            reading = reader.read(Call(command, 0, (0.0,) * 4, ""))
+            if isinstance(reading, AtOnce):
+                for text in reading.replies:
+                    self._say(line_of(reading.kind, text))
+
+    # --------------------------------------------------------------------------------------- the others
+
+    def _subscribe_output(self, client: Client, request: Request) -> Result:
+        client.output = template_of(request)
+        return {}
+
+    def _register_remote_method(self, client: Client, request: Request) -> Result:
+        name, template = text_of(request, "remote_method"), template_of(request)
+        if not client.register(name, template):
+            raise RequestError(f"a client may register {REMOTE_METHODS_MAX} remote methods")
+        self._registered()
+        return {}
+
+    def _emergency_stop(self, _client: Client, _request: Request) -> Result:
+        self._service.emergency_stop(WHO)
+        return {}
+
+
+def kind_of(told: Told) -> ReplyKind:
+    """Return how TOLD reads: notices are information."""
+    kind = getattr(told, "kind", ReplyKind.INFORMATION)
+    assert isinstance(kind, ReplyKind)
+    return kind

@@ -1,0 +1,309 @@
+"""The socket of the API: clients, the 0.25 s of their updates, what g-code answers (asyncio)."""
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.reply_kinds import ReplyKind, line_of
+from coordinator.ipc.turns import Turns
+from coordinator.ipc.unix_socket import BACKLOG, listen_at, may_use, peer_of
+from coordinator.klippy_api.client import RUNNING_MAX, Client
+from coordinator.klippy_api.endpoints import Endpoints, Result
+from coordinator.klippy_api.wire import Request, Unreadable, error_message, event_message, result_message
+from coordinator.service.machine_service import ServiceState
+from nodes.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.service.log_ring import Entry
+    from coordinator.service.machine_service import MachineService
+
+UPDATE_S: Final = 0.25
+"""Between two updates of what clients watch."""
+CLIENTS_MAX: Final = 64
+CALLS_MAX: Final = 256
+"""That run for all clients together, also for those that have left."""
+OUTPUT_BYTES_MAX: Final = 4_194_304
+"""A client with more unread is let go."""
+BLOCKED_S: Final = 5.0
+"""A client that reads nothing for so long is let go."""
+LINES_MAX: Final = 1_000
+"""Of g-code's answers that wait to be sent together; of more the first are left out."""
+
+
+class Connection(asyncio.BufferedProtocol):
+    """One client's end of the socket."""
+
+    def __init__(self, gateway: "Gateway", turns: Turns) -> None:
+        self._gateway = gateway
+        self._turns = turns
+        self._loop = asyncio.get_running_loop()
+        self._blocked: asyncio.TimerHandle | None = None
+        self.client: Client
+        self.transport: asyncio.Transport
+
+    @property
+    def writable(self) -> bool:
+        """Whether the client reads."""
+        return self._blocked is None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin, unless the client may not."""
+        assert isinstance(transport, asyncio.Transport)
+        self.transport = transport
+        opened = transport.get_extra_info("socket")
+        pid, uid = (0, None) if opened is None else peer_of(opened)
+        self.client = Client("a client" if uid is None else f"the client with pid {pid}")
+        self._gateway.admit(self, uid)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the client; what it has begun goes on."""
+        del exc
+        if self._blocked is not None:
+            self._blocked.cancel()
+        self._turns.leave(self)
+        self._gateway.forget(self)
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Tell where to put what comes."""
+        del sizehint
+        return self._turns.received
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Take what has come there."""
+        self.receive(self._turns.received[:nbytes])
+
+    def receive(self, data: bytes | memoryview) -> None:
+        """Take DATA."""
+        self.client.receive(data)
+        if self.client.fault is not None:
+            self.drop(str(self.client.fault))
+        elif not self.transport.is_closing():
+            self._turns.ask(self)
+
+    def pause_writing(self) -> None:
+        """Give the client some time to read."""
+        self._blocked = self._loop.call_later(
+            BLOCKED_S, self.drop, f"it has read nothing for {BLOCKED_S:g} s"
+        )
+
+    def resume_writing(self) -> None:
+        """Take note that it reads."""
+        if self._blocked is not None:
+            self._blocked.cancel()
+            self._blocked = None
+
+    def hold(self) -> None:
+        """Read no more until the next turn."""
+        self.transport.pause_reading()
+
+    def work(self, until_s: float) -> bool:
+        """Begin what was asked for; return whether there is more."""
+        while not self.transport.is_closing():
+            try:
+                request = self.client.next_request()
+            except Unreadable as problem:
+                if self.client.dropped == 1:
+                    self._gateway.notice(
+                        f"{self.client.peer} of the Klippy API sent what is dropped: {problem}"
+                    )
+            else:
+                if request is None:
+                    self.transport.resume_reading()
+                    return False
+                self._gateway.call(self, request)
+            if self.client.has_work and self._loop.time() >= until_s:
+                self.hold()
+                return True
+        return False
+
+    def send(self, data: bytes) -> None:
+        """Send DATA, unless the client does not read."""
+        if self.transport.is_closing():
+            return
+        self.transport.write(data)
+        unread = self.transport.get_write_buffer_size()
+        if unread > OUTPUT_BYTES_MAX:
+            self.drop(f"it has not read {unread:,} bytes")
+
+    def drop(self, why: str) -> None:
+        """Let the client go."""
+        if not self.transport.is_closing():
+            self._gateway.notice(f"{self.client.peer} of the Klippy API was let go: {why}")
+            self.transport.abort()
+
+
+class Gateway:
+    """Serves SERVICE, of the configuration file CONFIG; lives on the loop that starts it.
+
+    ON_NOTICE gets sentences for the machine's owner.
+    """
+
+    def __init__(self, service: "MachineService", config: Path, *, on_notice: Callable[[str], None]) -> None:
+        self.notice = on_notice
+        self.endpoints = Endpoints(service, config, self.say, self.registered)
+        service.programs.on_remote = self._call_remote
+        self._service = service
+        self._connections: dict[Connection, None] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._updates: asyncio.Task[None] | None = None
+        self._lines: list[str] = []
+        self._starts = service.starts
+        self._server: asyncio.AbstractServer | None = None
+        self._path: Path | None = None
+        self._turns = Turns()
+
+    # ------------------------------------------------------------------------------------------- life
+
+    async def start(self, path: Path | None) -> None:
+        """Serve at PATH (None: at no socket, for clients that are adopted); raises CanductorError."""
+        if path is not None:
+            listener = await listen_at(path)
+            self._path = path
+            self._server = await asyncio.get_running_loop().create_unix_server(
+                self.make_connection, sock=listener, backlog=BACKLOG
+            )
+        self._updates = asyncio.get_running_loop().create_task(self._update())
+
+    async def close(self) -> None:
+        """Let go of every client and close the socket."""
+        if self._updates is not None:
+            self._updates.cancel()
+            await asyncio.gather(self._updates, return_exceptions=True)
+        if self._server is not None:
+            self._server.close()
+        self._close_all()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._path is not None:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+        await asyncio.sleep(0)
+
+    def make_connection(self) -> Connection:
+        """Return the protocol of a new client."""
+        return Connection(self, self._turns)
+
+    def note(self, entry: "Entry") -> None:
+        """Take note of a line of the service's log: what g-code answers goes to clients."""
+        if "output" in entry:
+            self.say(line_of(ReplyKind(str(entry["output"])), str(entry["text"])))
+        if self._service.starts != self._starts and self._service.state is ServiceState.STARTUP:
+            # Clients read configuration and objects again only when they have to connect again.
+            if self._starts:
+                self._close_all()
+            self._starts = self._service.starts
+
+    def _close_all(self) -> None:
+        for connection in list(self._connections):
+            connection.transport.close()
+        self._connections.clear()
+        self.registered()
+
+    # ---------------------------------------------------------------------------------------- clients
+
+    def admit(self, connection: Connection, uid: int | None) -> None:
+        """Take CONNECTION on, of the user with UID (None: it came by no socket)."""
+        self._connections[connection] = None
+        if uid is not None and not may_use(uid):
+            connection.drop(f"the socket is not for the user with uid {uid}")
+        elif len(self._connections) > CLIENTS_MAX:
+            connection.drop(f"there are {CLIENTS_MAX} clients already")
+
+    def forget(self, connection: Connection) -> None:
+        """Take note that CONNECTION is over."""
+        self._connections.pop(connection, None)
+        self.registered()
+
+    def call(self, connection: Connection, request: Request) -> None:
+        """Begin REQUEST; it is answered when it is done."""
+        client = connection.client
+        if request.method != "emergency_stop" and (
+            client.running >= RUNNING_MAX or len(self._tasks) >= CALLS_MAX
+        ):
+            self._fail(connection, request, "too many requests are being done; wait for their answers")
+            return
+        try:
+            result = self.endpoints.begin(client, request)
+        except Exception as error:  # noqa: BLE001 (a bug of one endpoint must not end the machine)
+            self._fail(connection, request, self._sentence(request, error))
+            return
+        if isinstance(result, Awaitable):
+            client.running += 1
+            task = asyncio.get_running_loop().create_task(self._finish(connection, request, result))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        else:
+            self._succeed(connection, request, result)
+
+    async def _finish(self, connection: Connection, request: Request, result: Awaitable[Result]) -> None:
+        try:
+            self._succeed(connection, request, await result)
+        except Exception as error:  # noqa: BLE001 (as above)
+            self._fail(connection, request, self._sentence(request, error))
+        finally:
+            connection.client.running -= 1
+
+    @staticmethod
+    def _succeed(connection: Connection, request: Request, result: Result) -> None:
+        if request.id is not None:
+            connection.send(result_message(request.id, result))
+
+    @staticmethod
+    def _fail(connection: Connection, request: Request, sentence: str) -> None:
+        if request.id is not None:
+            connection.send(error_message(request.id, sentence))
+
+    @staticmethod
+    def _sentence(request: Request, error: Exception) -> str:
+        if isinstance(error, CanductorError):
+            return str(error)
+        name = request.method[:80]
+        asyncio.get_running_loop().call_exception_handler(
+            {"message": f"canductor: the endpoint {name} failed", "exception": error}
+        )
+        return f"{name} failed by a mistake of the program: {type(error).__name__}; please report it"
+
+    # ---------------------------------------------------------------------------------- what they hear
+
+    async def _update(self) -> None:
+        while True:
+            await asyncio.sleep(UPDATE_S)
+            watching = [c for c in self._connections if c.client.subscription is not None and c.writable]
+            if not watching:
+                continue
+            status, now_s = self.endpoints.status.build(), self._service.now_s
+            for connection in watching:
+                subscription = connection.client.subscription
+                changed = None if subscription is None else subscription.changes(status)
+                if subscription is not None and changed:
+                    params = {"eventtime": now_s, "status": changed}
+                    connection.send(event_message(subscription.template, params))
+
+    def say(self, text: str) -> None:
+        """Show TEXT to all who listen to g-code, together with what else comes in this round of the loop."""
+        if not any(connection.client.output is not None for connection in self._connections):
+            return
+        if not self._lines:
+            asyncio.get_running_loop().call_soon(self._say_all)
+        if len(self._lines) < LINES_MAX:
+            self._lines.append(text)
+
+    def _say_all(self) -> None:
+        text, self._lines = "\n".join(self._lines), []
+        for connection in list(self._connections):
+            if connection.client.output is not None:
+                connection.send(event_message(connection.client.output, {"response": text}))
+
+    def registered(self) -> None:
+        """Take note that what clients have registered may have changed."""
+        names = (name for connection in self._connections for name in connection.client.remote_methods)
+        self._service.programs.remote_methods = frozenset(names)
+
+    def _call_remote(self, name: str, values: Mapping[str, object]) -> None:
+        for connection in list(self._connections):
+            template = connection.client.remote_methods.get(name)
+            if template is not None:
+                connection.send(event_message(template, values))

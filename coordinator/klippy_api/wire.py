@@ -1,0 +1,127 @@
+"""Messages of the API: JSON objects in UTF-8, each ended by the byte 0x03; no I/O.
+
+A message that cannot be understood is dropped without an answer; one that is too long ends its connection.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any, Final, NoReturn
+
+from coordinator.ipc.json_values import has_more_items
+from nodes.errors import CanductorError
+from nodes.records import record
+
+END: Final = b"\x03"
+MESSAGE_BYTES_MAX: Final = 262_144
+"""One message of a client, without its end."""
+VALUES_MAX: Final = 8_192
+"""In all lists and objects of a message together."""
+URGENT: Final = (b"emergency_stop", b"M112")
+"""A message with one of these words is looked at before all others that wait."""
+
+
+class TooLong(CanductorError):  # noqa: N818
+    """A client sends a message that nobody would read."""
+
+
+class Unreadable(CanductorError):  # noqa: N818
+    """A message that is dropped; the text says why."""
+
+
+@record
+class Request:
+    """One call of a client."""
+
+    method: str
+    params: Mapping[str, Any]
+    id: Any = None
+    """Of any JSON type; None: no answer is wanted."""
+
+
+class Framer:
+    """Cuts what a client sends into messages; keeps at most MESSAGE_BYTES_MAX and one piece."""
+
+    def __init__(self) -> None:
+        self._rest = bytearray()
+        self._scanned = 0
+
+    def feed(self, data: bytes | memoryview) -> list[bytes]:
+        """Return the messages that DATA completes; raises TooLong."""
+        self._rest += data
+        found: list[bytes] = []
+        begin = 0
+        while (end := self._rest.find(END, max(begin, self._scanned))) >= 0:
+            found.append(bytes(self._rest[begin:end]))
+            begin = end + 1
+        del self._rest[:begin]
+        self._scanned = len(self._rest)
+        if self._scanned > MESSAGE_BYTES_MAX or any(len(body) > MESSAGE_BYTES_MAX for body in found):
+            self._rest.clear()
+            self._scanned = 0
+            raise TooLong(f"a message has more than {MESSAGE_BYTES_MAX:,} bytes")
+        return found
+
+
+def is_urgent(body: bytes) -> bool:
+    """Tell whether BODY may be a call that stops the machine."""
+    return any(word in body for word in URGENT)
+
+
+def read_request(body: bytes) -> Request:
+    """Return the call in BODY; raises Unreadable."""
+    if has_more_items(body, VALUES_MAX):
+        raise Unreadable(f"a message has more than {VALUES_MAX:,} values")
+    try:
+        message = json.loads(body, parse_constant=_refuse_constant)
+    except RecursionError:
+        raise Unreadable("a message is nested too deeply") from None
+    except ValueError as error:  # no JSON, no UTF-8, a number with thousands of digits
+        raise Unreadable(f"a message is no JSON: {str(error)[:80]}") from None
+    if not isinstance(message, dict):
+        raise Unreadable("a message is no object")
+    method, params = message.get("method"), message.get("params", {})
+    if not isinstance(method, str):
+        raise Unreadable("a message has no method")
+    if not isinstance(params, dict):
+        raise Unreadable("the params of a message are no object")
+    return Request(method, params, message.get("id"))
+
+
+def encode(message: Mapping[str, Any]) -> bytes:
+    """Return MESSAGE as it is sent; numbers that JSON does not have go out as null, other things as text."""
+    try:
+        text = json.dumps(message, separators=(",", ":"), allow_nan=False, default=str)
+    except ValueError:
+        text = json.dumps(_finite(message), separators=(",", ":"), allow_nan=False, default=str)
+    return text.encode(errors="replace") + END
+
+
+def result_message(request_id: Any, result: Mapping[str, Any]) -> bytes:
+    """Return the answer to the call with REQUEST_ID."""
+    return encode({"id": request_id, "result": result})
+
+
+def error_message(request_id: Any, sentence: str) -> bytes:
+    """Return the answer to a call that failed."""
+    return encode({"id": request_id, "error": {"error": "WebRequestError", "message": sentence}})
+
+
+def event_message(template: Mapping[str, Any], params: Mapping[str, Any]) -> bytes:
+    """Return what a client gets without a call: its TEMPLATE with PARAMS."""
+    return encode({**template, "params": params})
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no number")
+
+
+def _finite(value: Any) -> Any:
+    """Return VALUE with None for what is not finite."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return value

@@ -1,0 +1,1 @@
+"""The host API that Moonraker speaks."""

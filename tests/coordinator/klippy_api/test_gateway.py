@@ -1,0 +1,316 @@
+"""The gateway on a service in virtual time: what Moonraker asks for, in its order, and what comes back."""
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coordinator.klippy_api.gateway import BLOCKED_S, CLIENTS_MAX
+from coordinator.klippy_api.wire import MESSAGE_BYTES_MAX
+from tests.coordinator.klippy_api.schema import STATS, problems
+from tests.stages.klippy_clients import KlippyApi, KlippyClient
+from tests.stages.printer import PRINTING, Printer
+from tests.stages.served import Served
+
+SECTIONS = (
+    PRINTING
+    + """
+[gcode_macro SAY]
+variable_times: 2
+gcode:
+    RESPOND TYPE=command MSG="action:prompt_begin Hello"
+    RESPOND TYPE=error MSG="no filament"
+    RESPOND MSG="plain words"
+    { action_respond_info("for people") }
+    M105
+    M114
+    NONSENSE
+    GET_POSITION
+    { action_call_remote_method("shutdown_machine", delay=3) }
+    { action_call_remote_method("nobody_has_it") }
+[gcode_macro QUIET]
+gcode:
+    M117 quiet
+"""
+)
+JOB = "M83\n" + "".join(f"G1 X{20 + 20 * (n % 2)} Y{20 + n} F6000\n" for n in range(60))
+
+
+async def as_moonraker(client: KlippyClient) -> list[str]:
+    """Ask for what Moonraker does, in its order; return the objects there are."""
+    info = await client.ask("info", {"client_info": {"program": "Moonraker", "version": "0.11.0"}})
+    for field in ("klipper_path", "python_path", "config_file"):
+        assert Path(info[field]).is_absolute(), field
+    assert info["software_version"].startswith("canductor-"), "no semantic version, or UIs call it too old"
+    endpoints = (await client.ask("list_endpoints"))["endpoints"]
+    assert {"info", "objects/list", "pause_resume/cancel", "query_endstops/status"} <= set(endpoints)
+    assert info["state"] == "ready"
+    assert (await client.watch({"webhooks": None}))["webhooks"]["state"] == "ready"
+    await client.listen()
+    assert (await client.ask("list_endpoints"))["endpoints"] == endpoints
+    shown = await client.watch({"webhooks": None, "print_stats": None})
+    assert shown["print_stats"]["state"] == "standby"
+    objects: list[str] = (await client.ask("objects/list"))["objects"]
+    config = (await client.query("configfile"))["configfile"]["config"]
+    assert "virtual_sdcard" in objects
+    assert "virtual_sdcard" in config
+    for name in ("shutdown_machine", "reboot_machine", "pause_job_queue", "start_job_queue"):
+        params = {"remote_method": name, "response_template": {"method": name}}
+        assert await client.ask("register_remote_method", params) == {}
+    heaters = (await client.query("heaters"))["heaters"]
+    assert set(heaters["available_heaters"]) <= set(objects)
+    assert set(heaters["available_sensors"]) <= set(objects)
+    return objects
+
+
+def test_what_moonraker_and_a_browser_ask_for(tmp_path: Path) -> None:
+    printer = Printer(tmp_path, SECTIONS)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            client = api.connect()
+            objects = await as_moonraker(client)
+            await _check_objects(client, objects)
+            await _check_motion(client)
+            await _check_outputs(client)
+            await _check_print(client, served, printer)
+            await _check_stop_and_restart(api, client, served)
+            assert api.notices == []
+
+    printer.serve(main)
+
+
+async def _check_objects(client: KlippyClient, objects: list[str]) -> None:
+    status = await client.watch(dict.fromkeys(objects))
+    assert problems(status) == []
+    nodes = [name for name in objects if name.partition(" ")[0] == "mcu"]
+    assert len(nodes) == 2
+    for node in nodes:
+        stats = status[node]["last_stats"]
+        assert stats.keys() >= STATS, STATS - stats.keys()
+        assert status[node]["mcu_constants"]["MCU"]
+    assert status["gcode_macro SAY"] == {"times": 2}
+    assert status["gcode_macro QUIET"] == {}
+    assert "gcode_macro say" in status["configfile"]["settings"]
+    assert await client.query("nothing") == {"nothing": {}}
+    odd = await client.ask("objects/query", {"objects": {"toolhead": ["colour"]}})
+    assert odd["status"] == {"toolhead": {"colour": None}}
+    assert "must be null or a list" in await client.error("objects/query", {"objects": {"toolhead": 3}})
+    static = {"configfile", "gcode", "heaters", "exclude_object"}
+    for update in await client.updates(3.0):
+        assert not static & update.keys(), "static parts are sent once"
+    assert (await client.ask("gcode/help"))["PAUSE"] == "Pause the job"
+    assert "there is no endpoint 'none'" in await client.error("none")
+
+
+async def _check_motion(client: KlippyClient) -> None:
+    await client.script("g28", "G90", "SET_VELOCITY_LIMIT ACCEL=1234", "G1 X30 Y40 Z5 F6000", "M400")
+    await client.updates(0.3)
+    status = await client.query("toolhead", "gcode_move", "motion_report", "query_endstops")
+    assert status["toolhead"]["homed_axes"] == "xyz"
+    assert status["toolhead"]["max_accel"] == pytest.approx(1234)
+    assert status["toolhead"]["position"][:3] == pytest.approx([30, 40, 5])
+    assert status["motion_report"]["live_position"][:3] == pytest.approx([30, 40, 5])
+    assert status["motion_report"]["live_velocity"] == 0
+    assert status["gcode_move"]["speed"] == pytest.approx(6000), "mm/min"
+    assert status["gcode_move"]["absolute_coordinates"] is True
+    await client.script("G20", "G91", "SET_GCODE_OFFSET Z=0.2")
+    await client.updates(0.3)
+    status = await client.query("gcode_move")
+    assert status["gcode_move"]["gcode_position"][0] == pytest.approx(30), "mm, also after G20"
+    assert status["gcode_move"]["absolute_coordinates"] is False
+    assert status["gcode_move"]["homing_origin"][2] == pytest.approx(0.2)
+    await client.script("G21", "G90", "SET_GCODE_OFFSET Z=0", "G1 X120 F3000")
+    moving = await client.updates(1.0)
+    speeds = [
+        u["motion_report"]["live_velocity"] for u in moving if "live_velocity" in u.get("motion_report", {})
+    ]
+    assert max(speeds) == pytest.approx(50, rel=0.01)
+    await client.script("M400")
+    ends = await client.ask("query_endstops/status")
+    assert set(ends) == {"x", "y", "z"}
+    assert set(ends.values()) <= {"open", "TRIGGERED"}
+    assert set((await client.query("query_endstops"))["query_endstops"]["last_query"].values()) <= {0, 1}
+
+
+async def _check_outputs(client: KlippyClient) -> None:
+    client.said()
+    await client.script("SAY")
+    await asyncio.sleep(0.1)
+    said = client.said()
+    assert "// action:prompt_begin Hello" in said
+    assert "!! no filament" in said
+    assert "echo: plain words" in said
+    assert "// for people" in said
+    assert any(line.startswith("B:") and " T0:" in line for line in said), "filters of UIs know it so"
+    assert any(line.startswith("X:120.000 Y:40.000") for line in said)
+    assert any(line.startswith("// ") and "NONSENSE" in line for line in said), "unknown, and no error"
+    assert any(line.startswith("// toolhead: X:120.000000") for line in said)
+    assert "// the remote method nobody_has_it was not called: no client has registered one" in said
+    calls = [event["params"] for event in client.events if event["method"] == "shutdown_machine"]
+    assert calls == [{"delay": 3}]
+    assert "outside" in await client.error("gcode/script", {"script": "G1 X9999\nM117 not done"})
+    assert [line for line in client.said() if line.startswith("!! ")]
+    assert (await client.query("display_status"))["display_status"]["message"] is None
+    assert await client.ask("gcode/script", {"script": "\n"}) == {}
+
+
+async def _check_print(client: KlippyClient, served: Served, printer: Printer) -> None:
+    folder = served.jobs / "sub"
+    folder.mkdir()
+    (folder / "part.gcode").write_text(JOB)
+    await client.script('SDCARD_PRINT_FILE FILENAME="sub/part.gcode"')
+    states: list[str] = []
+
+    async def look(*until: str) -> dict[str, Any]:
+        while not states or states[-1] not in until:
+            for update in await client.updates(0.26):
+                told = update.get("print_stats", {})
+                states.extend(told[field] for field in ("state",) if field in told)
+        return await client.query("print_stats", "virtual_sdcard", "pause_resume", "display_status")
+
+    status = await look("printing")
+    assert status["print_stats"]["filename"] == "sub/part.gcode"
+    assert status["virtual_sdcard"]["file_path"] == str(served.jobs / "sub" / "part.gcode")
+    assert "pause it first" in await client.error("query_endstops/status")
+    client.said()
+    await client.script("M105")  # beside the job: told once
+    assert len([line for line in client.said() if line.startswith("B:")]) == 1
+    assert await client.ask("pause_resume/pause") == {}
+    assert (await look("paused"))["pause_resume"]["is_paused"] is True
+    assert await client.ask("pause_resume/resume") == {}
+    status = await look("printing")
+    assert status["display_status"]["progress"] == status["virtual_sdcard"]["progress"]
+    assert await client.ask("pause_resume/cancel") == {}
+    await look("cancelled")
+    assert states == ["printing", "paused", "printing", "cancelled"]
+
+
+async def _check_stop_and_restart(api: KlippyApi, client: KlippyClient, served: Served) -> None:
+    waiting = client.send("gcode/script", {"script": "G4 P60000\nM400"})
+    await asyncio.sleep(0.5)
+    # In one piece behind a hundred others: the machine is stopped before the first of them is answered.
+    calls = b"".join(b'{"method":"info","id":"n%d"}\x03' % n for n in range(100))
+    client.send_bytes(calls + b'{"method":"emergency_stop","id":"stop"}\x03')
+    assert str(served.service.state) == "shutdown"
+    answers = [json.loads(body) for body in bytes(client.transport.written).split(b"\x03") if body]
+    ids = [answer["id"] for answer in answers if "id" in answer]
+    assert ids.index("stop") == 0
+    assert all(a["result"]["state"] == "shutdown" for a in answers if a.get("id") == "n0")
+    assert "error" in await client.answer(waiting)
+    updates = await client.updates(0.3)
+    assert any(update.get("webhooks", {}).get("state") == "shutdown" for update in updates)
+    info = await client.ask("info")
+    assert "emergency stop" in info["state_message"]
+    assert await client.error("gcode/script", {"script": "G1 X1"}) == info["state_message"]
+    client.said()
+    await client.script("M105")
+    await client.script("M115")
+    await asyncio.sleep(0)
+    said = client.said()
+    assert said[0].startswith("B:")
+    assert said[1].startswith("FIRMWARE_NAME:")
+    client.send("gcode/firmware_restart")
+    await asyncio.sleep(1.0)
+    assert client.transport.ended, "so that clients read everything again"
+    again = api.connect()
+    assert (await again.ask("info"))["state"] == "startup"
+    await served.until_state("ready")
+    stats = (await again.query("print_stats"))["print_stats"]
+    assert (stats["state"], stats["filename"]) == ("standby", "")
+
+
+def test_a_configuration_that_does_not_load(tmp_path: Path) -> None:
+    printer = Printer(tmp_path, PRINTING)
+    good = printer.config.read_text()
+    printer.config.write_text(good + "[heater_generic\n")
+
+    async def whole() -> None:
+        served = Served(tmp_path, printer.load, printer.host)
+        life = asyncio.ensure_future(served.service.run())
+        async with KlippyApi.of(served, printer.config) as api:
+            client = api.connect()
+            await served.until_state("error")
+            info = await client.ask("info")
+            assert info["state"] == "error"
+            assert "heater_generic" in info["state_message"]
+            await client.listen()
+            objects = (await client.ask("objects/list"))["objects"]
+            status = await client.watch(dict.fromkeys(objects))
+            assert status["webhooks"]["state"] == "error"
+            assert status["configfile"]["config"] == {}
+            assert status["print_stats"]["state"] == "standby"
+            assert await client.error("gcode/script", {"script": "G28"}) == info["state_message"]
+            assert await client.ask("gcode/help") == {}
+            assert await client.ask("emergency_stop") == {}
+            printer.config.write_text(good)
+            client.send("gcode/script", {"script": "RESTART"})
+            await asyncio.sleep(0.1)
+            await served.until_state("ready")
+            assert client.transport.ended
+            assert (await api.connect().ask("info"))["state"] == "ready"
+        life.cancel()
+        await asyncio.gather(life, return_exceptions=True)
+
+    printer.run(whole)
+
+
+def test_clients_that_ask_too_much(tmp_path: Path) -> None:
+    printer = Printer(tmp_path, PRINTING)
+
+    async def main(served: Served) -> None:
+        async with KlippyApi.of(served, printer.config) as api:
+            good = api.connect()
+            await good.watch({"toolhead": None})
+            await _check_garbage(api)
+            await _check_blocked(api)
+            await _check_crowd(api)
+            assert len(await good.updates(1.1)) >= 4, "nobody else has lost anything"
+
+    printer.serve(main)
+
+
+async def _check_garbage(api: KlippyApi) -> None:
+    garbage = api.connect()
+    garbage.send_bytes(b"\x00\xff\x03{}\x03[1]\x03" * 1000)
+    assert (await garbage.ask("info"))["state"] == "ready", "what is no call is dropped, the connection stays"
+    assert len(api.notices) == 1, "one line of the log"
+    garbage.send_bytes(b'{"method": "gcode/script", "params": {"script": "' + b"x" * 20_000_000)
+    assert garbage.transport.ended
+    assert f"{MESSAGE_BYTES_MAX:,} bytes" in api.notices.pop()
+    assert len(api.notices) == 1
+    api.notices.clear()
+    half = api.connect()
+    half.send_bytes(b'{"method": "in')
+    await asyncio.sleep(10.0)
+    half.send_bytes(b'fo", "id": 0}\x03')
+    assert (await half.answer(0))["result"]["state"] == "ready"
+
+
+async def _check_blocked(api: KlippyApi) -> None:
+    blocked, greedy = api.connect(), api.connect()
+    await blocked.watch({"configfile": None})
+    blocked.transport.blocked = greedy.transport.blocked = True
+    blocked.send_bytes(b'{"method":"gcode/help","id":1}\x03' * 20)
+    greedy.send_bytes(b'{"method":"gcode/help","id":1}\x03' * 2_000)
+    await asyncio.sleep(1.0)
+    assert greedy.transport.ended
+    assert not blocked.transport.ended
+    await asyncio.sleep(BLOCKED_S)
+    assert blocked.transport.ended
+    assert len(api.notices) == 2
+    api.notices.clear()
+
+
+async def _check_crowd(api: KlippyApi) -> None:
+    crowd = [api.connect() for _ in range(CLIENTS_MAX)]
+    left = [client for client in crowd if not client.transport.ended]
+    assert len(left) < CLIENTS_MAX
+    assert len(api.notices) == CLIENTS_MAX - len(left)
+    assert (await left[-1].ask("info"))["state"] == "ready"
+    for client in left:
+        client.transport.close()
+    await asyncio.sleep(0)
+    assert not api.connect().transport.ended

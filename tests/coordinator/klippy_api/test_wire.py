@@ -1,0 +1,127 @@
+"""Framing, calls and messages, without any I/O: whatever comes, memory is bounded and nothing raises."""
+
+import contextlib
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coordinator.klippy_api.client import Client
+from coordinator.klippy_api.params import RequestError, template_of, text_of, wishes_of
+from coordinator.klippy_api.subscription import Status, Subscription, pick
+from coordinator.klippy_api.wire import (
+    MESSAGE_BYTES_MAX,
+    Framer,
+    Request,
+    TooLong,
+    Unreadable,
+    encode,
+    read_request,
+    result_message,
+)
+from tests.profiles import examples
+
+
+@given(st.lists(st.binary(max_size=40).filter(lambda body: b"\x03" not in body), max_size=6), st.data())
+@settings(max_examples=examples(40))
+def test_messages_come_out_whole_however_they_are_cut(bodies: list[bytes], data: st.DataObject) -> None:
+    stream = b"".join(body + b"\x03" for body in bodies)
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=8)))
+    framer, found = Framer(), []
+    for begin, end in zip([0, *cuts], [*cuts, len(stream)], strict=True):
+        found += framer.feed(stream[begin:end])
+    assert found == bodies
+
+
+def test_a_message_may_have_so_many_bytes_and_no_more() -> None:
+    body = b"x" * MESSAGE_BYTES_MAX
+    assert Framer().feed(body + b"\x03") == [body]
+    for too_long in (body + b"x", body + b"x\x03"):
+        with pytest.raises(TooLong):
+            Framer().feed(too_long)
+
+
+@given(st.binary(max_size=200))
+@settings(max_examples=examples(60))
+def test_garbage_is_a_call_or_is_dropped(body: bytes) -> None:
+    with contextlib.suppress(Unreadable):
+        assert isinstance(read_request(body).method, str)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"[]",
+        b"3",
+        b"\xff",
+        b'{"method": 3}',
+        b'{"params": {}}',
+        b'{"method": "info", "params": []}',
+        b'{"method": "info", "params": null}',
+        b'{"method": "info", "id": NaN}',
+        b'{"method": "info", "id": ' + b"9" * 5000 + b"}",
+        b"[" * 8_000,
+        b'{"method": "info", "params": {"x": [' + b"0," * 9_000 + b"0]}}",
+    ],
+)
+def test_what_is_no_call_is_dropped(body: bytes) -> None:
+    with pytest.raises(Unreadable):
+        read_request(body)
+
+
+@pytest.mark.parametrize("number", [1, "one", 1.5, [1, {"a": None}], {"b": 2}, True, 140_000_000_000_000])
+def test_an_id_is_of_any_type(number: object) -> None:
+    request = read_request(json.dumps({"method": "info", "id": number}).encode())
+    assert request == Request("info", {}, number)
+    assert json.loads(result_message(number, {})[:-1]) == {"id": number, "result": {}}
+
+
+def test_numbers_that_json_does_not_have_go_out_as_null() -> None:
+    message = encode({"a": float("nan"), "b": [1.0, float("inf")], "c": {"d": -float("inf")}})
+    assert json.loads(message[:-1]) == {"a": None, "b": [1.0, None], "c": {"d": None}}
+
+
+def test_a_stop_is_looked_at_before_all_that_waits() -> None:
+    client = Client("a client")
+    calls = [b'{"method": "info", "id": %d}\x03' % number for number in range(100)]
+    client.receive(b"".join(calls) + b'{"method": "emergency_stop"}\x03')
+    first = client.next_request()
+    assert first is not None
+    assert first.method == "emergency_stop"
+    rest = [client.next_request() for _ in calls]
+    assert [request.id for request in rest if request is not None] == list(range(100))
+    assert client.next_request() is None
+
+
+def test_parameters() -> None:
+    request = Request(
+        "gcode/script", {"script": 3, "objects": {"a": None, "b": ["c"]}, "response_template": {}}
+    )
+    with pytest.raises(RequestError, match="'script' must be a text"):
+        text_of(request, "script")
+    with pytest.raises(RequestError, match="'remote_method' is missing"):
+        text_of(request, "remote_method")
+    assert wishes_of(request) == {"a": None, "b": ["c"]}
+    assert template_of(request) == {}
+    wrong: list[object] = [[], "a", {"a": 3}, {"a": [3]}, {"a": {}}, None]
+    for objects in wrong:
+        with pytest.raises(RequestError):
+            wishes_of(Request("objects/query", {"objects": objects}))
+
+
+def test_a_subscription_tells_whole_fields_that_changed() -> None:
+    status: Status = {"fan": {"speed": 0.0, "rpm": None}, "toolhead": {"position": [0, 0, 0, 0]}}
+    assert pick({"fan": ["speed", "colour"], "none": None}, status) == {
+        "fan": {"speed": 0.0, "colour": None},
+        "none": {},
+    }
+    subscription = Subscription({}, {"fan": None, "toolhead": ["position"], "none": None})
+    assert subscription.begin(status) == {**status, "none": {}}
+    assert subscription.changes(status) == {}
+    later: Status = {"fan": {"speed": 0.5, "rpm": None, "new": 1}, "toolhead": {"position": [0, 0, 1, 0]}}
+    # What was wanted with null are the fields that there were.
+    assert subscription.changes(later) == {"fan": {"speed": 0.5}, "toolhead": {"position": [0, 0, 1, 0]}}
+    assert subscription.changes(later) == {}
+    assert subscription.changes({"none": {"came": 1}}) == {"none": {"came": 1}}
