@@ -70,6 +70,7 @@ bench: setup
 	@for b in bench/*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
 include tests/eyes.mk
+include tests/frontends.mk
 
 format: setup
 	$(BIN)/ruff check --fix . ; $(BIN)/ruff format .

@@ -1,0 +1,1 @@
+"""Real front ends on virtual hardware: `make frontends`, apart from `make test`."""
