@@ -226,7 +226,15 @@ async def _check_stop_and_restart(api: KlippyApi, client: KlippyClient, served: 
     assert client.transport.ended, "so that clients read everything again"
     again = api.connect()
     assert (await again.ask("info"))["state"] == "startup"
-    await served.until_state("ready")
+    seen = set()
+    while (state := (await again.ask("info"))["state"]) != "ready":
+        assert state == "startup"
+        objects = (await again.ask("objects/list"))["objects"]
+        status = await again.query(*objects)
+        assert status["webhooks"]["state"] == "startup"
+        seen.add(len(objects))
+        await asyncio.sleep(0.05)
+    assert seen
     stats = (await again.query("print_stats"))["print_stats"]
     assert (stats["state"], stats["filename"]) == ("standby", "")
 
