@@ -271,16 +271,26 @@ class Gateway:
     async def _update(self) -> None:
         while True:
             await asyncio.sleep(UPDATE_S)
-            watching = [c for c in self._connections if c.client.subscription is not None and c.writable]
-            if not watching:
-                continue
-            status, now_s = self.endpoints.status.build(), self._service.now_s
-            for connection in watching:
-                subscription = connection.client.subscription
-                changed = None if subscription is None else subscription.changes(status)
-                if subscription is not None and changed:
-                    params = {"eventtime": now_s, "status": changed}
-                    connection.send(event_message(subscription.template, params))
+            try:
+                self._send_changes()
+            except CanductorError:
+                continue  # it is stopped or closed in this moment: the next look finds how it is then
+            except Exception as error:  # noqa: BLE001 (a bug of one module's status must not end all updates)
+                asyncio.get_running_loop().call_exception_handler(
+                    {"message": "canductor: an update of the Klippy API failed", "exception": error}
+                )
+
+    def _send_changes(self) -> None:
+        watching = [c for c in self._connections if c.client.subscription is not None and c.writable]
+        if not watching:
+            return
+        status, now_s = self.endpoints.status.build(), self._service.now_s
+        for connection in watching:
+            subscription = connection.client.subscription
+            changed = None if subscription is None else subscription.changes(status)
+            if subscription is not None and changed:
+                params = {"eventtime": now_s, "status": changed}
+                connection.send(event_message(subscription.template, params))
 
     def say(self, text: str) -> None:
         """Show TEXT to all who listen to g-code, together with what else comes in this round of the loop."""

@@ -47,10 +47,13 @@ class JobRun:
         self.ended_s: float | None = None
         self.print_time_s = 0.0
         """For which it has moved, pauses left out."""
+        self.print_duration_s = 0.0
+        """The same from the first extrusion on."""
         self.line = 0
         """Being carried out."""
         self.filament_mm = 0.0
         """Of the extruder, drawn in since the begin."""
+        self._extruded = False
         self._trail = Trail()
         self._looked_s = now_s
         self._began_e = motion.moment().position[3]
@@ -117,12 +120,15 @@ class JobRun:
         if not self.active:
             return
         self._follow_programs()
-        if self.phase is not JobPhase.PAUSED and not self._motion.paused:
-            self.print_time_s += now_s - self._looked_s
-        self._looked_s = now_s
         moment = self._motion.moment()
         began_s = self._ticket.begun_at_s
         self.filament_mm = moment.position[3] - self._began_e
+        self._extruded = self._extruded or self.filament_mm > 0
+        if self.phase is not JobPhase.PAUSED and not self._motion.paused:
+            passed_s = now_s - self._looked_s
+            self.print_time_s += passed_s
+            self.print_duration_s += passed_s if self._extruded else 0.0
+        self._looked_s = now_s
         if moment.moving and moment.line and began_s is not None and self._motion.now_s >= began_s:
             self.line = max(self.line, moment.line)  # others that come between count from 1
         ticket = self._ticket

@@ -169,12 +169,19 @@ class Programs:
                 self.run_lines("on_error_gcode", ["_ON_ERROR_GCODE"])
         self._told = (job, job.phase)
 
+    def _state(self, job: JobRun) -> str:
+        """Return how JOB is; while it is being cancelled what it was before: it does not go on."""
+        told = "" if self._stats is None else self._stats.state
+        if job.phase is JobPhase.CANCELLING and told in ("printing", "paused"):
+            return told
+        return _STATES[job.phase]
+
     def _figures(self, job: JobRun) -> Mapping[str, Value]:
         return {
-            "state": _STATES[job.phase],
+            "state": self._state(job),
             "filename": job.file,
             "total_duration": round((job.ended_s or self._service.now_s) - job.began_s, 3),
-            "print_duration": round(job.print_time_s, 3),
+            "print_duration": round(job.print_duration_s, 3),
             "filament_used": round(job.filament_mm, 5),
             "message": job.message,
         }

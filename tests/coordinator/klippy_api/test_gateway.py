@@ -35,7 +35,7 @@ gcode:
     M117 quiet
 """
 )
-JOB = "M83\n" + "".join(f"G1 X{20 + 20 * (n % 2)} Y{20 + n} F6000\n" for n in range(60))
+JOB = "M83\nM109 S210\n" + "".join(f"G1 X{20 + 20 * (n % 2)} Y{20 + n} E0.01 F6000\n" for n in range(60))
 
 
 async def as_moonraker(client: KlippyClient) -> list[str]:
@@ -166,6 +166,7 @@ async def _check_print(client: KlippyClient, served: Served, printer: Printer) -
 
     async def look(*until: str) -> dict[str, Any]:
         while not states or states[-1] not in until:
+            assert states[-1:] != ["error"], await client.query("print_stats")
             for update in await client.updates(0.26):
                 told = update.get("print_stats", {})
                 states.extend(told[field] for field in ("state",) if field in told)
@@ -175,6 +176,12 @@ async def _check_print(client: KlippyClient, served: Served, printer: Printer) -
     assert status["print_stats"]["filename"] == "sub/part.gcode"
     assert status["virtual_sdcard"]["file_path"] == str(served.jobs / "sub" / "part.gcode")
     assert "pause it first" in await client.error("query_endstops/status")
+    async with asyncio.timeout(120):
+        while (told := (await client.query("print_stats"))["print_stats"])["filament_used"] == 0:
+            assert told["state"] == "printing", told
+            assert told["print_duration"] == 0, "heating is no printing"
+            await client.updates(0.26)
+    assert 0 < told["print_duration"] < told["total_duration"] - 1.0
     client.said()
     await client.script("M105")  # beside the job: told once
     assert len([line for line in client.said() if line.startswith("B:")]) == 1
@@ -183,9 +190,11 @@ async def _check_print(client: KlippyClient, served: Served, printer: Printer) -
     assert await client.ask("pause_resume/resume") == {}
     status = await look("printing")
     assert status["display_status"]["progress"] == status["virtual_sdcard"]["progress"]
+    assert await client.ask("pause_resume/pause") == {}
+    await look("paused")
     assert await client.ask("pause_resume/cancel") == {}
     await look("cancelled")
-    assert states == ["printing", "paused", "printing", "cancelled"]
+    assert states == ["printing", "paused", "printing", "paused", "cancelled"], "a cancel is no resume"
 
 
 async def _check_stop_and_restart(api: KlippyApi, client: KlippyClient, served: Served) -> None:
@@ -217,7 +226,15 @@ async def _check_stop_and_restart(api: KlippyApi, client: KlippyClient, served: 
     assert client.transport.ended, "so that clients read everything again"
     again = api.connect()
     assert (await again.ask("info"))["state"] == "startup"
-    await served.until_state("ready")
+    seen = set()
+    while (state := (await again.ask("info"))["state"]) != "ready":
+        assert state == "startup"
+        objects = (await again.ask("objects/list"))["objects"]
+        status = await again.query(*objects)
+        assert status["webhooks"]["state"] == "startup"
+        seen.add(len(objects))
+        await asyncio.sleep(0.05)
+    assert seen
     stats = (await again.query("print_stats"))["print_stats"]
     assert (stats["state"], stats["filename"]) == ("standby", "")
 
