@@ -171,3 +171,23 @@ def test_a_heater_that_is_off_is_not_looked_after(tmp_path: Path) -> None:
         assert sensor.unit._gone is None
 
     stage.connected(main)
+
+
+@pytest.mark.parametrize("celsius", [20.0, BROKEN_C])
+def test_a_measurement_after_the_end_changes_nothing(tmp_path: Path, celsius: float) -> None:
+    stage = HeatMachine(tmp_path, HOTEND_PID)
+
+    async def main() -> None:
+        sensor = await heating(stage)
+        sensor.unit.input.on_measured(1e6, 20.0)  # so late that the heater should be much hotter by now
+        assert "did not get 2 K nearer to 250 °C" in await stage.stopped(1.0)
+        await asyncio.sleep(1.0)
+        assert sensor.unit.power == 0
+        said = len(stage.notices)
+        for _ in range(BAD_ALLOWED + 2):
+            sensor.unit.input.on_measured(1e6, celsius)
+        assert sensor.unit._bad == 0, "what comes then is not even looked at"
+        assert sensor.unit.power == 0
+        assert len(stage.notices) == said
+
+    stage.connected(main)
