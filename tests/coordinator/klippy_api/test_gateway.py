@@ -182,6 +182,9 @@ async def _check_print(client: KlippyClient, served: Served, printer: Printer) -
             assert told["print_duration"] == 0, "heating is no printing"
             await client.updates(0.26)
     assert 0 < told["print_duration"] < told["total_duration"] - 1.0
+    reports = [update.get("motion_report", {}) for update in await client.updates(1.1)]
+    flows = [report["live_extruder_velocity"] for report in reports if "live_extruder_velocity" in report]
+    assert 0 < max(flows) < 0.1, "mm/s of filament: 0.01 mm in each 20 mm at 100 mm/s"
     client.said()
     await client.script("M105")  # beside the job: told once
     assert len([line for line in client.said() if line.startswith("B:")]) == 1
