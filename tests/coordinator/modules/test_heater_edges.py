@@ -191,3 +191,73 @@ def test_a_measurement_after_the_end_changes_nothing(tmp_path: Path, celsius: fl
         assert len(stage.notices) == said
 
     stage.connected(main)
+
+
+class Trial:
+    """A calibration at full power that never ends by itself, and fails at measurement FAILS_AT."""
+
+    watched_c = 60.0
+
+    def __init__(self, fails_at: int) -> None:
+        self.measurements = 0
+        self._fails_at = fails_at
+
+    def power(self, now_s: float, measured_c: float, target_c: float = 0.0) -> float:
+        del now_s, measured_c, target_c
+        self.measurements += 1
+        if self.measurements >= self._fails_at:
+            raise CanductorError("the calibration did not find anything")
+        return 1.0
+
+    def settled(self, measured_c: float, target_c: float) -> bool:
+        del measured_c, target_c
+        return False
+
+
+def test_a_calibration_that_fails_heats_no_more_from_that_measurement_on(tmp_path: Path) -> None:
+    stage = HeatMachine(tmp_path, HOTEND_PID)
+
+    async def main() -> None:
+        sensor, trial = Sensor(stage), Trial(fails_at=4)
+        running = asyncio.ensure_future(sensor.unit.tune(trial))
+        await sensor.good(3)
+        assert sensor.unit.power == 1.0
+        measure(sensor, 25.0, 3)  # the first fails it; the others come before who calibrates has noticed
+        assert trial.measurements == 4, "it is not asked again"
+        with pytest.raises(CanductorError, match="the calibration did not find anything"):
+            await running
+        await sensor.good(3)
+        assert sensor.unit.power == 0
+        assert trial.measurements == 4
+
+    stage.connected(main)
+
+
+def test_a_calibration_whose_node_went_away_heats_no_more(tmp_path: Path) -> None:
+    stage = HeatMachine(tmp_path, HOTEND_PID)
+
+    async def main() -> None:
+        sensor, trial = Sensor(stage), Trial(fails_at=1000)
+        running = asyncio.ensure_future(sensor.unit.tune(trial))
+        await sensor.good(3)
+        sensor.unit._let_go("node box is lost")
+        asked = trial.measurements
+        measure(sensor, 25.0, 3)
+        assert trial.measurements == asked
+        with pytest.raises(CanductorError, match="heater extruder went off: node box is lost"):
+            await running
+
+    stage.connected(main)
+
+
+def test_a_heater_that_was_never_calibrated_does_not_heat(tmp_path: Path) -> None:
+    stage = HeatMachine(tmp_path, "control: mpc\nheater_power: 40\n")
+
+    async def main() -> None:
+        sensor = Sensor(stage)
+        await sensor.good(5)
+        assert sensor.unit.controller is None
+        assert sensor.unit.power == 0
+        assert not any(level for _, level in stage.edges("PB3"))
+
+    stage.connected(main)
