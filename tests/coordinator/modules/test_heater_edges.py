@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.heat.mpc import Mpc
 from coordinator.modules.heater import LOOK_S, STALE_SPARE_S
 from coordinator.modules.pinned import AHEAD_S
 from nodes.errors import CanductorError
@@ -259,5 +260,45 @@ def test_a_heater_that_was_never_calibrated_does_not_heat(tmp_path: Path) -> Non
         assert sensor.unit.controller is None
         assert sensor.unit.power == 0
         assert not any(level for _, level in stage.edges("PB3"))
+
+    stage.connected(main)
+
+
+def test_a_model_uses_the_sensor_around_its_heater_once_that_has_measured(tmp_path: Path) -> None:
+    path = tmp_path / "room"
+    path.write_text("31500")
+    model = (
+        "control: mpc\nheater_power: 40\nblock_heat_capacity: 13\nambient_transfer: 0.075\n"
+        "sensor_responsiveness: 0.5\nambient_temp_sensor: temperature_sensor room\n"
+        "\n[temperature_sensor room]\nsensor_type: temperature_host\nmin_temp: 0\nmax_temp: 90\n"
+        f"sensor_path: {path}\n"
+    )
+    stage = HeatMachine(tmp_path, model)
+
+    async def main() -> None:
+        sensor = await heating(stage)
+        await sensor.good(10)
+        controller = sensor.unit.controller
+        assert isinstance(controller, Mpc)
+        assert controller._ambient_c == 31.5
+        path.write_text("28500")
+        await sensor.good(10)
+        assert controller._ambient_c == 28.5
+
+    stage.connected(main)
+
+
+def test_nobody_is_asked_for_power_after_a_fault(tmp_path: Path) -> None:
+    stage = HeatMachine(tmp_path, HOTEND_PID)
+
+    async def main() -> None:
+        sensor, trial = Sensor(stage), Trial(fails_at=1000)
+        running = asyncio.ensure_future(sensor.unit.tune(trial))
+        await sensor.good(3)
+        asked = trial.measurements
+        sensor.unit.input.on_measured(1e6, 20.0)
+        assert trial.measurements == asked
+        with pytest.raises(CanductorError, match="did not get 2 K nearer to 60 °C"):
+            await running
 
     stage.connected(main)

@@ -275,6 +275,26 @@ static void a_single_byte_counts_when_it_comes(void) {
     io_free(scene.bus);
 }
 
+// A block that is cut off is given up by time alone, and the counters of the link say so.
+static void what_time_gives_up_is_counted(void) {
+    struct scene scene;
+    const uint8_t cut_off[] = {20, WIRE_SEQ_MARK, 1};
+    open(&scene, IO_CAN_STREAM, NODE, &full_speed);
+    frame_comes(&scene, id_of(NODE) + 1u, cut_off, sizeof cut_off);
+    bus_stats(&scene);
+    CHECK_EQUAL(io_deadline(scene.bus, scene.now_ns), scene.now_ns + 100 * MS);
+    scene.now_ns += 100 * MS - 1;
+    io_handle_time(scene.bus, scene.now_ns);
+    bus_stats(&scene);
+    CHECK_EQUAL(link_stats(&scene).link.bytes_invalid, 0);
+    scene.now_ns++;
+    io_handle_time(scene.bus, scene.now_ns);
+    bus_stats(&scene);
+    CHECK_EQUAL(link_stats(&scene).link.bytes_received, sizeof cut_off);
+    CHECK_EQUAL(link_stats(&scene).link.bytes_invalid, sizeof cut_off);
+    io_free(scene.bus);
+}
+
 static void a_stream_may_come_byte_by_byte(void) {
     struct scene scene;
     open(&scene, IO_CAN_STREAM, NODE, &full_speed);
@@ -507,6 +527,7 @@ int main(void) {
     frames_belong_to_links_by_their_ids();
     frames_of_the_weakest_ids_count_apart();
     a_single_byte_counts_when_it_comes();
+    what_time_gives_up_is_counted();
     a_stream_may_come_byte_by_byte();
     a_serial_line_counts_bytes();
     what_goes_is_counted();
