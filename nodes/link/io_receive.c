@@ -8,6 +8,7 @@ enum { FROM_NODE = 1 };
 
 void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, size_t size, uint64_t now) {
     struct link_response response;
+    size_t waiting = node->link.rx_used;
     node->changed |= size > 0;
     while (link_receive(&node->link, &data, &size, now, &response)) {
         struct io_event event = {.notice = IO_RESPONSE, .size = response.size, .link = node->number};
@@ -16,6 +17,7 @@ void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, s
         memcpy(event.content, response.content, response.size);
         io_push(bus, &bus->responses, &event, &bus->stats.responses_dropped, &bus->stats.responses_max);
     }
+    node->changed |= node->link.rx_used != waiting; // without new bytes: what time has given up is counted
 }
 
 // An acknowledgement is one frame of one empty block; what motion costs includes those.

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.heat.mpc import Mpc
 from coordinator.modules.heater import LOOK_S, STALE_SPARE_S
 from coordinator.modules.pinned import AHEAD_S
 from nodes.errors import CanductorError
@@ -189,5 +190,115 @@ def test_a_measurement_after_the_end_changes_nothing(tmp_path: Path, celsius: fl
         assert sensor.unit._bad == 0, "what comes then is not even looked at"
         assert sensor.unit.power == 0
         assert len(stage.notices) == said
+
+    stage.connected(main)
+
+
+class Trial:
+    """A calibration at full power that never ends by itself, and fails at measurement FAILS_AT."""
+
+    watched_c = 60.0
+
+    def __init__(self, fails_at: int) -> None:
+        self.measurements = 0
+        self._fails_at = fails_at
+
+    def power(self, now_s: float, measured_c: float, target_c: float = 0.0) -> float:
+        del now_s, measured_c, target_c
+        self.measurements += 1
+        if self.measurements >= self._fails_at:
+            raise CanductorError("the calibration did not find anything")
+        return 1.0
+
+    def settled(self, measured_c: float, target_c: float) -> bool:
+        del measured_c, target_c
+        return False
+
+
+def test_a_calibration_that_fails_heats_no_more_from_that_measurement_on(tmp_path: Path) -> None:
+    stage = HeatMachine(tmp_path, HOTEND_PID)
+
+    async def main() -> None:
+        sensor, trial = Sensor(stage), Trial(fails_at=4)
+        running = asyncio.ensure_future(sensor.unit.tune(trial))
+        await sensor.good(3)
+        assert sensor.unit.power == 1.0
+        measure(sensor, 25.0, 3)  # the first fails it; the others come before who calibrates has noticed
+        assert trial.measurements == 4, "it is not asked again"
+        with pytest.raises(CanductorError, match="the calibration did not find anything"):
+            await running
+        await sensor.good(3)
+        assert sensor.unit.power == 0
+        assert trial.measurements == 4
+
+    stage.connected(main)
+
+
+def test_a_calibration_whose_node_went_away_heats_no_more(tmp_path: Path) -> None:
+    stage = HeatMachine(tmp_path, HOTEND_PID)
+
+    async def main() -> None:
+        sensor, trial = Sensor(stage), Trial(fails_at=1000)
+        running = asyncio.ensure_future(sensor.unit.tune(trial))
+        await sensor.good(3)
+        sensor.unit._let_go("node box is lost")
+        asked = trial.measurements
+        measure(sensor, 25.0, 3)
+        assert trial.measurements == asked
+        with pytest.raises(CanductorError, match="heater extruder went off: node box is lost"):
+            await running
+
+    stage.connected(main)
+
+
+def test_a_heater_that_was_never_calibrated_does_not_heat(tmp_path: Path) -> None:
+    stage = HeatMachine(tmp_path, "control: mpc\nheater_power: 40\n")
+
+    async def main() -> None:
+        sensor = Sensor(stage)
+        await sensor.good(5)
+        assert sensor.unit.controller is None
+        assert sensor.unit.power == 0
+        assert not any(level for _, level in stage.edges("PB3"))
+
+    stage.connected(main)
+
+
+def test_a_model_uses_the_sensor_around_its_heater_once_that_has_measured(tmp_path: Path) -> None:
+    path = tmp_path / "room"
+    path.write_text("31500")
+    model = (
+        "control: mpc\nheater_power: 40\nblock_heat_capacity: 13\nambient_transfer: 0.075\n"
+        "sensor_responsiveness: 0.5\nambient_temp_sensor: temperature_sensor room\n"
+        "\n[temperature_sensor room]\nsensor_type: temperature_host\nmin_temp: 0\nmax_temp: 90\n"
+        f"sensor_path: {path}\n"
+    )
+    stage = HeatMachine(tmp_path, model)
+
+    async def main() -> None:
+        sensor = await heating(stage)
+        await sensor.good(10)
+        controller = sensor.unit.controller
+        assert isinstance(controller, Mpc)
+        assert controller._ambient_c == 31.5
+        path.write_text("28500")
+        await sensor.good(10)
+        assert controller._ambient_c == 28.5
+
+    stage.connected(main)
+
+
+def test_nobody_is_asked_for_power_after_a_fault(tmp_path: Path) -> None:
+    stage = HeatMachine(tmp_path, HOTEND_PID)
+
+    async def main() -> None:
+        sensor, trial = Sensor(stage), Trial(fails_at=1000)
+        running = asyncio.ensure_future(sensor.unit.tune(trial))
+        await sensor.good(3)
+        asked = trial.measurements
+        sensor.unit.input.on_measured(1e6, 20.0)
+        assert trial.measurements == asked
+        with pytest.raises(CanductorError, match="did not get 2 K nearer to 60 °C"):
+            await running
 
     stage.connected(main)

@@ -259,6 +259,42 @@ static void frames_of_the_weakest_ids_count_apart(void) {
     io_free(scene.bus);
 }
 
+// Also when nothing was done on the bus for long before, and for the least that can come.
+static void a_single_byte_counts_when_it_comes(void) {
+    struct scene scene;
+    const uint8_t data[8] = {1};
+    open(&scene, IO_CAN_STREAM, NODE, &full_speed);
+    CHECK_EQUAL(bus_stats(&scene).received_bits, 0);
+    scene.now_ns += 5000 * MS + 50 * MS;
+    frame_comes(&scene, id_of(NODE) + 1u, data, 1);
+    uint64_t bits = can_frame_bits(id_of(NODE) + 1u, 1, data);
+    CHECK_EQUAL(bus_stats(&scene).recent_bits[SCHEDULE_DATA], bits * 1000000 / 1050000);
+    CHECK_EQUAL(link_stats(&scene).link.bytes_received, 1);
+    CHECK_EQUAL(link_stats(&scene).received.frames, 1);
+    CHECK_EQUAL(link_stats(&scene).received.bits, bits);
+    io_free(scene.bus);
+}
+
+// A block that is cut off is given up by time alone, and the counters of the link say so.
+static void what_time_gives_up_is_counted(void) {
+    struct scene scene;
+    const uint8_t cut_off[] = {20, WIRE_SEQ_MARK, 1};
+    open(&scene, IO_CAN_STREAM, NODE, &full_speed);
+    frame_comes(&scene, id_of(NODE) + 1u, cut_off, sizeof cut_off);
+    bus_stats(&scene);
+    CHECK_EQUAL(io_deadline(scene.bus, scene.now_ns), scene.now_ns + 100 * MS);
+    scene.now_ns += 100 * MS - 1;
+    io_handle_time(scene.bus, scene.now_ns);
+    bus_stats(&scene);
+    CHECK_EQUAL(link_stats(&scene).link.bytes_invalid, 0);
+    scene.now_ns++;
+    io_handle_time(scene.bus, scene.now_ns);
+    bus_stats(&scene);
+    CHECK_EQUAL(link_stats(&scene).link.bytes_received, sizeof cut_off);
+    CHECK_EQUAL(link_stats(&scene).link.bytes_invalid, sizeof cut_off);
+    io_free(scene.bus);
+}
+
 static void a_stream_may_come_byte_by_byte(void) {
     struct scene scene;
     open(&scene, IO_CAN_STREAM, NODE, &full_speed);
@@ -345,6 +381,44 @@ static void blocks_are_cut_into_frames(void) {
     io_free(scene.bus);
 }
 
+// Two blocks of 41 bytes: 82 bytes in 11 frames, where each by itself would take 6.
+static void a_frame_holds_the_end_of_one_block_and_the_start_of_the_next(void) {
+    struct scene scene;
+    open(&scene, IO_CAN_STREAM, NODE, &full_speed);
+    run_up(&scene);
+    for (size_t room = 1; room <= IO_OUT_FRAMES; room++) {
+        unsigned blocks = scene.blocks;
+        send_control(&scene, 36);
+        send_control(&scene, 36);
+        CHECK_EQUAL(pump(&scene, room * FRAME), 11);
+        CHECK_EQUAL(scene.blocks, blocks + 2);
+        scene.now_ns += 10 * MS;
+        answer(&scene, NULL, 0);
+        CHECK_EQUAL(link_stats(&scene).pending, 0);
+    }
+    io_free(scene.bus);
+}
+
+// Among links that are due alike the turn goes round.
+static void links_take_turns(void) {
+    struct scene one;
+    open(&one, IO_CAN_STREAM, NODE, &full_speed);
+    uint32_t links[3] = {one.link};
+    for (unsigned i = 1; i < 3; i++)
+        CHECK_EQUAL(io_open_link(one.bus, NODE + i, &usual, &links[i]), IO_OK);
+    for (unsigned i = 0; i < 3; i++)
+        CHECK_EQUAL(io_send(one.bus, links[i], LINK_CONTROL, (const uint8_t *)"\5", 1, 0, 0), IO_OK);
+    uint8_t out[IO_OUT_FRAMES * FRAME];
+    for (unsigned i = 0; i < 3; i++) { // first contact: 64 bytes, so 8 frames, to each
+        CHECK_EQUAL(io_next(one.bus, one.now_ns, 0, out, 8 * FRAME), 8 * FRAME);
+        for (size_t at = 0; at < 8 * FRAME; at += FRAME)
+            CHECK_EQUAL(out[at], id_of(NODE + i) % 256);
+        one.now_ns += MS;
+    }
+    CHECK_EQUAL(io_next(one.bus, one.now_ns, 0, out, 8 * FRAME), 0);
+    io_free(one.bus);
+}
+
 static void admin_frames_go_first_and_within_the_room(void) {
     struct scene scene;
     open(&scene, IO_CAN_STREAM, NODE, &full_speed);
@@ -399,17 +473,67 @@ static void a_serial_lines_queue_is_bounded_when_asked_for(void) {
     io_free(scene.bus);
 }
 
+// Whichever link waits for its acknowledgement for 7 ms: the line is left alone for the length of a frame.
+static void an_acknowledgement_that_does_not_come_makes_a_pause(void) {
+    for (unsigned silent = 0; silent < 2; silent++) {
+        struct scene scene;
+        open(&scene, IO_CAN_STREAM, NODE, &full_speed);
+        uint32_t links[2] = {scene.link};
+        CHECK_EQUAL(io_open_link(scene.bus, NODE + 1, &usual, &links[1]), IO_OK);
+        CHECK_EQUAL(io_send(scene.bus, links[silent], LINK_CONTROL, (const uint8_t *)"\5", 1, 0, 0), IO_OK);
+        uint8_t out[IO_OUT_FRAMES * FRAME], data = 0;
+        CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 0, out, sizeof out), 8 * FRAME);
+        CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 0, out, sizeof out), 0);
+        CHECK_EQUAL(bus_stats(&scene).queued_max, 8);
+        scene.now_ns += 7 * MS - 1;
+        CHECK_EQUAL(io_send_frame(scene.bus, TO_PYTHON_ID, &data, 1), IO_OK);
+        CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 0, out, sizeof out), FRAME);
+        CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 0, out, sizeof out), 0);
+        scene.now_ns += MS;
+        CHECK_EQUAL(io_send_frame(scene.bus, TO_PYTHON_ID, &data, 1), IO_OK);
+        CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 0, out, sizeof out), 0);
+        CHECK_EQUAL(io_deadline(scene.bus, scene.now_ns), scene.now_ns + 120000);
+        CHECK_EQUAL(bus_stats(&scene).queued_max, 8); // that nothing may go says nothing of the queue
+        scene.now_ns += 120000;
+        CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 0, out, sizeof out), FRAME);
+        io_free(scene.bus);
+    }
+}
+
+// What was queued before does not go, and a line that is not bounded has no figure of its queue.
+static void an_ended_bus_sends_nothing(void) {
+    struct scene scene;
+    static const struct io_settings unknown = {0};
+    open(&scene, IO_CAN_STREAM, NODE, &unknown);
+    uint8_t out[IO_OUT_FRAMES * FRAME], data = 0;
+    for (int i = 0; i < 2; i++)
+        CHECK_EQUAL(io_send_frame(scene.bus, TO_PYTHON_ID, &data, 1), IO_OK);
+    CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 0, out, FRAME), FRAME);
+    io_end(scene.bus, 0);
+    CHECK_EQUAL(io_next(scene.bus, scene.now_ns, 0, out, FRAME), 0);
+    struct io_stats stats;
+    io_get_stats(scene.bus, &stats);
+    CHECK_EQUAL(stats.queued_max, 0);
+    io_free(scene.bus);
+}
+
 int main(void) {
+    an_acknowledgement_that_does_not_come_makes_a_pause();
+    an_ended_bus_sends_nothing();
     an_answer_is_handed_over_with_its_times(IO_CAN_STREAM, NODE);
     an_answer_is_handed_over_with_its_times(IO_CAN_PACKET, LAST_NODE);
     an_answer_is_handed_over_with_its_times(IO_BYTES, 0);
     what_comes_is_counted();
     frames_belong_to_links_by_their_ids();
     frames_of_the_weakest_ids_count_apart();
+    a_single_byte_counts_when_it_comes();
+    what_time_gives_up_is_counted();
     a_stream_may_come_byte_by_byte();
     a_serial_line_counts_bytes();
     what_goes_is_counted();
     blocks_are_cut_into_frames();
+    a_frame_holds_the_end_of_one_block_and_the_start_of_the_next();
+    links_take_turns();
     admin_frames_go_first_and_within_the_room();
     the_kernels_queue_is_filled_and_no_more();
     a_serial_lines_queue_is_bounded_when_asked_for();

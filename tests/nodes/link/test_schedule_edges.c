@@ -43,6 +43,7 @@ static void settings_and_defaults(void) {
     CHECK_EQUAL(bus(320000, 0, 0, 0).queue_frames, 4);
     CHECK_EQUAL(bus(319999, 0, 0, 0).queue_frames, 3);
     CHECK_EQUAL(bus(125000, 0, 0, 0).queue_frames, 3);
+    CHECK_EQUAL(bus(1599999, 0, 0, 0).queue_frames, 19); // rounded down
     CHECK_EQUAL(bus(BITRATE, 0, 9, 0).queue_frames, 9);
     CHECK_EQUAL(bus(250000, 0, 0, 1).queue_frames, 0);
 }
