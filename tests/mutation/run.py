@@ -116,8 +116,9 @@ def in_order(
 class Runner:
     """Judges mutations, several at a time, each in a copy of the project of its own."""
 
-    def __init__(self, covered: CoverageMap, workers: int) -> None:
+    def __init__(self, covered: CoverageMap, workers: int, budget_s: float = BUDGET_S) -> None:
         self._covered = covered
+        self._budget_s = budget_s
         self._explained = explained.read_list()
         self._history_file = FOLDER / "history.json"
         self._history: dict[str, Counter[str]] = {}
@@ -153,7 +154,9 @@ class Runner:
     def _outcome(self, copy: ProjectCopy, mutation: Mutation) -> tuple[str, str]:
         tests = self._covered.tests(mutation, copy.read(mutation.file))
         with self._lock:
-            chosen = in_order(tests, mutation.file, self._history.setdefault(mutation.file, Counter()))
+            chosen = in_order(
+                tests, mutation.file, self._history.setdefault(mutation.file, Counter()), self._budget_s
+            )
         names = {test.file for test in chosen if test.is_c}
         programs = [program for program in copy.c_tests if program.name in names]
         try:
@@ -233,6 +236,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--area", default="", choices=["", *areas.AREAS])
     parser.add_argument("--file", default="", help="only this file")
     parser.add_argument("--lines", default="", help="only these lines of it, A:B")
+    parser.add_argument("--budget", type=float, default=BUDGET_S, help="seconds of tests for one mutant")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--measure", action="store_true", help="measure the coverage of all tests again")
     parser.add_argument("--list", action="store_true", help="only print the sample")
@@ -251,7 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if covered.failed:
         say(f"not counted, since they do not pass: {len(covered.failed)} tests", *covered.failed)
     verdicts = []
-    for verdict in Runner(covered, options.workers).judge_all(sample):
+    for verdict in Runner(covered, options.workers, options.budget).judge_all(sample):
         verdicts.append(verdict)
         say(f"{verdict.outcome:<12} {verdict.seconds:5.1f} s  {verdict.mutation}  [{verdict.evidence}]")
     lines, good = report(verdicts)
