@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from nodes.dictionary import Dictionary
+from nodes.dictionary.dictionary import Dictionary
 
 ROUNDS = 100_000
 

@@ -36,10 +36,10 @@ from typing import Any
 
 import msgpack
 
-from coordinator.ipc.methods import Caller, Method, Registry, Scope, Value
-from coordinator.ipc.server import IpcServer
-from coordinator.ipc.settings import IpcSettings
-from coordinator.ipc.state import StateTree
+from coordinator.ipc.protocol.methods import Caller, Method, Registry, Scope, Value
+from coordinator.ipc.server.server import IpcServer
+from coordinator.ipc.server.settings import IpcSettings
+from coordinator.ipc.server.state import StateTree
 
 FIELDS = 500
 ROOT = Path(__file__).resolve().parents[1]
@@ -302,7 +302,7 @@ class Served:
     def __init__(self, gcode: Path) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="canductor-bench-"))
         self.path = self.folder / "bench.sock"
-        command = [sys.executable, "-m", "coordinator.cli", "demo", "--serve", "--ipc", str(self.path)]
+        command = [sys.executable, "-m", "coordinator.cli.main", "demo", "--serve", "--ipc", str(self.path)]
         self.process = subprocess.Popen(
             [*command, "--jobs", str(gcode.parent)],
             cwd=ROOT,

@@ -30,7 +30,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from coordinator.motion.specs import NodeStreamSpec, StepKinematics, StepperSpec
-from coordinator.motion.steps import StepGenerator
+from coordinator.motion.steps.steps import StepGenerator
 from tests.coordinator.motion.exact_program import Planned, plan_program
 
 ROOT = Path(__file__).resolve().parents[1]

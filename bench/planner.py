@@ -13,7 +13,7 @@ from pathlib import Path
 from coordinator.gcode.events import End
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
-from coordinator.motion.planner import Planner
+from coordinator.motion.planner.planner import Planner
 from coordinator.motion.specs import MotionLimits
 
 ROUNDS = 5

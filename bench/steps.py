@@ -17,7 +17,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
-from coordinator.motion.steps import StepGenerator
+from coordinator.motion.steps.steps import StepGenerator
 
 ACCEL = 7000.0
 CORNER_V = 8.0

@@ -17,11 +17,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from nodes.clock import HostTime
+from nodes.clock.clock import HostTime
 from nodes.devices.table import Activation
-from nodes.table.cost import FRAME_BITS_MAX, RegisterCost
-from nodes.table.download import BUS_SHARE, Report, download
-from nodes.table.mt import transmission
+from nodes.mt.cost import FRAME_BITS_MAX, RegisterCost
+from nodes.mt.download import BUS_SHARE, Report, download
+from nodes.mt.mt import transmission
 from nodes.virtual.world import run
 from tests.nodes.table.machines import TableMachine, wavy
 

@@ -30,7 +30,7 @@ def test_the_table_names_what_is_missing_and_keeps_the_bounds(
         "firmware/core/sched.c": source(int(c_run), 100 - int(c_run)),
         "firmware/boards/linux/main.c": source(0, 100),  # no bound is set for it
     }
-    python = {"nodes/node.py": source(int(python_run), 100 - int(python_run))}
+    python = {"nodes/node/node.py": source(int(python_run), 100 - int(python_run))}
     assert table(c, python, verbose=True) is kept
     printed = capsys.readouterr().out
     assert f"C of these{100:>32}{int(c_run):>8}" in printed

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from coordinator.demo.heat_proof import HeatProof
-from coordinator.demo.proof import ClockProof, StepperProof
-from coordinator.demo.truth import PlaceProof
+from coordinator.verification.heat_proof import HeatProof
+from coordinator.verification.proof import ClockProof, StepperProof
+from coordinator.verification.true_position import PlaceProof
 
 
 @dataclass(frozen=True, slots=True)

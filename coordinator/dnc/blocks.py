@@ -2,8 +2,8 @@
 
 from typing import Final
 
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 SOH: Final = 0x01
 STX: Final = 0x02

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import IO, Final, Protocol
 
 from coordinator.dnc.blocks import INPUT, OUTPUT, Header
-from coordinator.dnc.command_line import DncJob
-from coordinator.dnc.desk import Desk, FileSource, Library, Outcome, Sink, Source, Take
+from coordinator.cli.commands.dnc import DncJob
+from coordinator.dnc.endpoint import Desk, FileSource, Library, Outcome, Sink, Source, Take
 from coordinator.dnc.driver import Driver, Line
 from coordinator.dnc.engine import Engine
 from coordinator.dnc.feeds import SlowSource
@@ -20,8 +20,8 @@ from coordinator.dnc.options import DncOptions
 from coordinator.dnc.port import Port
 from coordinator.dnc.tables import check_table
 from coordinator.dnc.verify import Compare, Twice
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 NOT_YET_S: Final = 0.02
 UNREADABLE: Final = "what comes cannot be read; are baud rate and frame those of the control?"
@@ -287,8 +287,8 @@ def _open_stream(file: Path, stack: contextlib.ExitStack, around: Surroundings) 
 
 def _drip_to_machine(job: DncJob, around: Surroundings) -> DncReport:
     from coordinator.dnc.machine import MachineSink  # noqa: PLC0415 (others do without)
-    from coordinator.front_ends import tls_of  # noqa: PLC0415 (likewise)
-    from coordinator.ipc.blocking import BlockingClient  # noqa: PLC0415 (likewise)
+    from coordinator.cli.commands.front_ends import tls_of  # noqa: PLC0415 (likewise)
+    from coordinator.ipc.client.blocking import BlockingClient  # noqa: PLC0415 (likewise)
 
     at = job.machine
     options = {"token": at.token, "tls": tls_of(at), "timeout_s": at.timeout_s, "name": "canductor dnc"}
@@ -314,7 +314,7 @@ def _drip_to_machine(job: DncJob, around: Surroundings) -> DncReport:
 
 
 def _print(job: DncJob, file: Path) -> None:
-    from coordinator.front_ends import send as send_to_machine  # noqa: PLC0415 (others do without)
+    from coordinator.cli.commands.front_ends import send as send_to_machine  # noqa: PLC0415 (others do without)
 
     send_to_machine(job.machine, file, file.name, replace=job.overwrite, start=True, quiet=job.json)
 

@@ -6,7 +6,7 @@ from typing import Final
 from coordinator.dnc import events
 from coordinator.dnc.blocks import ACK, EOT, ETX, OUTPUT, SOH, Header, write_block
 from coordinator.dnc.options import DncOptions
-from coordinator.dnc.scanner import Scanner
+from coordinator.dnc.lexer import Scanner
 
 ERROR_TEXT_MAX: Final = 32
 """Characters of an error's text: more, old controls do not show."""

@@ -29,7 +29,7 @@ from coordinator.dnc.blocks import (
     is_text,
 )
 from coordinator.dnc.conversation import State
-from coordinator.dnc.reactions import Reactions
+from coordinator.dnc.handlers import Reactions
 
 __all__ = ["Engine", "State"]
 

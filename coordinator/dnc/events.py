@@ -1,7 +1,7 @@
 """What an engine tells its owner."""
 
 from coordinator.dnc.blocks import Header
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

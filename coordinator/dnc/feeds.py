@@ -5,9 +5,9 @@ import queue
 import threading
 from typing import IO, Final
 
-from coordinator.dnc.desk import NOT_YET, Pause
+from coordinator.dnc.endpoint import NOT_YET, Pause
 from coordinator.dnc.files import read_lines
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 QUEUED_LINES_MAX: Final = 64
 """Lines read ahead: what feeds them waits, then, as the control does with its answers."""

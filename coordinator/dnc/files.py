@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import IO, Final
 
 from coordinator.dnc.blocks import BadText, is_text
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 Check = Callable[[bytes, str], None]
 """Gets a file's content and name; raises CanductorError if it may not be kept."""

@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from typing import Final
 
 from coordinator.dnc.files import Entry
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 SECTOR_BYTES: Final = 512
 _IGNORED_LINES: Final = 4

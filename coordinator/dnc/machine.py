@@ -10,8 +10,8 @@ from concurrent.futures import CancelledError, Future, wait
 from typing import Any, Final, Protocol
 
 from coordinator.dnc.files import FileRefused
-from coordinator.ipc.methods import ApiError
-from nodes.errors import CanductorError
+from coordinator.ipc.protocol.methods import ApiError
+from nodes.support.errors import CanductorError
 
 LINES_MAX: Final = 64
 """That wait for the machine here."""

@@ -8,7 +8,7 @@ said to be even; but no program has the same numbered line twice in a row.
 import re
 from typing import Final
 
-from coordinator.dnc.desk import Sink, Take
+from coordinator.dnc.endpoint import Sink, Take
 from coordinator.dnc.files import FileRefused
 
 _DIALOG: Final = re.compile(rb"\s*0\s+BEGIN PGM\b")

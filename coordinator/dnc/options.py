@@ -2,8 +2,8 @@
 
 from typing import Final
 
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 BAUD_RATES: Final = (110, 150, 300, 600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400)
 TRANSMISSIONS_MAX: Final = 15

@@ -14,7 +14,7 @@ from typing import Any, Final
 import serial
 
 from coordinator.dnc.options import DncOptions
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 READ_SIZE: Final = 4096
 _QUEUED_MAX: Final = 256

@@ -3,8 +3,8 @@
 import tempfile
 from pathlib import Path
 
-from coordinator.table.files import read_table
-from nodes.errors import CanductorError
+from coordinator.tables.files import read_table
+from nodes.support.errors import CanductorError
 
 _ANY_AXIS = "x"
 """Which axis a table is for is said when it is sent to one."""

@@ -7,7 +7,7 @@ see, however careful. To see the file twice closes that: the same damage would h
 from typing import IO
 
 from coordinator.dnc.blocks import Header
-from coordinator.dnc.desk import Sink
+from coordinator.dnc.endpoint import Sink
 from coordinator.dnc.files import FileRefused, Folder, Incoming, read_lines, stored_name
 
 _TEXT = "NOT THE SAME"

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from enum import Enum
 from typing import Final
 
-from nodes.records import record
+from nodes.support.records import record
 
 
 class Effect(Enum):

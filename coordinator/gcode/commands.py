@@ -18,12 +18,12 @@ from dataclasses import field, replace
 from typing import TYPE_CHECKING
 
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.gcode.words import Command
-from nodes.records import record
+from coordinator.gcode.parser import Command
+from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job
-    from coordinator.motion.planner import Planner
+    from coordinator.motion.planner.planner import Planner
 
 Position = tuple[float, float, float, float]
 

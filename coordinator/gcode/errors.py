@@ -1,6 +1,6 @@
 """What stops a G-code program."""
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 
 class GCodeError(CanductorError):

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 from coordinator.gcode.commands import Done
 from coordinator.gcode.reply_kinds import ReplyKind
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

@@ -11,7 +11,7 @@ from coordinator.kinematics.base import Weights
 from coordinator.kinematics.dual_carriage import CarriageState, DualCarriage
 from coordinator.kinematics.extruder import ExtruderMotion
 from coordinator.motion.specs import MotionLimits
-from nodes.records import record
+from nodes.support.records import record
 
 SHAPER_AXES = "XYZ"
 SHAPER_PERIODS = 2.0

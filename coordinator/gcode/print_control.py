@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Protocol
 
-from nodes.records import record
+from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job

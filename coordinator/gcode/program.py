@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from coordinator.gcode.errors import GCodeError
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 CHUNK_BYTES = 1 << 16
 MAX_LINE_BYTES = 1 << 20

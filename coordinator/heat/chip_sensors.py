@@ -22,7 +22,7 @@ sam3x, sam4e   SAM3X/A and SAM4E data sheets, "Temperature Sensor"
 
 from typing import Final
 
-from nodes.records import record
+from nodes.support.records import record
 
 REFERENCE_V: Final = 3.3
 SLOPE_TRUST: Final = 0.35

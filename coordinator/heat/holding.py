@@ -6,7 +6,7 @@ target changes. Neither a fan that starts nor filament that passes ends it: to h
 
 from typing import Final
 
-from nodes.records import record
+from nodes.support.records import record
 
 SETTLING_S: Final = 10.0
 """So long after a heater has reached its target it may still swing."""

@@ -7,7 +7,7 @@ gives no more; SOURCES says which.
 from typing import Final
 
 from coordinator.heat.resistors import Platinum, SteinhartHart
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from coordinator.heat.controller import NEAR_K, SLOW_K_PER_S, Slope
-from nodes.records import record
+from nodes.support.records import record
 
 OBSERVER_SPEED: Final = 1.5
 OBSERVER_FASTEST_PER_S: Final = 1.0

@@ -3,7 +3,7 @@
 from typing import Final
 
 from coordinator.heat.controller import NEAR_K, SLOW_K_PER_S, Slope
-from nodes.records import record
+from nodes.support.records import record
 
 PARAMETER_BASE: Final = 255.0
 """Users' pid_Kp, pid_Ki and pid_Kd stand for a power of 0 to 255."""

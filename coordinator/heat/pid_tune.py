@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from coordinator.heat.pid import PARAMETER_BASE, PidGains
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 SWINGS: Final = 5
 """Whole swings that count, after the first, which begins cold."""

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from typing import Final, Protocol
 
 from coordinator.heat.tables import Line, TableError
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 ZERO_C: Final = 273.15
 """0 °C in K."""

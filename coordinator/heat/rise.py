@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from coordinator.heat.pid_tune import TuneError
-from nodes.records import record
+from nodes.support.records import record
 
 MAX_POINTS: Final = 2000
 TRIES: Final = 60

@@ -9,7 +9,7 @@ from typing import Final, Protocol
 
 from coordinator.heat.resistors import MIN_OHMS, Resistor, SensorError
 from coordinator.heat.tables import Line, TableError
-from nodes.records import record
+from nodes.support.records import record
 
 RAIL: Final = 1e-6
 """A ratio nearer to 0 or 1 than this is taken as this near: wires that are open or touch."""

@@ -4,8 +4,8 @@ import itertools
 from bisect import bisect_right
 from collections.abc import Sequence
 
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 
 class TableError(CanductorError):

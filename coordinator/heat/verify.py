@@ -6,7 +6,7 @@ does not hold one, and it goes on heating when it has been off for long (a switc
 
 from typing import Final
 
-from nodes.records import record
+from nodes.support.records import record
 
 OFF_BEFORE_S: Final = 30.0
 """How long a heater must have been off before its heat cannot be what is left in it."""

@@ -8,7 +8,7 @@ import math
 from typing import Protocol
 
 from coordinator.motion.specs import StepKinematics
-from nodes.records import record
+from nodes.support.records import record
 
 Point = tuple[float, float, float]
 Weights = tuple[float, float, float, float]

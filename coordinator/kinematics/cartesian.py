@@ -1,7 +1,7 @@
 """Cartesian: each rail moves one axis. Formulas: none, a rail's position is the axis' position."""
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

@@ -6,7 +6,7 @@ that a motor alone moves its rail by the same way as on a cartesian machine.
 """
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

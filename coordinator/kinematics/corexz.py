@@ -4,7 +4,7 @@ a = x + z, c = x - z, and so x = (a + c) / 2, z = (a - c) / 2. Source: as corexy
 """
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

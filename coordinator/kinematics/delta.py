@@ -14,7 +14,7 @@ import math
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace
 from coordinator.kinematics.geometry import spheres_meet
 from coordinator.motion.specs import StepKinematics
-from nodes.records import record
+from nodes.support.records import record
 
 USUAL_TOWER_SPEED = 3.0
 """How much faster than the head a carriage may be: where a rod lies flatter, the head is slower instead."""

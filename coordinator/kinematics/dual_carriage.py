@@ -17,7 +17,7 @@ from dataclasses import replace
 from enum import Enum
 
 from coordinator.kinematics.base import Weights
-from nodes.records import record
+from nodes.support.records import record
 
 
 class CarriageMode(Enum):

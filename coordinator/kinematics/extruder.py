@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from coordinator.kinematics.base import FILAMENT, NO_WEIGHTS, Weights
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

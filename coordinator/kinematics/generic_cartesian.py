@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
 from coordinator.kinematics.geometry import cross, dot, solve
-from nodes.records import record
+from nodes.support.records import record
 
 MIN_INDEPENDENCE = 1e-6
 """Smallest determinant of three motors' weights, each scaled to length 1, that counts as independent."""

@@ -5,7 +5,7 @@ Source: the way of a belt whose free length is x - y, as described for the Markf
 """
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

@@ -4,7 +4,7 @@ a = x - z, c = z, and so x = a + c. Source: as hybrid_corexy.py, with Z for Y.
 """
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

@@ -1,7 +1,7 @@
 """A machine whose head nothing moves: heaters, fans and sensors alone, perhaps an extruder."""
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

@@ -11,7 +11,7 @@ import math
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
 from coordinator.motion.specs import StepKinematics
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

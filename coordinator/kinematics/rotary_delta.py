@@ -19,7 +19,7 @@ import math
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace
 from coordinator.kinematics.geometry import spheres_meet
 from coordinator.motion.specs import StepKinematics
-from nodes.records import record
+from nodes.support.records import record
 
 MIN_LEVERAGE = 1 / 3
 """Smallest share of the lower arm that is in the elbow's direction: an elbow is at most three times as fast

@@ -13,7 +13,7 @@ import math
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace
 from coordinator.kinematics.geometry import along, cross, dot, solve, spheres_meet, subtract
 from coordinator.motion.specs import StepKinematics
-from nodes.records import record
+from nodes.support.records import record
 
 MIN_WINCHES = 3
 _FLAT = 1e-3

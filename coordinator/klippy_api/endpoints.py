@@ -8,24 +8,24 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from coordinator.command_line import version
+from coordinator.cli.parser import version
 from coordinator.gcode.commands import AtOnce, Call
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
-from coordinator.gcode.words import WordError, parse
+from coordinator.gcode.parser import WordError, parse
 from coordinator.klippy_api.client import REMOTE_METHODS_MAX, Client
 from coordinator.klippy_api.params import RequestError, template_of, text_of, wishes_of
 from coordinator.klippy_api.status import StatusBuilder, state_of
 from coordinator.klippy_api.subscription import Subscription, pick
 from coordinator.klippy_api.wire import Request
-from coordinator.modules.homing import Homing
-from coordinator.modules.pause_resume import PauseResume
-from coordinator.move_source import Told
-from coordinator.service.methods_motion import RESTARTS, run_script
-from coordinator.service.work import LINES_MAX
-from nodes.errors import CanductorError
+from coordinator.modules.homing.homing import Homing
+from coordinator.modules.programs.pause_resume import PauseResume
+from coordinator.streaming.move_source import Told
+from coordinator.service.api.motion import RESTARTS, run_script
+from coordinator.service.core.work import LINES_MAX
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.service.machine_service import MachineService
+    from coordinator.service.core.machine_service import MachineService
 
 Result = Mapping[str, Any]
 Endpoint = Callable[[Client, Request], Result | Awaitable[Result]]

@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
-from coordinator.ipc.turns import Turns
-from coordinator.ipc.unix_socket import BACKLOG, listen_at, may_use, peer_of
+from coordinator.ipc.server.fair_scheduler import Turns
+from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
 from coordinator.klippy_api.client import RUNNING_MAX, Client
 from coordinator.klippy_api.endpoints import Endpoints, Result
 from coordinator.klippy_api.wire import Request, Unreadable, error_message, event_message, result_message
-from coordinator.service.machine_service import ServiceState
-from nodes.errors import CanductorError
+from coordinator.service.core.machine_service import ServiceState
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.service.log_ring import Entry
-    from coordinator.service.machine_service import MachineService
+    from coordinator.service.state.log_ring import Entry
+    from coordinator.service.core.machine_service import MachineService
 
 UPDATE_S: Final = 0.25
 """Between two updates of what clients watch."""

@@ -3,8 +3,8 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from coordinator.machine.description import MachineDescription
-    from coordinator.service.motion import Motion
+    from coordinator.assembly.load import MachineDescription
+    from coordinator.service.core.motion import Motion
 
 Objects = dict[str, dict[str, Any]]
 

@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from coordinator.app import link_of
-from nodes.errors import CanductorError
-from nodes.load import STATS_INTERVAL_S
+from coordinator.runtime.machine import link_of
+from nodes.support.errors import CanductorError
+from nodes.node.load import STATS_INTERVAL_S
 
 if TYPE_CHECKING:
-    from coordinator.app import Machine
-    from nodes.node import Node
+    from coordinator.runtime.machine import Machine
+    from nodes.node.node import Node
 
 
 def object_name(node: str) -> str:

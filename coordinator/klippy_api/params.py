@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from coordinator.klippy_api.wire import Request
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 TEMPLATE_ITEMS_MAX: Final = 32
 OBJECTS_MAX: Final = 1024

@@ -9,16 +9,16 @@ from coordinator.klippy_api.motion_objects import motion_objects, resting_object
 from coordinator.klippy_api.node_objects import firmware_of, node_objects
 from coordinator.klippy_api.subscription import Status
 from coordinator.modules.base import Module
-from coordinator.modules.config_view import ConfigView
-from coordinator.modules.gcode_macro import GCodeMacro
-from coordinator.modules.heaters import Heaters
-from coordinator.modules.machine_view import available_kb
-from coordinator.modules.print_stats import NOTHING
-from coordinator.service.machine_service import ServiceState
+from coordinator.modules.status.config_view import ConfigView
+from coordinator.modules.programs.gcode_macro import GCodeMacro
+from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.status.machine_view import available_kb
+from coordinator.modules.status.print_stats import NOTHING
+from coordinator.service.core.machine_service import ServiceState
 
 if TYPE_CHECKING:
-    from coordinator.app import Machine
-    from coordinator.service.machine_service import MachineService
+    from coordinator.runtime.machine import Machine
+    from coordinator.service.core.machine_service import MachineService
 
 STATS_S: Final = 1.0
 """Load and traffic of nodes and computer are looked at again after so long."""

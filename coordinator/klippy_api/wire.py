@@ -8,9 +8,9 @@ import math
 from collections.abc import Mapping
 from typing import Any, Final, NoReturn
 
-from coordinator.ipc.json_values import has_more_items
-from nodes.errors import CanductorError
-from nodes.records import record
+from coordinator.ipc.protocol.json_values import has_more_items
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 END: Final = b"\x03"
 MESSAGE_BYTES_MAX: Final = 262_144

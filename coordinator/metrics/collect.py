@@ -16,7 +16,7 @@ from prometheus_client.core import (
 )
 from prometheus_client.registry import Collector
 
-from coordinator.ipc.methods import Value, printable
+from coordinator.ipc.protocol.methods import Value, printable
 from coordinator.metrics.catalog import BUSES, GROUPS, MODULES, NODES, PREFIX, Group, Kind, Metric
 
 ENTITIES_MAX: Final = 256

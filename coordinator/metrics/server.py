@@ -15,9 +15,9 @@ from typing import Final
 
 from prometheus_client.exposition import choose_encoder
 
-from coordinator.ipc.methods import Value
+from coordinator.ipc.protocol.methods import Value
 from coordinator.metrics.collect import registry_of
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 CONNECTIONS_MAX: Final = 8
 REQUEST_BYTES_MAX: Final = 8_192

@@ -18,17 +18,17 @@ from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 from coordinator.gcode.commands import GCodeCommand
-from coordinator.machine.config_file import RawSection
-from coordinator.machine.options import BadValue, ListOption, Option, SectionReader, SectionSpec
-from coordinator.machine.pins import PinDescription, PinOption, PinRegistry
-from coordinator.machine.problem import ConfigError, NotActing, Place, nearest, shown
-from nodes.node_config import NodeConfig
+from coordinator.config.file import RawSection
+from coordinator.config.options import BadValue, ListOption, Option, SectionReader, SectionSpec
+from coordinator.config.pins import PinDescription, PinOption, PinRegistry
+from coordinator.config.errors import ConfigError, NotActing, Place, nearest, shown
+from nodes.node.config import NodeConfig
 
 if TYPE_CHECKING:  # planning needs neither, and they draw in asyncio
-    from coordinator.machine.model import MachineDescription
-    from coordinator.modules.live import Live
-    from coordinator.motion.planner import Planner
-    from nodes.node import Node
+    from coordinator.config.model import MachineDescription
+    from coordinator.runtime.module_context import Live
+    from coordinator.motion.planner.planner import Planner
+    from nodes.node.node import Node
 
 Value = None | bool | int | float | str | list["Value"] | dict[str, "Value"]
 """What a status may hold."""

@@ -7,31 +7,31 @@ from dataclasses import field
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from coordinator.gcode.absent_commands import ABSENT
-from coordinator.gcode.basic_commands import BESIDE, HANDLERS
+from coordinator.gcode.builtins.basic import BESIDE, HANDLERS
 from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
-from coordinator.gcode.helps import HELPS
-from coordinator.machine.config_file import RawSection
-from coordinator.machine.pins import PinRegistry
-from coordinator.machine.problem import ConfigError, NotActing, Place
-from coordinator.machine.well_known import LATER_SECTIONS
+from coordinator.gcode.builtins.command_help import HELPS
+from coordinator.config.file import RawSection
+from coordinator.config.pins import PinRegistry
+from coordinator.config.errors import ConfigError, NotActing, Place
+from coordinator.config.unsupported import LATER_SECTIONS
 from coordinator.modules.base import Build, Device, Module, Value
-from coordinator.modules.console import Console
-from coordinator.modules.homing import Homing
-from coordinator.modules.idle_timeout import IdleTimeout
-from coordinator.modules.manual_probe import ManualProbe
-from coordinator.modules.motor_power import MotorPower
-from coordinator.modules.positions import Positions
-from coordinator.modules.save_config import SaveConfig
-from coordinator.modules.stepper_buzz import StepperBuzz
-from nodes.errors import CanductorError
-from nodes.node_config import NodeConfig
-from nodes.records import record
+from coordinator.modules.status.console import Console
+from coordinator.modules.homing.homing import Homing
+from coordinator.modules.programs.idle_timeout import IdleTimeout
+from coordinator.modules.probes.manual_probe import ManualProbe
+from coordinator.modules.drivers.motor_power import MotorPower
+from coordinator.modules.status.positions import Positions
+from coordinator.modules.programs.save_config import SaveConfig
+from coordinator.modules.drivers.stepper_buzz import StepperBuzz
+from nodes.support.errors import CanductorError
+from nodes.node.config import NodeConfig
+from nodes.support.records import record
 
 if TYPE_CHECKING:
-    from coordinator.machine.model import MachineDescription
-    from coordinator.modules.live import Live
-    from coordinator.motion.planner import Planner
-    from nodes.node import Node
+    from coordinator.config.model import MachineDescription
+    from coordinator.runtime.module_context import Live
+    from coordinator.motion.planner.planner import Planner
+    from nodes.node.node import Node
 
 M = TypeVar("M", bound=Module)
 IDLE_TIMEOUT: Final = "idle_timeout"
@@ -344,7 +344,7 @@ class ModuleSet:
         return frozenset(found)
 
     def _too_cold(self, extruder: str) -> bool:
-        from coordinator.modules.heater_sections import ExtruderHeater  # noqa: PLC0415 (start-up time)
+        from coordinator.modules.heaters.sections import ExtruderHeater  # noqa: PLC0415 (start-up time)
 
         if extruder in self.left_out:
             return self._live is not None  # nobody knows how hot it is; a plan takes it for granted

@@ -2,16 +2,16 @@
 
 from typing import TYPE_CHECKING, Final
 
-from coordinator.machine.options import FloatOption
-from coordinator.machine.pins import PinDescription
+from coordinator.config.options import FloatOption
+from coordinator.config.pins import PinDescription
 from coordinator.modules.base import Build, Device
 from nodes.devices.pwm_out import SOFTWARE_FASTEST_S
-from nodes.node_config import NodeConfig
+from nodes.node.config import NodeConfig
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from nodes.node import Node
+    from nodes.node.node import Node
 
 
 AHEAD_S: Final = 0.4

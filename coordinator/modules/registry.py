@@ -5,7 +5,7 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
-from coordinator.machine.problem import ConfigError, Place
+from coordinator.config.errors import ConfigError, Place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,43 +16,43 @@ if TYPE_CHECKING:
 ENTRY_POINTS: Final = "canductor.modules"
 """Name: the section's first word; value: ``package.module:Class``."""
 _OURS: Final[dict[str, str]] = {
-    "adc_temperature": "coordinator.modules.thermistor:AdcTemperature",
-    "controller_fan": "coordinator.modules.automatic_fans:ControllerFan",
-    "delayed_gcode": "coordinator.modules.delayed_gcode:DelayedGCode",
-    "display_status": "coordinator.modules.display_status:DisplayStatus",
-    "exclude_object": "coordinator.modules.exclude_object:ExcludeObject",
-    "fan": "coordinator.modules.fans:Fan",
-    "fan_generic": "coordinator.modules.fans:FanGeneric",
-    "filament_switch_sensor": "coordinator.modules.filament_switch_sensor:FilamentSwitchSensor",
-    "firmware_retraction": "coordinator.modules.firmware_retraction:FirmwareRetraction",
-    "force_move": "coordinator.modules.force_move:ForceMove",
-    "gcode_arcs": "coordinator.modules.gcode_arcs:GCodeArcs",
-    "gcode_button": "coordinator.modules.gcode_button:GCodeButton",
-    "gcode_macro": "coordinator.modules.gcode_macro:GCodeMacro",
-    "heater_bed": "coordinator.modules.heater_sections:HeaterBed",
-    "heater_fan": "coordinator.modules.automatic_fans:HeaterFan",
-    "heater_generic": "coordinator.modules.heater_sections:HeaterGeneric",
-    "homing_override": "coordinator.modules.homing_override:HomingOverride",
-    "idle_timeout": "coordinator.modules.idle_timeout:IdleTimeout",
-    "output_pin": "coordinator.modules.output_pin:OutputPin",
-    "pause_resume": "coordinator.modules.pause_resume:PauseResume",
-    "pid_profile": "coordinator.modules.pid_profile:PidProfile",
-    "respond": "coordinator.modules.respond:Respond",
-    "safe_z_home": "coordinator.modules.safe_z_home:SafeZHome",
-    "save_variables": "coordinator.modules.save_variables:SaveVariables",
-    "skew_correction": "coordinator.modules.skew_correction:SkewCorrection",
-    "static_digital_output": "coordinator.modules.output_pin:StaticDigitalOutput",
-    "temperature_fan": "coordinator.modules.temperature_fan:TemperatureFan",
-    "temperature_sensor": "coordinator.modules.sensor_module:TemperatureSensor",
-    "tmc2208": "coordinator.modules.tmc_driver:Tmc2208",
-    "tmc2209": "coordinator.modules.tmc_driver:Tmc2209",
-    "thermistor": "coordinator.modules.thermistor:Thermistor",
-    "verify_heater": "coordinator.modules.verify_heater:VerifyHeater",
-    "virtual_sdcard": "coordinator.modules.virtual_sdcard:VirtualSdcard",
+    "adc_temperature": "coordinator.modules.sensors.thermistor:AdcTemperature",
+    "controller_fan": "coordinator.modules.fans.automatic_fans:ControllerFan",
+    "delayed_gcode": "coordinator.modules.programs.delayed_gcode:DelayedGCode",
+    "display_status": "coordinator.modules.status.display_status:DisplayStatus",
+    "exclude_object": "coordinator.modules.programs.exclude_object:ExcludeObject",
+    "fan": "coordinator.modules.fans.fans:Fan",
+    "fan_generic": "coordinator.modules.fans.fans:FanGeneric",
+    "filament_switch_sensor": "coordinator.modules.sensors.filament_switch_sensor:FilamentSwitchSensor",
+    "firmware_retraction": "coordinator.modules.motion.firmware_retraction:FirmwareRetraction",
+    "force_move": "coordinator.modules.motion.force_move:ForceMove",
+    "gcode_arcs": "coordinator.modules.motion.gcode_arcs:GCodeArcs",
+    "gcode_button": "coordinator.modules.sensors.gcode_button:GCodeButton",
+    "gcode_macro": "coordinator.modules.programs.gcode_macro:GCodeMacro",
+    "heater_bed": "coordinator.modules.heaters.sections:HeaterBed",
+    "heater_fan": "coordinator.modules.fans.automatic_fans:HeaterFan",
+    "heater_generic": "coordinator.modules.heaters.sections:HeaterGeneric",
+    "homing_override": "coordinator.modules.homing.homing_override:HomingOverride",
+    "idle_timeout": "coordinator.modules.programs.idle_timeout:IdleTimeout",
+    "output_pin": "coordinator.modules.outputs.output_pin:OutputPin",
+    "pause_resume": "coordinator.modules.programs.pause_resume:PauseResume",
+    "pid_profile": "coordinator.modules.heaters.pid_profile:PidProfile",
+    "respond": "coordinator.modules.status.respond:Respond",
+    "safe_z_home": "coordinator.modules.homing.safe_z_home:SafeZHome",
+    "save_variables": "coordinator.modules.programs.save_variables:SaveVariables",
+    "skew_correction": "coordinator.modules.levelling.skew_correction:SkewCorrection",
+    "static_digital_output": "coordinator.modules.outputs.output_pin:StaticDigitalOutput",
+    "temperature_fan": "coordinator.modules.fans.temperature_fan:TemperatureFan",
+    "temperature_sensor": "coordinator.modules.sensors.temperature_sensor:TemperatureSensor",
+    "tmc2208": "coordinator.modules.drivers.tmc_driver:Tmc2208",
+    "tmc2209": "coordinator.modules.drivers.tmc_driver:Tmc2209",
+    "thermistor": "coordinator.modules.sensors.thermistor:Thermistor",
+    "verify_heater": "coordinator.modules.heaters.verify_heater:VerifyHeater",
+    "virtual_sdcard": "coordinator.modules.programs.virtual_sdcard:VirtualSdcard",
 }
 """By the section's first word: module and class."""
 _BESIDE: Final[dict[str, str]] = {
-    r"extruder[0-9]*": "coordinator.modules.heater_sections:ExtruderHeater",
+    r"extruder[0-9]*": "coordinator.modules.heaters.sections:ExtruderHeater",
 }
 """By a pattern of section names that the machine's own readers read too: whose further options they are."""
 

@@ -2,7 +2,7 @@
 
 from enum import IntEnum
 
-from nodes.records import record
+from nodes.support.records import record
 
 AXIS_RANGE_OPTIONS = (
     "position_min and position_max of [stepper_x]",

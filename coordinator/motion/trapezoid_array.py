@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.motion._planner import ffi
+from coordinator.motion.planner._planner import ffi
 
 _FORMATS: Mapping[str, Any] = {"double": "f8", "double[4]": ("f8", 4), "int64_t": "i8"}
 

@@ -1,6 +1,6 @@
 """The checker: what the nodes' pins did in truth, against the plan; independent of the code under test.
 
-Expected steps come from numpy over the planner's trapezoids (`coordinator.demo.expected`), executed ones from
+Expected steps come from numpy over the planner's trapezoids (`coordinator.verification.expected`), executed ones from
 the pins of the simulated boards with the simulation's true time. Neither the step generator, nor links, nor
 clock estimates take part. Steps are paired in order, so one that is doubled, lost or reversed shows as a
 difference in number, direction or time.
@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.demo.expected import ExpectedSteps, Floats, Ints
+from coordinator.verification.expected import ExpectedSteps, Floats, Ints
 
 STEP_BAND_S: Final = 12.5e-6
 """How far step generation may put a step from its planned time."""

@@ -3,11 +3,11 @@
 import asyncio
 import sys
 
-from coordinator.app import Machine
+from coordinator.runtime.machine import Machine
 from coordinator.gcode.commands import Call, InTime
-from coordinator.gcode.words import parse
-from coordinator.host import LinuxHost
-from coordinator.machine.description import load_machine
+from coordinator.gcode.parser import parse
+from coordinator.runtime.host import LinuxHost
+from coordinator.assembly.load import load_machine
 
 
 async def main(path: str, celsius: float) -> None:

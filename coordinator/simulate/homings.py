@@ -16,18 +16,18 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.app import Machine
-from coordinator.demo.plant import AXES, PlantSettings, machine_plants
-from coordinator.homing import CYCLE_S, HomingMove
-from coordinator.host import Host, LinuxHost
-from coordinator.machine.description import MachineDescription, RailDescription, load_machine
-from coordinator.simulate.real_nodes import CONFIG, real_nodes
+from coordinator.runtime.machine import Machine
+from coordinator.virtual_machine.plant import AXES, PlantSettings, machine_plants
+from coordinator.runtime.moves.homing import CYCLE_S, HomingMove
+from coordinator.runtime.host import Host, LinuxHost
+from coordinator.assembly.load import MachineDescription, RailDescription, load_machine
+from coordinator.virtual_machine.real_nodes import CONFIG, real_nodes
 from coordinator.simulate.scenario import BusSetting, Scenario
 from coordinator.simulate.stage import Stage
 from coordinator.simulate.values import Dice, Range
-from coordinator.single_move import Ramp, SingleMove, ratio_of
-from nodes.errors import CanductorError
-from nodes.records import record
+from coordinator.runtime.moves.single import Ramp, SingleMove, ratio_of
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 from nodes.virtual.plant_page import PlantPage
 
 MACHINE: Final = Path(__file__).parent / "machines" / "homing.cfg"

@@ -7,11 +7,11 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from coordinator.app import Machine, link_of
+from coordinator.runtime.machine import Machine, link_of
 from coordinator.gcode.program import Program
-from coordinator.machine.description import StepperDescription
-from coordinator.pipeline import PlanRecord
-from coordinator.session import Outcome, run_job
+from coordinator.assembly.load import StepperDescription
+from coordinator.streaming.pipeline import PlanRecord
+from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.simulate import checker, truth
 from coordinator.simulate.checker import Ending, OutputTruth, QueueDepth, StepperTruth, Violation
 from coordinator.simulate.program import make_program
@@ -19,7 +19,7 @@ from coordinator.simulate.result import Result
 from coordinator.simulate.scenario import OutputSetting, Scenario
 from coordinator.simulate.stage import Stage
 from coordinator.simulate.values import ScenarioError
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.link import Link
 
 LIMIT_S: Final = 90.0

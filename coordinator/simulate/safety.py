@@ -14,8 +14,8 @@ from typing import Final
 from coordinator.simulate import safety_real
 from coordinator.simulate.safety_rig import Found, Rig
 from coordinator.simulate.safety_row import MAX_DURATION_S, Row, table
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 from nodes.virtual.plant_page import Fault, Kind
 
 STOP_S: Final = 0.02

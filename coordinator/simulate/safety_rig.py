@@ -12,15 +12,15 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.app import Machine, MachineStopped
-from coordinator.demo.plant import PlantSettings, machine_plants
-from coordinator.demo.plant_heat import HeatSettings
+from coordinator.runtime.machine import Machine, MachineStopped
+from coordinator.virtual_machine.plant import PlantSettings, machine_plants
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from coordinator.gcode.program import Program
-from coordinator.session import run_job
+from coordinator.streaming.job_runner import run_job
 from coordinator.simulate.scenario import Scenario
 from coordinator.simulate.stage import Stage
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 from nodes.virtual.plant_page import Fault, Kind
 
 MACHINE: Final = Path(__file__).parent / "machines" / "safety.cfg"

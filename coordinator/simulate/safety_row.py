@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Final
 
-from nodes.records import record
+from nodes.support.records import record
 
 MAX_DURATION_S: Final = 1.5
 """As it is without the option: within this a node ends its heat by itself."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.machine.problem import shown
+from coordinator.config.errors import shown
 from coordinator.simulate.values import (
     Range,
     ScenarioError,

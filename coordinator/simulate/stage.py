@@ -7,10 +7,10 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from coordinator.demo.expected import Floats, Ints
-from coordinator.demo.plant import PlantSettings, machine_plants
-from coordinator.host import Port as HostPort
-from coordinator.machine.description import (
+from coordinator.verification.expected import Floats, Ints
+from coordinator.virtual_machine.plant import PlantSettings, machine_plants
+from coordinator.runtime.host import Port as HostPort
+from coordinator.assembly.load import (
     CanConnection,
     MachineDescription,
     NodeDescription,
@@ -25,9 +25,9 @@ from coordinator.simulate.scenario import BusSetting, NodeSetting, Scenario
 from coordinator.simulate.script import ScriptedWorld
 from coordinator.simulate.truth import BoardTruth
 from coordinator.simulate.values import Dice, ScenarioError
-from nodes.clock import HostTime
+from nodes.clock.clock import HostTime
 from nodes.link import LinkIO
-from nodes.seams import LinkIOLike, OnFrame, OnLost
+from nodes.link.interfaces import LinkIOLike, OnFrame, OnLost
 from nodes.virtual._sim import lib
 from nodes.virtual.plant import NodePlant
 from nodes.virtual.sim_plant import SimPlant, connect_plants

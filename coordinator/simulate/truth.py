@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.demo.expected import ExpectedSteps, Ints, expected_steps
-from coordinator.machine.description import StepperDescription
-from coordinator.pipeline import PlanRecord
+from coordinator.verification.expected import ExpectedSteps, Ints, expected_steps
+from coordinator.assembly.load import StepperDescription
+from coordinator.streaming.pipeline import PlanRecord
 from coordinator.simulate.checker import ExecutedSteps, concatenate
 from nodes.virtual.edge_log import steps_of
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from coordinator.machine.problem import nearest, shown
-from nodes.errors import CanductorError
+from coordinator.config.errors import nearest, shown
+from nodes.support.errors import CanductorError
 
 T = TypeVar("T")
 Convert = Callable[[object], object]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from aiohttp import web
 
-    from coordinator.ipc.connection import Connection
+    from coordinator.ipc.server.connection import Connection
 
 LOW_SHARE: Final = 4
 """Sending goes on when a quarter of the limit is left."""

@@ -12,21 +12,21 @@ from typing import TYPE_CHECKING, Any, Final
 
 from aiohttp import WSMsgType, web
 
-from coordinator.ipc.auth import Grant, digest_of
-from coordinator.ipc.door import Door
-from coordinator.ipc.methods import ApiError, Scope
-from coordinator.ipc.server import Adopted, IpcServer, tls_context
-from coordinator.ipc.wire import Fault
+from coordinator.ipc.server.auth import Grant, digest_of
+from coordinator.ipc.server.tcp_listener import Door
+from coordinator.ipc.protocol.methods import ApiError, Scope
+from coordinator.ipc.server.server import Adopted, IpcServer, tls_context
+from coordinator.ipc.protocol.messages import Fault
 from coordinator.web.access import LINK_S, SESSION_S, PageAccess, PageSession, is_key_of
 from coordinator.web.files import PageFile, page_files
 from coordinator.web.names import is_known_host, is_own_origin
 from coordinator.web.pipe import Pipe
 from coordinator.web.session_file import read_sessions, write_sessions
 from coordinator.web.settings import WebSettings
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.ipc.connection import Connection
+    from coordinator.ipc.server.connection import Connection
 
 SOCKET_PATH: Final = "/socket"
 LOGIN_PATH: Final = "/login"

@@ -4,11 +4,11 @@ import json
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.ipc.methods import Scope
+from coordinator.ipc.protocol.methods import Scope
 from coordinator.web.access import SESSIONS_MAX, PageSession
-from coordinator.whole_file import write_whole
-from nodes.errors import CanductorError
-from nodes.secret_file import read_secret
+from coordinator.support.atomic_file import write_whole
+from nodes.support.errors import CanductorError
+from nodes.support.secret_file import read_secret
 
 VERSION: Final = 1
 

@@ -4,15 +4,15 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from nodes.devices.ticks import start_clock, ticks_for
-from nodes.message_format import Message
-from nodes.node_config import NodeConfig
-from nodes.node_errors import NodeError
-from nodes.records import record
+from nodes.dictionary.message_format import Message
+from nodes.node.config import NodeConfig
+from nodes.node.errors import NodeError
+from nodes.support.records import record
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from nodes.node import Node  # planning needs no node, which draws in asyncio
+    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
 
 COMMANDS: Final = ("config_analog_in", "query_analog_in")
 SAMPLES: Final = 8

@@ -3,14 +3,14 @@
 from typing import TYPE_CHECKING, Final
 
 from nodes.devices.ticks import start_clock, ticks_for
-from nodes.message_format import Message
-from nodes.node_config import NodeConfig
-from nodes.node_errors import NodeError
+from nodes.dictionary.message_format import Message
+from nodes.node.config import NodeConfig
+from nodes.node.errors import NodeError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from nodes.node import Node  # planning needs no node, which draws in asyncio
+    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
 
 COMMANDS: Final = ("config_buttons", "buttons_add", "buttons_query", "buttons_ack")
 REPEAT_SAMPLES: Final = 50

@@ -3,11 +3,11 @@
 from typing import TYPE_CHECKING, Final
 
 from nodes.devices.timed_output import TimedOutput
-from nodes.node_config import NodeConfig
-from nodes.node_errors import NodeError
+from nodes.node.config import NodeConfig
+from nodes.node.errors import NodeError
 
 if TYPE_CHECKING:
-    from nodes.node import Node  # planning needs no node, which draws in asyncio
+    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
 
 COMMANDS: Final = ("config_digital_out", "queue_digital_out", "update_digital_out")
 

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 from nodes.devices.trsync import TriggerReason
-from nodes.node_config import NodeConfig
-from nodes.node_errors import NodeError
-from nodes.records import record
+from nodes.node.config import NodeConfig
+from nodes.node.errors import NodeError
+from nodes.support.records import record
 
 if TYPE_CHECKING:
-    from nodes.node import Node  # planning needs no node, which draws in asyncio
+    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
 
 COMMANDS: Final = ("config_endstop", "endstop_home", "endstop_query_state")
 SAMPLE_S: Final = 15e-6

@@ -4,10 +4,10 @@ from typing import TYPE_CHECKING, Final
 
 from nodes.devices.ticks import ticks_for
 from nodes.devices.timed_output import TimedOutput
-from nodes.node_config import NodeConfig, NodeConfigError
+from nodes.node.config import NodeConfig, NodeConfigError
 
 if TYPE_CHECKING:
-    from nodes.node import Node  # planning needs no node, which draws in asyncio
+    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
 
 HARDWARE_COMMANDS: Final = ("config_pwm_out", "queue_pwm_out")
 SOFTWARE_COMMANDS: Final = ("config_digital_out", "set_digital_out_pwm_cycle", "queue_digital_out")

@@ -3,11 +3,11 @@
 import math
 from typing import TYPE_CHECKING, Final
 
-from nodes.node_config import NodeConfig, NodeConfigError
-from nodes.node_errors import NodeError
+from nodes.node.config import NodeConfig, NodeConfigError
+from nodes.node.errors import NodeError
 
 if TYPE_CHECKING:
-    from nodes.node import Node  # planning needs no node, which draws in asyncio
+    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
 
 BOTH_EDGE_CONSTANTS: Final = ("STEPPER_BOTH_EDGE", "STEPPER_STEP_BOTH_EDGE")
 COMMANDS: Final = (

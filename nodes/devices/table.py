@@ -3,18 +3,18 @@
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, Protocol
 
-from nodes.node_config import NodeConfig, NodeConfigError
-from nodes.node_errors import NodeError
-from nodes.records import record
-from nodes.table.mt import AXLES, MtStatus, Pair, checksum, digest
+from nodes.node.config import NodeConfig, NodeConfigError
+from nodes.node.errors import NodeError
+from nodes.support.records import record
+from nodes.mt.mt import AXLES, MtStatus, Pair, checksum, digest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from nodes.devices.stepper import Stepper
-    from nodes.dictionary import Dictionary
-    from nodes.message_format import Message, Value
-    from nodes.seams import LinkLike  # planning needs no node, which draws in asyncio
+    from nodes.dictionary.dictionary import Dictionary
+    from nodes.dictionary.message_format import Message, Value
+    from nodes.link.interfaces import LinkLike  # planning needs no node, which draws in asyncio
 
 COMMANDS: Final = ("config_table", "table_query", "table_bytes", "table_activate", "table_query_active")
 CONSTANT: Final = "MT_AXLES"

@@ -2,10 +2,10 @@
 
 from typing import TYPE_CHECKING, Final
 
-from nodes.node_config import NodeConfig, NodeConfigError
+from nodes.node.config import NodeConfig, NodeConfigError
 
 if TYPE_CHECKING:
-    from nodes.node import Node  # planning needs no node, which draws in asyncio
+    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
 
 LONGEST_TICKS: Final = (1 << 31) - 1
 """Clocks further apart than this cannot be told from the past."""
@@ -32,7 +32,7 @@ def clock_after(node: "Node", seconds: float) -> int:
     """
     import asyncio  # noqa: PLC0415 (planning needs none)
 
-    from nodes.clock import HostTime  # noqa: PLC0415 (it draws in numpy)
+    from nodes.clock.clock import HostTime  # noqa: PLC0415 (it draws in numpy)
 
     at_s = asyncio.get_running_loop().time() + seconds
     return node.best_clock.ticks_at(HostTime(round(at_s * 1e9)))

@@ -13,14 +13,14 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from nodes.devices.ticks import clock_after, ticks_for
-from nodes.node_config import NodeConfig
-from nodes.node_errors import NodeError
-from nodes.node_states import NodeState
+from nodes.node.config import NodeConfig
+from nodes.node.errors import NodeError
+from nodes.node.states import NodeState
 
 if TYPE_CHECKING:
     import asyncio
 
-    from nodes.node import Node  # planning needs no node, which draws in asyncio
+    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
 
 FREE_AFTER_S: Final = 0.002
 """So long behind a value's clock, as the host knows that clock, its slot is free for certain."""

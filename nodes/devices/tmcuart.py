@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from nodes.devices import tmc_datagram
-from nodes.errors import CanductorError
-from nodes.node_config import NodeConfig
-from nodes.node_errors import NodeError
+from nodes.support.errors import CanductorError
+from nodes.node.config import NodeConfig
+from nodes.node.errors import NodeError
 
 if TYPE_CHECKING:
     import asyncio
 
-    from nodes.node import Node  # planning needs neither
+    from nodes.node.node import Node  # planning needs neither
 
 COMMANDS: Final = ("config_tmcuart", "tmcuart_send")
 BAUD: Final = 40_000

@@ -4,13 +4,13 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
-from nodes.message_format import Message
-from nodes.node_config import NodeConfig
-from nodes.node_errors import NodeError
-from nodes.records import record
+from nodes.dictionary.message_format import Message
+from nodes.node.config import NodeConfig
+from nodes.node.errors import NodeError
+from nodes.support.records import record
 
 if TYPE_CHECKING:
-    from nodes.node import Node  # planning needs no node, which draws in asyncio
+    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
 
 COMMANDS: Final = ("config_trsync", "trsync_start", "trsync_set_timeout", "trsync_trigger")
 GROUPS_CONSTANT: Final = "CAN_TRIGGER_GROUPS"

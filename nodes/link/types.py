@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 
 class LinkError(CanductorError):

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.transport.base import (
     ByteTransport,
     CanTransport,

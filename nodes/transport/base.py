@@ -8,7 +8,7 @@ same transport. Neither ever blocks for longer than its timeout.
 from enum import IntEnum
 from typing import Protocol
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.transport.frame import CanFrame
 
 SEND_TIMEOUT_S = 1.0

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import can
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.transport.base import TransportClosedError
 from nodes.transport.frame import ID_MAX, RECORD_SIZE, CanFrame
 from nodes.transport.stream import SEND_BUFFER, RecordStream

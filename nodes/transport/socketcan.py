@@ -8,7 +8,7 @@ import socket
 import struct
 import time
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.transport.base import SEND_TIMEOUT_S, TransportBusyError, TransportClosedError, TransportKind
 from nodes.transport.frame import RECORD_SIZE, CanFrame
 from nodes.transport.stream import wait_for

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import serial
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.transport.base import SEND_TIMEOUT_S, TransportBusyError, TransportClosedError, TransportKind
 from nodes.transport.stream import wait_for
 

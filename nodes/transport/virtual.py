@@ -4,7 +4,7 @@ import os
 import socket
 from pathlib import Path
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.transport.stream import READ_SIZE, RecordStream
 
 

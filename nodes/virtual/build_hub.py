@@ -5,18 +5,18 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent.parent))
 
-from nodes.native_build import builder
+from nodes.support.native_build import builder
 
 ffibuilder = builder(
     "nodes.virtual._hub",
     headers=[
-        "nodes/can_bits.h",
+        "nodes/support/can_bits.h",
         "nodes/virtual/hub_faults.h",
         "nodes/virtual/hub.h",
         "nodes/virtual/hub_loop.h",
     ],
     sources=[
-        "nodes/can_bits.c",
+        "nodes/support/can_bits.c",
         "nodes/virtual/hub_faults.c",
         "nodes/virtual/hub.c",
         "nodes/virtual/hub_loop.c",

@@ -10,8 +10,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent.parent))
 
-from nodes.link_sources import CORE_HEADERS, CORE_SOURCES
-from nodes.native_build import ROOT, builder
+from nodes.link.sources import CORE_HEADERS, CORE_SOURCES
+from nodes.support.native_build import ROOT, builder
 
 TABLES = Path("build/sim/tables.c")
 FOLDERS = ("wire", "core", "objects", "net", "boards/virtual", "boards/sim")
@@ -36,7 +36,7 @@ def generate() -> None:
 
 generate()
 WORLD = [
-    *("nodes/can_bits.c", "nodes/virtual/world/agenda.c", "nodes/virtual/world/clock.c"),
+    *("nodes/support/can_bits.c", "nodes/virtual/world/agenda.c", "nodes/virtual/world/clock.c"),
     *(f"nodes/virtual/world/{name}.c" for name in ("can_wire", "controller", "uart", "nodes", "node_world")),
     *(f"nodes/virtual/world/{name}.c" for name in ("host", "world")),
 ]
@@ -45,7 +45,7 @@ ffibuilder = builder(
     "nodes.virtual._sim",
     headers=[
         *CORE_HEADERS,
-        *("nodes/can_bits.h", "firmware/objects/mt.h", "firmware/boards/sim/sim.h"),
+        *("nodes/support/can_bits.h", "firmware/objects/mt.h", "firmware/boards/sim/sim.h"),
         *("nodes/virtual/world/can_wire.h", "nodes/virtual/world/world.h"),
     ],
     # The wire codec is in both, and linked once.

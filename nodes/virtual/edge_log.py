@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 MAGIC = b"CNDEDGE1"
 HEADER_SIZE = 64

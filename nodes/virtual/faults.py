@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 ID_MAX: Final = 0x7FF
 CLIENTS: Final = 64

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Final
 
-from nodes.dictionary import Dictionary
-from nodes.errors import CanductorError
+from nodes.dictionary.dictionary import Dictionary
+from nodes.support.errors import CanductorError
 
 BIN: Final = Path(__file__).parent / "bin"
 MAINBOARD: Final = "canductor-node-mainboard"

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // See hub.h.
 #include "nodes/virtual/hub.h"
-#include "nodes/can_bits.h"
+#include "nodes/support/can_bits.h"
 #include "nodes/virtual/hub_queue.h"
 
 #include <string.h>

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual._hub import ffi, lib
 from nodes.virtual.faults import RULES_MAX, Fault
 

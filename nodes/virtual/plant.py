@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 NAME_MAX: Final = 63
 

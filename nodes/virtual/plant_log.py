@@ -8,8 +8,8 @@ whenever a heater's changes), ``fan`` (duty), ``switch`` (1: pressed), ``lost`` 
 from collections.abc import Iterator
 from pathlib import Path
 
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 
 @record

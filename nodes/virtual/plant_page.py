@@ -11,8 +11,8 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from nodes.errors import CanductorError
-from nodes.records import record
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 _MAGIC: Final = 0x31544E4C50444E43
 _NAME: Final = 64

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 BIN_DIR = Path(__file__).parent / "bin"
 READY_TIMEOUT_S = 30.0

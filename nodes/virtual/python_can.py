@@ -9,7 +9,7 @@ from typing import Any
 import can
 from can.typechecking import CanFilters
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.transport.base import TransportBusyError, TransportClosedError
 from nodes.transport.frame import RECORD_SIZE, CanFrame
 from nodes.transport.python_can_bridge import is_plain, to_message

@@ -5,7 +5,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual._sim import ffi, lib
 from nodes.virtual.plant import NodePlant
 from nodes.virtual.sim_plant import SimPlant

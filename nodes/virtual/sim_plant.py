@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual._sim import ffi, lib
 from nodes.virtual.plant import NodePlant
 from nodes.virtual.plant_page import PlantPage

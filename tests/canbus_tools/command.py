@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from canbus_tools.computer import Computer
+from canbus_tools.bus.computer import Computer
 from coordinator.cli import main
-from coordinator.command_line import read_words
+from coordinator.cli.parser import read_words
 
 
 @dataclass(frozen=True)

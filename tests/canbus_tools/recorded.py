@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from canbus_tools.frame import Frame
-from canbus_tools.protocol import Direction, data_id
+from canbus_tools.bus.frame import Frame
+from canbus_tools.protocol.protocol import Direction, data_id
 
 SHARED = Path(__file__).parents[2] / ".." / "shared" / "data"
 RECORD = struct.Struct("<dBI")

@@ -6,11 +6,11 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from canbus_tools.decoded import Decoded
-from canbus_tools.decoder import BusDecoder
-from canbus_tools.frame import Frame
-from canbus_tools.protocol import Direction, data_id
-from nodes.dictionary import Dictionary
+from canbus_tools.protocol.decoded import Decoded
+from canbus_tools.protocol.decoder import BusDecoder
+from canbus_tools.bus.frame import Frame
+from canbus_tools.protocol.protocol import Direction, data_id
+from nodes.dictionary.dictionary import Dictionary
 from tests import wire_twin as twin
 
 DICTIONARY_JSON = (Path(__file__).parents[1] / "data" / "dictionary.json").read_bytes()

@@ -2,14 +2,14 @@
 
 import pytest
 
-from canbus_tools.discovery import take_census
-from canbus_tools.node_list import NodesReport, list_nodes
-from canbus_tools.release_id import release_on
-from canbus_tools.survey import DAMAGED_BLOCK, PROBED, State, survey_all
-from canbus_tools.talk import LISTEN_S, BusTalk, TalkError
-from nodes.assign import AssignError
-from nodes.can_bus import CanBus
-from nodes.node_states import NodeState
+from canbus_tools.discovery.ask_bus import take_census
+from canbus_tools.tools.nodes import NodesReport, list_nodes
+from canbus_tools.tools.release_id import release_on
+from canbus_tools.discovery.inventory import DAMAGED_BLOCK, PROBED, State, survey_all
+from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError
+from nodes.bus.assign import AssignError
+from nodes.bus.can_bus import CanBus
+from nodes.node.states import NodeState
 from tests.nodes.machine import make_config, stepper_x
 from tests.stages.can_stage import BED, MAIN, MAIN_ID, TOOL_ID, SixNodes
 

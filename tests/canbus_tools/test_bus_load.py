@@ -5,7 +5,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from canbus_tools.bus_load import (
+from canbus_tools.bus.bus_load import (
     ERROR_BITS,
     EXTENDED,
     IDS_MAX,
@@ -15,8 +15,8 @@ from canbus_tools.bus_load import (
     TrafficClass,
     frame_bits,
 )
-from canbus_tools.frame import Frame, FrameKind
-from nodes.errors import CanductorError
+from canbus_tools.bus.frame import Frame, FrameKind
+from nodes.support.errors import CanductorError
 from tests.nodes.wire_bits import bits_on_wire, crc15
 
 BITRATE = 100_000

@@ -3,7 +3,7 @@
 import random
 from collections.abc import Callable
 
-from canbus_tools.census import (
+from canbus_tools.discovery.node_discovery import (
     LATE_NS,
     MAX_UUIDS,
     ROUND_NS,
@@ -13,7 +13,7 @@ from canbus_tools.census import (
     Census,
     CensusResult,
 )
-from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, ANSWER_NS, QUERY_UNASSIGNED, WHO_IS_HERE, Uuid
+from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID, ANSWER_NS, QUERY_UNASSIGNED, WHO_IS_HERE, Uuid
 
 A, B = Uuid(b"\x01" * 6), Uuid(b"\x02" * 6)
 Answers = Callable[[int, int], list[bytes]]

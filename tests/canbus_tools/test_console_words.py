@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canbus_tools.console_words import (
+from canbus_tools.console.parser import (
     ConsoleError,
     NodeCommand,
     OwnCommand,
@@ -17,8 +17,8 @@ from canbus_tools.console_words import (
     read_repeat,
     values_of,
 )
-from canbus_tools.expressions import Quantity
-from nodes.message_format import MessageError
+from canbus_tools.console.expressions import Quantity
+from nodes.dictionary.message_format import MessageError
 from nodes.virtual.firmware import MAINBOARD, firmware_dictionary
 
 WORDS = firmware_dictionary(MAINBOARD)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from canbus_tools.candump import candump_line
-from canbus_tools.frame import Frame
-from canbus_tools.mcap_file import McapWriter
+from canbus_tools.recordings.candump import candump_line
+from canbus_tools.bus.frame import Frame
+from canbus_tools.recordings.mcap_file import McapWriter
 from coordinator.cli import main
 from tests.canbus_tools import recorded
 from tests.canbus_tools.talk_twin import DICTIONARY_JSON, Talk, identify_pieces
@@ -218,7 +218,7 @@ def test_a_file_that_is_no_dictionary(capsys: Output, log: Path, tmp_path: Path)
 
 
 def test_a_piped_log_is_followed_and_ctrl_c_ends_it_in_order() -> None:
-    command = [sys.executable, "-m", "coordinator.cli", "can", "decode", "-", "--json"]
+    command = [sys.executable, "-m", "coordinator.cli.main", "can", "decode", "-", "--json"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None
         assert process.stdout is not None

@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from canbus_tools.decoded import Decoded, Kind
-from canbus_tools.decoder import BusDecoder
-from canbus_tools.dictionaries import LEARNT, DictionarySource
-from canbus_tools.frame import Frame, FrameKind
-from canbus_tools.protocol import Direction
-from nodes.dictionary import Dictionary
+from canbus_tools.protocol.decoded import Decoded, Kind
+from canbus_tools.protocol.decoder import BusDecoder
+from canbus_tools.protocol.dictionaries import LEARNT, DictionarySource
+from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.protocol.protocol import Direction
+from nodes.dictionary.dictionary import Dictionary
 from tests import wire_twin as twin
 from tests.canbus_tools import recorded
 from tests.canbus_tools.talk_twin import (

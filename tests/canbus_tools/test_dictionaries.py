@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from canbus_tools.decoder import BusDecoder
-from canbus_tools.dictionaries import CACHED, GIVEN, LEARNT, DictionarySource
-from nodes.dictionary_cache import DictionaryCache
+from canbus_tools.protocol.decoder import BusDecoder
+from canbus_tools.protocol.dictionaries import CACHED, GIVEN, LEARNT, DictionarySource
+from nodes.dictionary.cache import DictionaryCache
 from tests.canbus_tools.talk_twin import (
     DICTIONARY,
     DICTIONARY_JSON,

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from canbus_tools.bus_load import LoadMeter
-from canbus_tools.census import Application, Census
-from canbus_tools.doctor_checks.facts import (
+from canbus_tools.bus.bus_load import LoadMeter
+from canbus_tools.discovery.node_discovery import Application, Census
+from canbus_tools.doctor.facts import (
     AdapterFacts,
     InterfaceFacts,
     NodeFacts,
@@ -17,18 +17,18 @@ from canbus_tools.doctor_checks.facts import (
     TrafficFacts,
     WayFacts,
 )
-from canbus_tools.doctor_checks.finding import Finding, Severity
-from canbus_tools.doctor_checks.interface import check_link, check_presence
-from canbus_tools.doctor_checks.known_faults import faults_of, kernel_version
-from canbus_tools.doctor_checks.population import check_nodes
-from canbus_tools.doctor_checks.traffic import check_traffic
-from canbus_tools.doctor_facts import error_kinds, read_adapter
-from canbus_tools.frame import Frame, FrameKind
-from canbus_tools.interview import CanStatus, Facts, Firmware
-from canbus_tools.link_facts import LinkFacts, parse_link
-from canbus_tools.survey import Entry, State, SurveyResult
-from nodes.assign import Uuid
-from nodes.errors import CanductorError
+from canbus_tools.doctor.finding import Finding, Severity
+from canbus_tools.doctor.interface import check_link, check_presence
+from canbus_tools.doctor.known_faults import faults_of, kernel_version
+from canbus_tools.doctor.population import check_nodes
+from canbus_tools.doctor.traffic import check_traffic
+from canbus_tools.doctor.gather import error_kinds, read_adapter
+from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.discovery.node_info import CanStatus, Facts, Firmware
+from canbus_tools.bus.link_facts import LinkFacts, parse_link
+from canbus_tools.discovery.inventory import Entry, State, SurveyResult
+from nodes.bus.assign import Uuid
+from nodes.support.errors import CanductorError
 
 DATA = Path(__file__).parents[1] / "data" / "can"
 PLACE = Place(name="can0", words="-c can0", socketcan=True, bitrate=1_000_000)

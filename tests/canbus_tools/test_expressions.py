@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canbus_tools.expressions import ExpressionError, Quantity, evaluate, is_name, names_in
+from canbus_tools.console.expressions import ExpressionError, Quantity, evaluate, is_name, names_in
 
 FREQ_HZ = 12_000_000
 NAMES = {"clock": Quantity.clock(2**32 - 5), "start": Quantity.clock(7), "freq": Quantity(Fraction(FREQ_HZ))}

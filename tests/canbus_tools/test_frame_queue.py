@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import can
 import pytest
 
-from canbus_tools.computer import ThisComputer
-from canbus_tools.frame import Frame
-from canbus_tools.frame_queue import FrameQueue
-from canbus_tools.open_bus import BusOptions
-from nodes.errors import CanductorError
+from canbus_tools.bus.computer import ThisComputer
+from canbus_tools.bus.frame import Frame
+from canbus_tools.bus.frame_queue import FrameQueue
+from canbus_tools.bus.open_bus import BusOptions
+from nodes.support.errors import CanductorError
 
 WAIT_S = 60.0
 OPTIONS = BusOptions(interface="virtual", channel="a/frame queue")

@@ -13,11 +13,11 @@ from typing import Any
 import can
 import pytest
 
-from canbus_tools.fault_options import read_fault
-from canbus_tools.inject_report import status
-from coordinator import cli
-from nodes.assign import ADMIN_ID, ADMIN_RESPONSE_ID, NEED_NODEID, QUERY_UNASSIGNED
-from nodes.option_values import UsageError
+from canbus_tools.inject.fault_options import read_fault
+from canbus_tools.inject.inject_report import status
+from coordinator.cli import main as cli
+from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID, NEED_NODEID, QUERY_UNASSIGNED
+from nodes.support.option_values import UsageError
 from nodes.virtual.faults import Fault, FaultKind
 from nodes.virtual.hub import VirtualBus
 
@@ -33,7 +33,7 @@ class Running:
         command = [
             sys.executable,
             "-m",
-            "coordinator.cli",
+            "coordinator.cli.main",
             "can",
             "inject",
             "--json",

@@ -5,10 +5,10 @@ import signal
 
 import pytest
 
-from canbus_tools.discovery import take_census
-from canbus_tools.talk import BusTalk
-from nodes.assign import ADMIN_ID
-from nodes.errors import CanductorError
+from canbus_tools.discovery.ask_bus import take_census
+from canbus_tools.bus.talk import BusTalk
+from nodes.bus.assign import ADMIN_ID
+from nodes.support.errors import CanductorError
 from nodes.link import Frame
 from nodes.transport import CanFrame
 from nodes.transport.frame import BUS_OFF

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from canbus_tools import interview
-from canbus_tools.interview import CanStatus, Firmware
-from nodes.dictionary import BOOTSTRAP, Dictionary
-from nodes.message_format import Message, Value
+from canbus_tools.discovery import node_info as interview
+from canbus_tools.discovery.node_info import CanStatus, Firmware
+from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
+from nodes.dictionary.message_format import Message, Value
 from nodes.virtual.firmware import MAINBOARD, firmware_dictionary
 
 WORDS = firmware_dictionary(MAINBOARD)

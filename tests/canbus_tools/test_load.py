@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from canbus_tools.candump import candump_line
-from canbus_tools.frame import Frame
-from canbus_tools.load import find_bitrate
-from canbus_tools.recordings import read_frames
-from canbus_tools.talk import BusTalk
+from canbus_tools.recordings.candump import candump_line
+from canbus_tools.bus.frame import Frame
+from canbus_tools.tools.load import find_bitrate
+from canbus_tools.recordings.recordings import read_frames
+from canbus_tools.bus.talk import BusTalk
 from coordinator.cli import main
 from nodes.transport import CanFrame
 from tests.canbus_tools.command import Command, Said

@@ -2,7 +2,7 @@
 
 import pytest
 
-from canbus_tools.protocol import (
+from canbus_tools.protocol.protocol import (
     ADMIN_FRAMES,
     BLOCK,
     BUS_STOP_ID,
@@ -15,8 +15,9 @@ from canbus_tools.protocol import (
     frame_format,
     owner_of,
 )
-from nodes import can_bus, sync_pulse
-from nodes._wire import lib
+from nodes.bus import can_bus
+from nodes.clock import sync_pulse
+from nodes.support._wire import lib
 from tests import wire_twin as twin
 
 ALL = (*ADMIN_FRAMES, *SIGNAL_FRAMES)

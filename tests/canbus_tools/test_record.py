@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from canbus_tools.decoder import BusDecoder
-from canbus_tools.frame import Frame
-from canbus_tools.mcap_file import COUNTERS, FRAMES, MESSAGES
-from canbus_tools.record import DRAIN_S
-from canbus_tools.recordings import read_frames
+from canbus_tools.protocol.decoder import BusDecoder
+from canbus_tools.bus.frame import Frame
+from canbus_tools.recordings.mcap_file import COUNTERS, FRAMES, MESSAGES
+from canbus_tools.tools.record import DRAIN_S
+from canbus_tools.recordings.recordings import read_frames
 from coordinator.cli import main
 from nodes.transport import CanFrame
 from tests.canbus_tools.command import Command

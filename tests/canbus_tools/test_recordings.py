@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canbus_tools import pcap as _pcap
-from canbus_tools.candump import candump_line, read_candump
-from canbus_tools.frame import Frame, FrameKind
-from canbus_tools.mcap_file import McapWriter
-from canbus_tools.recordings import read_frames
-from nodes.errors import CanductorError
+from canbus_tools.recordings import pcap as _pcap
+from canbus_tools.recordings.candump import candump_line, read_candump
+from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.recordings.mcap_file import McapWriter
+from canbus_tools.recordings.recordings import read_frames
+from nodes.support.errors import CanductorError
 
 FRAMES = [
     Frame(1_700_000_000.25, 0x3F0, b"\x00", channel="can0"),

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from canbus_tools.frame import Frame
-from canbus_tools.recordings import read_frames
+from canbus_tools.bus.frame import Frame
+from canbus_tools.recordings.recordings import read_frames
 from coordinator.cli import main
 from nodes.virtual.firmware import MAINBOARD, firmware_path
 from tests.canbus_tools.command import Command

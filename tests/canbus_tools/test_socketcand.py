@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canbus_tools.socketcand import COMMAND_MAX, HELD_MAX, JOBS_MAX, SETTLE_S, SocketcandSession
+from canbus_tools.inject.socketcand import COMMAND_MAX, HELD_MAX, JOBS_MAX, SETTLE_S, SocketcandSession
 from nodes.transport.frame import CanFrame
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import can
 import pytest
 
-from canbus_tools.socketcand_server import CLIENTS_MAX, SocketcandServer
-from nodes.errors import CanductorError
+from canbus_tools.inject.socketcand_server import CLIENTS_MAX, SocketcandServer
+from nodes.support.errors import CanductorError
 from nodes.transport.frame import CanFrame
 from nodes.virtual.hub import VirtualBus
 

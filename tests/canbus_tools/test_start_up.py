@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 
-from canbus_tools.command_line import CONSOLE, TOOLS
+from canbus_tools.tools.parser import CONSOLE, TOOLS
 
 HEAVY = {"numpy", "textual", "prompt_toolkit", "rich", "matplotlib", "coordinator.motion"}
 

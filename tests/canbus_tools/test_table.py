@@ -1,6 +1,6 @@
 """Plain tables and paragraphs."""
 
-from canbus_tools.table import WIDTH, count, paragraph, table
+from canbus_tools.support.text_table import WIDTH, count, paragraph, table
 
 
 def test_columns_line_up_and_empty_ones_are_left_out() -> None:

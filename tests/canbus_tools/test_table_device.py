@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.table.mt import MT_CAN_ID, WORD_BYTES, from_bytes
+from nodes.mt.mt import MT_CAN_ID, WORD_BYTES, from_bytes
 from nodes.virtual.firmware import TOOLHEAD
 from tests.canbus_tools.command import Command, Said
 from tests.nodes.table import literal

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from canbus_tools.frame import Frame
-from canbus_tools.talk import LISTEN_S, BusTalk, NodeTalk, TalkError
-from nodes.dictionary_cache import DictionaryCache
-from nodes.message_format import Message
+from canbus_tools.bus.frame import Frame
+from canbus_tools.bus.talk import LISTEN_S, BusTalk, NodeTalk, TalkError
+from nodes.dictionary.cache import DictionaryCache
+from nodes.dictionary.message_format import Message
 from tests.stages.can_stage import MAIN, MAIN_ID, TOOL_ID, CanStage, SixNodes
 
 OTHER_ID = 200

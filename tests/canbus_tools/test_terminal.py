@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.assign import ADMIN_ID, SET_NODEID
+from nodes.bus.assign import ADMIN_ID, SET_NODEID
 from nodes.transport import CanFrame, open_can
 from nodes.virtual.hub import VirtualBus
 
@@ -60,7 +60,7 @@ def terminal() -> Iterator[Terminal]:
 
 
 def test_a_terminal_is_left_as_it_was(terminal: Terminal, tmp_path: Path) -> None:
-    entry = "import sys; from coordinator.entry import main; sys.exit(main())"
+    entry = "import sys; from coordinator.cli.entry import main; sys.exit(main())"
     before = terminal.settings
     with VirtualBus(tmp_path / "bus") as bus:
         command = [sys.executable, "-c", entry, "can", "monitor", "-i", "canductor", "-c", str(bus.path)]

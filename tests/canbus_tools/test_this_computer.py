@@ -7,9 +7,9 @@ from pathlib import Path
 import can
 import pytest
 
-from canbus_tools.computer import FrameLine, ThisComputer
-from canbus_tools.open_bus import BusOptions
-from nodes.errors import CanductorError
+from canbus_tools.bus.computer import FrameLine, ThisComputer
+from canbus_tools.bus.open_bus import BusOptions
+from nodes.support.errors import CanductorError
 from nodes.link import Frame
 from nodes.transport import CanFrame
 from nodes.virtual.hub import VirtualBus

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from canbus_tools.dissector import dissector
-from canbus_tools.frame import Frame, FrameKind
-from nodes.dictionary import Dictionary
+from canbus_tools.bus.frame import Frame, FrameKind
+from nodes.dictionary.dictionary import Dictionary
 
 NANOSECOND_PCAP = 0xA1B23C4D
 LINKTYPE_CAN_SOCKETCAN = 227

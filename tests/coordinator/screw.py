@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.table.axis_table import AxisTable
+from coordinator.tables.axis_table import AxisTable
 from tests.coordinator.motion.exact_program import Planned, plan_program
 from tests.stages.printer_text import MCU, printer_section, section, stepper_section
 

@@ -12,9 +12,9 @@ from types import ModuleType
 
 import pytest
 
-from coordinator import cli
-from coordinator.commands import DEMO_MACHINE, DemoOptions, PlanOptions, RunOptions
-from nodes.errors import CanductorError
+from coordinator.cli import main as cli
+from coordinator.support.command_options import DEMO_MACHINE, DemoOptions, PlanOptions, RunOptions
+from nodes.support.errors import CanductorError
 
 
 @dataclass
@@ -256,15 +256,15 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 LONG_REPORT = """
 import sys, types
-from coordinator import cli
+from coordinator.cli import main as cli
 
 class Report:
     ok = True
     def to_text(self):
         return "line\\n" * 100_000
 
-sys.modules["coordinator.run"] = types.ModuleType("coordinator.run")
-sys.modules["coordinator.run"].run_machine = lambda options: Report()
+sys.modules["coordinator.cli.commands.run"] = types.ModuleType("coordinator.cli.commands.run")
+sys.modules["coordinator.cli.commands.run"].run_machine = lambda options: Report()
 sys.exit(cli.main(["run", __file__]))
 """
 
@@ -283,7 +283,7 @@ def test_a_closed_reader_is_no_error(tmp_path: Path) -> None:
 
 
 def test_starting_imports_nothing_slow() -> None:
-    script = "import sys, coordinator.cli; print(*sys.modules)"
+    script = "import sys, coordinator.cli.main; print(*sys.modules)"
     out = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
     ).stdout
@@ -295,7 +295,7 @@ def test_starting_imports_nothing_slow() -> None:
         "rich",
         "asyncio",
         "importlib.metadata",
-        "coordinator.machine.options",
+        "coordinator.config.options",
     }
     assert not slow & set(out.split())
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coordinator import cli
-from coordinator.compensation import NO_CORRECTION, Compensation, kept_compensation
-from coordinator.machine.description import load_machine
-from coordinator.machine.model import AxisTablesDescription
-from coordinator.motion.shapers import Impulses, shaper_impulses
-from coordinator.motion.steps import TABLE_POINTS_MAX, StepError, StepGenerator
-from coordinator.table.axis_table import AxisTable, Direction, Unit
-from coordinator.table.store import TableStore
+from coordinator.cli import main as cli
+from coordinator.streaming.compensation import NO_CORRECTION, Compensation, kept_compensation
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import AxisTablesDescription
+from coordinator.motion.steps.shapers import Impulses, shaper_impulses
+from coordinator.motion.steps.steps import TABLE_POINTS_MAX, StepError, StepGenerator
+from coordinator.tables.axis_table import AxisTable, Direction, Unit
+from coordinator.tables.store import TableStore
 from tests.coordinator.motion.exact_program import Planned, plan_program
 from tests.coordinator.motion.planner_helpers import LIMITS, homed_planner, planned
 from tests.coordinator.motion.steps_harness import NODES, E, X, Y, Z, stepper

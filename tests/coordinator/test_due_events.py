@@ -1,6 +1,6 @@
 """What is to be done in time is done near its time, and in the program's order."""
 
-from coordinator.due_events import AHEAD_S, DueEvents
+from coordinator.streaming.timed_events import AHEAD_S, DueEvents
 from coordinator.gcode.events import AS_SOON_AS_POSSIBLE, Timed
 
 

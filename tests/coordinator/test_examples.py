@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.commands import EXAMPLES, PlanOptions
+from coordinator.support.command_options import EXAMPLES, PlanOptions
 from coordinator.kinematics.base import Point
-from coordinator.machine.description import MachineDescription, load_machine
-from coordinator.modules.homing_override import HomingOverride
-from coordinator.plan import plan_file
+from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.modules.homing.homing_override import HomingOverride
+from coordinator.planning.plan import plan_file
 
 SAMPLES = 2000
 EXAMPLE_FILES = sorted(path for path in EXAMPLES.glob("*.cfg") if path.stem != "none")  # whose head stands

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.filament_forecast import KEPT_S, FilamentForecast
-from coordinator.motion._planner import ffi
+from coordinator.streaming.filament_forecast import KEPT_S, FilamentForecast
+from coordinator.motion.planner._planner import ffi
 from coordinator.motion.trapezoid_array import TRAPEZOID
 
 DRIVEN = (0.0, 0.0, 0.0, 1.0)

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
-from coordinator import cli
-from coordinator.ipc.methods import Caller, Kind, Method, Param, Scope
-from coordinator.ipc.uploads import PART_MAX, upload_method
+from coordinator.cli import main as cli
+from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Scope
+from coordinator.ipc.server.uploads import PART_MAX, upload_method
 from coordinator.web.methods import add_page_methods
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, serving
 from tests.stages import jump_loop
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from coordinator.web.server import WebServer
 
 Command = Callable[..., tuple[int, str, str]]
-CANDUCTOR = (sys.executable, "-m", "coordinator.cli")
+CANDUCTOR = (sys.executable, "-m", "coordinator.cli.main")
 
 
 @pytest.fixture
@@ -304,7 +304,7 @@ def test_completion_knows_every_command(canductor: Command, shell: str) -> None:
 
 def test_planning_does_not_pay_for_the_interface() -> None:
     code = (
-        "import sys; from coordinator.cli import main; main(['plan', '--help']);"
+        "import sys; from coordinator.cli.main import main; main(['plan', '--help']);"
         "sys.exit(any(m.split('.')[0] in ('msgpack', 'shtab', 'asyncio') or 'ipc' in m for m in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0

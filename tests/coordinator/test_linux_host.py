@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.commands import RunOptions
-from coordinator.run import run_machine
-from nodes.errors import CanductorError
+from coordinator.support.command_options import RunOptions
+from coordinator.cli.commands.run import run_machine
+from nodes.support.errors import CanductorError
 from tests.stages.printer_text import changed, without_endstops, write
 
 MCU_ON_CAN = """\

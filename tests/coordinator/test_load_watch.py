@@ -2,8 +2,8 @@
 
 import pytest
 
-from coordinator.load_watch import PERSISTS_S, URGENT_S, BusOverload, LoadWatch
-from nodes.clock import HostTime
+from coordinator.runtime.bus_overload import PERSISTS_S, URGENT_S, BusOverload, LoadWatch
+from nodes.clock.clock import HostTime
 from nodes.link import Forecast
 
 

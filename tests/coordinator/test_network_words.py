@@ -4,8 +4,8 @@ import argparse
 
 import pytest
 
-from coordinator.network_words import declare_network, read_announce, read_metrics
-from nodes.option_values import UsageError
+from coordinator.cli.arguments.network import declare_network, read_announce, read_metrics
+from nodes.support.option_values import UsageError
 
 
 def given(*words: str) -> argparse.Namespace:

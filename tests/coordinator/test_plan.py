@@ -14,14 +14,14 @@ from typing import Any
 
 import pytest
 
-from coordinator.commands import DEMO_MACHINE, PlanOptions
-from coordinator.machine.description import load_machine
-from coordinator.plan import plan_file
-from coordinator.plan_figures import Peak
-from coordinator.plan_plot import draw
-from coordinator.plan_report import PlanReport, Timeline
-from coordinator.plan_warnings import NodeClock, step_rate_warnings, ticks_per_step
-from nodes.errors import CanductorError
+from coordinator.support.command_options import DEMO_MACHINE, PlanOptions
+from coordinator.assembly.load import load_machine
+from coordinator.planning.plan import plan_file
+from coordinator.planning.figures import Peak
+from coordinator.planning.plot import draw
+from coordinator.planning.report import PlanReport, Timeline
+from coordinator.planning.warnings import NodeClock, step_rate_warnings, ticks_per_step
+from nodes.support.errors import CanductorError
 from nodes.virtual.firmware import MAINBOARD, firmware_dictionary
 
 SQUARE = """\
@@ -272,7 +272,7 @@ def test_the_picture_is_xml_for_any_title_and_any_length() -> None:
 
 
 def test_reads_standard_input(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "coordinator.cli", "plan", "--json", str(DEMO_MACHINE), "-"]
+    words = [sys.executable, "-m", "coordinator.cli.main", "plan", "--json", str(DEMO_MACHINE), "-"]
     done = subprocess.run(
         words, input=SQUARE.encode(), capture_output=True, timeout=60, check=True, cwd=tmp_path
     )
@@ -302,13 +302,13 @@ def test_planning_imports_nothing_slow(tmp_path: Path) -> None:
     gcode = tmp_path / "short.gcode"
     gcode.write_text("G28\nG1 X10 F3000\n")
     script = (
-        "import sys; from coordinator.cli import main; "
+        "import sys; from coordinator.cli.main import main; "
         f"assert main(['plan', {str(CONFIG)!r}, {str(gcode)!r}]) == 0; print(*sys.modules, sep=chr(10))"
     )
     out = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
     ).stdout
-    assert "coordinator.modules.heater" in out.splitlines()
+    assert "coordinator.modules.heaters.heater" in out.splitlines()
     assert not SLOW & set(out.splitlines())
 
 

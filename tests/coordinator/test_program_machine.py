@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from coordinator.gcode.machine_state import Shaper
-from coordinator.machine.description import load_machine
-from coordinator.program_machine import machine_state
+from coordinator.assembly.load import load_machine
+from coordinator.streaming.program_machine import machine_state
 
 CONFIG = Path(__file__).parents[2] / "config"
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from coordinator.progress import NodeFigures, Progress, ProgressDisplay, summary
+from coordinator.support.progress import NodeFigures, Progress, ProgressDisplay, summary
 
 
 class Terminal(io.StringIO):

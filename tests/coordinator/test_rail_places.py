@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.commands import EXAMPLES
-from coordinator.demo.plant import start_point
+from coordinator.support.command_options import EXAMPLES
+from coordinator.virtual_machine.plant import start_point
 from coordinator.kinematics.dual_carriage import CarriageMode
-from coordinator.machine.description import MachineDescription, load_machine
-from coordinator.motion.planner import Position
-from coordinator.rail_places import RailPlaces
+from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.motion.planner.planner import Position
+from coordinator.runtime.stepper_positions import RailPlaces
 
 CONFIGS = sorted(path for path in EXAMPLES.glob("*.cfg") if path.stem != "none")  # whose head stands
 

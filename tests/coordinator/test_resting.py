@@ -6,8 +6,8 @@ import pytest
 
 from coordinator.gcode.commands import Done
 from coordinator.gcode.events import Resting
-from coordinator.resting import RestTask
-from nodes.errors import CanductorError
+from coordinator.streaming.standstill_task import RestTask
+from nodes.support.errors import CanductorError
 
 
 async def look_until_over(task: RestTask) -> None:

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from coordinator import cli
-from coordinator.commands import DEMO_GCODE, DEMO_MACHINE
+from coordinator.cli import main as cli
+from coordinator.support.command_options import DEMO_GCODE, DEMO_MACHINE
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from coordinator.timebase import SLEW_LIMIT, ClockJumpError, ClockPiece, TimeBase
-from nodes.clock import HostTime, Ticks
-from nodes.pulse_fit import PulseFit
-from nodes.sync_pulse import PulseClock
+from coordinator.runtime.timebase import SLEW_LIMIT, ClockJumpError, ClockPiece, TimeBase
+from nodes.clock.clock import HostTime, Ticks
+from nodes.clock.pulse_fit import PulseFit
+from nodes.clock.sync_pulse import PulseClock
 
 
 class Clock:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.whole_file import write_whole
+from coordinator.support.atomic_file import write_whole
 
 
 def test_a_new_file_is_the_users_alone_and_another_ones_mode_can_be_kept(tmp_path: Path) -> None:

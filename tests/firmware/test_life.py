@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 import pytest
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual.sim import SimNode, edge_clocks
 from tests import wire_twin
 from tests.firmware import twin

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.commands import DEMO_MACHINE
+from coordinator.support.command_options import DEMO_MACHINE
 
 START_S: Final = 60.0
 STEP_S: Final = 60.0
@@ -242,7 +242,7 @@ def main() -> int:
         config.write_text(DEMO_MACHINE.read_text() + SECTIONS.format(gcodes=gcodes))
         path, port = data / "comms" / "klippy.sock", _free_port()
         (data / "config" / "moonraker.conf").write_text(MOONRAKER.format(port=port, socket=path))
-        host = [sys.executable, "-c", "from coordinator.cli import main; raise SystemExit(main())"]
+        host = [sys.executable, "-c", "from coordinator.cli.main import main; raise SystemExit(main())"]
         serve = [
             *host,
             "demo",

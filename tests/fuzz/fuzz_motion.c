@@ -6,8 +6,8 @@
 // letter says what, the second byte how much (act). Whatever the text, no sanitizer may report, no number may
 // become NaN, trapezoids must join without gaps and jumps and keep all limits, and the steps replayed from
 // the emitted commands must stay in the machine.
-#include "coordinator/motion/gcode_lines.h"
-#include "coordinator/motion/steps.h"
+#include "coordinator/motion/planner/gcode_lines.h"
+#include "coordinator/motion/steps/steps.h"
 #include "nodes/link/batch.h"
 #include "wire/wire.h"
 #include <math.h>

@@ -9,7 +9,7 @@ from typing import Any
 
 atheris: Any = import_module("atheris")  # has no types, and need not be installed to check this file
 
-with atheris.instrument_imports(include=["nodes.table"]):
+with atheris.instrument_imports(include=["nodes.mt"]):
     from tests.fuzz.mt_target import run_receivers
 
 

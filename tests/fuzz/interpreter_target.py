@@ -6,9 +6,9 @@ from coordinator.gcode.machine_state import Extruder, MachineState, Shaper
 from coordinator.gcode.program import Program
 from coordinator.kinematics.dual_carriage import Carriage, DualCarriage
 from coordinator.kinematics.extruder import ExtruderMotion
-from coordinator.motion.planner import Planner
+from coordinator.motion.planner.planner import Planner
 from coordinator.motion.trapezoid_array import TRAPEZOID
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from tests.coordinator.motion.planner_helpers import LIMITS, check_limits, drain, joined
 
 SEEDS = (

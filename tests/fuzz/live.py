@@ -24,9 +24,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.commands import DEMO_GCODE
-from coordinator.ipc.client import Client
-from nodes.errors import CanductorError
+from coordinator.support.command_options import DEMO_GCODE
+from coordinator.ipc.client.client import Client
+from nodes.support.errors import CanductorError
 from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
 
 ROOT: Final = Path(__file__).resolve().parents[2]

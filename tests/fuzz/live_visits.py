@@ -19,9 +19,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.ipc.client import Client
-from coordinator.ipc.settings import Limits
-from coordinator.ipc.wire import Encoding, Fault, WireReader
+from coordinator.ipc.client.client import Client
+from coordinator.ipc.server.settings import Limits
+from coordinator.ipc.protocol.messages import Encoding, Fault, WireReader
 from tests.fuzz.ipc_target import line, packed
 
 ENDS: Final = frozenset(

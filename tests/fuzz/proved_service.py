@@ -18,23 +18,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.commands import DEMO_MACHINE, DemoOptions
+from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
 from coordinator.demo.run import Prover, report_of
-from coordinator.demo.stage import Stage
-from coordinator.host import LinuxHost
-from coordinator.ipc.methods import Registry, Scope
-from coordinator.ipc.server import IpcServer
-from coordinator.ipc.settings import IpcSettings, Limits, TcpSettings
-from coordinator.ipc.state import StateTree
-from coordinator.ipc.uploads import upload_method
-from coordinator.machine.description import load_machine
+from coordinator.virtual_machine.stage import Stage
+from coordinator.runtime.host import LinuxHost
+from coordinator.ipc.protocol.methods import Registry, Scope
+from coordinator.ipc.server.server import IpcServer
+from coordinator.ipc.server.settings import IpcSettings, Limits, TcpSettings
+from coordinator.ipc.server.state import StateTree
+from coordinator.ipc.server.uploads import upload_method
+from coordinator.assembly.load import load_machine
 from coordinator.motion.trapezoid_array import TRAPEZOID
-from coordinator.pipeline import PlanRecord
-from coordinator.service.log_ring import Entry
-from coordinator.service.machine_service import MachineService, ServiceSettings
-from coordinator.service.methods import add_methods
-from coordinator.service.motion_lead import MotionLead
-from coordinator.session import Outcome, outcome_of
+from coordinator.streaming.pipeline import PlanRecord
+from coordinator.service.state.log_ring import Entry
+from coordinator.service.core.machine_service import MachineService, ServiceSettings
+from coordinator.service.api.methods import add_methods
+from coordinator.service.core.motion_lead import MotionLead
+from coordinator.streaming.job_runner import Outcome, outcome_of
 
 WATCH_TOKEN, ADMIN_TOKEN = "watch" * 8, "admin" * 8
 LOOK_S = 0.02

@@ -5,7 +5,7 @@ import random
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from nodes.table.mt import to_bytes, transmission
+from nodes.mt.mt import to_bytes, transmission
 from tests.fuzz.mt_target import run_receivers
 from tests.profiles import examples
 

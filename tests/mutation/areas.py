@@ -11,24 +11,24 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
     "objects": ("firmware/objects/*.[ch]",),
     "net": ("firmware/net/*.[ch]",),
     "link": ("nodes/link/*.c", "nodes/link/*.h", "nodes/link/*.py"),
-    "clock": ("nodes/clock*.py", "nodes/sync_pulse.py", "nodes/pulse_fit.py", "nodes/estimated_clock.py"),
+    "clock": ("nodes/clock*.py", "nodes/clock/sync_pulse.py", "nodes/clock/pulse_fit.py", "nodes/clock/estimated_clock.py"),
     "homing": (
-        "coordinator/homing.py",
-        "coordinator/modules/homing.py",
-        "coordinator/modules/homing_plan.py",
-        "coordinator/modules/homing_override.py",
-        "coordinator/modules/safe_z_home.py",
+        "coordinator/runtime/moves/homing.py",
+        "coordinator/modules/homing/homing.py",
+        "coordinator/modules/homing/homing_plan.py",
+        "coordinator/modules/homing/homing_override.py",
+        "coordinator/modules/homing/safe_z_home.py",
     ),
     "heat": (
         "coordinator/heat/verify.py",
         "coordinator/heat/watermark.py",
         "coordinator/heat/pid.py",
-        "coordinator/modules/heater.py",
-        "coordinator/modules/heaters.py",
-        "coordinator/modules/verify_heater.py",
-        "coordinator/modules/temperature_source.py",
+        "coordinator/modules/heaters/heater.py",
+        "coordinator/modules/heaters/heaters.py",
+        "coordinator/modules/heaters/verify_heater.py",
+        "coordinator/modules/sensors/temperature_source.py",
     ),
-    "streams": ("coordinator/motion/step_stream.c",),
+    "streams": ("coordinator/motion/steps/step_stream.c",),
 }
 """Name of an area to the patterns of its files, from the project's root."""
 
@@ -43,8 +43,8 @@ SAFETY: Final = (
     ),
     "firmware/net/bus_signals.c",
     "coordinator/heat/verify.py",
-    "coordinator/modules/heater.py",
-    "coordinator/modules/temperature_source.py",
+    "coordinator/modules/heaters/heater.py",
+    "coordinator/modules/sensors/temperature_source.py",
 )
 """What makes heat or stops motion: no mutant may survive here without a reason."""
 
@@ -65,7 +65,7 @@ may fail them, which would count as a killed mutant."""
 MODULES: Final = (
     "nodes/virtual/build_sim.py",
     "nodes/link/build_link.py",
-    "coordinator/motion/build_steps.py",
+    "coordinator/motion/steps/build_steps.py",
 )
 """Build scripts of the extension modules that contain mutated C."""
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from nodes.clock import ClockEstimate, ClockEstimator, HostTime, Ticks
+from nodes.clock.clock import ClockEstimate, ClockEstimator, HostTime, Ticks
 
 SETTLED_S = 5.0
 GOOD_S = 50e-6

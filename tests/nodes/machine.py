@@ -4,18 +4,18 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
-from nodes.assign import Uuid
-from nodes.can_bus import CanBus
+from nodes.bus.assign import Uuid
+from nodes.bus.can_bus import CanBus
 from nodes.devices.stepper import Stepper
-from nodes.dictionary import Dictionary
-from nodes.node_config import NodeConfig
-from nodes.node_states import NodeState
-from nodes.seams import BuildConfig
+from nodes.dictionary.dictionary import Dictionary
+from nodes.node.config import NodeConfig
+from nodes.node.states import NodeState
+from nodes.link.interfaces import BuildConfig
 from tests.nodes import virtual_time
 from tests.nodes.twin_bus import TwinIO, TwinNode
 
 if TYPE_CHECKING:
-    from nodes.clock import ClockEstimate
+    from nodes.clock.clock import ClockEstimate
 
 
 def uuid(number: int) -> Uuid:

@@ -6,13 +6,13 @@ import zlib
 
 import pytest
 
-from nodes.assign import AssignError
-from nodes.bus import UartBus
-from nodes.can_bus import CanBus
-from nodes.dictionary_parts import DictionaryError
-from nodes.message_format import Message
-from nodes.node_errors import NodeLost
-from nodes.node_states import NodeState
+from nodes.bus.assign import AssignError
+from nodes.bus.bus import UartBus
+from nodes.bus.can_bus import CanBus
+from nodes.dictionary.parts import DictionaryError
+from nodes.dictionary.message_format import Message
+from nodes.node.errors import NodeLost
+from nodes.node.states import NodeState
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
 from tests.nodes.twin_bus import TwinIO, TwinNode, source_of, without_commands

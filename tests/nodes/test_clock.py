@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.clock import (
+from nodes.clock.clock import (
     SETTLE_SAMPLES,
     ClockEstimate,
     ClockEstimator,

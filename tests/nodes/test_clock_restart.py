@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from nodes.clock import CONTRADICTIONS, GAP_NS, START_SAMPLES, ClockEstimator, HostTime
+from nodes.clock.clock import CONTRADICTIONS, GAP_NS, START_SAMPLES, ClockEstimator, HostTime
 
 FREQ_HZ = 168_000_000
 SECOND_NS = 1_000_000_000

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nodes.clock import ClockEstimator, HostTime
+from nodes.clock.clock import ClockEstimator, HostTime
 from tests.nodes import clock_traces as traces
 from tests.profiles import examples
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nodes.dictionary import BOOTSTRAP, MAX_INFLATED_BYTES, Dictionary
-from nodes.dictionary_parts import OUTPUT, DictionaryError
-from nodes.message_format import Message, MessageError, MessageFormat, Value
+from nodes.dictionary.dictionary import BOOTSTRAP, MAX_INFLATED_BYTES, Dictionary
+from nodes.dictionary.parts import OUTPUT, DictionaryError
+from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value
 from tests import real_dictionaries
 from tests import wire_twin as twin
 from tests.profiles import examples

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from nodes.can_bus import CanBus
-from nodes.dictionary import Dictionary
-from nodes.dictionary_cache import MAX_FILES, MAX_KEPT, DictionaryCache
-from nodes.dictionary_parts import DictionaryError
-from nodes.node_states import NodeState
+from nodes.bus.can_bus import CanBus
+from nodes.dictionary.dictionary import Dictionary
+from nodes.dictionary.cache import MAX_FILES, MAX_KEPT, DictionaryCache
+from nodes.dictionary.parts import DictionaryError
+from nodes.node.states import NodeState
 from tests.nodes import virtual_time
 from tests.nodes.machine import make_config, uuid
 from tests.nodes.twin_bus import TwinIO, TwinNode, source_of

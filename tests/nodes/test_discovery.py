@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from nodes.assign import (
+from nodes.bus.assign import (
     ADMIN_RESPONSE_ID,
     MAX_NS,
     QUERY_UNASSIGNED,

@@ -4,11 +4,11 @@ import asyncio
 
 import pytest
 
-from nodes.can_bus import CanBus
-from nodes.errors import CanductorError
-from nodes.node_errors import NodeError, NodeRestarted
-from nodes.node_states import NodeState
-from nodes.seams import OnFrame, OnLost
+from nodes.bus.can_bus import CanBus
+from nodes.support.errors import CanductorError
+from nodes.node.errors import NodeError, NodeRestarted
+from nodes.node.states import NodeState
+from nodes.link.interfaces import OnFrame, OnLost
 from nodes.transport.frame import BUS_OFF
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid

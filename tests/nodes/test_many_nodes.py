@@ -3,9 +3,9 @@
 import asyncio
 from dataclasses import dataclass, field
 
-from nodes.can_bus import CanBus
-from nodes.dictionary_cache import DictionaryCache
-from nodes.node_states import NodeState
+from nodes.bus.can_bus import CanBus
+from nodes.dictionary.cache import DictionaryCache
+from nodes.node.states import NodeState
 from tests.nodes import virtual_time
 from tests.nodes.machine import make_config, stepper_x, uuid
 from tests.nodes.twin_bus import TwinIO, TwinNode

@@ -6,20 +6,20 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from nodes.assign import AssignError
-from nodes.bus import UartBus
-from nodes.can_bus import CanBus
-from nodes.clock import HostTime
-from nodes.conversation import QUERY_TRIES
-from nodes.errors import CanductorError
-from nodes.node_errors import NodeError, NodeLost, NodeShutdown
-from nodes.node_states import NodeState
+from nodes.bus.assign import AssignError
+from nodes.bus.bus import UartBus
+from nodes.bus.can_bus import CanBus
+from nodes.clock.clock import HostTime
+from nodes.node.request_reply import QUERY_TRIES
+from nodes.support.errors import CanductorError
+from nodes.node.errors import NodeError, NodeLost, NodeShutdown
+from nodes.node.states import NodeState
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
 from tests.nodes.twin_bus import DELAY_S, TwinIO, TwinLink, TwinNode, source_of, without_commands
 
 if TYPE_CHECKING:
-    from nodes.node import Node
+    from nodes.node.node import Node
 
 # ---------------------------------------------------------------------------------------------------- start
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from nodes.devices.stepper import Stepper
-from nodes.dictionary import Dictionary
-from nodes.node_config import NodeConfig, NodeConfigError
-from nodes.node_states import TRANSITIONS, NodeEvent, NodeState, page
+from nodes.dictionary.dictionary import Dictionary
+from nodes.node.config import NodeConfig, NodeConfigError
+from nodes.node.states import TRANSITIONS, NodeEvent, NodeState, page
 from tests.nodes.machine import make_config, stepper_x
 from tests.nodes.twin_bus import TwinNode, source_of, without_commands
 

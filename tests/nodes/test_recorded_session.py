@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from nodes.dictionary import BOOTSTRAP, Dictionary
-from nodes.message_format import Message
+from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
+from nodes.dictionary.message_format import Message
 from tests import wire_twin as twin
 
 ROOT = Path(__file__).parents[2]

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from nodes.records import record
+from nodes.support.records import record
 
 
 @record

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nodes.wire_time import can_wire_ns, narrow
+from nodes.clock.wire_time import can_wire_ns, narrow
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def run(folder: Path, command: Sequence[str]) -> subprocess.CompletedProcess[str
 
 def simulate(folder: Path, scenarios: Sequence[str], seeds: int) -> subprocess.CompletedProcess[str]:
     """Run the simulation of the project in FOLDER."""
-    command = [sys.executable, "-m", "coordinator.cli", "simulate", "--seeds", f"0:{seeds}", *scenarios]
+    command = [sys.executable, "-m", "coordinator.cli.main", "simulate", "--seeds", f"0:{seeds}", *scenarios]
     return run(folder, command)
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.basic_commands import BESIDE
-from coordinator.ipc.methods import ApiError
+from coordinator.gcode.builtins.basic import BESIDE
+from coordinator.ipc.protocol.methods import ApiError
 from tests.stages.printer import PRINTING, Printer, gcode
 from tests.stages.served import Served
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.app import Machine, link_of
+from coordinator.runtime.machine import Machine, link_of
 from coordinator.gcode.program import Program
-from coordinator.session import Outcome, run_job
+from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.play import Text
 from coordinator.simulate.stage import Stage
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.link import IOStats, LinkError
 
 SENSORS = 0x104

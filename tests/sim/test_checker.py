@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coordinator.demo.expected import ExpectedSteps
+from coordinator.verification.expected import ExpectedSteps
 from coordinator.simulate import checker
 from coordinator.simulate.checker import Ending, ExecutedSteps, QueueDepth, StepperTruth, Violation
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from coordinator.commands import EXAMPLES
-from coordinator.demo.proof import EDGE_TOLERANCE_S
+from coordinator.support.command_options import EXAMPLES
+from coordinator.verification.proof import EDGE_TOLERANCE_S
 from coordinator.simulate.scenario import BusSetting, NodeSetting
 from coordinator.simulate.values import Range
 from tests.stages.demo_machine import SQUARE

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
-from coordinator.service.fed import LINES_AHEAD_MAX
-from coordinator.service.journal import NAME, Journal
+from coordinator.ipc.protocol.methods import ApiError
+from coordinator.service.jobs.fed import LINES_AHEAD_MAX
+from coordinator.service.jobs.journal import NAME, Journal
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from tests.stages.served import Served, running

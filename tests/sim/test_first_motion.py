@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.program import Program
-from coordinator.session import run_job
+from coordinator.streaming.job_runner import run_job
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
 

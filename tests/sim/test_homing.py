@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.app import Machine
-from coordinator.homing import TIMEOUT_S, HomingError, HomingMove, HomingResult
+from coordinator.runtime.machine import Machine
+from coordinator.runtime.moves.homing import TIMEOUT_S, HomingError, HomingMove, HomingResult
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.link import Link
 from tests.profiles import examples
 from tests.stages.printer_text import MCU, TOOLHEAD, printer_section, section, stepper_section

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.simulate.safety_rig import Rig
 from tests.stages.plant_stage import STEP_MM, PlantStage
 from tests.stages.served import running

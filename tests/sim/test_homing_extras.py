@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.errors import GCodeError
-from coordinator.machine.check import check_config
+from coordinator.assembly.check import check_config
 from tests.stages.printer_text import SWITCHES_CFG
 from tests.stages.program_stage import ProgramStage
 from tests.stages.switch_printer import PINS, STEPS_PER_MM, SwitchPrinter

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.commands import EXAMPLES
-from coordinator.machine.description import load_machine
+from coordinator.support.command_options import EXAMPLES
+from coordinator.assembly.load import load_machine
 from coordinator.simulate.scenario import NodeSetting
 from tests.stages.plant_stage import STEP_MM, PlantStage
 from tests.stages.printer_text import MCU, TOOLHEAD, printer_section, stepper_section

@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from coordinator.ipc.methods import Scope
+from coordinator.ipc.protocol.methods import Scope
 from tests.stages.demo_machine import DemoMachine
 from tests.stages.interface import Interface, Line
 from tests.stages.served import Served, zigzag

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.program import Program
-from coordinator.ipc.methods import ApiError
-from coordinator.service.forward import read_forward
+from coordinator.ipc.protocol.methods import ApiError
+from coordinator.service.jobs.forward import read_forward
 from tests.stages.printer import Printer, gcode
 from tests.stages.served import Served
 

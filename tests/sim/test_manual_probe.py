@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.simulate.safety_rig import MACHINE
 from tests.stages.plant_stage import PlantStage
 from tests.stages.served import running

@@ -7,10 +7,10 @@ import pytest
 from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
-from coordinator.ipc.methods import Scope
+from coordinator.ipc.protocol.methods import Scope
 from coordinator.metrics.catalog import GROUPS, NOT_SHOWN, Kind, Metric, full_name
 from coordinator.metrics.collect import LABEL_MAX, registry_of
-from coordinator.service.figures import field_name
+from coordinator.service.state.figures import field_name
 from tests.stages.demo_machine import SQUARE, DemoMachine
 from tests.stages.interface import Interface
 from tests.stages.served import Served

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.demo.plant_heat import HeatSettings
-from nodes.errors import CanductorError
+from coordinator.virtual_machine.plant_heat import HeatSettings
+from nodes.support.errors import CanductorError
 from tests.stages.plant_stage import PlantStage
 from tests.stages.served import running
 

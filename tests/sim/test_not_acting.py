@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from tests.stages.printer import PRINTING, Printer, gcode
 from tests.stages.served import Served
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.app import Machine
+from coordinator.runtime.machine import Machine
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
-from coordinator.motion.planner import Planner
-from coordinator.move_source import JobState
-from coordinator.streamer import Streamer
+from coordinator.motion.planner.planner import Planner
+from coordinator.streaming.move_source import JobState
+from coordinator.streaming.streamer import Streamer
 from tests.stages.demo_machine import NODES, DemoMachine
 
 JOB = "G28\n" + "".join(f"G1 X{20 + 2 * (n % 2)} F1200\n" for n in range(65))

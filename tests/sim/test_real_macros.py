@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.machine.check import check_config
+from coordinator.assembly.check import check_config
 from tests.stages.printer import PRINTING, Printer, gcode
 from tests.stages.served import Served
 

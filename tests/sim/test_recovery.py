@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
+from coordinator.ipc.protocol.methods import ApiError
 from tests.stages.printer import PRINTING, Printer, gcode
 from tests.stages.served import Served
 

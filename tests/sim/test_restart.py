@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
-from coordinator.machine.description import load_machine
-from coordinator.modules.live import Live
-from coordinator.modules.save_config import SaveConfig
+from coordinator.ipc.protocol.methods import ApiError
+from coordinator.assembly.load import load_machine
+from coordinator.runtime.module_context import Live
+from coordinator.modules.programs.save_config import SaveConfig
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from tests.stages.served import Served, running

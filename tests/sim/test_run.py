@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator import cli
-from coordinator.commands import SimulateOptions
+from coordinator.cli import main as cli
+from coordinator.support.command_options import SimulateOptions
 from coordinator.simulate import run, scenario
 from coordinator.simulate.checker import Violation
 from coordinator.simulate.result import Result, SimulationReport

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.app import MachineStopped
-from coordinator.commands import Terminated
+from coordinator.runtime.machine import MachineStopped
+from coordinator.support.command_options import Terminated
 from coordinator.gcode.errors import GCodeError
-from coordinator.move_source import Told
-from coordinator.run import RunReport
-from coordinator.session import Outcome
-from nodes.errors import CanductorError
+from coordinator.streaming.move_source import Told
+from coordinator.cli.commands.run import RunReport
+from coordinator.streaming.job_runner import Outcome
+from nodes.support.errors import CanductorError
 from tests.stages.demo_machine import NODES, SQUARE, DemoMachine, TypedRun
 
 LONG = "G28\nG1 X200 F360\nG1 X1 Z20 E50 F360\n"

@@ -7,8 +7,8 @@ import pytest
 
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program as GCode
-from coordinator.machine.description import load_machine
-from coordinator.motion.planner import Planner
+from coordinator.assembly.load import load_machine
+from coordinator.motion.planner.planner import Planner
 from coordinator.simulate import reference, scenario
 from coordinator.simulate.program import make_program
 from coordinator.simulate.values import Dice, Range, ScenarioError

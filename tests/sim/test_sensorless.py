@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coordinator.app import Machine, MachineStopped
-from coordinator.demo.plant import PlantSettings
+from coordinator.runtime.machine import Machine, MachineStopped
+from coordinator.virtual_machine.plant import PlantSettings
 from coordinator.gcode.errors import GCodeError
-from coordinator.modules.tmc_driver import TmcDriver
-from coordinator.move_source import Told
-from coordinator.session import Outcome
+from coordinator.modules.drivers.tmc_driver import TmcDriver
+from coordinator.streaming.move_source import Told
+from coordinator.streaming.job_runner import Outcome
 from coordinator.simulate.scenario import BusSetting
 from coordinator.simulate.values import Range
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual.plant_page import Fault, Kind, PlantPage
 from tests.stages.machine_stage import MachineStage
 from tests.stages.printer_text import SENSORLESS_CFG

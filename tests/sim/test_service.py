@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from tests.profiles import examples

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.simulate.scenario import NodeSetting
 from coordinator.simulate.values import Range
 from tests.stages.demo_machine import SQUARE, DemoMachine

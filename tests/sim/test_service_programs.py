@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
+from coordinator.ipc.protocol.methods import ApiError
 from tests.stages.demo_machine import DemoMachine
 from tests.stages.printer import gcode as run
 from tests.stages.served import Served, zigzag

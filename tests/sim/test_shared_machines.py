@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.demo.plant_heat import HeatSettings
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from tests.stages.plant_stage import PlantStage
 from tests.stages.served import running
 

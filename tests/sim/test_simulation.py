@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import pytest
 
-from coordinator import cli
-from coordinator.machine_devices import MachineDevices
+from coordinator.cli import main as cli
+from coordinator.runtime.devices import MachineDevices
 from coordinator.motion.specs import StepperSpec
 from coordinator.simulate import scenario
 from coordinator.simulate.play import play
 from coordinator.simulate.result import Result
-from coordinator.timebase import ClockMap, ClockPiece, TimeBase
-from nodes.bus import BusBase
-from nodes.can_bus import CanBus
+from coordinator.runtime.timebase import ClockMap, ClockPiece, TimeBase
+from nodes.bus.bus import BusBase
+from nodes.bus.can_bus import CanBus
 from nodes.link import Link
 
 USUAL = [entry for entry in map(scenario.find, scenario.names()) if entry.weight > 0]

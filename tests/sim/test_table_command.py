@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
-from coordinator.table.commands import _answer
-from coordinator.table.files import read_table
+from coordinator.ipc.protocol.methods import ApiError
+from coordinator.cli.commands.table import _answer
+from coordinator.tables.files import read_table
 from tests.stages.demo_machine import DemoMachine
 from tests.stages.served import Served
 

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
-from coordinator.machine.description import MachineDescription
-from coordinator.machine.model import AxisTablesDescription
+from coordinator.ipc.protocol.methods import ApiError
+from coordinator.assembly.load import MachineDescription
+from coordinator.config.model import AxisTablesDescription
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
-from coordinator.table.axis_table import AxisTable
-from coordinator.table.store import TableStore
+from coordinator.tables.axis_table import AxisTable
+from coordinator.tables.store import TableStore
 from tests.stages.served import Served, running
 
 SCENARIOS = Path("coordinator/simulate/scenarios")

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.app import Machine
-from coordinator.homing import LOOK_S, HomingMove, HomingResult
+from coordinator.runtime.machine import Machine
+from coordinator.runtime.moves.homing import LOOK_S, HomingMove, HomingResult
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from coordinator.machine.description import StepperDescription, load_machine
+from coordinator.assembly.load import StepperDescription, load_machine
 from coordinator.simulate import scenario, truth
 from coordinator.simulate.truth import BoardTruth
 

@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from coordinator.ipc.blocking import BlockingClient
-from coordinator.ipc.discovery import Browser
-from coordinator.service.journal import NAME
+from coordinator.ipc.client.blocking import BlockingClient
+from coordinator.ipc.discovery.browser import Browser
+from coordinator.service.jobs.journal import NAME
 from tests.stages.processes import (
     LONG,
     MCU_UUID,

@@ -19,8 +19,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.ipc.client import Client
-from nodes.errors import CanductorError
+from coordinator.ipc.client.client import Client
+from nodes.support.errors import CanductorError
 from tests.soak.footprint import Footprint, growth, of_process, problems
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -47,7 +47,7 @@ def job(prints: int) -> str:
 @contextmanager
 def service(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     """Run the demo's virtual machine as a service in FOLDER; its output goes to a file there."""
-    command = [sys.executable, "-m", "coordinator.cli", "demo", "--serve", "--no-web", "--ipc"]
+    command = [sys.executable, "-m", "coordinator.cli.main", "demo", "--serve", "--no-web", "--ipc"]
     with (folder / "output").open("wb") as output:
         process = subprocess.Popen(
             [*command, str(folder / "soak.sock"), "--jobs", str(folder / "jobs")],

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Final
 
-from canbus_tools.frame import Frame
-from canbus_tools.open_bus import BusOptions
-from canbus_tools.talk import BusTalk, NodeTalk
+from canbus_tools.bus.frame import Frame
+from canbus_tools.bus.open_bus import BusOptions
+from canbus_tools.bus.talk import BusTalk, NodeTalk
 from coordinator.simulate.script import ScriptedWorld
-from nodes.assign import (
+from nodes.bus.assign import (
     ADMIN_ID,
     ADMIN_RESPONSE_ID,
     NEED_NODEID,
@@ -21,9 +21,9 @@ from nodes.assign import (
     SET_NODEID_BOOTLOADER,
     Uuid,
 )
-from nodes.dictionary_cache import DictionaryCache
+from nodes.dictionary.cache import DictionaryCache
 from nodes.link import LinkSettings
-from nodes.message_format import Message
+from nodes.dictionary.message_format import Message
 from nodes.transport import CanFrame
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary, firmware_path
 from nodes.virtual.world import NodeSettings, WorldNode

@@ -8,10 +8,10 @@ from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
 
-from coordinator.commands import RunOptions
+from coordinator.support.command_options import RunOptions
 from coordinator.gcode.program import Program
-from coordinator.run import RunReport, run_machine
-from coordinator.session import Outcome, run_job
+from coordinator.cli.commands.run import RunReport, run_machine
+from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.simulate.scenario import BusSetting, NodeSetting
 from tests.stages.machine_stage import MachineStage
 from tests.stages.printer_text import without_endstops

@@ -4,17 +4,17 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
-from coordinator.app import Machine, MachineStopped
-from coordinator.demo.plant import PlantSettings
-from coordinator.demo.plant_heat import HeatSettings
+from coordinator.runtime.machine import Machine, MachineStopped
+from coordinator.virtual_machine.plant import PlantSettings
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, InTime, Reading
-from coordinator.gcode.words import parse
-from coordinator.machine.description import load_machine
+from coordinator.gcode.parser import parse
+from coordinator.assembly.load import load_machine
 from coordinator.modules.base import Value
 from coordinator.modules.module_set import ModuleSet
 from coordinator.simulate.scenario import BusSetting
 from coordinator.simulate.values import Range
-from nodes.node_config import NodeConfig
+from nodes.node.config import NodeConfig
 from nodes.virtual.firmware import firmware_dictionary
 from nodes.virtual.plant_page import Fault, Kind, PlantPage
 from tests.stages.machine_stage import MachineStage

@@ -10,9 +10,9 @@ from typing import Any
 
 import msgpack
 
-from coordinator.ipc.methods import ApiError, Scope
-from coordinator.ipc.server import Adopted, IpcServer
-from coordinator.ipc.settings import IpcSettings
+from coordinator.ipc.protocol.methods import ApiError, Scope
+from coordinator.ipc.server.server import Adopted, IpcServer
+from coordinator.ipc.server.settings import IpcSettings
 from tests.stages.served import Served
 
 LIMIT_S = 60.0

@@ -5,11 +5,11 @@ from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from coordinator.app import Machine
-from coordinator.demo.plant import PlantSettings, machine_plants
+from coordinator.runtime.machine import Machine
+from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from coordinator.gcode.program import Program
-from coordinator.move_source import Told
-from coordinator.session import Outcome, run_job
+from coordinator.streaming.move_source import Told
+from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.simulate.scenario import BusSetting, NodeSetting, Scenario
 from coordinator.simulate.stage import Stage
 from nodes.virtual.plant_page import Kind, PlantPage

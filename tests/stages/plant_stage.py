@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.demo.plant import PlantSettings
-from coordinator.demo.plant_heat import HeatSettings
+from coordinator.virtual_machine.plant import PlantSettings
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from coordinator.kinematics.base import Point
 from coordinator.simulate.safety_rig import MACHINE, START
 from coordinator.simulate.scenario import NodeSetting

@@ -3,9 +3,9 @@
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
-from coordinator.demo.plant import PlantSettings
-from coordinator.demo.plant_heat import HeatSettings
-from coordinator.machine.description import MachineDescription, load_machine
+from coordinator.virtual_machine.plant import PlantSettings
+from coordinator.virtual_machine.plant_heat import HeatSettings
+from coordinator.assembly.load import MachineDescription, load_machine
 from coordinator.modules.base import Value
 from tests.stages.machine_stage import MachineStage
 from tests.stages.served import Served, running

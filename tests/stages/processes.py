@@ -16,7 +16,7 @@ from nodes.virtual.processes import BusProcess, ChildProcess, NodeProcess
 from tests.stages.printer_text import DEMO_CFG, without_endstops
 
 ROOT = Path(__file__).parents[2]
-CANDUCTOR = (sys.executable, "-m", "coordinator.cli")
+CANDUCTOR = (sys.executable, "-m", "coordinator.cli.main")
 MCU_UUID, TOOLHEAD_UUID = "90a4ae022dfc", "5e1ec7ab1e02"
 END_S = 60.0
 """No command of these tests may take longer; on a busy machine they take a third of it."""

@@ -7,11 +7,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
-from canbus_tools.computer import Port
-from canbus_tools.frame import Frame, FrameKind
-from canbus_tools.frame_queue import FRAMES_MAX
-from canbus_tools.open_bus import BusOptions
-from nodes.errors import CanductorError
+from canbus_tools.bus.computer import Port
+from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.bus.frame_queue import FRAMES_MAX
+from canbus_tools.bus.open_bus import BusOptions
+from nodes.support.errors import CanductorError
 from nodes.link import BusSettings, LinkIO
 from nodes.link.types import Frame as LinkFrame
 from nodes.link.types import FrameHandler

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coordinator.demo.plant import PlantSettings, start_point
-from coordinator.demo.plant_heat import HeatSettings
+from coordinator.virtual_machine.plant import PlantSettings, start_point
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from coordinator.demo.report import DemoReport
 from coordinator.demo.run import print_and_prove
-from coordinator.demo.stage import START_MM, WARM_C
+from coordinator.virtual_machine.stage import START_MM, WARM_C
 from coordinator.gcode.program import Program
-from coordinator.machine.description import load_machine
+from coordinator.assembly.load import load_machine
 from coordinator.simulate.scenario import BusSetting, NodeSetting
 from nodes.virtual.edge_log import Clocks, Directions, steps_of
 from nodes.virtual.plant_log import PlantEvent

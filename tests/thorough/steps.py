@@ -52,7 +52,7 @@ def steps(amount: Amount) -> Iterator[Step]:
     yield Step(
         "sim",
         "machines in virtual time, each seed with other faults",
-        (python, "-m", "coordinator.cli", "simulate", "--seeds", f"0:{amount.seeds}"),
+        (python, "-m", "coordinator.cli.main", "simulate", "--seeds", f"0:{amount.seeds}"),
         r"^.*\d+ failed.*$",
     )
     yield Step("mutants", "planted bugs", (python, "tests/sim/mutants.py"), r"^\d+ of \d+ planted bugs.*$")

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from canbus_tools.candump import candump_line
-from canbus_tools.recordings import read_frames
+from canbus_tools.recordings.candump import candump_line
+from canbus_tools.recordings.recordings import read_frames
 from nodes.transport import CanFrame, open_can
 from nodes.virtual.processes import NodeProcess
 from tests.canbus_tools.command import Command
@@ -59,7 +59,7 @@ def test_discovery(tool: Command) -> None:
 
 def test_recording(tmp_path: Path) -> None:
     path = tmp_path / "some.log"
-    words = [sys.executable, "-m", "coordinator.cli", "can", "record", "-c", INTERFACE, "-o", str(path)]
+    words = [sys.executable, "-m", "coordinator.cli.main", "can", "record", "-c", INTERFACE, "-o", str(path)]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as recorder:
         assert recorder.stderr is not None
         assert recorder.stderr.readline().startswith(f"recording {INTERFACE} to ")

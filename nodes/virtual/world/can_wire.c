@@ -2,7 +2,7 @@
 // The wire between the controllers: who sends when, and how it ends. See can_wire.h.
 #include "nodes/virtual/world/can_wire.h"
 
-#include "nodes/can_bits.h"
+#include "nodes/support/can_bits.h"
 
 #include <math.h>
 #include <string.h>

@@ -7,7 +7,7 @@ from collections.abc import Callable, Coroutine
 from functools import partial
 from typing import Any, Final, TypeVar
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual.world.world import World
 
 T = TypeVar("T")

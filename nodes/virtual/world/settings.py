@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 NEVER_NS: Final = (1 << 64) - 1
 RECEIVE_QUEUE_MAX: Final = 4096

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.demo.expected import TRAPEZOID, expected_steps
+from coordinator.verification.expected import TRAPEZOID, expected_steps
 
 
 def trapezoid(

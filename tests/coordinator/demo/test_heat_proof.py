@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from coordinator.demo.heat_proof import HeatProof, not_steady, prove_heat
+from coordinator.verification.heat_proof import HeatProof, not_steady, prove_heat
 from coordinator.heat.holding import Held
 from nodes.virtual.plant_log import PlantEvent
 

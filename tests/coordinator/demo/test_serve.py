@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from coordinator.commands import DEMO_GCODE, DEMO_MACHINE, ServeOptions
+from coordinator.support.command_options import DEMO_GCODE, DEMO_MACHINE, ServeOptions
 from coordinator.demo.serve import with_jobs
-from coordinator.machine.description import load_machine
+from coordinator.assembly.load import load_machine
 from tests.stages.printer_text import DEMO_CFG, write
 
 

@@ -15,9 +15,9 @@ import pytest
 from serial import rfc2217
 
 from coordinator.cli import main
-from coordinator.command_line import read_words
+from coordinator.cli.parser import read_words
 from coordinator.dnc import commands
-from coordinator.dnc.command_line import DncCommand
+from coordinator.cli.commands.dnc import DncCommand
 from coordinator.dnc.commands import Surroundings
 from coordinator.dnc.options import DncOptions
 from coordinator.dnc.port import Port, PortError

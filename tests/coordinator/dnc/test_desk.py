@@ -8,7 +8,7 @@ import pytest
 from coordinator.dnc import events
 from coordinator.dnc.blocks import ACK, DIRECTORY_REQUEST, EOT, SOH, write_block
 from coordinator.dnc.commands import _sentence
-from coordinator.dnc.desk import Desk, Library, Outcome
+from coordinator.dnc.endpoint import Desk, Library, Outcome
 from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.files import Folder
 from coordinator.dnc.listing import read_listing

@@ -8,7 +8,7 @@ from coordinator.dnc import events
 from coordinator.dnc.blocks import ACK, DIRECTORY_REQUEST, EOT, NAK, SOH, write_block
 from coordinator.dnc.files import Entry
 from coordinator.dnc.listing import read_listing, write_listing
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from tests.coordinator.dnc.bench import Bench
 
 

@@ -19,7 +19,7 @@ from coordinator.dnc.blocks import (
 )
 from coordinator.dnc.engine import State
 from coordinator.dnc.options import DncOptions, Frame
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from tests.coordinator.dnc.bench import Bench, block, receiving, sending, take
 
 

@@ -15,7 +15,7 @@ from coordinator.dnc.files import (
     stored_name,
 )
 from coordinator.dnc.tables import check_table
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 
 def names(path: Path) -> list[str]:

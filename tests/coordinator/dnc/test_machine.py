@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 
 from coordinator.dnc.blocks import SOH, STX, write_block
-from coordinator.dnc.desk import Desk
+from coordinator.dnc.endpoint import Desk
 from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.files import FileRefused
 from coordinator.dnc.machine import LINES_MAX, MachineSink
 from coordinator.dnc.options import DncOptions
-from coordinator.ipc.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
-from coordinator.ipc.uploads import upload_method
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
+from coordinator.ipc.server.uploads import upload_method
 from tests.coordinator.dnc.virtual_cable import PROGRAM, Ended, VirtualCable
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, serving
 from tests.stages.loop_thread import in_thread

@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import IO, Any, Final
 
-from coordinator.command_line import read_words
-from coordinator.commands import Terminated
+from coordinator.cli.parser import read_words
+from coordinator.support.command_options import Terminated
 from coordinator.dnc import commands
-from coordinator.dnc.command_line import DncCommand
+from coordinator.cli.commands.dnc import DncCommand
 from coordinator.dnc.commands import Surroundings
 from coordinator.dnc.options import DncOptions
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from tests.stages.lockstep import Lockstep, Thread
 
 FIFO: Final = 16

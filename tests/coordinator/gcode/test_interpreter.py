@@ -21,8 +21,8 @@ from coordinator.gcode.events import (
 )
 from coordinator.gcode.interpreter import MAX_NOTICES, Job
 from coordinator.gcode.program import CHUNK_BYTES, Program
-from coordinator.motion.planner import Planner
-from nodes.errors import CanductorError
+from coordinator.motion.planner.planner import Planner
+from nodes.support.errors import CanductorError
 from tests.coordinator.motion.planner_helpers import (
     LIMITS,
     Array,

@@ -24,7 +24,7 @@ from coordinator.gcode.machine_state import Extruder, MachineState, Shaper
 from coordinator.gcode.program import Program
 from coordinator.kinematics.dual_carriage import Carriage, DualCarriage
 from coordinator.kinematics.extruder import ExtruderMotion
-from coordinator.motion.planner import Planner
+from coordinator.motion.planner.planner import Planner
 from tests.coordinator.motion.planner_helpers import LIMITS, Array, check_invariants, drain, joined
 
 HOME = {"X": 0.0, "Y": 0.0, "Z": 0.0}

@@ -19,8 +19,8 @@ from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import End, Event, Full, Notice, PositionSet, Progress, Reply, Resting, Timed
 from coordinator.gcode.interpreter import MAX_DEPTH, Job
 from coordinator.gcode.program import Program
-from coordinator.gcode.words import WordError
-from coordinator.motion.planner import Planner
+from coordinator.gcode.parser import WordError
+from coordinator.motion.planner.planner import Planner
 from tests.coordinator.motion.planner_helpers import LIMITS, drain
 
 HOME = {"X": 0.0, "Y": 0.0, "Z": 0.0}

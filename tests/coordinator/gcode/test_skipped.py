@@ -8,7 +8,7 @@ from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import End, Event, Notice, Reply
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
-from coordinator.motion.planner import Planner
+from coordinator.motion.planner.planner import Planner
 from tests.coordinator.motion.planner_helpers import LIMITS
 
 HOME = {"X": 0.0, "Y": 0.0, "Z": 0.0}

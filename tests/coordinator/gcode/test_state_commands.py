@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.errors import GCodeError
-from coordinator.gcode.state_commands import SAVED_MAX
+from coordinator.gcode.builtins.state import SAVED_MAX
 from tests.stages.program_stage import ProgramStage
 
 

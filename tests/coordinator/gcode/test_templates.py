@@ -2,7 +2,7 @@
 
 import pytest
 
-from coordinator.gcode.templates import Asked, Template, TemplateError
+from coordinator.gcode.templates.templates import Asked, Template, TemplateError
 
 DOUBLING = "{% set n = namespace(s='ab') %}{% for i in range(99) %}"
 

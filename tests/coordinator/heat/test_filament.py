@@ -6,7 +6,7 @@ import pytest
 
 from coordinator.heat.mpc import HeaterModel, Mpc, filament_heat
 from coordinator.heat.pid import Pid, PidGains
-from coordinator.modules.heater import COMING_S
+from coordinator.modules.heaters.heater import COMING_S
 from tests.coordinator.heat.plant import INTERVAL_S, Plant
 
 TARGET_C = 220.0

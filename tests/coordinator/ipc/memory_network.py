@@ -5,11 +5,11 @@ from collections.abc import Iterable
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any, cast
 
-from coordinator.ipc.announce_process import Announcing, follow, lines_of
-from coordinator.ipc.announcement import Announcement
-from coordinator.ipc.discovery import Heard
-from coordinator.ipc.multicast import Place
-from nodes.errors import CanductorError
+from coordinator.ipc.discovery.announce_process import Announcing, follow, lines_of
+from coordinator.ipc.discovery.announcement import Announcement
+from coordinator.ipc.discovery.browser import Heard
+from coordinator.ipc.discovery.multicast import Place
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     from zeroconf import ServiceInfo

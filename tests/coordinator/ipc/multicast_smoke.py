@@ -10,9 +10,9 @@ import signal
 import socket
 import sys
 
-from coordinator.ipc.announcement import Announcement
-from coordinator.ipc.announcer import Announcer
-from coordinator.ipc.discovery import Browser
+from coordinator.ipc.discovery.announcement import Announcement
+from coordinator.ipc.discovery.announcer import Announcer
+from coordinator.ipc.discovery.browser import Browser
 
 _MACHINE = Announcement(
     name="mini",

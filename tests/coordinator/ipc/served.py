@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from coordinator.ipc.methods import Caller, Kind, Method, Param, Registry, Scope, Value
-from coordinator.ipc.server import IpcServer
-from coordinator.ipc.settings import IpcSettings, TcpSettings
-from coordinator.ipc.state import StateTree
+from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Registry, Scope, Value
+from coordinator.ipc.server.server import IpcServer
+from coordinator.ipc.server.settings import IpcSettings, TcpSettings
+from coordinator.ipc.server.state import StateTree
 from tests.stages import jump_loop
 
 TOKENS = {scope: f"{scope.word}-token-of-at-least-32-characters" for scope in Scope}

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.methods import Scope
-from coordinator.ipc.server import IpcServer
-from coordinator.ipc.settings import IpcSettings, TcpSettings
-from nodes.errors import CanductorError
+from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.server import IpcServer
+from coordinator.ipc.server.settings import IpcSettings, TcpSettings
+from nodes.support.errors import CanductorError
 from tests.coordinator.ipc.served import (
     TOKENS,
     Script,

@@ -2,9 +2,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.auth import ADDRESSES_MAX, FAILURES_MAX, SHUT_OUT_S, FailureBrake, Grant, Tokens
-from coordinator.ipc.methods import Scope
-from nodes.errors import CanductorError
+from coordinator.ipc.server.auth import ADDRESSES_MAX, FAILURES_MAX, SHUT_OUT_S, FailureBrake, Grant, Tokens
+from coordinator.ipc.protocol.methods import Scope
+from nodes.support.errors import CanductorError
 
 TOKEN = "a" * 31 + "b"
 

@@ -15,12 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from zeroconf import ServiceInfo
 
-from coordinator.discover import Found, find_machines
-from coordinator.ipc.announce_process import RESCAN_S, UPDATE_SPACING_S, Announcing
-from coordinator.ipc.announcement import ADDRESSES_MAX, SERVICE_TYPE, Announcement, usable_addresses
-from coordinator.ipc.announcer import RESTART_S, Announcer
-from coordinator.ipc.discovery import INSTANCES_MAX, Browser
-from coordinator.ipc.multicast import Place, reached_at, spoken_on
+from coordinator.cli.commands.discover import Found, find_machines
+from coordinator.ipc.discovery.announce_process import RESCAN_S, UPDATE_SPACING_S, Announcing
+from coordinator.ipc.discovery.announcement import ADDRESSES_MAX, SERVICE_TYPE, Announcement, usable_addresses
+from coordinator.ipc.discovery.announcer import RESTART_S, Announcer
+from coordinator.ipc.discovery.browser import INSTANCES_MAX, Browser
+from coordinator.ipc.discovery.multicast import Place, reached_at, spoken_on
 from tests.coordinator.ipc.memory_network import MemoryNetwork, MemoryProcess
 from tests.coordinator.ipc.served import serving
 from tests.profiles import examples
@@ -359,7 +359,7 @@ def test_sockets_and_announcements_in_one_table(tmp_path: Path, monkeypatch: pyt
 
 # ------------------------------------------------------------------- multicast DNS, on networks of its own
 
-_DISCOVER = "from coordinator.cli import main; main(['discover', '--timeout', '0.2'])\n"
+_DISCOVER = "from coordinator.cli.main import main; main(['discover', '--timeout', '0.2'])\n"
 
 
 def test_a_computer_without_networks() -> None:
@@ -386,8 +386,8 @@ def test_a_coordinator_that_is_killed_is_seen_to_go() -> None:
 
 def test_no_other_command_pays_for_it() -> None:
     code = (
-        "import sys; from coordinator.cli import main; main(['plan', '--help']); main(['estop', '--help']); "
-        "import coordinator.front_ends, coordinator.service.serve;"
+        "import sys; from coordinator.cli.main import main; main(['plan', '--help']); main(['estop', '--help']); "
+        "import coordinator.cli.commands.front_ends, coordinator.service.core.serve;"
         "sys.exit(any(m.split('.')[0] in ('zeroconf', 'ifaddr', 'prometheus_client') for m in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.ipc.json_values import has_more_items
-from coordinator.ipc.settings import Limits
-from coordinator.ipc.wire import Fault, WireReader
+from coordinator.ipc.protocol.json_values import has_more_items
+from coordinator.ipc.server.settings import Limits
+from coordinator.ipc.protocol.messages import Fault, WireReader
 from tests.profiles import examples
 
 text = st.text(alphabet='\\",[]{}ab', max_size=12)

@@ -4,7 +4,7 @@ import msgpack
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.ipc.packed_values import has_more_values
+from coordinator.ipc.protocol.packed_values import has_more_values
 from tests.profiles import examples
 
 plain = (

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.connection import UNREAD_BYTES
-from coordinator.ipc.settings import Limits
-from coordinator.ipc.turns import TURN_S
+from coordinator.ipc.server.connection import UNREAD_BYTES
+from coordinator.ipc.server.settings import Limits
+from coordinator.ipc.server.fair_scheduler import TURN_S
 from tests.coordinator.ipc.served import (
     Script,
     Served,

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.server import TOKENS_LOOK_S
-from coordinator.ipc.settings import TcpSettings
+from coordinator.ipc.server.server import TOKENS_LOOK_S
+from coordinator.ipc.server.settings import TcpSettings
 from tests.coordinator.ipc.served import Script, Served, serving
 from tests.stages import jump_loop
 

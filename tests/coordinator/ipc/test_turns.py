@@ -2,7 +2,7 @@
 
 import asyncio
 
-from coordinator.ipc.turns import ROUND_S, TURN_S, Turns
+from coordinator.ipc.server.fair_scheduler import ROUND_S, TURN_S, Turns
 
 TURNS_IN_A_ROUND = round(ROUND_S / TURN_S)
 

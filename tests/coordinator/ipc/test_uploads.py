@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.uploads import FREE_MIN, PARTS_MAX, upload_method
+from coordinator.ipc.server.uploads import FREE_MIN, PARTS_MAX, upload_method
 from tests.coordinator.ipc.served import Script, Served, serving
 from tests.stages import jump_loop
 

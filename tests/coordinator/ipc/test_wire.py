@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.ipc.settings import Limits
-from coordinator.ipc.wire import Encoder, Encoding, Fault, WireReader
+from coordinator.ipc.server.settings import Limits
+from coordinator.ipc.protocol.messages import Encoder, Encoding, Fault, WireReader
 from tests.profiles import examples
 
 LIMITS = Limits(message_timeout_s=5.0)

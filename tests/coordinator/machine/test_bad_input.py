@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.machine.description import ConfigError, load_machine
+from coordinator.assembly.load import ConfigError, load_machine
 from tests.profiles import examples
 from tests.stages.printer_text import PRINTER_CFG, changed, write
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.machine.description import ConfigError, load_machine
-from coordinator.machine.read_printer import KINEMATICS
+from coordinator.assembly.load import ConfigError, load_machine
+from coordinator.config.sections.printer import KINEMATICS
 from tests.stages.printer_text import changed, example_text, write
 
 BAD: dict[str, tuple[str, str, str, str]] = {

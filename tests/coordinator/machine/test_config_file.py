@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.machine import config_text
-from coordinator.machine.config_file import ConfigFile, parse_config
-from coordinator.machine.problem import ConfigError, Place
+from coordinator.config import text as config_text
+from coordinator.config.file import ConfigFile, parse_config
+from coordinator.config.errors import ConfigError, Place
 from tests.profiles import examples
 from tests.stages.printer_text import write
 

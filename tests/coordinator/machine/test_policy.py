@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.machine.description import ConfigError, NodePolicy, load_machine
+from coordinator.assembly.load import ConfigError, NodePolicy, load_machine
 from tests.stages.printer_text import PRINTER_CFG, changed, write
 
 LIGHT = "\n[mcu light]\ncanbus_uuid: 0102030405aa\npolicy: {}\n"

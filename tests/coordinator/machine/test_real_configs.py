@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.machine.check import check_config
-from coordinator.machine.description import load_machine
+from coordinator.assembly.check import check_config
+from coordinator.assembly.load import load_machine
 
 REAL = Path(__file__).parents[3] / ".." / "shared" / "data" / "config" / "real"
 

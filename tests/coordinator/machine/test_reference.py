@@ -2,11 +2,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.machine import reference
+from coordinator.assembly import reference
 from coordinator.modules.registry import own_kinds
 
 PAGE = Path(__file__).parents[3] / "docs" / "configuration.md"
-HINT = "the page is stale; run: python -m coordinator.machine.reference docs/configuration.md"
+HINT = "the page is stale; run: python -m coordinator.assembly.reference docs/configuration.md"
 
 
 @pytest.mark.parametrize("title", reference.sections())

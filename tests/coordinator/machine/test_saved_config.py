@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.machine.config_file import SAVED_HEADER, parse_config, parse_saved, saved_values
-from coordinator.machine.config_text import split_lines
-from coordinator.machine.saved_config import ConfigSource, PendingConfig, SaveError, replace_file, with_block
+from coordinator.config.file import SAVED_HEADER, parse_config, parse_saved, saved_values
+from coordinator.config.text import split_lines
+from coordinator.config.saved import ConfigSource, PendingConfig, SaveError, replace_file, with_block
 
 USER = "# mine: ä\r\n[extruder]\r\ncontrol: pid   # by hand\r\n\r\n[bed_mesh default]\r\n"
 

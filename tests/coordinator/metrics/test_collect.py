@@ -12,7 +12,7 @@ from prometheus_client.openmetrics.exposition import generate_latest as generate
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
-from coordinator.ipc.methods import Value
+from coordinator.ipc.protocol.methods import Value
 from coordinator.metrics import catalog
 from coordinator.metrics.catalog import GROUPS, JOB_STATES, NODE_STATES, SERVICE_STATES, Kind
 from coordinator.metrics.collect import (
@@ -23,9 +23,9 @@ from coordinator.metrics.collect import (
     lead_buckets,
     registry_of,
 )
-from coordinator.service.jobs import JobPhase
-from coordinator.service.machine_service import ServiceState
-from nodes.node_states import NodeState
+from coordinator.service.jobs.jobs import JobPhase
+from coordinator.service.core.machine_service import ServiceState
+from nodes.node.states import NodeState
 from tests.profiles import examples
 
 Samples = dict[tuple[str, tuple[tuple[str, str], ...]], float]

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.methods import Value
+from coordinator.ipc.protocol.methods import Value
 from coordinator.metrics.server import (
     CONNECTIONS_MAX,
     REQUEST_BYTES_MAX,
@@ -15,7 +15,7 @@ from coordinator.metrics.server import (
     MetricsServer,
     MetricsSettings,
 )
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from tests.stages import jump_loop
 
 ASK = b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1:1\r\n\r\n"

@@ -1,7 +1,7 @@
 """A heater's sensor in a simulated machine: its wire breaks for some measurements, or it falls silent."""
 
-from coordinator.modules.heaters import Heaters
-from coordinator.modules.temperature_input import TemperatureInput
+from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.sensors.temperature_input import TemperatureInput
 from nodes.virtual.plant_page import Fault, Kind
 from tests.stages.heat_machine import HeatMachine
 

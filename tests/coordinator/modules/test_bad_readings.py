@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.modules.heater import BAD_MEASUREMENTS
+from coordinator.modules.heaters.heater import BAD_MEASUREMENTS
 from coordinator.modules.pinned import AHEAD_S
-from coordinator.modules.sensor_module import TemperatureSensor
-from coordinator.modules.temperature_source import BAD_IN_A_ROW
+from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
+from coordinator.modules.sensors.temperature_source import BAD_IN_A_ROW
 from nodes.devices.analog_in import RANGE_CHECKS
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual.plant_page import Fault
 from tests.coordinator.modules.broken_sensor import Sensor
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine

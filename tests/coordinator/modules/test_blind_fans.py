@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.modules.heater import LOOK_S, SILENT_LOOKS
-from coordinator.modules.temperature_fan import TemperatureFan
-from coordinator.modules.temperature_input import TemperatureInput
+from coordinator.modules.heaters.heater import LOOK_S, SILENT_LOOKS
+from coordinator.modules.fans.temperature_fan import TemperatureFan
+from coordinator.modules.sensors.temperature_input import TemperatureInput
 from nodes.virtual.plant_page import Fault, Kind
 from tests.coordinator.modules.broken_sensor import Sensor
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine

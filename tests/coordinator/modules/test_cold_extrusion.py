@@ -9,9 +9,9 @@ from coordinator.gcode.commands import Vocabulary
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
-from coordinator.motion.planner import Planner
-from coordinator.program_machine import machine_state
-from coordinator.streamer import Streamer
+from coordinator.motion.planner.planner import Planner
+from coordinator.streaming.program_machine import machine_state
+from coordinator.streaming.streamer import Streamer
 from tests.coordinator.motion.planner_helpers import drain
 from tests.stages.heat_machine import HeatMachine
 from tests.stages.program_stage import events_of

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.words import WordError
+from coordinator.gcode.parser import WordError
 from nodes.virtual.plant_page import Fault, Kind
 from tests.stages.heat_machine import BASE, BED, FAN, HeatMachine
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.machine.check import check_config
+from coordinator.assembly.check import check_config
 from coordinator.modules.base import Value
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from tests.stages.heat_machine import BASE, BED, HOTEND_PID, HeatMachine
 
 CHIP = "\n[temperature_sensor board]\nsensor_type: temperature_mcu\nsensor_mcu: toolhead\n"

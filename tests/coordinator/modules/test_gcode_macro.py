@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.machine.problem import ConfigError
+from coordinator.config.errors import ConfigError
 from coordinator.modules.base import Value
-from coordinator.modules.display_status import DisplayStatus
-from coordinator.modules.printer_status import PrinterStatus
+from coordinator.modules.status.display_status import DisplayStatus
+from coordinator.modules.status.printer_status import PrinterStatus
 from tests.stages.program_stage import ProgramStage
 
 

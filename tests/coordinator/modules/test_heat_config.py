@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.commands import Call, InTime
-from coordinator.gcode.words import WordError, parse
+from coordinator.gcode.parser import WordError, parse
 from coordinator.heat.known_sensors import PT1000, THERMISTORS
-from coordinator.machine.description import ConfigError, load_machine
-from coordinator.modules.heater_sections import ExtruderHeater, HeaterBed
-from coordinator.modules.sensor_module import TemperatureSensor
-from coordinator.modules.temperature_input import TemperatureInput
+from coordinator.assembly.load import ConfigError, load_machine
+from coordinator.modules.heaters.sections import ExtruderHeater, HeaterBed
+from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
+from coordinator.modules.sensors.temperature_input import TemperatureInput
 from tests.stages.heat_machine import BASE, BED, HOTEND_PID, build, configured
 
 THREE = "\n[thermistor x]\ntemperature1: 25\ntemperature2: 50\ntemperature3: 70\n"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.node_states import NodeState
+from nodes.node.states import NodeState
 from nodes.virtual.plant_page import Fault, Kind
 from tests.stages.heat_machine import BED, HeatMachine
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from coordinator.heat.mpc import Mpc
-from coordinator.modules.heater import LOOK_S, STALE_SPARE_S
+from coordinator.modules.heaters.heater import LOOK_S, STALE_SPARE_S
 from coordinator.modules.pinned import AHEAD_S
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from tests.coordinator.modules.broken_sensor import Sensor
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 

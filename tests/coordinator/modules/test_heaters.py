@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.demo.heat_proof import HeatWatch
-from coordinator.gcode.words import WordError
+from coordinator.verification.heat_proof import HeatWatch
+from coordinator.gcode.parser import WordError
 from coordinator.heat.mpc import Mpc
-from coordinator.machine.check import check_config
-from nodes.errors import CanductorError
+from coordinator.assembly.check import check_config
+from nodes.support.errors import CanductorError
 from tests.stages.heat_machine import BED, FAN, HOTEND_PID, HeatMachine
 
 MPC = (

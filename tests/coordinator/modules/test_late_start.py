@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from nodes.devices.ticks import start_clock
-from nodes.node import Node
+from nodes.node.node import Node
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 
 STALL_S = 0.7

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.commands import EXAMPLES
+from coordinator.support.command_options import EXAMPLES
 from coordinator.gcode.errors import GCodeError
-from coordinator.machine.check import check_config
+from coordinator.assembly.check import check_config
 from coordinator.modules import registry
 from tests.stages.program_stage import ProgramStage
 
@@ -72,7 +72,7 @@ BROKEN = {
     "no module": ("class Bell: pass", r"is no module for \[bell\]: it must be a subclass of"),
     "in building": (
         """
-from coordinator.machine.options import SectionSpec
+from coordinator.config.options import SectionSpec
 from coordinator.modules.base import Module
 class Bell(Module):
     SPEC = SectionSpec("A bell", ())

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.words import WordError
-from coordinator.machine.check import check_config
-from coordinator.modules.heaters import Heaters
+from coordinator.gcode.parser import WordError
+from coordinator.assembly.check import check_config
+from coordinator.modules.heaters.heaters import Heaters
 from tests.stages.heat_machine import BASE, BED, HOTEND_PID, HeatMachine
 
 FAST = "\n[pid_profile extruder fast]\ncontrol: pid\npid_kp: 30\npid_ki: 2\npid_kd: 120\npid_target: 240\n"

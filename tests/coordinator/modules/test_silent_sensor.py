@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.modules.heater import LOOK_S, SILENT_LOOKS
-from nodes.errors import CanductorError
+from coordinator.modules.heaters.heater import LOOK_S, SILENT_LOOKS
+from nodes.support.errors import CanductorError
 from tests.coordinator.modules.broken_sensor import Sensor
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 

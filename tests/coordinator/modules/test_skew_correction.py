@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.events import PositionSet, WeightsChange
-from coordinator.machine.description import load_machine
-from coordinator.machine.problem import ConfigError
-from coordinator.modules.skew_correction import Skew, Skews
+from coordinator.assembly.load import load_machine
+from coordinator.config.errors import ConfigError
+from coordinator.modules.levelling.skew_correction import Skew, Skews
 from tests.stages.program_stage import ProgramStage
 
 PROFILE = "[skew_correction cold]\nxy_skew: 0.01\nxz_skew: -0.002\nyz_skew: 0.003\n"

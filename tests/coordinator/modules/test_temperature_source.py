@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from coordinator.modules.temperature_source import BAD_IN_A_ROW, MAX_WAITERS, SILENT_S, TemperatureSource
-from nodes.errors import CanductorError
+from coordinator.modules.sensors.temperature_source import BAD_IN_A_ROW, MAX_WAITERS, SILENT_S, TemperatureSource
+from nodes.support.errors import CanductorError
 from nodes.virtual.world import VirtualLoop, World
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from coordinator.modules.live import Live
+    from coordinator.runtime.module_context import Live
 
 
 class Stops:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.demo.exact_path import SNAP, Leg, Position, StepperPath, follow, resting, solve
-from coordinator.demo.exact_signal import Floats
+from coordinator.verification.exact_path import SNAP, Leg, Position, StepperPath, follow, resting, solve
+from coordinator.verification.exact_signal import Floats
 from tests.coordinator.motion.replay import Stream
 
 CHUNK = 1 << 18

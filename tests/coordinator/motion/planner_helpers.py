@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from coordinator.motion.planner import FeedStatus, Planner
+from coordinator.motion.planner.planner import FeedStatus, Planner
 from coordinator.motion.specs import MotionLimits
 from coordinator.motion.trapezoid_array import TRAPEZOID
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-from coordinator.motion.planner import Position
+from coordinator.motion.planner.planner import Position
 from coordinator.motion.specs import MotionLimits
 
 WORD = re.compile(r"([XYZEF])([+-]?\d*\.?\d*)")

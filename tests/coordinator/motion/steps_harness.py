@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
-from coordinator.motion.steps import StepGenerator, resting_step
+from coordinator.motion.steps.steps import StepGenerator, resting_step
 from tests.coordinator.motion.steps_oracle import Move, Node, Position, Step, step_times
 
 ORIGIN: Position = (0.0, 0.0, 0.0, 0.0)

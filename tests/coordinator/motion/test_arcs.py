@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.motion.language import ARC_DEVIATION_MM, ARC_PIECE_MM, ArcFault, Plane
-from coordinator.motion.planner import FeedStatus, Planner
+from coordinator.motion.planner.language import ARC_DEVIATION_MM, ARC_PIECE_MM, ArcFault, Plane
+from coordinator.motion.planner.planner import FeedStatus, Planner
 from tests.coordinator.motion.planner_helpers import drain, flushed, homed_planner, joined
 from tests.profiles import examples
 

@@ -7,7 +7,7 @@ from functools import cache
 
 import pytest
 
-from nodes.message_format import vlq
+from nodes.dictionary.message_format import vlq
 from tests.coordinator.motion.compress_cases import KINDS, OPTIMA, PREFIX, Case, Yield, cases, compress
 from tests.coordinator.motion.compress_oracle import Price, Problem, commands, optimum, payload_bytes
 

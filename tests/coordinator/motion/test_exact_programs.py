@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.motion.steps import MAX_ERROR_S
+from coordinator.motion.steps.steps import MAX_ERROR_S
 from tests.coordinator.motion.exact_program import Planned, plan_program
 from tests.profiles import is_full
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.motion._planner import ffi, lib
-from coordinator.motion.planner import FeedStatus
+from coordinator.motion.planner._planner import ffi, lib
+from coordinator.motion.planner.planner import FeedStatus
 from tests.coordinator.motion.planner_helpers import (
     check_invariants,
     drain,

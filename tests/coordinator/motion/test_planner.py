@@ -9,7 +9,7 @@ from operator import xor
 import numpy as np
 import pytest
 
-from coordinator.motion.planner import RING_TRAPEZOIDS, FaultKind, FeedStatus, Planner
+from coordinator.motion.planner.planner import RING_TRAPEZOIDS, FaultKind, FeedStatus, Planner
 from tests.coordinator.motion.planner_helpers import (
     LIMITS,
     check_invariants,

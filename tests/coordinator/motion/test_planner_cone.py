@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.motion.planner import FaultKind, FeedStatus, Planner
+from coordinator.motion.planner.planner import FaultKind, FeedStatus, Planner
 from tests.coordinator.motion.planner_helpers import LIMITS
 
 TOP = 300.0

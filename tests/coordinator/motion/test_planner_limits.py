@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.motion.planner import FaultKind, FeedStatus
+from coordinator.motion.planner.planner import FaultKind, FeedStatus
 from coordinator.motion.specs import MotionLimits
 from tests.coordinator.motion.planner_helpers import (
     LIMITS,

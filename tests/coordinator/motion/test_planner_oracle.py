@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.motion.planner import Planner
+from coordinator.motion.planner.planner import Planner
 from coordinator.motion.specs import MotionLimits
 from tests.coordinator.motion.planner_helpers import (
     LIMITS,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coordinator.kinematics.delta import USUAL_TOWER_SPEED, Delta, Tower
-from coordinator.motion.planner import Planner
+from coordinator.motion.planner.planner import Planner
 from tests.coordinator.motion.planner_helpers import LIMITS, flushed, joined
 
 ROD, RADIUS = 207.0, 100.0

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: coordinator/motion/step*.c coordinator/motion/kin_*.c firmware/wire/vlq.c
+// sources: coordinator/motion/steps/step*.c coordinator/kinematics/*.c firmware/wire/vlq.c
 // Shaped, smoothed and non-linear steppers under the sanitizers: many moves without drift, changes at rest.
-#include "coordinator/motion/steps.h"
+#include "coordinator/motion/steps/steps.h"
 #include "tests/check.h"
 
 #include <math.h>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // sources: coordinator/motion/step*.c coordinator/motion/kin_*.c firmware/wire/vlq.c
 // What step generation refuses, and that a refused call changes nothing.
-#include "coordinator/motion/steps.h"
+#include "coordinator/motion/steps/steps.h"
 #include "tests/check.h"
 
 #include <math.h>

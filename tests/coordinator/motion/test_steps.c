@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: coordinator/motion/step*.c coordinator/motion/kin_*.c firmware/wire/vlq.c
+// sources: coordinator/motion/steps/step*.c coordinator/kinematics/*.c firmware/wire/vlq.c
 // Step generation under the sanitizers: memory of exactly the promised size, hostile numbers, random moves.
-#include "coordinator/motion/steps.h"
+#include "coordinator/motion/steps/steps.h"
 #include "nodes/link/batch.h"
 #include "tests/check.h"
 

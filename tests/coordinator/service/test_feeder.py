@@ -2,14 +2,14 @@
 
 import pytest
 
-from coordinator.commands import DEMO_MACHINE
+from coordinator.support.command_options import DEMO_MACHINE
 from coordinator.gcode.events import Emergency, End, Event, Full, Idle, PositionSet, Reply
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
-from coordinator.machine.description import load_machine
-from coordinator.motion.planner import Planner
-from coordinator.service.feeder import ASIDES_MAX, WAITING_MAX, Feeder, FeederFull, Ticket
-from coordinator.service.work import FileWork, LinesWork, MoveWork, Rest, WorkError, commands_in
+from coordinator.assembly.load import load_machine
+from coordinator.motion.planner.planner import Planner
+from coordinator.service.core.feeder import ASIDES_MAX, WAITING_MAX, Feeder, FeederFull, Ticket
+from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Rest, WorkError, commands_in
 
 LIMITS = load_machine(str(DEMO_MACHINE)).limits
 

@@ -7,10 +7,10 @@ import pytest
 from coordinator.gcode.commands import AtRest, Done, GCodeCommand, Vocabulary
 from coordinator.gcode.events import End, Event, Full, Idle, Notice, Reply, Resting
 from coordinator.gcode.program import Program
-from coordinator.modules.pause_resume import PauseResume
-from coordinator.modules.print_stats import PrintStats
-from coordinator.service.feeder import Feeder, Ticket
-from coordinator.service.work import FileWork, LinesWork, MoveWork
+from coordinator.modules.programs.pause_resume import PauseResume
+from coordinator.modules.status.print_stats import PrintStats
+from coordinator.service.core.feeder import Feeder, Ticket
+from coordinator.service.core.work import FileWork, LinesWork, MoveWork
 from tests.stages.program_stage import ProgramStage
 
 MACROS = """

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.service.job_folder import JobFolder, NoSuchJob
+from coordinator.service.jobs.job_folder import JobFolder, NoSuchJob
 from tests.profiles import examples
 
 

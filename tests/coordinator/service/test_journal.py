@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.service.journal import FILE_BYTES_MAX, NAME, Interrupted, Journal, read_journal
+from coordinator.service.jobs.journal import FILE_BYTES_MAX, NAME, Interrupted, Journal, read_journal
 
 
 def written(folder: Path, *entries: tuple[int, Mapping[str, object]], ended: bool = False) -> Path:

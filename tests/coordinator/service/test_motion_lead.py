@@ -1,4 +1,4 @@
-from coordinator.service.motion_lead import SETTLED_S, MotionLead
+from coordinator.service.core.motion_lead import SETTLED_S, MotionLead
 
 
 def seen(lead: MotionLead) -> list[float | None]:

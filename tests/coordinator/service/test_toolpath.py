@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from coordinator.motion.trapezoid_array import TRAPEZOID
-from coordinator.service.toolpath import KEEP_SHARE, Toolpath
-from coordinator.service.trace import Moves
+from coordinator.service.state.toolpath import KEEP_SHARE, Toolpath
+from coordinator.service.state.trace import Moves
 
 
 def straight(*corners: tuple[float, float, float], extrudes: bool = True, from_s: float = 0.0) -> Moves:

@@ -2,7 +2,7 @@
 
 import random
 
-from coordinator.service.jobs import TRAIL_MAX, Trail
+from coordinator.service.jobs.jobs import TRAIL_MAX, Trail
 
 
 def test_bytes_follow_the_line_that_is_carried_out() -> None:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.methods import ApiError
-from coordinator.machine.description import load_machine
-from coordinator.service.way_home import WayHome, sure_height, way_home
+from coordinator.ipc.protocol.methods import ApiError
+from coordinator.assembly.load import load_machine
+from coordinator.service.jobs.resume_homing import WayHome, sure_height, way_home
 
 CONFIG = Path("config")
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.table.axis_table import (
+from coordinator.tables.axis_table import (
     SLOPE_MAX,
     AxisTable,
     Direction,
@@ -17,7 +17,7 @@ from coordinator.table.axis_table import (
     figures,
     notes,
 )
-from coordinator.table.plot import draw
+from coordinator.tables.plot import draw
 
 TABLE = AxisTable(
     axis="x", positions=(0.0, 10.0, 20.0), forward=(0.0, 0.01, -0.02), reverse=(0.1, 0.11, 0.08)

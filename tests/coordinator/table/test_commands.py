@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator import cli
-from coordinator.table.commands import _side
+from coordinator.cli import main as cli
+from coordinator.cli.commands.table import _side
 
 TABLE = "0 0 0\n100 100.01 99.99\n"
 MACHINE = Path("config/demo/machine.cfg")

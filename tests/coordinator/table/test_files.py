@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coordinator.table.axis_table import AxisTable, TableError, Unit
-from coordinator.table.files import ACTUAL, TRIM, read_table
+from coordinator.tables.axis_table import AxisTable, TableError, Unit
+from coordinator.tables.files import ACTUAL, TRIM, read_table
 
 
 def write(folder: Path, text: str | bytes, name: str = "x.comp") -> Path:

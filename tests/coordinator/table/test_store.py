@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.table.axis_table import AxisTable, TableError, Unit
-from coordinator.table.store import TableStore, table_folder
+from coordinator.tables.axis_table import AxisTable, TableError, Unit
+from coordinator.tables.store import TableStore, table_folder
 
 TABLE = AxisTable(axis="x", positions=(0.0, 0.1), forward=(1e-3 / 3, 0.0), reverse=(0.0, 0.0), unit=Unit.DEG)
 

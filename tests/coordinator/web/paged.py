@@ -10,7 +10,7 @@ from typing import Any
 
 import aiohttp
 
-from coordinator.ipc.methods import Scope
+from coordinator.ipc.protocol.methods import Scope
 from coordinator.web.server import WebServer
 from coordinator.web.settings import WebSettings
 from tests.coordinator.ipc.served import Served, serving

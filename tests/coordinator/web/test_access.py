@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.methods import Scope
+from coordinator.ipc.protocol.methods import Scope
 from coordinator.web.access import (
     LINK_S,
     LINKS_MAX,
@@ -17,7 +17,7 @@ from coordinator.web.access import (
     is_key_of,
 )
 from coordinator.web.session_file import read_sessions, write_sessions
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 
 HOST = "127.0.0.1:8080"
 

@@ -13,9 +13,9 @@ import aiohttp
 import pytest
 from yarl import URL
 
-from coordinator.ipc.auth import FAILURES_MAX, SHUT_OUT_S
-from coordinator.ipc.methods import Scope
-from coordinator.ipc.server import TOKENS_LOOK_S
+from coordinator.ipc.server.auth import FAILURES_MAX, SHUT_OUT_S
+from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.server import TOKENS_LOOK_S
 from coordinator.web.access import LINK_S
 from coordinator.web.methods import add_page_methods
 from coordinator.web.names import is_known_host, is_own_origin

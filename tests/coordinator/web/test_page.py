@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, WebSocketRoute
 
-from coordinator.ipc.methods import Scope
+from coordinator.ipc.protocol.methods import Scope
 from tests.coordinator.ipc.served import TOKENS, tokens_file
 from tests.coordinator.web.browser import PATIENCE_MS, Demo, Visitor, chromium, demo
 from tests.coordinator.web.paged import LOOPBACK, Paged, paging

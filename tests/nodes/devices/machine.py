@@ -4,12 +4,12 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Protocol
 
-from nodes.assign import Uuid
-from nodes.can_bus import CanBus
-from nodes.dictionary import Dictionary
-from nodes.node import Node
-from nodes.node_config import NodeConfig
-from nodes.node_states import NodeState
+from nodes.bus.assign import Uuid
+from nodes.bus.can_bus import CanBus
+from nodes.dictionary.dictionary import Dictionary
+from nodes.node.node import Node
+from nodes.node.config import NodeConfig
+from nodes.node.states import NodeState
 from nodes.virtual.world import World, run
 from tests.nodes.virtual.world.machines import start_io, uuid
 

@@ -9,7 +9,7 @@ from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.devices.button import Button
 from nodes.devices.counter import Counter
 from nodes.devices.pwm_out import PwmOut
-from nodes.message_format import Message
+from nodes.dictionary.message_format import Message
 from tests.nodes.devices.machine import HZ, DeviceMachine
 
 

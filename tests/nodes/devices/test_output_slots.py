@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
 from nodes.devices.timed_output import WAY_S
-from nodes.queue_slots import OUTPUT_SLOTS_MAX, OUTPUT_SLOTS_MIN, STEP_SLOTS_MIN, share_slots
+from nodes.node.queue_slots import OUTPUT_SLOTS_MAX, OUTPUT_SLOTS_MIN, STEP_SLOTS_MIN, share_slots
 from tests.nodes.devices.machine import HZ, DeviceMachine
 
 SLOTS = 16

@@ -6,9 +6,9 @@ import pytest
 
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
-from nodes.dictionary import Dictionary
-from nodes.node_config import NodeConfigError
-from nodes.node_errors import NodeError
+from nodes.dictionary.dictionary import Dictionary
+from nodes.node.config import NodeConfigError
+from nodes.node.errors import NodeError
 from tests.nodes.devices.machine import HZ, DeviceMachine
 
 

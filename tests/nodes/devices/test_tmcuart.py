@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from nodes.devices.tmcuart import BAUD, BAUD_SLOW, IFCNT, TmcError, TmcUart
-from nodes.dictionary import Dictionary
-from nodes.node_config import NodeConfig
+from nodes.dictionary.dictionary import Dictionary
+from nodes.node.config import NodeConfig
 from nodes.virtual.plant import NodePlant, Stepper, Tmc
 from nodes.virtual.plant_page import Fault, Kind
 from tests import real_dictionaries

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/can_bits.c
+// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
 // A bus without I/O, in virtual time: what it refuses, what it does with broken frames, and its end.
 #include <errno.h>
 #include <linux/can.h>

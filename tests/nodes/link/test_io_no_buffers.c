@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/can_bits.c
+// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
 // SocketCAN's ENOBUFS: a full interface queue costs time, no frame and no busy loop. The kernels of build
 // machines have no CAN, so the one call that tells it is replaced: this file's write() refuses first.
 #define _GNU_SOURCE

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/can_bits.c
+// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
 // The thread of a bus between several calling threads and a node that answers as fast as it can. Also built
 // by hand with -fsanitize=thread: what the mutex guards, it guards.
 #include "tests/check.h"

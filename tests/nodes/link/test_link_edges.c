@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/can_bits.c
+// sources: firmware/wire/*.c nodes/link/[a-z]*.c nodes/support/can_bits.c
 // A bus and a node that answers when it is told to, in virtual time: to whom each byte belongs, what each
 // counter says of it, and how many bytes may go at once.
 #include <linux/can.h>
 #include <string.h>
 
-#include "nodes/can_bits.h"
+#include "nodes/support/can_bits.h"
 #include "nodes/link/io_api.h"
 #include "tests/check.h"
 

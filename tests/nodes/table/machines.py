@@ -5,21 +5,21 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from coordinator.simulate.script import ScriptedWorld
-from nodes.assign import Uuid
-from nodes.bus import UartBus
-from nodes.can_bus import CanBus
+from nodes.bus.assign import Uuid
+from nodes.bus.bus import UartBus
+from nodes.bus.can_bus import CanBus
 from nodes.devices.table import AxleTable
-from nodes.dictionary import Dictionary
-from nodes.node_config import NodeConfig
-from nodes.seams import BuildConfig
-from nodes.table.download import Place
-from nodes.table.mt import Pair
+from nodes.dictionary.dictionary import Dictionary
+from nodes.node.config import NodeConfig
+from nodes.link.interfaces import BuildConfig
+from nodes.mt.download import Place
+from nodes.mt.mt import Pair
 from nodes.virtual._sim import lib
 from nodes.virtual.world import CanWire, NodeSettings, World, WorldNode
 from tests.nodes.virtual.world.machines import start_io, uuid
 
 if TYPE_CHECKING:
-    from nodes.node import Node
+    from nodes.node.node import Node
 
 NS: Final = 1_000_000_000
 LOAD_ID: Final = 0x300

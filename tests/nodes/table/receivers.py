@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 from typing import Any, Protocol
 
-from nodes.table.mt import MtStatus, Pair
-from nodes.table.receiver import MtReceiver
+from nodes.mt.mt import MtStatus, Pair
+from nodes.mt.receiver import MtReceiver
 from nodes.virtual._sim import ffi, lib
 
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from nodes.table.cost import AROUND, FRAME_BITS_MAX, CanCost, RegisterCost, SerialCost, frame_bits, literals
-from nodes.table.mt import Pair, to_frames, transmission
+from nodes.mt.cost import AROUND, FRAME_BITS_MAX, CanCost, RegisterCost, SerialCost, frame_bits, literals
+from nodes.mt.mt import Pair, to_frames, transmission
 
 TABLES: tuple[list[Pair], ...] = ([], [(1, 2), (3, 4)], [(7, 7)] * 5, [(0, -1), (-1, 0), (0, 0)])
 

@@ -6,11 +6,11 @@ from collections.abc import Awaitable, Callable, Sequence
 import numpy as np
 import pytest
 
-from nodes.clock import HostTime
+from nodes.clock.clock import HostTime
 from nodes.devices.table import Activation, AxleTable
-from nodes.node_config import NodeConfigError
-from nodes.table.download import BUS_SHARE, Outcome, Place, download
-from nodes.table.mt import MtError, MtStatus, Pair, to_frames, transmission
+from nodes.node.config import NodeConfigError
+from nodes.mt.download import BUS_SHARE, Outcome, Place, download
+from nodes.mt.mt import MtError, MtStatus, Pair, to_frames, transmission
 from nodes.virtual.world import run
 from tests.nodes.table.machines import TableMachine, UartTableMachine, wavy
 

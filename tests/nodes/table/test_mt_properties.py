@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.table.mt import (
+from nodes.mt.mt import (
     C_CKHIGH,
     C_CKLOW,
     C_MASK,
@@ -22,7 +22,7 @@ from nodes.table.mt import (
     to_frames,
     transmission,
 )
-from nodes.table.receiver import MtReceiver
+from nodes.mt.receiver import MtReceiver
 from tests.nodes.table import literal
 from tests.nodes.table.receivers import BOTH, FirmwareReceiver, feed
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from nodes.table.mt import (
+from nodes.mt.mt import (
     C_CKHIGH,
     C_CKLOW,
     C_MASK,
@@ -18,7 +18,7 @@ from nodes.table.mt import (
     mask_of,
     transmission,
 )
-from nodes.table.receiver import MtReceiver
+from nodes.mt.receiver import MtReceiver
 from tests.nodes.table import literal
 from tests.nodes.table.receivers import BOTH, FirmwareReceiver, feed
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.table.mt import MtError, Pair, from_bytes, to_bytes, transmission
-from nodes.table.pace import NS_PER_S, PacedFrames, PacedWords
-from nodes.table.receiver import ByteWords, MtReceiver, PolledRegister
+from nodes.mt.mt import MtError, Pair, from_bytes, to_bytes, transmission
+from nodes.mt.pace import NS_PER_S, PacedFrames, PacedWords
+from nodes.mt.receiver import ByteWords, MtReceiver, PolledRegister
 from nodes.virtual._sim import ffi, lib
 from tests.nodes.table import literal
 from tests.nodes.table.receivers import feed

@@ -13,7 +13,7 @@ from typing import Protocol
 import can
 import pytest
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.transport import (
     CanFrame,
     CanTransport,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual.edge_log import HEADER_SIZE, EdgeLog
 
 Edge = tuple[int, int, int]

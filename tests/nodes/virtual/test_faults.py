@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.transport.frame import RECORD_SIZE, CanFrame
 from nodes.virtual.faults import RULES_MAX, Fault, FaultKind
 from nodes.virtual.hub import FaultStats, VirtualBus

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: nodes/virtual/hub.c nodes/virtual/hub_faults.c nodes/can_bits.c
+// sources: nodes/virtual/hub.c nodes/virtual/hub_faults.c nodes/support/can_bits.c
 // The virtual bus under virtual time: arbitration, one order, true rate, back-pressure, loss, garbage.
-#include "nodes/can_bits.h"
+#include "nodes/support/can_bits.h"
 #include "nodes/virtual/hub.h"
 #include "tests/check.h"
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.transport import CanFrame, TransportClosedError, open_can
 from nodes.transport.frame import RECORD_SIZE
 from nodes.virtual.hub import VirtualBus

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: nodes/virtual/hub.c nodes/virtual/hub_faults.c nodes/can_bits.c
+// sources: nodes/virtual/hub.c nodes/virtual/hub_faults.c nodes/support/can_bits.c
 // Faults of the virtual bus under virtual time: each kind does what it says, to whom it says, when it says.
-#include "nodes/can_bits.h"
+#include "nodes/support/can_bits.h"
 #include "nodes/virtual/hub.h"
 #include "tests/check.h"
 

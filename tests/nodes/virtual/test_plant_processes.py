@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.plant import Axis, NodePlant, Stepper, Switch, Term
 from nodes.virtual.plant_log import plant_log

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual.processes import BusProcess, ChildProcess, NodeProcess
 
 WAIT_S = 20.0

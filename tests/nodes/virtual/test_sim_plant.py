@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nodes.errors import CanductorError
+from nodes.support.errors import CanductorError
 from nodes.virtual.plant import (
     Axis,
     Body,

@@ -3,14 +3,14 @@
 from typing import TYPE_CHECKING, Final
 
 from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
-from coordinator.gcode.words import WordError, quoted
-from coordinator.machine.options import FloatOption, SectionSpec
-from coordinator.machine.pins import PinOption
+from coordinator.gcode.parser import WordError, quoted
+from coordinator.config.options import FloatOption, SectionSpec
+from coordinator.config.pins import PinOption
 from coordinator.modules.base import Build, Module, Value
 from nodes.devices.digital_out import DigitalOut
 
 if TYPE_CHECKING:
-    from coordinator.modules.live import Live
+    from coordinator.runtime.module_context import Live
 
 LENGTH_MAX_S: Final = 5.0
 PIN: Final = PinOption(name="pin", help="the bell's output; ! when low means ringing")

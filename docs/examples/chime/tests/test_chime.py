@@ -7,8 +7,8 @@ import pytest
 
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.program import Program
-from coordinator.machine.check import check_config
-from coordinator.session import run_job
+from coordinator.assembly.check import check_config
+from coordinator.streaming.job_runner import run_job
 from coordinator.simulate import scenario
 from coordinator.simulate.stage import Stage
 

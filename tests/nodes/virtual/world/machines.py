@@ -3,17 +3,17 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from nodes.assign import Uuid
-from nodes.bus import UartBus
-from nodes.can_bus import CanBus
+from nodes.bus.assign import Uuid
+from nodes.bus.bus import UartBus
+from nodes.bus.can_bus import CanBus
 from nodes.link import LinkIO
-from nodes.node_states import NodeState
-from nodes.seams import IoFactory, LinkIOLike, OnFrame, OnLost
+from nodes.node.states import NodeState
+from nodes.link.interfaces import IoFactory, LinkIOLike, OnFrame, OnLost
 from nodes.virtual.world import CanPort, CanWire, Port, UartSettings, World, WorldNode, run
 from tests.nodes.machine import make_config, stepper_x
 
 if TYPE_CHECKING:
-    from nodes.node import Node
+    from nodes.node.node import Node
 
 
 def uuid(number: int) -> str:

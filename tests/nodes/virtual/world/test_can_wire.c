@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: nodes/can_bits.c nodes/virtual/world/agenda.c nodes/virtual/world/c*.c
+// sources: nodes/support/can_bits.c nodes/virtual/world/agenda.c nodes/virtual/world/c*.c
 // The wire under the sanitizers: everything that can happen
 // to it, at random, and what must hold whatever it was.
 #include "tests/check.h"

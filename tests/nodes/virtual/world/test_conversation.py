@@ -7,9 +7,9 @@ import sys
 
 import pytest
 
-from nodes.clock import HostTime
-from nodes.node_errors import NodeLost
-from nodes.node_states import NodeState
+from nodes.clock.clock import HostTime
+from nodes.node.errors import NodeLost
+from nodes.node.states import NodeState
 from nodes.virtual.world import Stuck, UartSettings, World, run
 from tests.nodes.virtual.world.machines import CanMachine, UartMachine, ready, trace_of
 

@@ -6,7 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from nodes.node_states import NodeState
+from nodes.node.states import NodeState
 from nodes.virtual.sim import SimNode
 from nodes.virtual.world import (
     CanState,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from nodes.clock import Ticks
+from nodes.clock.clock import Ticks
 from nodes.virtual.world import run
 from tests.nodes.virtual.world.machines import CanMachine
 

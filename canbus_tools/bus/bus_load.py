@@ -1,0 +1,284 @@
+"""How busy a CAN bus is: the library behind ``canductor can load``, for any user of python-can.
+
+    meter = LoadMeter(bitrate=1_000_000)
+    for message in bus:                 # can.Message, or canbus_tools.bus.frame.Frame
+        meter.feed(message)
+    print(f"{meter.load().mean:.1%}")   # of all the bus could carry
+
+A frame counts with the bits it really has on the wire: all fields, the stuff bits that its very content
+needs, and the pause of three bits behind it. What an error costs nobody reports: it is estimated, and shown
+apart. CAN FD frames are counted but not measured.
+
+Times are seconds of one clock, as they come with the frames; a frame belongs to the window in which it was
+received. Memory is bounded: WINDOWS_MAX windows, which become longer when the time does not fit; IDS_MAX ids,
+and one entry for the frames of all ids beyond.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from enum import Enum
+from typing import Final, NamedTuple
+
+import can
+
+from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.protocol.protocol import SIGNAL_FRAMES, Direction, owner_of
+from nodes.support._can_bits import ffi, lib
+from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
+
+BITRATE_MIN, BITRATE_MAX = 10_000, 1_000_000
+WINDOW_S: Final = 1.0
+WINDOW_S_MIN, WINDOW_S_MAX = 0.01, 3600.0
+WINDOWS_MAX: Final = 1024
+IDS_MAX: Final = 4096
+"""All 11-bit ids, and as many others."""
+OTHER_IDS: Final = -1
+"""Stands for the ids beyond IDS_MAX."""
+EXTENDED: Final = 1 << 29
+"""Added to the number of a 29-bit id, as 11-bit ids may have the same."""
+DATA_MAX: Final = 8
+ERROR_BITS: Final = 80
+"""Of one error on the wire, estimated: flag and echo of 6 to 12 bits, delimiter of 8, pause of 3, and the
+part of a frame it destroyed, which nobody knows: half of a full one is taken."""
+_WIRE_ERRORS: Final = 0x008 | 0x020 | 0x080
+"""linux/can/error.h: protocol violation, missing acknowledgement, bus error. The others take no time."""
+
+
+class TrafficClass(Enum):
+    """What a frame is for."""
+
+    ADMIN = "admin"
+    """Questions for nodes and ids, and their answers; sync pulses."""
+    SIGNAL = "signals"
+    """Bus stop and triggers, which win over everything else."""
+    TO_NODES = "to nodes"
+    FROM_NODES = "from nodes"
+    OTHER = "other"
+    """Another protocol's."""
+    ERROR = "errors"
+    """Estimated."""
+
+
+Classify = Callable[[Frame], TrafficClass]
+_SIGNAL_IDS: Final = frozenset(i for f in SIGNAL_FRAMES for i in range(f.can_id, f.can_id + f.ids))
+
+
+def classify(frame: Frame) -> TrafficClass:
+    """Tell what a frame is for by its id."""
+    if frame.kind is FrameKind.ERROR:
+        return TrafficClass.ERROR
+    if frame.kind is not FrameKind.DATA:
+        return TrafficClass.OTHER
+    if frame.can_id in (ADMIN_ID, ADMIN_RESPONSE_ID):
+        return TrafficClass.ADMIN
+    if frame.can_id in _SIGNAL_IDS:
+        return TrafficClass.SIGNAL
+    owner = owner_of(frame.can_id)
+    if owner is None:
+        return TrafficClass.OTHER
+    return TrafficClass.TO_NODES if owner[1] is Direction.TO_NODE else TrafficClass.FROM_NODES
+
+
+def frame_bits(frame: Frame, length: int | None = None) -> int:
+    """Return the bit times FRAME keeps a bus busy, 0 where that cannot be told (FD, some error reports).
+
+    LENGTH: that a remote frame asks for, as it has no data; it changes the frame by some stuff bits.
+    """
+    if frame.kind is FrameKind.ERROR:
+        return ERROR_BITS if frame.can_id & _WIRE_ERRORS else 0
+    if frame.kind is FrameKind.FD or len(frame.data) > DATA_MAX:
+        return 0
+    kind = 0
+    if frame.kind is FrameKind.EXTENDED or frame.can_id > 0x7FF:
+        kind |= lib.CAN_BITS_EXTENDED
+    if frame.kind is FrameKind.REMOTE:
+        kind |= lib.CAN_BITS_REMOTE
+    size = len(frame.data) if length is None else min(length, DATA_MAX)
+    bits: int = lib.can_any_frame_bits(frame.can_id & 0x1FFFFFFF, kind, size, ffi.from_buffer(frame.data))
+    return bits
+
+
+class Part(NamedTuple):
+    """Some of the traffic."""
+
+    frames: int
+    bits: int
+    share: float
+    """Of what the bus could have carried in the time, 0..1."""
+
+
+@record
+class Window:
+    """One stretch of time."""
+
+    start_s: float
+    """Since the measurement began."""
+    length_s: float
+    """In the last one: as far as it went."""
+    frames: int
+    bits: Mapping[TrafficClass, int]
+    load: float
+    """0..1; a little more may come of frames that began before the window."""
+
+
+@record(kw_only=True)
+class BusLoad:
+    """What a LoadMeter found."""
+
+    bitrate: int
+    duration_s: float
+    frames: int
+    """Without error reports."""
+    bits: int
+    mean: float
+    """Share of the time that the bus was busy, 0..1."""
+    peak: float
+    """The same of the busiest window."""
+    peak_at_s: float
+    """When that began, since the measurement did."""
+    window_s: float
+    """Of the peak."""
+    frames_per_s: float
+    classes: Mapping[TrafficClass, Part]
+    ids: Mapping[int, Part]
+    """Busiest first; 29-bit ids with EXTENDED added, OTHER_IDS those that did not fit."""
+    windows: tuple[Window, ...]
+    error_reports: int
+    unmeasured: int
+    """CAN FD frames."""
+
+
+class LoadMeter:
+    """Measures one bus of BITRATE bit/s; for one thread. Raises CanductorError for arguments out of range."""
+
+    def __init__(self, bitrate: int, classify: Classify = classify, window_s: float = WINDOW_S) -> None:
+        if not BITRATE_MIN <= bitrate <= BITRATE_MAX:
+            raise CanductorError(f"bit rate {bitrate} is not between {BITRATE_MIN} and {BITRATE_MAX} bit/s")
+        if not WINDOW_S_MIN <= window_s <= WINDOW_S_MAX:
+            raise CanductorError(f"window {window_s} s is not between {WINDOW_S_MIN} and {WINDOW_S_MAX:g} s")
+        self.bitrate = bitrate
+        self._classify = classify
+        self._window_s = window_s
+        self._classes = {kind: [0, 0] for kind in TrafficClass}
+        self._ids: dict[int, list[int]] = {}
+        self._start_s: float | None = None
+        self._end_s = -math.inf
+        self._bins: dict[int, list[int]] = {}
+        self._bin_s = window_s
+        self._current = 0
+        self._current_bits = 0
+        self._peak = (0, 0)
+        self._unmeasured = 0
+
+    def begin(self, now_s: float) -> None:
+        """Begin to measure before the first frame, on a live bus; else that begins the time."""
+        if self._start_s is None:
+            self._start_s = self._end_s = now_s
+
+    def advance(self, now_s: float) -> None:
+        """Let time pass without a frame."""
+        self.begin(now_s)
+        self._end_s = max(self._end_s, now_s)
+
+    def feed(self, frame: Frame | can.Message) -> int:
+        """Count a frame; returns its bits on the wire."""
+        length = None
+        if isinstance(frame, can.Message):
+            length = frame.dlc if frame.is_remote_frame else None
+            frame = Frame.from_message(frame)
+        bits = frame_bits(frame, length)
+        kind = self._classify(frame)
+        self._unmeasured += frame.kind is FrameKind.FD
+        for tally in (self._classes[kind], self._id_tally(frame)):
+            tally[0] += 1
+            tally[1] += bits
+        self._feed_time(frame.time_s, bits, kind)
+        return bits
+
+    def load(self) -> BusLoad:
+        """Return what was measured until now."""
+        duration_s = 0.0 if self._start_s is None else self._end_s - self._start_s
+        carried = duration_s * self.bitrate
+        frames = sum(tally[0] for kind, tally in self._classes.items() if kind is not TrafficClass.ERROR)
+        bits = sum(tally[1] for tally in self._classes.values())
+        peak_bits, peak_window = max(self._peak, (self._current_bits, self._current), key=lambda p: p[0])
+
+        def part(tally: list[int]) -> Part:
+            return Part(tally[0], tally[1], tally[1] / carried if carried > 0 else 0.0)
+
+        # A shorter measurement than a window has no other peak than its mean, and the last window may be too
+        # short to show what the mean already does.
+        peak_s = min(self._window_s, duration_s)
+        mean = bits / carried if carried > 0 else 0.0
+        return BusLoad(
+            bitrate=self.bitrate,
+            duration_s=duration_s,
+            frames=frames,
+            bits=bits,
+            mean=mean,
+            peak=max(mean, peak_bits / (peak_s * self.bitrate)) if peak_s > 0 else 0.0,
+            peak_at_s=peak_window * self._window_s,
+            window_s=self._window_s,
+            frames_per_s=frames / duration_s if duration_s > 0 else 0.0,
+            classes={kind: part(tally) for kind, tally in self._classes.items() if tally[0]},
+            ids={i: part(t) for i, t in sorted(self._ids.items(), key=lambda item: -item[1][1])},
+            windows=self._windows(duration_s),
+            error_reports=self._classes[TrafficClass.ERROR][0],
+            unmeasured=self._unmeasured,
+        )
+
+    # ----------------------------------------------------------------------------------------------- inside
+
+    def _id_tally(self, frame: Frame) -> list[int]:
+        if frame.kind is FrameKind.ERROR:
+            return [0, 0]  # its "id" says what went wrong
+        extended = frame.kind is FrameKind.EXTENDED or frame.can_id > 0x7FF
+        key = frame.can_id | EXTENDED if extended else frame.can_id
+        if key not in self._ids and len(self._ids) >= IDS_MAX:
+            key = OTHER_IDS
+        return self._ids.setdefault(key, [0, 0])
+
+    def _feed_time(self, time_s: float, bits: int, kind: TrafficClass) -> None:
+        if self._start_s is None:
+            # It counts from when the first frame began.
+            self._start_s = self._end_s = time_s - bits / self.bitrate
+        self._end_s = max(self._end_s, time_s)
+        since_s = max(0.0, time_s - self._start_s)
+        window = int(since_s / self._window_s)
+        if window > self._current:
+            self._peak = max(self._peak, (self._current_bits, self._current), key=lambda p: p[0])
+            self._current, self._current_bits = window, 0
+        self._current_bits += bits  # what comes late counts now: recordings may be a little out of order
+        while since_s / self._bin_s >= WINDOWS_MAX:
+            self._merge_bins()
+        tallies = self._bins.setdefault(int(since_s / self._bin_s), [0] * (len(TrafficClass) + 1))
+        tallies[0] += kind is not TrafficClass.ERROR
+        tallies[_COLUMN[kind]] += bits
+
+    def _merge_bins(self) -> None:
+        """Make windows twice as long."""
+        old, self._bins = self._bins, {}
+        self._bin_s *= 2
+        for number, tallies in old.items():
+            into = self._bins.setdefault(number // 2, [0] * len(tallies))
+            into[:] = [a + b for a, b in zip(into, tallies, strict=True)]
+
+    def _windows(self, duration_s: float) -> tuple[Window, ...]:
+        found = []
+        while duration_s / self._bin_s > WINDOWS_MAX:
+            self._merge_bins()
+        last = min(WINDOWS_MAX, max(math.ceil(duration_s / self._bin_s), max(self._bins, default=-1) + 1))
+        for number in range(last):
+            start_s = number * self._bin_s
+            length_s = min(self._bin_s, duration_s - start_s)
+            tallies = self._bins.get(number, [0] * (len(TrafficClass) + 1))
+            # A last frame just behind the border must not look like a busy bus.
+            of_bits = max(length_s, self._bin_s / 10) * self.bitrate
+            bits = {kind: tallies[column] for kind, column in _COLUMN.items() if tallies[column]}
+            found.append(Window(start_s, length_s, tallies[0], bits, sum(bits.values()) / of_bits))
+        return tuple(found)
+
+
+_COLUMN: Final = {kind: column for column, kind in enumerate(TrafficClass, 1)}

@@ -1,0 +1,110 @@
+"""What Linux knows of a CAN interface: read by ``ip -details -statistics -json link show``."""
+
+import json
+import subprocess
+from collections.abc import Mapping
+from typing import Any, Final
+
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
+
+_TIMEOUT_S: Final = 5.0
+DRIVER_CAN, DRIVER_VCAN = "can", "vcan"
+
+
+class NoInterface(CanductorError):  # noqa: N818 (it says what is the case)
+    """There is no such interface."""
+
+
+@record(kw_only=True)
+class LinkFacts:
+    """An interface. None: the kernel does not say; a vcan has no bit rate, no errors and no state."""
+
+    name: str
+    kind: str
+    """As Linux calls it: can, vcan, vxcan; slcan and others are "can" too. Empty: no CAN at all."""
+    up: bool
+    txqueuelen: int | None = None
+    bitrate: int | None = None
+    driver: str = ""
+    """Of the timing table, which is the controller's: gs_usb, mcp251xfd, …"""
+    state: str | None = None
+    """ERROR-ACTIVE, ERROR-WARNING, ERROR-PASSIVE, BUS-OFF, STOPPED."""
+    restart_ms: int | None = None
+    tx_errors: int | None = None
+    """The controller's error counters now, 0..255 and beyond."""
+    rx_errors: int | None = None
+    modes: tuple[str, ...] = ()
+    """LISTEN-ONLY, ONE-SHOT, LOOPBACK, BERR-REPORTING, FD, …"""
+    bus_errors: int = 0
+    """From here on: counted since the interface was made."""
+    passives: int = 0
+    bus_offs: int = 0
+    restarts: int = 0
+    rx_dropped: int = 0
+    """Frames received that nobody could be given."""
+    rx_overruns: int = 0
+    """Frames that the adapter had no room for."""
+    tx_dropped: int = 0
+
+
+def parse_link(text: str) -> LinkFacts:
+    """Read ip's answer about one interface; raises CanductorError when it makes no sense."""
+    try:
+        links = json.loads(text)
+        link = next(entry for entry in links if entry)
+        return _read(link)
+    except (ValueError, StopIteration, KeyError, TypeError, AttributeError) as error:
+        raise CanductorError(
+            f"'ip -json link show' said something this tool cannot read ({type(error).__name__}); is iproute2"
+            " older than 4.14?"
+        ) from None
+
+
+def _read(link: Mapping[str, Any]) -> LinkFacts:
+    info = link.get("linkinfo", {})
+    data = info.get("info_data", {})
+    counted = info.get("info_xstats", {})
+    stats = link.get("stats64", link.get("stats", {}))
+    errors = data.get("berr_counter", {})
+    is_can = link.get("link_type") == "can"
+    return LinkFacts(
+        name=link["ifname"],
+        kind=info.get("info_kind", DRIVER_CAN if is_can else "") if is_can else "",
+        up="UP" in link.get("flags", ()),
+        txqueuelen=link.get("txqlen"),
+        bitrate=data.get("bittiming", {}).get("bitrate"),
+        driver=data.get("bittiming_const", {}).get("name", ""),
+        state=data.get("state"),
+        # Zero is the default, which ip leaves out in some versions.
+        restart_ms=data.get("restart_ms", 0) if data else None,
+        tx_errors=errors.get("tx"),
+        rx_errors=errors.get("rx"),
+        modes=tuple(data.get("ctrlmode", ())),
+        bus_errors=counted.get("bus_error", 0),
+        passives=counted.get("error_passive", 0),
+        bus_offs=counted.get("bus_off", 0),
+        restarts=counted.get("restarts", 0),
+        rx_dropped=stats.get("rx", {}).get("dropped", 0),
+        rx_overruns=stats.get("rx", {}).get("over_errors", 0),
+        tx_dropped=stats.get("tx", {}).get("dropped", 0),
+    )
+
+
+def read_link(interface: str) -> LinkFacts:
+    """Ask the kernel; raises NoInterface, or CanductorError when ip is not there or does not answer."""
+    words = ["ip", "-details", "-statistics", "-json", "link", "show", "dev", interface]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+    except FileNotFoundError:
+        raise CanductorError("the command 'ip' is missing; install the package iproute2") from None
+    except subprocess.TimeoutExpired:
+        raise CanductorError(f"'{' '.join(words)}' does not answer") from None
+    if done.returncode:
+        said = " ".join(done.stderr.split())
+        if "does not exist" in said or "Cannot find device" in said or "not found" in said:
+            raise NoInterface(
+                f"there is no interface {interface}; 'ip -details link show type can' lists those there are"
+            )
+        raise CanductorError(f"'{' '.join(words)}' failed: {said}")
+    return parse_link(done.stdout)

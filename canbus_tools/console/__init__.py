@@ -1,0 +1,1 @@
+"""The console: parser, session, prompt."""

@@ -1,0 +1,1 @@
+"""Which nodes are on a bus, found by asking or by listening."""

@@ -1,0 +1,93 @@
+"""What a coordinator that runs on this computer says of the nodes that it drives, asked over its socket.
+
+Its interface is specified in docs/ipc.md; this uses the form that is made for scripts: lines of JSON.
+"""
+
+import asyncio
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from canbus_tools.discovery.node_info import Facts, Firmware
+from canbus_tools.bus.open_bus import BusOptions
+from nodes.bus.assign import AssignError, Uuid
+from nodes.support.errors import CanductorError
+from nodes.support.host_sockets import host_sockets
+
+TIMEOUT_S: Final = 1.0
+LINE_MAX: Final = 1 << 20
+_REQUESTS: Final = (
+    {"id": 1, "method": "api.hello", "params": {"version": 1, "client": "canductor can", "scope": "watch"}},
+    {"id": 2, "method": "nodes.list"},
+)
+
+
+async def ask_hosts(options: BusOptions, timeout_s: float = TIMEOUT_S) -> dict[int, Facts]:
+    """Return what this user's coordinators say of their nodes on a bus, by id; nothing where none runs.
+
+    One that says nothing is waited for TIMEOUT_S.
+    """
+    answers = await asyncio.gather(*(_ask(path, timeout_s) for path in host_sockets()))
+    bus = _bus_name(options)
+    told: dict[int, Facts] = {}
+    for node in (node for nodes in answers for node in nodes if isinstance(node, Mapping)):
+        nodeid = node.get("nodeid")
+        if node.get("bus") == bus and isinstance(nodeid, int):
+            told[nodeid] = _facts(node)
+    return told
+
+
+def _bus_name(options: BusOptions) -> str:
+    """Return how a coordinator's configuration calls the bus."""
+    if options.interface == "socketcan":
+        return options.channel
+    interface = "virtual" if options.interface == "canductor" else options.interface
+    return f"{interface}:{options.channel}"
+
+
+async def _ask(path: Path, timeout_s: float) -> list[object]:
+    """Return the nodes that the coordinator at PATH lists; none when there is no sense to be had from it."""
+    try:
+        async with asyncio.timeout(timeout_s):
+            reader, writer = await asyncio.open_unix_connection(path, limit=LINE_MAX)
+            try:
+                writer.write(b"".join(json.dumps(request).encode() + b"\n" for request in _REQUESTS))
+                while line := await reader.readline():
+                    answer = json.loads(line)
+                    if answer.get("id") == _REQUESTS[-1]["id"]:
+                        return list(answer["result"]["nodes"])
+            finally:
+                writer.close()
+    # A socket that nobody serves any more, or a program that speaks otherwise: then nobody is there to ask.
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return []
+    return []
+
+
+def _facts(node: Mapping[str, object]) -> Facts:
+    uuid, clock_hz, nodeid = node.get("uuid"), node.get("clock_freq_hz"), node.get("nodeid")
+    try:
+        known = Uuid.parse(uuid) if isinstance(uuid, str) else None
+    except (AssignError, CanductorError):
+        known = None
+    state = node.get("state")
+    return Facts(
+        firmware=Firmware(
+            mcu=_text(node, "mcu"),
+            version=_text(node, "firmware_version"),
+            app=_text(node, "firmware"),
+            build="",
+            clock_hz=clock_hz if isinstance(clock_hz, int) else None,
+            bitrate=None,
+        ),
+        uuid=known,
+        believed_nodeid=nodeid if isinstance(nodeid, int) else None,
+        configured=state == "ready",
+        shut_down=state == "shutdown",
+    )
+
+
+def _text(node: Mapping[str, object], name: str) -> str:
+    value = node.get(name)
+    return value if isinstance(value, str) else ""

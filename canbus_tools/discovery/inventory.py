@@ -1,0 +1,284 @@
+"""Everything alive on a bus, with an id or without, and what it is.
+
+First only listened: ids to which another host sends something belong to that host, and nothing is sent there.
+The nodes on all other ids are found by a damaged block: by the protocol a node answers one with its number of
+the next block, executes nothing and changes nothing. Those that answer are asked who they are.
+"""
+
+import asyncio
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
+from enum import Enum
+from typing import Final
+
+from canbus_tools.discovery.ask_host import ask_hosts
+from canbus_tools.discovery.node_discovery import ROUNDS, Application, CensusResult, NodeHere, WaitingNode
+from canbus_tools.discovery.ask_bus import take_census
+from canbus_tools.discovery.node_info import Facts, interview
+from canbus_tools.bus.open_bus import BusOptions
+from canbus_tools.discovery.passive_discovery import Overhearing
+from canbus_tools.bus.talk import DATA_IDS, LISTEN_S, BusTalk, data_ids
+from nodes.bus.assign import FIRST_NODEID, Uuid
+from nodes.support.errors import CanductorError
+from nodes.link import Frame
+from nodes.support.records import record
+
+PROBED: Final = range(FIRST_NODEID, 68)
+"""Hosts hand out 4, 5, 6, …; ids beyond are tried when something was heard from them, or when asked for."""
+DAMAGED_BLOCK: Final = b"\x05\x10\x00\x00\x7e\x7e"
+"""An empty block with a wrong checksum; the second sync byte ends it for parsers that look for one behind."""
+PROBE_PASSES: Final = 3
+"""Frames get lost; of nodes that a census does not know one answer is all there is."""
+PROBES_AT_ONCE: Final = 4
+PROBE_PAUSE_S: Final = 0.002
+"""Between so many: a fifth of the bus at 1 Mbit/s, all of it for 40 ms at 250 kbit/s."""
+PROBE_ANSWER_S: Final = 0.03
+"""For the last answers; adapters on USB may hold frames back for 16 ms."""
+INTERVIEWS_AT_ONCE: Final = 8
+HEAR_OUT_S: Final = 0.1
+HEAR_OUT_TIMES: Final = 22
+"""At most so often: a host that asks for clocks every 0.98 s has asked three times since the beginning."""
+
+
+class State(Enum):
+    """What a node is doing, as far as can be told."""
+
+    WAITING = "waiting"
+    BOOTLOADER = "bootloader"
+    IN_USE = "in use"
+    """Another host talks to it, so it was not asked."""
+    IDLE = "idle"
+    """It has an id and no configuration."""
+    CONFIGURED = "configured"
+    """It has a configuration, and no host that talks to it."""
+    SHUTDOWN = "shutdown"
+    UNCLEAR = "unclear"
+    """``trouble`` says why."""
+
+
+@record(kw_only=True)
+class Entry:
+    """One node."""
+
+    nodeid: int | None
+    uuid: Uuid | None
+    application: Application
+    state: State
+    facts: Facts | None = None
+    twins: bool = False
+    """Another board has the same uuid."""
+    told: Facts | None = None
+    """Of a node in use: what the coordinator says that drives it."""
+    overheard: Facts | None = None
+    """Of a node in use: what its traffic tells by a dictionary of the cache that explains it."""
+    trouble: str = ""
+
+
+@record
+class SurveyResult:
+    """All nodes that were found: by id, then those that wait."""
+
+    entries: tuple[Entry, ...]
+    census: CensusResult
+    probed: tuple[int, ...]
+    """Ids to which a damaged block was sent."""
+
+    @property
+    def boards(self) -> int:
+        """How many there are at least: twins that answer alike are one entry."""
+        rows = Counter(entry.uuid for entry in self.entries)
+        return len(self.entries) + sum(entry.twins and rows[entry.uuid] == 1 for entry in self.entries)
+
+    def by_uuid(self, uuid: Uuid) -> list[Entry]:
+        """Return the nodes that have a uuid."""
+        return [entry for entry in self.entries if entry.uuid == uuid]
+
+    def by_nodeid(self, nodeid: int) -> list[Entry]:
+        """Return the nodes that have an id."""
+        return [entry for entry in self.entries if entry.nodeid == nodeid]
+
+
+async def survey(
+    bus: BusTalk, *, probed: Iterable[int] = PROBED, listen_s: float = LISTEN_S, rounds: int = ROUNDS
+) -> SurveyResult:
+    """Find all nodes on BUS, after listening for LISTEN_S; raises CanductorError when the bus fails."""
+    started_s = asyncio.get_running_loop().time()
+    census = await take_census(bus, rounds)
+    await bus.wait(max(0.0, started_s + listen_s - asyncio.get_running_loop().time()))
+    here = {node.nodeid for node in census.here}
+    candidates = tuple(sorted({*probed, *here, *bus.talking} - bus.hosted))
+    answering = await probe(bus, candidates)
+    hosted = frozenset(bus.hosted)
+    shared = _shared_ids(census)
+    # Who said that it is here is asked even when no probe was answered: an interview asks again and again.
+    asked = sorted((answering | here) - hosted - shared)
+    facts = dict(zip(asked, await _interview_all(bus, asked), strict=True))
+    silent = {n for n in here - answering if isinstance(facts.get(n), CanductorError)}
+    entries = [_assigned(n, facts[n], census, silent=n in silent) for n in asked]
+    entries += [_not_asked(node, shared) for node in census.here if node.nodeid not in facts]
+    entries += [_hosted(nodeid, answers=nodeid in bus.talking) for nodeid in sorted(hosted - here)]
+    entries.sort(key=lambda entry: (entry.nodeid or 0, entry.uuid.raw if entry.uuid else b""))
+    entries += [_waiting(node) for node in await _still_waiting(bus, census, {e.uuid for e in entries})]
+    return SurveyResult(_mark_twins(entries), census, candidates)
+
+
+async def survey_all(
+    bus: BusTalk, options: BusOptions, *, probed: Iterable[int], listen_s: float
+) -> SurveyResult:
+    """Find all nodes as ``survey`` does, and of nodes in use what their host or else their traffic tells."""
+    overhearing = Overhearing(bus.cache)
+    end = bus.on_frame(overhearing.frame)
+    try:
+        found = await survey(bus, probed=probed, listen_s=listen_s)
+        told = await ask_hosts(options)
+        await _hear_out(bus, frozenset(bus.hosted - told.keys()), overhearing)
+    finally:
+        end()
+    entries = [_in_use(entry, told, overhearing) for entry in found.entries]
+    return replace(found, entries=_mark_twins(entries))
+
+
+async def _hear_out(bus: BusTalk, hosted: Iterable[int], overhearing: Overhearing) -> None:
+    """Wait for a node's second word about its clock where that may tell what it is."""
+    for _ in range(HEAR_OUT_TIMES):
+        if not any(overhearing.is_open(nodeid) for nodeid in hosted):
+            return
+        await bus.wait(HEAR_OUT_S)
+
+
+def _in_use(entry: Entry, told: Mapping[int, Facts], overhearing: Overhearing) -> Entry:
+    if entry.state is not State.IN_USE or entry.nodeid is None:
+        return entry
+    if said := told.get(entry.nodeid):
+        return replace(entry, told=said, uuid=entry.uuid or said.uuid)
+    facts = overhearing.facts(entry.nodeid)
+    uuid = entry.uuid or (facts.uuid if facts else None)
+    return replace(entry, overheard=facts, uuid=uuid)
+
+
+async def _still_waiting(
+    bus: BusTalk, census: CensusResult, with_id: Collection[Uuid | None]
+) -> Iterable[WaitingNode]:
+    """Return who waits; of a uuid that was found with an id as well, only when it still does: a second board.
+
+    Else another host gave the board its id meanwhile.
+    """
+    if not any(node.uuid in with_id for node in census.waiting):
+        return census.waiting
+    now = {node.uuid for node in (await take_census(bus)).waiting}
+    return [node for node in census.waiting if node.uuid not in with_id or node.uuid in now]
+
+
+async def probe(bus: BusTalk, nodeids: Iterable[int]) -> set[int]:
+    """Send a damaged block to each of NODEIDS to whom no other host talks; return those that answered."""
+    wanted = set(nodeids)
+    answered: set[int] = set()
+
+    def came(frame: Frame) -> None:
+        if frame.can_id in DATA_IDS and frame.can_id % 2:
+            answered.add((frame.can_id - 0x101) // 2)
+
+    end = bus.on_frame(came)
+    try:
+        for _ in range(PROBE_PASSES):
+            for number, nodeid in enumerate(sorted(wanted - answered)):
+                if number % PROBES_AT_ONCE == 0:
+                    await bus.wait(PROBE_PAUSE_S)
+                if nodeid not in bus.hosted:
+                    bus.send_frame(data_ids(nodeid)[0], DAMAGED_BLOCK)
+            await bus.wait(PROBE_ANSWER_S)
+    finally:
+        end()
+    return answered & wanted
+
+
+async def _interview_all(bus: BusTalk, nodeids: list[int]) -> list[Facts | CanductorError]:
+    """Ask them all, a few at a time, beside a host one at a time; what went wrong with one is its result."""
+    room = asyncio.Semaphore(1 if bus.hosted else INTERVIEWS_AT_ONCE)
+
+    async def one(nodeid: int) -> Facts | CanductorError:
+        async with room:
+            try:
+                return await interview(bus, nodeid)
+            except CanductorError as error:
+                return error
+
+    return list(await asyncio.gather(*(one(nodeid) for nodeid in nodeids)))
+
+
+# --------------------------------------------------------------------------------------------------- entries
+
+
+def _shared_ids(census: CensusResult) -> frozenset[int]:
+    """Return the ids that more than one board has: their answers would be a mixture."""
+    boards = Counter(node.nodeid for node in census.here)
+    twins = {node.nodeid for node in census.here if node.twins}
+    return frozenset(twins | {nodeid for nodeid, count in boards.items() if count > 1})
+
+
+def _assigned(nodeid: int, said: Facts | CanductorError, census: CensusResult, *, silent: bool) -> Entry:
+    ours = next((node for node in census.here if node.nodeid == nodeid), None)
+    application = Application.CANDUCTOR if ours else Application.KLIPPER
+    if isinstance(said, CanductorError):
+        uuid = ours.uuid if ours else None
+        trouble = "it says that it is here, but does not answer on its id" if silent else str(said)
+        return Entry(nodeid=nodeid, uuid=uuid, application=application, state=State.UNCLEAR, trouble=trouble)
+    uuid = said.uuid or (ours.uuid if ours else None)
+    trouble = "" if said.configured is not None else "its firmware does not tell whether it is configured"
+    if said.believed_nodeid not in (None, nodeid):
+        trouble = f"it answers on id {nodeid}, but says that it has id {said.believed_nodeid}"
+    elif ours and uuid != ours.uuid:
+        trouble = (
+            f"two boards answer on this id: {ours.uuid} and {uuid}; power both off, and let one host assign"
+        )
+    return Entry(
+        nodeid=nodeid, uuid=uuid, application=application, state=_state(said), facts=said, trouble=trouble
+    )
+
+
+def _state(facts: Facts) -> State:
+    if facts.shut_down:
+        return State.SHUTDOWN
+    if facts.configured is None:
+        return State.UNCLEAR
+    return State.CONFIGURED if facts.configured else State.IDLE
+
+
+def _not_asked(node: NodeHere, shared: frozenset[int]) -> Entry:
+    """Our firmware that said that it is here, and has a host or shares its id."""
+    both = "more than one board has this id; switch them off and on, and let only one host assign ids"
+    is_shared = node.nodeid in shared
+    return Entry(
+        nodeid=node.nodeid,
+        uuid=node.uuid,
+        application=Application.CANDUCTOR,
+        state=State.UNCLEAR if is_shared else State.IN_USE,
+        twins=node.twins,
+        trouble=both if is_shared else "",
+    )
+
+
+def _hosted(nodeid: int, *, answers: bool) -> Entry:
+    """Return what is known of a node by its traffic alone. A host that could be asked would know more."""
+    silent = "another program sends to this id, and nobody answers"
+    return Entry(
+        nodeid=nodeid,
+        uuid=None,
+        application=Application.KLIPPER if answers else Application.UNKNOWN,
+        state=State.IN_USE if answers else State.UNCLEAR,
+        trouble="" if answers else silent,
+    )
+
+
+def _waiting(node: WaitingNode) -> Entry:
+    state = State.BOOTLOADER if node.application is Application.KATAPULT else State.WAITING
+    return Entry(nodeid=None, uuid=node.uuid, application=node.application, state=state, twins=node.twins)
+
+
+def _mark_twins(entries: list[Entry]) -> tuple[Entry, ...]:
+    boards = Counter(entry.uuid for entry in entries if entry.uuid is not None)
+    return tuple(
+        replace(entry, twins=entry.twins or (entry.uuid is not None and boards[entry.uuid] > 1))
+        for entry in entries
+    )

@@ -1,0 +1,167 @@
+"""What one node says about itself, asked in its own words as far as its firmware knows the questions."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final, TypeVar
+
+from canbus_tools.bus.talk import BusTalk, NodeTalk
+from nodes.bus.assign import UUID_SIZE, Uuid
+from nodes.dictionary.dictionary import Dictionary
+from nodes.dictionary.parts import DictionaryError
+from nodes.support.errors import CanductorError
+from nodes.dictionary.message_format import Message
+from nodes.support.records import record
+
+T = TypeVar("T")
+BUS_STATES: Final = "canbus_bus_state"
+_TICKS_PER_WORD: Final = 1 << 32
+_QUESTIONS: Final = (
+    ("get_canbus_id", "canbus_id"),
+    ("get_config", "config"),
+    ("get_uptime", "uptime"),
+    ("get_canbus_status", "canbus_status"),
+)
+
+
+@record(kw_only=True)
+class Firmware:
+    """What a dictionary says of a build."""
+
+    mcu: str
+    version: str
+    app: str
+    build: str
+    clock_hz: int | None
+    bitrate: int | None
+
+    @classmethod
+    def common(cls, dictionaries: Sequence[Dictionary]) -> "Firmware":
+        """Read what all of them say."""
+        builds = [cls.of(dictionary) for dictionary in dictionaries]
+        return cls(
+            mcu=_same([build.mcu for build in builds]) or "",
+            version=_same([build.version for build in builds]) or "",
+            app=_same([build.app for build in builds]) or "",
+            build=_same([build.build for build in builds]) or "",
+            clock_hz=_same([build.clock_hz for build in builds]),
+            bitrate=_same([build.bitrate for build in builds]),
+        )
+
+    @classmethod
+    def of(cls, dictionary: Dictionary) -> "Firmware":
+        """Read what is there; what is missing or no sense is empty or None."""
+        return cls(
+            mcu=_text(dictionary, "MCU"),
+            version=dictionary.version,
+            app=dictionary.app,
+            build=dictionary.build_versions,
+            clock_hz=_number(dictionary, "CLOCK_FREQ"),
+            bitrate=_number(dictionary, "CANBUS_FREQUENCY"),
+        )
+
+
+@record(kw_only=True)
+class CanStatus:
+    """The node's own counters of its CAN controller."""
+
+    rx_errors: int
+    tx_errors: int
+    tx_retries: int
+    state: str
+    """active, warn, passive or off."""
+
+
+@record(kw_only=True)
+class Facts:
+    """What a node said. None: its firmware does not know the question."""
+
+    firmware: Firmware
+    uuid: Uuid | None = None
+    believed_nodeid: int | None = None
+    """The id that it says it has."""
+    uptime_s: float | None = None
+    configured: bool | None = None
+    shut_down: bool | None = None
+    can: CanStatus | None = None
+
+
+async def interview(bus: BusTalk, nodeid: int) -> Facts:
+    """Ask node NODEID, to whom nobody else talks; raises CanductorError."""
+    async with bus.node(nodeid) as talk:
+        said = [await _said(talk, command, response) for command, response in _QUESTIONS]
+        return facts_of((talk.dictionary,), {message.name: message for message in said if message})
+
+
+def facts_of(alike: Sequence[Dictionary], said: Mapping[str, Message]) -> Facts:
+    """Return what a node SAID, by name; of several dictionaries that it may have what all of them say."""
+    firmware = Firmware.common(alike)
+    board, config = said.get("canbus_id"), said.get("config")
+    return Facts(
+        firmware=firmware,
+        uuid=_uuid(board),
+        believed_nodeid=_integer(board, "canbus_nodeid"),
+        uptime_s=_uptime_s(said.get("uptime"), firmware.clock_hz),
+        configured=_flag(config, "is_config"),
+        shut_down=_flag(config, "is_shutdown"),
+        can=_status(said.get("canbus_status"), alike[0]),
+    )
+
+
+async def _said(talk: NodeTalk, command: str, response: str) -> Message | None:
+    """Return the answer; None when the firmware lacks the question, or puts it otherwise than we know it."""
+    if not talk.knows(command, response) or talk.dictionary.commands[command].names:
+        return None
+    return (await talk.ask(command, response)).message
+
+
+def _same(values: Sequence[T]) -> T | None:
+    return values[0] if all(value == values[0] for value in values) else None
+
+
+def _text(dictionary: Dictionary, constant: str) -> str:
+    try:
+        return dictionary.str_constant(constant, "")
+    except DictionaryError:
+        return ""
+
+
+def _number(dictionary: Dictionary, constant: str) -> int | None:
+    try:
+        value = dictionary.int_constant(constant)
+    except CanductorError:
+        return None
+    return value if value > 0 else None
+
+
+def _integer(message: Message | None, param: str) -> int | None:
+    value = message.params.get(param) if message is not None else None
+    return value if isinstance(value, int) else None
+
+
+def _flag(message: Message | None, param: str) -> bool | None:
+    value = _integer(message, param)
+    return None if value is None else bool(value)
+
+
+def _uuid(message: Message | None) -> Uuid | None:
+    value = message.params.get("canbus_uuid") if message is not None else None
+    return Uuid(value) if isinstance(value, bytes) and len(value) == UUID_SIZE else None
+
+
+def _uptime_s(message: Message | None, clock_hz: int | None) -> float | None:
+    high, clock = _integer(message, "high"), _integer(message, "clock")
+    if high is None or clock is None or clock_hz is None:
+        return None
+    return (high * _TICKS_PER_WORD + clock % _TICKS_PER_WORD) / clock_hz
+
+
+def _status(message: Message | None, dictionary: Dictionary) -> CanStatus | None:
+    numbers = [_integer(message, name) for name in ("rx_error", "tx_error", "tx_retries", BUS_STATES)]
+    rx_errors, tx_errors, tx_retries, state = numbers
+    if rx_errors is None or tx_errors is None or tx_retries is None or state is None:
+        return None
+    return CanStatus(
+        rx_errors=rx_errors,
+        tx_errors=tx_errors,
+        tx_retries=tx_retries,
+        state=dictionary.enum_name(BUS_STATES, state),
+    )

@@ -1,0 +1,48 @@
+"""What is known of nodes in use without asking them: their own words to their host, overheard.
+
+Hosts ask their nodes for clocks, and those on CAN for their error counters, about once a second.
+"""
+
+from typing import Final
+
+from canbus_tools.protocol.decoder import BusDecoder
+from canbus_tools.protocol.dictionaries import DictionarySource
+from canbus_tools.bus.frame import Frame as BusFrame
+from canbus_tools.discovery.node_info import Facts, facts_of
+from canbus_tools.protocol.protocol import Direction
+from nodes.dictionary.cache import DictionaryCache
+from nodes.link import Frame
+from nodes.dictionary.message_format import Message
+
+_ANSWERS: Final = {"canbus_id", "config", "uptime", "canbus_status"}
+ID_MAX: Final = 0x7FF
+
+
+class Overhearing:
+    """Listens along on one bus."""
+
+    def __init__(self, cache: DictionaryCache) -> None:
+        self._source = DictionarySource(cache=cache)
+        self._decoder = BusDecoder(self._source)
+        self._said: dict[int, dict[str, Message]] = {}
+
+    def frame(self, frame: Frame) -> None:
+        """Take a frame that other programs sent, or that answers them."""
+        if frame.can_id > ID_MAX:
+            return
+        for said in self._decoder.feed(BusFrame(frame.received_ns * 1e-9, frame.can_id, frame.data)):
+            if said.nodeid is not None and said.direction is Direction.FROM_NODE and said.name in _ANSWERS:
+                messages = self._said.setdefault(said.nodeid, {})
+                messages[said.name] = Message(said.name, dict(said.params))
+
+    def is_open(self, nodeid: int) -> bool:
+        """Tell whether listening on may make NODEID's dictionary known."""
+        return self._source.is_open(nodeid)
+
+    def facts(self, nodeid: int) -> Facts | None:
+        """Return what is known of a node; None: its dictionary is not."""
+        dictionary = self._source.known.get(nodeid)
+        if dictionary is None:
+            return None
+        alike = self._source.fitting.get(nodeid, (dictionary,))
+        return facts_of(alike, self._said.get(nodeid, {}))

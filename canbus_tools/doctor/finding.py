@@ -1,0 +1,44 @@
+"""One thing that the doctor has to say."""
+
+from enum import Enum
+
+from nodes.support.records import record
+
+
+class Severity(Enum):
+    """How bad it is."""
+
+    PROBLEM = "problem"
+    """It does not work, or will not for long."""
+    WARNING = "warning"
+    """It works, and will fail on a worse day."""
+    NOTE = "note"
+    """Good to know; no reason for a bad exit status."""
+
+
+@record(kw_only=True)
+class Finding:
+    """What was seen, what it means, what to do."""
+
+    name: str
+    """Short and fixed, for scripts: ``interface-down``."""
+    severity: Severity
+    seen: str
+    means: str
+    do: str
+    """With the command that does it, where there is one."""
+
+
+def problem(name: str, seen: str, means: str, do: str) -> Finding:
+    """Return a finding of that severity."""
+    return Finding(name=name, severity=Severity.PROBLEM, seen=seen, means=means, do=do)
+
+
+def warning(name: str, seen: str, means: str, do: str) -> Finding:
+    """Return a finding of that severity."""
+    return Finding(name=name, severity=Severity.WARNING, seen=seen, means=means, do=do)
+
+
+def note(name: str, seen: str, means: str, do: str) -> Finding:
+    """Return a finding of that severity."""
+    return Finding(name=name, severity=Severity.NOTE, seen=seen, means=means, do=do)

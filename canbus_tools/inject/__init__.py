@@ -1,0 +1,1 @@
+"""A virtual bus with faults, and socketcand clients on it."""

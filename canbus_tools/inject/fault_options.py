@@ -1,0 +1,193 @@
+"""Faults as users write them: ``--loss 1%,id=0x109``, ``--bus-off 2s,at=5,sender=toolhead``.
+
+The first word is what the fault is about (a share, or how long); KEY=VALUE pairs behind it say whom it hits
+and when.
+"""
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+from nodes.support.errors import CanductorError
+from nodes.support.option_values import UsageError, number, share, whole
+from nodes.virtual.faults import CLIENTS, ID_MAX, TIME_S_MAX, Fault, FaultKind
+
+_KINDS: Final = {
+    "loss": (
+        FaultKind.LOSE,
+        "SHARE",
+        "frames reach nobody, or not the receiver, and the sender believes they did",
+    ),
+    "corrupt": (FaultKind.CORRUPT, "SHARE", "receivers get frames with one bit of their data changed"),
+    "duplicate": (FaultKind.DUPLICATE, "SHARE", "frames come twice, as when an acknowledgement is lost"),
+    "error": (FaultKind.ERROR, "SHARE", "frames are destroyed by an error frame and sent again"),
+    "delay": (FaultKind.DELAY, "TIME", "frames come later, the order of each sender's kept"),
+    "bus-off": (FaultKind.BUS_OFF, "TIME", "a client is off the bus for so long: at a time, or by share"),
+}
+UNITS_S: Final = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0}
+EXPLAINED: Final = """faults:
+  Each may be given several times, up to 32 in all. SHARE is a share or percentage of the frames that the
+  fault picks (0.01, 1%), TIME a number with its unit (300us, 5ms, 2s; without one: seconds). Behind it may
+  come, separated by commas:
+    id=ID[/MASK]   picks frames with this id; with a mask only its bits count (id=0x101/0x701: all from nodes)
+    sender=CLIENT  picks frames of one client: a node started here by its name, or a number: clients count
+                   from 0 in the order in which they connect, nodes started here come first
+    receiver=CLIENT  only this client is hit (loss, corrupt)
+    frame=N        instead of a share: hits of each sender the N-th frame picked
+    from=S until=S   picks frames in this time, in seconds since the bus was ready
+    share=SHARE    delay, bus-off: of the frames picked (a delay hits all, if not given)
+    jitter=TIME    delay: up to this much more, evenly spread
+    at=S           bus-off: at this time; sender= says who, else everybody
+  The same --seed hits the same frames of every sender."""
+
+
+def declare_faults(command: argparse.ArgumentParser) -> None:
+    """Add an option for every kind of fault."""
+    group = command.add_argument_group("faults (explained below)")
+    for name, (_, metavar, meaning) in _KINDS.items():
+        group.add_argument(f"--{name}", action="append", default=[], metavar=f"{metavar},…", help=meaning)
+    command.formatter_class = argparse.RawDescriptionHelpFormatter
+    command.epilog = EXPLAINED
+
+
+def read_faults(given: argparse.Namespace, names: Mapping[str, int]) -> list[tuple[str, Fault]]:
+    """Return the faults with the words that asked for them; NAMES: places of clients. Raises UsageError."""
+    return [
+        (f"{name} {text}", read_fault(name, text, names))
+        for name in _KINDS
+        for text in getattr(given, name.replace("-", "_"))
+    ]
+
+
+def read_fault(name: str, text: str, names: Mapping[str, int]) -> Fault:
+    """Read what stands behind --NAME; raises UsageError."""
+    option = f"--{name}"
+    first, *rest = text.split(",")
+    if "=" in first:
+        first, rest = "", [first, *rest]
+    reader = _Reader(option, names)
+    for pair in rest:
+        key, equals, value = pair.partition("=")
+        if not equals or key not in _KEYS:
+            raise UsageError(f"{option} has '{pair}', must be one of {', '.join(f'{k}=' for k in _KEYS)}")
+        if key in reader.fields:
+            raise UsageError(f"{option} has {key}= twice")
+        reader.fields[key] = _KEYS[key](reader, value)
+    return reader.fault(_KINDS[name][0], first)
+
+
+class _Reader:
+    """Collects the parts of one fault."""
+
+    def __init__(self, option: str, names: Mapping[str, int]) -> None:
+        self.option = option
+        self.fields: dict[str, Any] = {}
+        self._names = names
+
+    def fault(self, kind: FaultKind, first: str) -> Fault:
+        """Put the fault together."""
+        timed = kind in (FaultKind.DELAY, FaultKind.BUS_OFF)
+        self._check_keys(kind)
+        if not first and (timed or "frame" not in self.fields):
+            raise UsageError(
+                f"{self.option} needs {'a time' if timed else 'a share'} first, as in {_EXAMPLES[kind]}"
+            )
+        if timed:
+            self.fields["time"] = self.time(first)
+        elif first:
+            self.fields["share"] = self.share(first)
+        values = {_FIELDS[key]: value for key, value in self.fields.items() if key not in ("id", "at")}
+        can_id, mask = self.fields.get("id", (0, 0))
+        try:
+            fault = Fault(kind=kind, can_id=can_id, mask=mask, **values)
+            if "at" in self.fields:
+                fault = replace(fault, timed=True, from_s=self.fields["at"])
+        except CanductorError as error:
+            raise UsageError(f"{self.option}: {error}") from error
+        return fault
+
+    def _check_keys(self, kind: FaultKind) -> None:
+        only = {
+            "jitter": (FaultKind.DELAY,),
+            "at": (FaultKind.BUS_OFF,),
+            "share": (FaultKind.DELAY, FaultKind.BUS_OFF),
+        }
+        for key, kinds in only.items():
+            if key in self.fields and kind not in kinds:
+                raise UsageError(f"{self.option} has no {key}=")
+        if "at" in self.fields and self.fields.keys() - {"at", "sender"}:
+            raise UsageError(f"{self.option} with at= takes only sender= besides")
+        if kind is FaultKind.BUS_OFF and not self.fields.keys() & {"at", "share", "frame"}:
+            raise UsageError(f"{self.option} needs at=SECONDS, share= or frame= to know when")
+
+    def share(self, text: str) -> float:
+        return share(self.option, text, 1.0)
+
+    def seconds(self, text: str) -> float:
+        return number(self.option, text, 0, TIME_S_MAX, "s")
+
+    def time(self, text: str) -> float:
+        digits = text.rstrip("abcdefghijklmnopqrstuvwxyz")
+        unit = text[len(digits) :]
+        if unit not in UNITS_S:
+            raise UsageError(f"{self.option} is '{text}', must be a number with us, ms or s behind it")
+        return number(self.option, digits, 0, TIME_S_MAX, unit) * UNITS_S[unit]
+
+    def frame(self, text: str) -> int:
+        return whole(f"{self.option}'s frame", text, 1)
+
+    def place(self, text: str) -> int:
+        if text in self._names:
+            return self._names[text]
+        if not text.isdecimal() and self._names:
+            raise UsageError(
+                f"{self.option}: no node '{text}' is started here, only {', '.join(self._names)}"
+            )
+        return whole(f"{self.option}'s client", text, 0, CLIENTS - 1)
+
+    def id(self, text: str) -> tuple[int, int]:
+        can_id, slash, mask = text.partition("/")
+        return self._id(can_id), self._id(mask) if slash else ID_MAX
+
+    def _id(self, text: str) -> int:
+        try:
+            value = int(text, 0)
+        except ValueError:
+            value = -1
+        if not 0 <= value <= ID_MAX:
+            raise UsageError(
+                f"{self.option}'s id is '{text}', must be a number from 0 to 0x7ff such as 0x109"
+            )
+        return value
+
+
+_KEYS: Final[dict[str, Callable[[_Reader, str], Any]]] = {
+    "id": _Reader.id,
+    "sender": _Reader.place,
+    "receiver": _Reader.place,
+    "frame": _Reader.frame,
+    "from": _Reader.seconds,
+    "until": _Reader.seconds,
+    "share": _Reader.share,
+    "jitter": _Reader.time,
+    "at": _Reader.seconds,
+}
+_FIELDS: Final = {
+    "sender": "sender",
+    "receiver": "receiver",
+    "frame": "nth",
+    "from": "from_s",
+    "until": "until_s",
+    "share": "share",
+    "jitter": "jitter_s",
+    "time": "time_s",
+}
+_EXAMPLES: Final = {
+    FaultKind.LOSE: "--loss 1%,id=0x109",
+    FaultKind.CORRUPT: "--corrupt 1%",
+    FaultKind.DUPLICATE: "--duplicate 1%",
+    FaultKind.ERROR: "--error 1%",
+    FaultKind.DELAY: "--delay 5ms,jitter=2ms",
+    FaultKind.BUS_OFF: "--bus-off 2s,at=5,sender=0",
+}

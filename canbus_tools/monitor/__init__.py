@@ -1,0 +1,1 @@
+"""What the live monitor knows and shows."""

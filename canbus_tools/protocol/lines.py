@@ -1,0 +1,69 @@
+"""How the tools write what was said on a bus, and each node's counters, as plain text."""
+
+import math
+from collections.abc import Iterable
+from functools import lru_cache
+
+from canbus_tools.protocol.decoded import Decoded
+from canbus_tools.protocol.protocol import Direction
+from canbus_tools.protocol.traffic import NodeTraffic
+
+_ENDS = {Direction.TO_NODE: "to", Direction.FROM_NODE: "from", Direction.ANY: "from"}
+_NOBODY = {Direction.TO_NODE: "to all", Direction.FROM_NODE: "from ?", Direction.ANY: "-"}
+_WORDS = {
+    (nodeid, direction): (f"{word} {nodeid}" if nodeid is not None else _NOBODY[direction]).ljust(8)
+    for nodeid in (None, *range(256))
+    for direction, word in _ENDS.items()
+}
+
+
+def line_of(said: Decoded) -> str:
+    """Return time, bus, whom it goes to or comes from, and the text; without the line's end."""
+    time_s, channel, nodeid, direction, _, _, repeated, shape, values = said
+    again = "  (repeated)" if repeated else ""
+    return f"{time_s:.6f}  {printable(channel)}  {_WORDS[nodeid, direction]}  {shape.text(values)}{again}"
+
+
+@lru_cache(maxsize=256)
+def printable(name: str) -> str:
+    """Return a bus's name without what a terminal would obey: recordings come from anywhere."""
+    return "".join(c if c.isprintable() else "?" for c in name) or "-"
+
+
+_HEADINGS = ("node", "uuid", "mcu", "frames", "to", "from", "repeated", "missed", "naks", "invalid", "unread")
+
+
+def table_of(nodes: Iterable[NodeTraffic]) -> str:
+    """Return each node's counters as lines with a heading; to and from count messages."""
+    rows: list[tuple[str, ...]] = [(*_HEADINGS, "round trip (median, p99)")]
+    for node in nodes:
+        ways = (node.to_node, node.from_node)
+        cells = (
+            node.nodeid,
+            node.uuid or "-",
+            printable(node.mcu),
+            sum(way.frames for way in ways),
+            *(way.messages for way in ways),
+            node.flow.repeated_blocks,
+            node.flow.missed_blocks,
+            node.flow.naks,
+            sum(way.invalid_bytes for way in ways),
+            sum(way.unknown_messages for way in ways),
+            round_trip_text(node),
+        )
+        rows.append(tuple(map(str, cells)))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
+    )
+
+
+def round_trip_text(node: NodeTraffic) -> str:
+    """Return the median and the 99th percentile of a node's round trips."""
+    median_s, p99_s = (node.flow.round_trips.quantile_s(share) for share in (0.5, 0.99))
+    return "-" if math.isnan(median_s) else f"{milliseconds(median_s)}, {milliseconds(p99_s)}"
+
+
+def milliseconds(time_s: float) -> str:
+    """Return a time with three digits that count."""
+    return f"{time_s * 1e3:.3g} ms"

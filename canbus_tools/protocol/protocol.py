@@ -1,0 +1,290 @@
+"""What travels on the bus, described once: ids, admin and signal frames, message blocks.
+
+The decoder reads frames by these tables, and the Wireshark dissector is generated from them. Nothing here
+acts; the project's own nodes and hosts take the same numbers from ``nodes.bus.assign`` and ``firmware/wire``.
+"""
+
+from collections.abc import Mapping
+from dataclasses import field
+from enum import Enum
+from typing import Final
+
+from nodes.bus.assign import (
+    ADMIN_ID,
+    ADMIN_RESPONSE_ID,
+    NEED_NODEID,
+    NODE_IS_HERE,
+    QUERY_UNASSIGNED,
+    SET_NODEID,
+    SET_NODEID_BOOTLOADER,
+    UUID_SIZE,
+    WHO_IS_HERE,
+)
+from nodes.dictionary.message_format import CONTENT_MAX
+from nodes.support.records import record
+
+
+class Direction(Enum):
+    """Which way a frame goes."""
+
+    TO_NODE = "to"
+    FROM_NODE = "from"
+    ANY = "any"
+    """The host and every node may send it."""
+
+    __hash__ = object.__hash__  # Enum's own is a Python function, and runs thousands of times a second
+
+
+# -------------------------------------------------------------------------------------------------------- ids
+
+FIRST_DATA_ID: Final = 0x100
+DATA_NODEID_MAX: Final = 255
+TRIGGER_ID: Final = 0x020
+TRIGGER_GROUPS: Final = 16
+REQUEST_BOOTLOADER: Final = 0x02
+BUS_STOP_ID: Final = 0x010
+"""As in nodes.bus.can_bus; imported from there it would cost every tool that module's numpy at its start."""
+SYNC_PULSE: Final = 0x40
+"""As in nodes.clock.sync_pulse."""
+
+
+def data_id(nodeid: int, direction: Direction) -> int:
+    """Return the CAN id of the bytes to or from node NODEID (1..255)."""
+    return FIRST_DATA_ID + 2 * nodeid + (direction is Direction.FROM_NODE)
+
+
+def owner_of(can_id: int) -> tuple[int, Direction] | None:
+    """Return the node and the direction of a data id; None for other ids, also for those of nodeid 0."""
+    nodeid, odd = divmod(can_id - FIRST_DATA_ID, 2)
+    if not 1 <= nodeid <= DATA_NODEID_MAX:
+        return None
+    return nodeid, Direction.FROM_NODE if odd else Direction.TO_NODE
+
+
+# ----------------------------------------------------------------------------------------------------- frames
+
+
+class FieldKind(Enum):
+    """How the bytes of a field are to be read."""
+
+    UNSIGNED = "unsigned, little-endian"
+    HEX = "unsigned, little-endian, shown in hex"
+    UUID = "a board's bytes as they stand, shown as hex digits"
+
+
+@record(kw_only=True)
+class Field:
+    """One field of a frame."""
+
+    name: str
+    size: int
+    """Bytes."""
+    kind: FieldKind = FieldKind.UNSIGNED
+    sentence: str = ""
+    """What it means."""
+    values: Mapping[int, str] = field(default_factory=dict)
+    """Names of values, where it is an enumeration."""
+
+    def read(self, data: bytes, at: int) -> int | bytes:
+        """Return the value that stands at AT of DATA, which is long enough."""
+        raw = data[at : at + self.size]
+        return raw if self.kind is FieldKind.UUID else int.from_bytes(raw, "little")
+
+    def text(self, value: int | bytes) -> str:
+        """Return a value as users see it."""
+        if isinstance(value, bytes):
+            return value.hex()
+        digits = f"0x{value:02x}" if self.kind is FieldKind.HEX else str(value)
+        return self.values.get(value, digits)
+
+
+@record(kw_only=True)
+class FrameFormat:
+    """A frame that is a whole message by itself."""
+
+    name: str
+    direction: Direction
+    can_id: int
+    """The first id it has."""
+    ids: int = 1
+    """How many ids in a row it may have."""
+    command: int | None = None
+    """Its first byte, which tells it from others of the same id; None: the id alone tells."""
+    fields: tuple[Field, ...] = ()
+    """What follows, from the second byte on where there is a command, else from the first."""
+    extension: bool = False
+    """Only firmware of this project knows it; Klipper's ignores it."""
+    sentence: str = ""
+
+    @property
+    def size(self) -> int:
+        """Bytes of a whole frame; what may follow them means nothing."""
+        return self.fields_at + sum(f.size for f in self.fields)
+
+    @property
+    def fields_at(self) -> int:
+        """Where the first field stands."""
+        return 0 if self.command is None else 1
+
+
+_UUID: Final = Field(
+    name="uuid", size=UUID_SIZE, kind=FieldKind.UUID, sentence="the board's own number, from its chip's"
+)
+_NODEID: Final = Field(name="nodeid", size=1, sentence="the node's id; its data ids follow from it")
+_SET_COMMANDS: Final = {SET_NODEID: "application", SET_NODEID_BOOTLOADER: "bootloader"}
+
+ADMIN_FRAMES: Final = (
+    FrameFormat(
+        name="query_unassigned",
+        direction=Direction.TO_NODE,
+        can_id=ADMIN_ID,
+        command=QUERY_UNASSIGNED,
+        sentence="Who waits for an id? Nodes without one answer need_nodeid.",
+    ),
+    FrameFormat(
+        name="set_nodeid",
+        direction=Direction.TO_NODE,
+        can_id=ADMIN_ID,
+        command=SET_NODEID,
+        fields=(_UUID, _NODEID),
+        sentence="Gives a node that runs its application its id; another that has this id shuts down.",
+    ),
+    FrameFormat(
+        name="request_bootloader",
+        direction=Direction.TO_NODE,
+        can_id=ADMIN_ID,
+        command=REQUEST_BOOTLOADER,
+        fields=(_UUID,),
+        sentence="Tells a node to restart into its bootloader.",
+    ),
+    FrameFormat(
+        name="set_nodeid_bootloader",
+        direction=Direction.TO_NODE,
+        can_id=ADMIN_ID,
+        command=SET_NODEID_BOOTLOADER,
+        fields=(_UUID, _NODEID),
+        sentence="Gives a node that runs its bootloader (Katapult) its id.",
+    ),
+    FrameFormat(
+        name="sync_pulse",
+        direction=Direction.TO_NODE,
+        can_id=ADMIN_ID,
+        command=SYNC_PULSE,
+        fields=(Field(name="seq", size=1, sentence="number of the pulse, 1..255"),),
+        extension=True,
+        sentence="Every node latches its clock on reception, all within a bit time.",
+    ),
+    FrameFormat(
+        name="who_is_here",
+        direction=Direction.TO_NODE,
+        can_id=ADMIN_ID,
+        command=WHO_IS_HERE,
+        extension=True,
+        sentence="Which nodes have an id? They answer node_is_here.",
+    ),
+    FrameFormat(
+        name="need_nodeid",
+        direction=Direction.FROM_NODE,
+        can_id=ADMIN_RESPONSE_ID,
+        command=NEED_NODEID,
+        fields=(
+            _UUID,
+            Field(
+                name="set_command",
+                size=1,
+                kind=FieldKind.HEX,
+                values=_SET_COMMANDS,
+                sentence="the command that sets its id, which tells what runs on it",
+            ),
+        ),
+        sentence="This node waits for an id.",
+    ),
+    FrameFormat(
+        name="node_is_here",
+        direction=Direction.FROM_NODE,
+        can_id=ADMIN_RESPONSE_ID,
+        command=NODE_IS_HERE,
+        fields=(_UUID, _NODEID),
+        extension=True,
+        sentence="This node has an id.",
+    ),
+)
+"""Frames that give out node ids and synchronise clocks; told apart by their id and first byte."""
+
+SIGNAL_FRAMES: Final = (
+    FrameFormat(
+        name="bus_stop",
+        direction=Direction.ANY,
+        can_id=BUS_STOP_ID,
+        fields=(
+            Field(
+                name="reason",
+                size=1,
+                sentence="number of the reason in the origin's enumeration static_string_id; 0: none given",
+            ),
+            Field(name="origin", size=1, sentence="node id of the sender", values={0: "host"}),
+        ),
+        extension=True,
+        sentence="Emergency stop of the whole bus: receivers shut down from the receive interrupt.",
+    ),
+    FrameFormat(
+        name="trigger",
+        direction=Direction.FROM_NODE,
+        can_id=TRIGGER_ID,
+        ids=TRIGGER_GROUPS,
+        fields=(
+            Field(name="group", size=1, sentence="the stop group, also the id less 0x020"),
+            Field(name="reason", size=1, sentence="what trsync_state reports as trigger_reason"),
+            Field(name="clock", size=4, sentence="clock of the sender when it triggered"),
+        ),
+        extension=True,
+        sentence="A trsync triggered: every node whose trsync joined the group stops at once.",
+    ),
+)
+"""Frames from node to node with ids that win against all data."""
+
+
+def frame_format(can_id: int, data: bytes) -> FrameFormat | None:
+    """Return the format of an admin or signal frame that is whole; None when it is none."""
+    first = data[0] if data else None
+    for known in _BY_ID.get(can_id, ()):
+        if known.command in (None, first) and len(data) >= known.size:
+            return known
+    return None
+
+
+_BY_ID: Final[dict[int, list[FrameFormat]]] = {}
+for _frame in (*ADMIN_FRAMES, *SIGNAL_FRAMES):
+    for _id in range(_frame.can_id, _frame.can_id + _frame.ids):
+        _BY_ID.setdefault(_id, []).append(_frame)
+
+
+# ----------------------------------------------------------------------------------------------------- blocks
+
+
+@record(kw_only=True)
+class BlockFormat:
+    """A message block: ``<length> <sequence> <content> <crc high> <crc low> <sync>``.
+
+    The payloads of the frames with one data id make one stream of bytes; a block may begin and end anywhere
+    in a frame. To a node a block carries commands, from it one response; an empty one acknowledges.
+    """
+
+    length_min: int = 5
+    """Of the whole block; its first byte."""
+    length_max: int = CONTENT_MAX + 5
+    sequence_mark: int = 0x10
+    """The high half of the second byte."""
+    sequence_mask: int = 0x0F
+    """The low half: to a node the block's number modulo 16, from a node the number it expects next."""
+    content_at: int = 2
+    crc_before_end: int = 3
+    """The checksum's high byte stands that far from the end."""
+    crc_polynomial: int = 0x8408
+    """CRC-16/MCRF4XX, least significant bit first: 0x1021 reflected."""
+    crc_start: int = 0xFFFF
+    sync: int = 0x7E
+    """The last byte. Further ones between blocks mean nothing."""
+
+
+BLOCK: Final = BlockFormat()

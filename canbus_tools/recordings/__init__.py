@@ -1,0 +1,1 @@
+"""Recordings of CAN buses: candump, pcap, MCAP."""

@@ -1,0 +1,131 @@
+"""Reading recordings of CAN buses, whoever made them.
+
+What was readable of a broken or truncated file is yielded; then one CanductorError tells where it breaks.
+"""
+
+import sys
+from collections.abc import Callable, Iterator
+from io import BufferedReader, TextIOWrapper
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import can
+
+from canbus_tools.recordings import mcap_file, pcap
+from canbus_tools.recordings.candump import read_candump
+from canbus_tools.bus.frame import Frame
+from nodes.support.errors import CanductorError
+from nodes.support.option_values import existing_file
+
+STANDARD_INPUT: Final = Path("-")
+BATCH: Final = 512
+_BLF_MAGIC: Final = b"LOGG"
+_ASC_BEGINNINGS: Final = (b"date ", b"base ", b"// ", b"begin ", b"internal ")
+_MAGIC_SIZE: Final = 16
+_TIME_END_S: Final = 1e12
+
+
+def read_frames(path: Path) -> Iterator[Frame]:
+    """Yield the frames of a file in the order they stand there; raises CanductorError.
+
+    Knows candump logs, BLF, ASC, pcap, pcapng and MCAP by their content. PATH ``-`` is standard input, a
+    candump log.
+    """
+    for frames in read_batches(path):
+        yield from frames
+
+
+def read_batches(path: Path, before_read: Callable[[], object] | None = None) -> Iterator[list[Frame]]:
+    """Yield the frames as read_frames does, many at once: the quickest way to work on them.
+
+    BEFORE_READ is called whenever more of a log is to be read.
+    """
+    if path == STANDARD_INPUT:
+        yield from read_candump(sys.stdin.buffer, "standard input", before_read)
+        return
+    existing_file(path)
+    try:
+        with path.open("rb") as file:
+            reader = _reader(file, path)
+            if reader is None:
+                yield from read_candump(file, str(path), before_read)
+            else:
+                yield from _in_batches(reader(file, str(path)))
+    except OSError as error:
+        raise CanductorError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _in_batches(frames: Iterator[Frame]) -> Iterator[list[Frame]]:
+    """Yield up to BATCH frames at once; what came before an error is yielded before it is raised."""
+    batch: list[Frame] = []
+    try:
+        for frame in frames:
+            batch.append(frame)
+            if len(batch) == BATCH:
+                yield batch
+                batch = []
+    except CanductorError:
+        if batch:
+            yield batch
+        raise
+    if batch:
+        yield batch
+
+
+def _reader(file: BufferedReader, path: Path) -> Callable[[BinaryIO, str], Iterator[Frame]] | None:
+    """Return who reads such a file; None: it is taken for a candump log."""
+    start = file.peek(_MAGIC_SIZE)[:_MAGIC_SIZE]
+    if start[:4] in pcap.PCAP_MAGICS:
+        return pcap.read_pcap
+    if start[:4] == pcap.PCAPNG_MAGIC:
+        return pcap.read_pcapng
+    if start.startswith(mcap_file.MAGIC):
+        return mcap_file.read_mcap
+    if start.startswith(_BLF_MAGIC):
+        return _read_blf
+    if start.lower().startswith(_ASC_BEGINNINGS) or path.suffix.lower() == ".asc":
+        return _read_asc
+    if not start:
+        raise CanductorError(f"{path}: is empty")
+    if b"\0" in start:
+        raise CanductorError(
+            f"{path}: is no recording this tool knows; it reads candump logs, BLF, ASC, pcap, pcapng and MCAP"
+        )
+    return None
+
+
+def _read_blf(source: BinaryIO, name: str) -> Iterator[Frame]:
+    readers: list[can.BLFReader] = []
+
+    def open_reader() -> can.BLFReader:
+        readers.append(can.BLFReader(source))
+        return readers[0]
+
+    size = Path(name).stat().st_size
+    yield from _read_python_can(open_reader, name)
+    # A container that is cut off inflates to what there is of it, without a complaint.
+    if readers[0].file_size > size:
+        raise CanductorError(
+            f"{name}: is cut off at byte {size} of {readers[0].file_size}; the frames before that were read"
+        )
+
+
+def _read_asc(source: BinaryIO, name: str) -> Iterator[Frame]:
+    text = TextIOWrapper(source, encoding="utf-8", errors="replace")
+    yield from _read_python_can(lambda: can.ASCReader(text), name)
+
+
+def _read_python_can(open_reader: Callable[[], can.BLFReader | can.ASCReader], name: str) -> Iterator[Frame]:
+    count = 0
+    try:
+        for message in open_reader():
+            frame = Frame.from_message(message)
+            if 0 <= frame.time_s < _TIME_END_S:
+                yield frame
+                count += 1
+    # Its readers raise whatever a damaged byte leads to: struct.error, zlib.error, KeyError, …
+    except Exception as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise CanductorError(
+            f"{name}: is broken or cut off behind frame {count} ({said}); the frames before that were read"
+        ) from error

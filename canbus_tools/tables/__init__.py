@@ -1,0 +1,1 @@
+"""Tables sent to drives and nodes without a coordinator."""

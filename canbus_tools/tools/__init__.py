@@ -1,0 +1,1 @@
+"""One file per ``canductor can`` command, and ``canductor console``."""

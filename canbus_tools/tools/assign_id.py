@@ -1,0 +1,161 @@
+"""``canductor can assign UUID NODEID``: gives a node that waits its id, and makes sure that it has it."""
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Final
+
+from canbus_tools.bus.computer import Computer
+from canbus_tools.discovery.ask_bus import declare_listen, listen_option, take_census, where
+from canbus_tools.discovery.node_info import Facts, interview
+from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
+from canbus_tools.discovery.inventory import PROBED, State, SurveyResult, survey
+from canbus_tools.bus.talk import LISTEN_S, BusTalk
+from nodes.bus.assign import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID, AssignError, Uuid
+from nodes.support.option_values import UsageError, whole
+from nodes.support.records import record
+
+TRIES: Final = 3
+"""Nobody acknowledges an id, and frames get lost."""
+
+
+def declare(command: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    command.add_argument("uuid", metavar="UUID", help="12 hex digits, as 'canductor can query' prints them")
+    command.add_argument("nodeid", metavar="NODEID", help=f"{FIRST_NODEID} to {LAST_NODEID}")
+    declare_bus(command)
+    declare_listen(command)
+
+
+def make_job(given: argparse.Namespace) -> Callable[[Computer], "AssignReport"]:
+    """Return the job; raises UsageError."""
+    bus = bus_options(given)
+    uuid = uuid_option("UUID", given.uuid)
+    nodeid = whole("NODEID", given.nodeid, FIRST_NODEID, LAST_NODEID)
+    listen_s = listen_option(given)
+    return lambda computer: assign(computer, bus, uuid, nodeid, listen_s=listen_s)
+
+
+def uuid_option(option: str, text: str) -> Uuid:
+    """Read a uuid; raises UsageError."""
+    try:
+        return Uuid.parse(text)
+    except AssignError:
+        raise UsageError(
+            f"{option} is '{text}', must be the 12 hex digits that 'canductor can query' prints"
+        ) from None
+
+
+def assign(
+    computer: Computer, options: BusOptions, uuid: Uuid, nodeid: int, *, listen_s: float = LISTEN_S
+) -> "AssignReport":
+    """Give UUID the id NODEID; raises CanductorError with what to do.
+
+    LISTEN_S: how long to listen for other hosts first.
+    """
+
+    async def run() -> AssignReport:
+        async with BusTalk.open(computer, options) as bus:
+            return await _assign(bus, uuid, nodeid, listen_s)
+
+    return computer.run(run())
+
+
+@record(kw_only=True)
+class AssignReport:
+    """The node has its id."""
+
+    bus: BusOptions
+    uuid: Uuid
+    nodeid: int
+    facts: Facts
+    had_it: bool
+    ok: bool = True
+
+    def to_json(self) -> Mapping[str, object]:
+        """Return all of it."""
+        return {
+            "bus": self.bus.name,
+            "uuid": str(self.uuid),
+            "nodeid": self.nodeid,
+            "had_it_before": self.had_it,
+            "firmware": asdict(self.facts.firmware),
+        }
+
+    def to_text(self) -> str:
+        """Say it in one line."""
+        firmware = self.facts.firmware
+        has = "had id {} before" if self.had_it else "has id {} now"
+        return f"{self.uuid} {has.format(self.nodeid)}: {firmware.mcu}, {firmware.app} {firmware.version}"
+
+
+async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int, listen_s: float) -> AssignReport:
+    # Of a node that has an id, only the survey learns the uuid; a second board with this one would take the
+    # id as well.
+    found = await survey(bus, probed={*PROBED, nodeid}, listen_s=listen_s)
+    had_it = _check_node(bus, uuid, nodeid, found)
+    if not had_it:
+        _check_id(bus, nodeid, found)
+        await _tell(bus, uuid, nodeid)
+    facts = await interview(bus, nodeid)
+    if facts.uuid not in (None, uuid):
+        raise AssignError(
+            f"{uuid} was given id {nodeid}, but {facts.uuid} answers on it; switch both off and on"
+        )
+    return AssignReport(bus=bus.options, uuid=uuid, nodeid=nodeid, facts=facts, had_it=had_it)
+
+
+def _check_node(bus: BusTalk, uuid: Uuid, nodeid: int, found: SurveyResult) -> bool:
+    """Return whether UUID has the id already; raise AssignError unless it can be given it."""
+    boards = found.by_uuid(uuid)
+    if not boards:
+        waiting = ", ".join(str(node.uuid) for node in found.census.waiting) or "none"
+        raise AssignError(
+            f"node {uuid} does not wait for an id on {bus.name} (those that do: {waiting}), nor has one that "
+            "answered; compare the uuid, and check the node's power, cable and bit rate: "
+            f"'canductor can query {where(bus.options)}' says how"
+        )
+    board = boards[0]
+    if len(boards) > 1 or board.twins:
+        raise AssignError(
+            f"two boards on {bus.name} have the uuid {uuid} (cloned chips?), and both would take the id; "
+            "take one of them off the bus"
+        )
+    if board.state is State.BOOTLOADER:
+        raise AssignError(
+            f"node {uuid} is in its bootloader (Katapult) and runs no firmware that could take an id; flash "
+            "it, or reset it to start the firmware that it has"
+        )
+    if board.nodeid not in (None, nodeid):
+        raise AssignError(
+            f"node {uuid} has id {board.nodeid} already; 'canductor can release {board.nodeid} "
+            f"{where(bus.options)}' makes it wait for another"
+        )
+    if board.state is State.IN_USE:
+        raise AssignError(f"node {uuid} on {bus.name} has id {nodeid} already, and another program uses it")
+    return board.nodeid == nodeid
+
+
+def _check_id(bus: BusTalk, nodeid: int, found: SurveyResult) -> None:
+    """Raise AssignError when another node has the id: it would shut down."""
+    owners = {entry.nodeid: entry.uuid for entry in found.entries if entry.nodeid is not None}
+    taken = set(owners) | bus.hosted | bus.talking
+    if nodeid in taken:
+        free = next((str(n) for n in range(FIRST_NODEID, LAST_NODEID + 1) if n not in taken), "none")
+        owner = owners.get(nodeid) or "another node"
+        raise AssignError(
+            f"id {nodeid} on {bus.name} belongs to {owner}, which would shut down; {free} is free"
+        )
+
+
+async def _tell(bus: BusTalk, uuid: Uuid, nodeid: int) -> None:
+    """Tell the node its id until it waits no more."""
+    for _ in range(TRIES):
+        bus.send_frame(ADMIN_ID, bytes((SET_NODEID, *uuid.raw, nodeid)))
+        found = await take_census(bus, rounds=2)
+        if all(node.uuid != uuid for node in found.waiting):
+            return
+    raise AssignError(
+        f"node {uuid} on {bus.name} was told id {nodeid} {TRIES} times and still waits for one; the bus may "
+        f"lose frames ('canductor can doctor {where(bus.options)}'), or two boards have this uuid"
+    )

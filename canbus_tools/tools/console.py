@@ -1,0 +1,207 @@
+"""``canductor console``: talk to one node in its own words, at a prompt or by a script."""
+
+import argparse
+import contextlib
+import os
+import re
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from pathlib import Path
+
+from canbus_tools.bus.computer import Computer
+from canbus_tools.console.session import Quit, Session
+from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
+from canbus_tools.discovery.inventory import survey
+from canbus_tools.bus.talk import BusTalk, NodeTalk, TalkError, refuse_if_in_use
+from canbus_tools.bus.uart_talk import open_uart_talk
+from nodes.bus.assign import Uuid
+from nodes.support.errors import CanductorError
+from nodes.support.option_values import UsageError, existing_file, whole
+from nodes.support.records import record
+from nodes.transport import BAUD_DEFAULT
+
+NODEID_MAX = 255
+BAUD_MIN, BAUD_MAX = 1200, 12_000_000
+_UUID = re.compile(r"[0-9a-fA-F]{12}\Z")
+
+
+@record(kw_only=True)
+class ConsoleOptions:
+    """Which node, and what to say to it."""
+
+    bus: BusOptions | None
+    """None: the UART."""
+    node: str = ""
+    uart: Path | None = None
+    baud: int = BAUD_DEFAULT
+    force: bool = False
+    commands: tuple[str, ...] = ()
+    script: Path | None = None
+    as_json: bool = False
+
+
+def declare(command: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    declare_bus(command)
+    add = command.add_argument
+    add("--node", metavar="ID|UUID", help="the node on the CAN bus: its id, or its uuid of 12 hex digits")
+    add("--uart", type=Path, metavar="PATH", help="the node is at this serial device")
+    add("--baud", metavar="BIT/S", help=f"rate of the serial device; {BAUD_DEFAULT} if not given")
+    add("--force", action="store_true", help="talk even if another host may talk to the node: it loses it")
+    add("-e", "--execute", metavar="LINE", action="append", help="run this line; may be given repeatedly")
+    add("--script", type=Path, metavar="FILE", help="run the lines of a file; an error ends it")
+
+
+def make_job(given: argparse.Namespace) -> Callable[[Computer], "ConsoleReport"]:
+    """Return the job; raises UsageError, CanductorError for a script that is not there."""
+    if (given.node is None) == (given.uart is None):
+        raise UsageError("console takes either --node, on a CAN bus, or --uart")
+    if given.uart is not None and given.channel is not None:
+        raise UsageError("--uart does not go with --channel")
+    if given.baud is not None and given.uart is None:
+        raise UsageError("--baud goes with --uart; a CAN bus takes --bitrate")
+    if given.execute and given.script:
+        raise UsageError("console takes either --execute or --script")
+    if given.node is not None and not _UUID.match(given.node):
+        if not given.node.isdecimal():
+            raise UsageError(
+                f"--node is '{given.node}', must be an id from 1 to 255, or a uuid of 12 hex digits"
+            )
+        whole("--node", given.node, 1, NODEID_MAX)
+    options = ConsoleOptions(
+        bus=None if given.uart is not None else bus_options(given),
+        node=given.node or "",
+        uart=given.uart,
+        baud=BAUD_DEFAULT if given.baud is None else whole("--baud", given.baud, BAUD_MIN, BAUD_MAX),
+        force=given.force,
+        commands=tuple(given.execute or ()),
+        script=existing_file(given.script),
+        as_json=given.json,
+    )
+    return lambda computer: run_console(computer, options)
+
+
+def run_console(computer: Computer, options: ConsoleOptions) -> "ConsoleReport":
+    """Run the session to its end; raises CanductorError, with the line of a script that failed."""
+    return computer.run(_run(computer, options))
+
+
+@record
+class ConsoleReport:
+    """How the session ended."""
+
+    node: str
+    firmware: str
+    commands: int
+    messages: int
+    ok: bool = True
+
+    def to_json(self) -> Mapping[str, object]:
+        """Return it."""
+        return {
+            "node": self.node,
+            "firmware": self.firmware,
+            "commands": self.commands,
+            "messages": self.messages,
+        }
+
+    def to_text(self) -> str:
+        """Return nothing: all has been shown."""
+        return ""
+
+
+async def _run(computer: Computer, options: ConsoleOptions) -> ConsoleReport:
+    async with _open(computer, options) as talk:
+        session = Session(talk, _say, as_json=options.as_json)
+        try:
+            if options.commands or options.script or not sys.stdin.isatty():
+                await _run_lines(session, options)
+            else:
+                from canbus_tools.console.prompt import prompt  # noqa: PLC0415 (only where there is a prompt)
+
+                await prompt(session, _history_file())
+        finally:
+            session.close()
+        return ConsoleReport(talk.name, talk.dictionary.version, session.commands, session.messages)
+
+
+async def _run_lines(session: Session, options: ConsoleOptions) -> None:
+    for where, line in _lines(options):
+        try:
+            await session.run(line)
+        except Quit:
+            return
+        except CanductorError as error:
+            raise CanductorError(f"{where}: {error}") from error
+    await session.talk.drained()
+
+
+def _lines(options: ConsoleOptions) -> Iterator[tuple[str, str]]:
+    """Yield each line of the script with where it is."""
+    if options.commands:
+        for n, line in enumerate(options.commands, 1):
+            yield f"--execute {n}", line
+        return
+    name = str(options.script) if options.script else "standard input"
+    with contextlib.ExitStack() as stack:
+        if options.script is None:
+            lines: Iterator[str] = iter(sys.stdin)
+        else:
+            lines = stack.enter_context(options.script.open(encoding="utf-8"))
+        try:
+            for n, line in enumerate(lines, 1):
+                yield f"{name}:{n}", line
+        except UnicodeDecodeError as error:
+            raise CanductorError(f"{name} is no text in UTF-8 ({error.reason})") from None
+        except OSError as error:
+            raise CanductorError(f"{name} cannot be read ({error.strerror})") from None
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
+
+
+def _history_file() -> Path:
+    """Return where lines are remembered (XDG_STATE_HOME)."""
+    base = os.environ.get("XDG_STATE_HOME", "")
+    # A relative path there is to be ignored, says the XDG Base Directory Specification.
+    root = Path(base) if os.path.isabs(base) else Path.home() / ".local" / "state"  # noqa: PTH117
+    return root / "canductor" / "console_history"
+
+
+# ------------------------------------------------------------------------------------------------- the node
+
+
+@contextlib.asynccontextmanager
+async def _open(computer: Computer, options: ConsoleOptions) -> AsyncIterator[NodeTalk]:
+    if options.bus is None:
+        assert options.uart is not None
+        async with open_uart_talk(computer, options.uart, options.baud) as talk:
+            yield talk
+        return
+    async with BusTalk.open(computer, options.bus) as bus:
+        nodeid = await _nodeid(bus, options.node)
+        if not options.force:
+            await refuse_if_in_use(bus, nodeid)
+        async with bus.node(nodeid) as talk:
+            yield talk
+
+
+async def _nodeid(bus: BusTalk, node: str) -> int:
+    """Return the id of the node that was named; raises TalkError."""
+    if not _UUID.match(node):
+        return int(node)
+    uuid = Uuid.parse(node.lower())
+    found = (await survey(bus)).by_uuid(uuid)
+    if len(found) > 1:
+        raise TalkError(
+            f"{len(found)} boards on bus {bus.name} have the uuid {uuid} (cloned chips?); name one by its id"
+        )
+    if not found:
+        raise TalkError(f"no node on bus {bus.name} says that it is {uuid}; 'canductor can nodes' lists all")
+    if found[0].nodeid is None:
+        raise TalkError(
+            f"node {uuid} on bus {bus.name} waits for an id; give it one first with 'canductor can assign'"
+        )
+    return found[0].nodeid

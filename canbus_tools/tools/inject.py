@@ -1,0 +1,221 @@
+"""``canductor can inject``: a virtual bus that goes wrong on purpose, for those who test a host or a board.
+
+It runs the bus, nodes with the project's firmware when asked for, and a door for other CAN programs
+(socketcand), shows what happens meanwhile, and counts at the end.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import math
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import AsyncExitStack, ExitStack
+from dataclasses import field
+from pathlib import Path
+from typing import Final, cast
+
+from canbus_tools.inject.fault_options import declare_faults, read_faults
+from canbus_tools.inject.inject_report import InjectReport, StatusLine
+from canbus_tools.inject.socketcand_server import PORT, SocketcandServer
+from nodes.support.option_values import UsageError, number, whole
+from nodes.support.records import record
+from nodes.virtual.faults import Fault
+from nodes.virtual.hub import BITRATE_MAX, BusStats, VirtualBus
+from nodes.virtual.processes import Flavour, NodeProcess
+
+FLAVOURS: Final = ("mainboard", "toolhead")
+NODES_MAX: Final = 32
+TICK_S: Final = 0.5
+"""How often the status line is renewed, and nodes and bus are looked after."""
+DEFAULT_PATH: Final = Path(tempfile.gettempdir()) / "canductor-bus"
+
+
+@record(kw_only=True)
+class InjectOptions:
+    """What is to be run."""
+
+    path: Path = DEFAULT_PATH
+    """Where the bus's socket goes."""
+    bitrate: int = 1_000_000
+    """Bit/s; 0: frames take no time."""
+    seed: int = 0
+    faults: tuple[tuple[str, Fault], ...] = ()
+    """With the words that asked for each."""
+    nodes: Mapping[str, Flavour] = field(default_factory=dict)
+    """Firmware processes by name, in the order in which they connect."""
+    socketcand: tuple[str, int] | None = None
+    """Host and port for other CAN programs."""
+    socketcand_bus: str = "can0"
+    duration_s: float | None = None
+    """None: until Ctrl-C."""
+    json: bool = False
+
+
+def declare(command: argparse.ArgumentParser) -> None:
+    """Add the options of this tool."""
+    add = command.add_argument
+    add(
+        "-c",
+        "--channel",
+        type=Path,
+        default=DEFAULT_PATH,
+        metavar="PATH",
+        help=f"where the bus's socket goes; other tools take it as -i canductor -c PATH ({DEFAULT_PATH})",
+    )
+    add("-b", "--bitrate", metavar="BIT/S", default="1000000", help="1000000 if not given; 0: no limit")
+    add("--seed", metavar="N", default="0", help="decides which frames the faults hit; 0 if not given")
+    add("--duration", "--for", metavar="S", help="end after so long; else at Ctrl-C")
+    add(
+        "--nodes",
+        metavar="BOARD,…",
+        help=f"run nodes with canductor's firmware on the bus: {' or '.join(FLAVOURS)}, also several of one",
+    )
+    add(
+        "--socketcand",
+        metavar="[HOST:]PORT",
+        help=f"serve the socketcand protocol there; HOST: 127.0.0.1 if not given; PORT: often {PORT}, 0: any",
+    )
+    add(
+        "--socketcand-bus",
+        metavar="NAME",
+        default="can0",
+        help="how its clients call the bus; can0 if not given",
+    )
+    declare_faults(command)
+
+
+def make_job(given: argparse.Namespace) -> Callable[[object], InjectReport]:
+    """Check what was given; raises UsageError."""
+    nodes = _nodes(given.nodes)
+    name = given.socketcand_bus
+    if not 1 <= len(name) <= 16 or not name.isascii() or not name.replace("-", "").replace("_", "").isalnum():
+        raise UsageError(f"--socketcand-bus is '{name}', must be 1 to 16 letters and digits")
+    options = InjectOptions(
+        path=given.channel,
+        bitrate=whole("--bitrate", given.bitrate, 0, BITRATE_MAX),
+        seed=whole("--seed", given.seed, 0, 2**64 - 1),
+        faults=tuple(read_faults(given, {node: place for place, node in enumerate(nodes)})),
+        nodes=nodes,
+        socketcand=None if given.socketcand is None else _address(given.socketcand),
+        socketcand_bus=name,
+        duration_s=None if given.duration is None else number("--duration", given.duration, 0, 1e8, "s"),
+        json=given.json,
+    )
+    return lambda _: Injection(options).run()
+
+
+def _nodes(text: str | None) -> dict[str, Flavour]:
+    words = [] if text is None else text.split(",")
+    for word in words:
+        if word not in FLAVOURS:
+            raise UsageError(f"--nodes has '{word}', must be {' or '.join(FLAVOURS)}, separated by commas")
+    if len(words) > NODES_MAX:
+        raise UsageError(f"--nodes has {len(words)} nodes, must be at most {NODES_MAX}")
+    names: dict[str, Flavour] = {}
+    seen: Counter[str] = Counter()
+    for word in words:
+        seen[word] += 1
+        names[word if seen[word] == 1 else f"{word}{seen[word]}"] = cast("Flavour", word)
+    return names
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, colon, port = text.rpartition(":")
+    if colon and not host:
+        raise UsageError(f"--socketcand is '{text}', must be a port, or HOST:PORT")
+    return host.strip("[]") or "127.0.0.1", whole("--socketcand's port", port, 0, 65535)
+
+
+def uuid_of(index: int) -> str:
+    """Return the uuid of the node at place INDEX: recognisable, and the same in every run."""
+    return f"ca4d{index + 1:08x}"
+
+
+class Injection:
+    """One run, from the bus's start to its figures."""
+
+    def __init__(self, options: InjectOptions) -> None:
+        """Nothing happens before run(); raises CanductorError for a bus that cannot be."""
+        self._options = options
+        self._bus = VirtualBus(options.path, bitrate=options.bitrate, seed=options.seed)
+        self._processes: dict[str, NodeProcess] = {}
+        self._server: SocketcandServer | None = None
+        self._stats: BusStats | None = None
+        self._ran_s = 0.0
+
+    def run(self) -> InjectReport:
+        """Run until the time is over or Ctrl-C, which is the usual end, and report."""
+        options = self._options
+        with ExitStack() as stack:
+            stack.enter_context(self._bus)
+            self._start_nodes(stack)
+            with contextlib.suppress(KeyboardInterrupt):  # the user has seen enough
+                asyncio.run(self._serve())
+            figures = {name: process.stop() for name, process in self._processes.items()}
+        return InjectReport(
+            path=str(options.path),
+            bitrate=options.bitrate,
+            seed=options.seed,
+            ran_s=self._ran_s,
+            stats=self._stats or self._bus.stats,
+            faults=tuple(words for words, _ in options.faults),
+            nodes=figures,
+            socketcand=None if self._server is None else self._server.figures(),
+        )
+
+    def _start_nodes(self, stack: ExitStack) -> None:
+        """One after the other, so that each has the place on the bus that its order says."""
+        for place, (name, flavour) in enumerate(self._options.nodes.items()):
+            process = NodeProcess(flavour, name=f"node {name}", uuid=uuid_of(place), can=self._options.path)
+            self._processes[name] = stack.enter_context(process)
+            process.wait_ready()
+
+    async def _serve(self) -> None:
+        options = self._options
+        async with AsyncExitStack() as stack:
+            if options.socketcand is not None:
+                host, port = options.socketcand
+                server = SocketcandServer(options.path, host, port, options.socketcand_bus)
+                self._server = await stack.enter_async_context(server)
+            self._bus.set_faults([fault for _, fault in options.faults])
+            begin_s = time.monotonic()
+            self._say_ready()
+            line = StatusLine(sys.stderr, self._bus) if not options.json and sys.stderr.isatty() else None
+            try:
+                await self._watch(begin_s, line)
+            finally:
+                self._ran_s = time.monotonic() - begin_s
+                self._stats = self._bus.stats  # while the clients of socketcand are still there
+                if line is not None:
+                    line.clear()
+
+    async def _watch(self, begin_s: float, line: StatusLine | None) -> None:
+        duration_s = math.inf if self._options.duration_s is None else self._options.duration_s
+        while (left_s := begin_s + duration_s - time.monotonic()) > 0 and self._bus.running:
+            for process in self._processes.values():
+                if not process.running:
+                    process.stop()  # raises what it said when it died
+            if line is not None:
+                line.show(0 if self._server is None else self._server.stats.connected)
+            await asyncio.sleep(min(TICK_S, left_s))
+
+    def _say_ready(self) -> None:
+        """Tell how to get on the bus: in JSON as a line of its own, for programs that start this one."""
+        path, server = self._options.path, self._server
+        uuids = {name: uuid_of(place) for place, name in enumerate(self._processes)}
+        if self._options.json:
+            address = None if server is None else f"{server.host}:{server.port}"
+            said = json.dumps({"ready": True, "bus": str(path), "nodes": uuids, "socketcand": address})
+        else:
+            lines = [f"virtual bus ready; attach with -i canductor -c {path}"]
+            lines += [f"node {name} has uuid {uuid}" for name, uuid in uuids.items()]
+            if server is not None:
+                lines.append(f"socketcand at {server.host}:{server.port}, bus {server.name}")
+            said = "\n".join(lines)
+        sys.stdout.write(said + "\n")
+        sys.stdout.flush()

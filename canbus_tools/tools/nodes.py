@@ -1,0 +1,227 @@
+"""``canductor can nodes``: every node that is alive, and what it is."""
+
+import argparse
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from typing import Final
+
+from canbus_tools.discovery.node_discovery import Application
+from canbus_tools.bus.computer import Computer
+from canbus_tools.discovery.ask_bus import declare_listen, listen_option, where
+from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
+from canbus_tools.discovery.inventory import PROBED, Entry, State, SurveyResult, survey_all
+from canbus_tools.support.text_table import count, paragraph, table
+from canbus_tools.bus.talk import LISTEN_S, BusTalk
+from nodes.bus.assign import LAST_NODEID
+from nodes.support.option_values import UsageError, whole
+from nodes.support.records import record
+
+HEADINGS: Final = (
+    "id",
+    "uuid",
+    "application",
+    "state",
+    "MCU",
+    "clock",
+    "firmware",
+    "up",
+    "rx/tx errors",
+    "retries",
+    "bus",
+)
+NAMES: Final[Mapping[Application, str]] = {
+    Application.KLIPPER: "Klipper-type",
+    Application.CANDUCTOR: "canductor",
+    Application.KATAPULT: "Katapult",
+    Application.UNKNOWN: "unknown",
+}
+STATES: Final[Mapping[State, str]] = {
+    State.WAITING: "waits for an id",
+    State.BOOTLOADER: "in its bootloader",
+    State.IN_USE: "in use by a host",
+    State.IDLE: "idle",
+    State.CONFIGURED: "configured",
+    State.SHUTDOWN: "SHUT DOWN",
+    State.UNCLEAR: "unclear",
+}
+
+
+def declare(command: argparse.ArgumentParser) -> None:
+    """Add the options."""
+    declare_bus(command)
+    add = command.add_argument
+    add(
+        "--probe",
+        metavar="IDS",
+        default=f"{PROBED.start}-{PROBED[-1]}",
+        help=f"node ids to try, {PROBED.start}-{PROBED[-1]} if not given; 'none' only listens and asks by"
+        " uuid, for a bus that devices of other protocols share",
+    )
+    declare_listen(command)
+
+
+def make_job(given: argparse.Namespace) -> Callable[[Computer], "NodesReport"]:
+    """Return the job; raises UsageError."""
+    bus = bus_options(given)
+    probed = _ids("--probe", given.probe)
+    listen_s = listen_option(given)
+    return lambda computer: list_nodes(computer, bus, probed=probed, listen_s=listen_s)
+
+
+def _ids(option: str, text: str) -> range:
+    if text.strip() == "none":
+        return range(0)
+    first, dash, last = text.partition("-")
+    low = whole(option, first, 1, LAST_NODEID)
+    high = whole(option, last, 1, LAST_NODEID) if dash else low
+    if low > high:
+        raise UsageError(f"{option} is '{text}', must go from the lower id to the higher")
+    return range(low, high + 1)
+
+
+def list_nodes(
+    computer: Computer, options: BusOptions, *, probed: range = PROBED, listen_s: float = LISTEN_S
+) -> "NodesReport":
+    """Find all nodes and ask those to whom nobody talks who they are. Raises CanductorError."""
+
+    async def find() -> SurveyResult:
+        async with BusTalk.open(computer, options) as bus:
+            return await survey_all(bus, options, probed=probed, listen_s=listen_s)
+
+    return NodesReport(options, computer.run(find()))
+
+
+@record
+class NodesReport:
+    """Every node."""
+
+    bus: BusOptions
+    found: SurveyResult
+    ok: bool = True
+
+    def to_json(self) -> Mapping[str, object]:
+        """Return all of it."""
+        return {
+            "bus": self.bus.name,
+            "nodes": [entry_json(entry) for entry in self.found.entries],
+            "duplicate_uuids": sorted({str(entry.uuid) for entry in self.found.entries if entry.twins}),
+            "probed": list(self.found.probed),
+            "foreign_frames": self.found.census.foreign_frames,
+        }
+
+    def to_text(self) -> str:
+        """Return the table, and what to know about it."""
+        entries = self.found.entries
+        lines = [f"{count(self.found.boards, 'node')} on {self.bus.name}", ""]
+        if not entries:
+            return "\n".join(lines + _nobody(self.bus, self.found))
+        lines += [*table(HEADINGS, [_row(entry) for entry in entries]), ""]
+        notes = _notes(self.found, self.bus)
+        return "\n".join(lines + [line for note in notes for line in paragraph(note)]).rstrip()
+
+
+def entry_json(entry: Entry) -> dict[str, object]:
+    """Return one node with all that it said."""
+    facts = entry.facts or entry.told or entry.overheard
+    return {
+        "nodeid": entry.nodeid,
+        "uuid": None if entry.uuid is None else str(entry.uuid),
+        "application": entry.application.value,
+        "state": entry.state.value,
+        "several_boards": entry.twins,
+        "trouble": entry.trouble or None,
+        "told_by_host": entry.told is not None,
+        "guessed": entry.overheard is not None,
+        "firmware": None if facts is None else asdict(facts.firmware),
+        "uptime_s": None if facts is None else facts.uptime_s,
+        "configured": None if facts is None else facts.configured,
+        "shut_down": None if facts is None else facts.shut_down,
+        "can": None if facts is None or facts.can is None else asdict(facts.can),
+    }
+
+
+def _row(entry: Entry) -> list[str]:
+    row = [
+        "-" if entry.nodeid is None else str(entry.nodeid),
+        "?" if entry.uuid is None else str(entry.uuid),
+        NAMES[entry.application],
+        STATES[entry.state] + (", two boards!" if entry.twins else ""),
+    ]
+    facts = entry.facts or entry.told or entry.overheard
+    if facts is None:
+        return row + [""] * (len(HEADINGS) - len(row))
+    firmware, can = facts.firmware, facts.can
+    return [
+        *row,
+        firmware.mcu + (" ?" if entry.overheard else ""),
+        "" if firmware.clock_hz is None else f"{firmware.clock_hz / 1e6:g} MHz",
+        " ".join(filter(None, (firmware.app, firmware.version))),
+        duration(facts.uptime_s),
+        "" if can is None else f"{can.rx_errors}/{can.tx_errors}",
+        "" if can is None else str(can.tx_retries),
+        "" if can is None else can.state,
+    ]
+
+
+def duration(seconds: float | None) -> str:
+    """Return a time as people read it: 12 s, 3 min, 4.5 h, 6.2 d."""
+    if seconds is None:
+        return ""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    if seconds < 6000:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.1f} d"
+
+
+def _notes(found: SurveyResult, bus: BusOptions) -> list[str]:
+    entries = found.entries
+    notes = [f"Node {_name(entry)}: {entry.trouble}." for entry in entries if entry.trouble]
+    if twins := sorted({str(entry.uuid) for entry in entries if entry.twins}):
+        notes.append(
+            f"Two boards have the uuid {', '.join(twins)} (cloned chips?): they cannot be used on one bus. "
+            "Take one of them off."
+        )
+    for entry in entries:
+        if entry.state is State.SHUTDOWN:
+            notes.append(
+                f"Node {_name(entry)} has shut down and does nothing until its host restarts it; "
+                f"'canductor can release {entry.nodeid} {where(bus)}' resets it."
+            )
+        if entry.state is State.BOOTLOADER:
+            notes.append(f"Node {_name(entry)} runs no firmware: flash it, or reset it.")
+    if any(entry.state is State.IN_USE for entry in entries):
+        notes.append(
+            "Nodes in use were not asked, so as not to disturb their host. The coordinator that drives them "
+            "tells what they are; of nodes of other hosts a uuid is known when their firmware is canductor's."
+        )
+    if any(entry.overheard for entry in entries):
+        notes.append(
+            "What stands in a row with '?' was guessed: a dictionary in the cache explains what the node and "
+            "its host were heard to say."
+        )
+    elif any(entry.state is State.IN_USE for entry in entries):
+        notes.append(
+            "Their traffic tells what they are when their dictionary is in the cache: run this once while "
+            "their host is stopped."
+        )
+    return notes
+
+
+def _name(entry: Entry) -> str:
+    return str(entry.uuid) if entry.nodeid is None else str(entry.nodeid)
+
+
+def _nobody(bus: BusOptions, found: SurveyResult) -> list[str]:
+    tried = f"ids {found.probed[0]} to {found.probed[-1]}" if found.probed else "no ids (--probe none)"
+    lines = paragraph(
+        f"Nobody waits for an id, nobody says that it has one, no host was heard that talks to one, and of "
+        f"{tried} none answered."
+    )
+    if found.census.foreign_frames:
+        lines += paragraph(
+            f"The bus works: {count(found.census.foreign_frames, 'frame')} of other protocols came by."
+        )
+    return lines + paragraph(
+        f"'canductor can query {where(bus)}' says what to check; 'canductor can doctor {where(bus)}' checks."
+    )

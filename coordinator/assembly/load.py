@@ -1,0 +1,241 @@
+"""From a configuration file to the description of a machine, in one call."""
+
+import re
+from dataclasses import replace
+
+from coordinator.config.file import ConfigFile, RawSection, parse_config, saved_values
+from coordinator.config.sections.kinematics.frame import Frame
+from coordinator.config.model import (
+    CanConnection,
+    DualCarriageDescription,
+    ExtruderDescription,
+    ExtruderStepperDescription,
+    HomingDescription,
+    MachineDescription,
+    NodeDescription,
+    NodePolicy,
+    NotYetActing,
+    RailDescription,
+    ShaperDescription,
+    StepperDescription,
+    UartConnection,
+)
+from coordinator.config.pins import PinDescription
+from coordinator.config.sections.kinematics.printer_options import PRINTER_SPECS
+from coordinator.config.errors import ConfigError, MissingSection, Place, nearest
+from coordinator.config.sections.extruder import limits_without_extruder, read_extruder_steppers, read_extruders
+from coordinator.config.sections.kinematics.select import read_frame
+from coordinator.config.sections.nodes import check_policies, make_pin_registry, read_nodes
+from coordinator.config.sections.printer import open_printer, read_printer
+from coordinator.config.sections.shaper import read_shapers
+from coordinator.config.sections.steppers import is_extra_stepper
+from coordinator.config.sections.tables import read_axis_tables
+from coordinator.config.sections.reading import Reading
+from coordinator.config.saved import ConfigSource
+from coordinator.config.sections.second_endstops import with_second_endstops
+from coordinator.config.unsupported import LATER_SECTIONS
+from coordinator.modules.module_set import ModuleSource, ModuleSources
+from coordinator.modules.registry import known_kinds, module_for, modules_beside, own_kinds
+from coordinator.motion.specs import MotionLimits
+
+__all__ = [
+    "CanConnection",
+    "ConfigError",
+    "DualCarriageDescription",
+    "ExtruderDescription",
+    "ExtruderStepperDescription",
+    "HomingDescription",
+    "MachineDescription",
+    "NodeDescription",
+    "NodePolicy",
+    "NotYetActing",
+    "PinDescription",
+    "Place",
+    "RailDescription",
+    "ShaperDescription",
+    "StepperDescription",
+    "UartConnection",
+    "load_machine",
+]
+
+_SINGLE_SECTIONS = (
+    *("printer", "stepper_x", "stepper_y", "stepper_z", "extruder", "input_shaper"),
+    "axis_tables",
+)
+SHELL_COMMAND = "gcode_shell_command"
+"""Programs of the host, called from macros on other hosts: said once, however many there are."""
+_NAMED_SECTIONS = ("mcu", "board_pins", "duplicate_pin_override")
+_MOTION_SECTIONS = re.compile(
+    r"stepper_([a-z]|bed|arm|left|right)|extruder[1-9]?|extruder1[0-5]|dual_carriage"
+    r"|(stepper|carriage|extra_carriage|dual_carriage|extruder_stepper) \S+",
+    re.ASCII,
+)
+"""Sections that have a place in some machine, besides further steppers."""
+
+
+def load_machine(path: str) -> MachineDescription:
+    """Read and check a configuration file with all it includes.
+
+    Raises ConfigError, one sentence that begins with file and line, for the first mistake found.
+    """
+    return describe(parse_config(str(path)))
+
+
+def describe(config: ConfigFile) -> MachineDescription:
+    """Return the machine that CONFIG speaks of; raises ConfigError for the first mistake found.
+
+    Where the file collects mistakes it is raised only for those that leave nothing to go on with.
+    """
+    later: list[NotYetActing] = []
+    _check_section_names(config)
+    nodes = read_nodes(config, later)
+    reading = Reading(config, make_pin_registry(config, nodes), later)
+    kinematics, reader = open_printer(_required(config, "printer"), PRINTER_SPECS)
+    printer = read_printer(reader)
+    frame = with_second_endstops(reading, read_frame(reading, kinematics, reader))
+    reading.finish(reader)
+    space = frame.kinematics.work_space
+    extruders = tuple(
+        replace(extruder, limits=_named(extruder.limits, frame))
+        for extruder in read_extruders(reading, printer, space)
+    )
+    followers = read_extruder_steppers(reading, extruders)
+    shapers = read_shapers(reading)
+    axis_tables = read_axis_tables(reading)
+    description = MachineDescription(
+        path=config.path,
+        nodes=nodes,
+        kinematics=frame.kinematics,
+        limits=extruders[0].limits if extruders else _named(limits_without_extruder(printer, space), frame),
+        rails=frame.rails,
+        motors=frame.steppers,
+        home=frame.home,
+        dual_carriage=frame.dual_carriage,
+        extruders=extruders,
+        extruder_steppers=followers,
+        shapers=shapers,
+        modules=_module_sources(reading),
+        not_yet_acting=(),
+        notes=(),
+        axis_tables=axis_tables,
+        source=ConfigSource(config.path, config.data, saved_values(config)),
+    )
+    later += [
+        NotYetActing(_section_of(stepper), stepper.place, ("enable_pin",), stepper.unpowered)
+        for stepper in description.steppers
+        if stepper.unpowered
+    ]
+    _check_names(description)
+    check_policies(description.nodes, description.steppers)
+    built = description.modules.build(description)  # made once to find mistakes
+    reading.pins = built.pins
+    return replace(
+        description,
+        not_yet_acting=(
+            *later,
+            *(NotYetActing(one.name, one.place, (), one.reason) for one in built.left_out.values()),
+            *_later_sections(reading, kinematics),
+        ),
+        notes=(*config.notes, *built.notes),
+    )
+
+
+def _module_sources(reading: Reading) -> ModuleSources:
+    """Return what the modules are made from; raises ConfigError."""
+    sources: list[ModuleSource] = []
+    for section in reading.config.sections.values():
+        sources += [ModuleSource(section, kind, whole=False) for kind in modules_beside(section.name)]
+        if not _is_acting(section) and (kind := module_for(section.kind, section.place)) is not None:
+            if kind.NAMED and not (kind.NAMELESS or section.instance):
+                error = f"[{section.kind}] needs a name; write [{section.kind} NAME]"
+                section.report(ConfigError(section.place, error))
+            sources.append(ModuleSource(section, kind, whole=True))
+            reading.used.add(section.name)
+    config = {
+        section.name: {option.name: option.value for option in section.options.values()}
+        for section in reading.config.sections.values()
+    }
+    used = {section.name: section.used for section in reading.config.sections.values()}
+    return ModuleSources(tuple(sources), reading.pins, config, used)
+
+
+def _named(limits: MotionLimits, frame: Frame) -> MotionLimits:
+    """Return LIMITS that know which options the ranges come from."""
+    return replace(limits, range_options=frame.range_options)
+
+
+def _section_of(stepper: StepperDescription) -> str:
+    """Return the section that STEPPER is of, by what its pins are for."""
+    return stepper.step_pin.purpose.partition("[")[2].rstrip("]")
+
+
+def _check_names(description: MachineDescription) -> None:
+    """Refuse two steppers of one name, which commands could not tell apart; raises ConfigError."""
+    seen: dict[str, Place] = {}
+    for stepper in description.steppers:
+        other = seen.setdefault(stepper.name, stepper.place)
+        if other is not stepper.place:
+            raise ConfigError(
+                stepper.place, f"a stepper is named {stepper.name} here and at {other}; rename one of them"
+            )
+
+
+def _required(config: ConfigFile, name: str) -> RawSection:
+    section = config.sections.get(name)
+    if section is None:
+        raise MissingSection(config.path, name)
+    return section
+
+
+def _is_acting(section: RawSection) -> bool:
+    return (
+        section.name in _SINGLE_SECTIONS
+        or section.kind in _NAMED_SECTIONS
+        or _MOTION_SECTIONS.fullmatch(section.name) is not None
+        or is_extra_stepper(section.name)
+    )
+
+
+def _check_section_names(config: ConfigFile) -> None:
+    for section in config.sections.values():
+        if _is_acting(section) or section.kind in LATER_SECTIONS or section.kind in own_kinds():
+            continue
+        if section.kind in known_kinds():  # asked for last: it looks through all packages
+            continue
+        if section.kind in _SINGLE_SECTIONS:
+            error = f"[{section.name}] must be [{section.kind}]: there is only one of it"
+            section.report(ConfigError(section.place, error))
+            continue
+        valid = (*_SINGLE_SECTIONS, *_NAMED_SECTIONS, *known_kinds(), *sorted(LATER_SECTIONS))
+        hint = nearest(section.kind, valid, pattern="[{}]") or "; remove it or correct its name"
+        section.report(ConfigError(section.place, f"there is no section [{section.name}]{hint}"))
+
+
+def _later_sections(reading: Reading, kinematics: str) -> list[NotYetActing]:
+    """Return the sections without a module; raises ConfigError when one takes a stepper's pin.
+
+    So it does for a motion section that has no place in this machine.
+    """
+    waiting = {(entry.section, name) for entry in reading.later for name in entry.options}
+    result = []
+    for section in reading.config.sections.values():
+        if section.name in reading.used and not _is_acting(section):
+            continue
+        if not _is_acting(section):
+            if section.kind != SHELL_COMMAND:
+                result.append(NotYetActing(section.name, section.place, ()))
+            elif not any(entry.section == SHELL_COMMAND for entry in result):
+                result.append(
+                    NotYetActing(SHELL_COMMAND, section.place, (), "no section of that kind is run")
+                )
+            reading.pins.check_unclaimed(section.options.values(), section.name)
+            continue
+        if section.name not in reading.used and section.kind not in ("printer", *_NAMED_SECTIONS):
+            useless = (
+                f"[{section.name}] has no place in a machine of kinematics {kinematics}; remove it, or"
+                " correct its name or 'kinematics' of [printer]"
+            )
+            section.report(ConfigError(section.place, useless))
+        options = [option for name, option in section.options.items() if (section.name, name) in waiting]
+        reading.pins.check_unclaimed(options, section.name)
+    return result

@@ -1,0 +1,137 @@
+"""The tables of docs/configuration.md, made from the options themselves.
+
+``python -m coordinator.assembly.reference`` prints them all; with a page's name it puts them there.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from coordinator.config.sections.kinematics import delta as read_delta, deltesian as read_deltesian, dual_carriage as read_dual, generic_cartesian as read_generic, polar as read_polar, rotary_delta as read_rotary_delta, winch as read_winch
+from coordinator.config.sections import extruder as read_extruder, nodes as read_nodes, printer as read_printer, rails as read_rails, shaper as read_shaper, tables as read_tables
+from coordinator.config.options import Option, SectionSpec
+from coordinator.config.sections.kinematics.printer_options import PRINTER_SPECS
+from coordinator.config.unsupported import LATER_SECTIONS
+from coordinator.modules.registry import own_beside, own_modules
+
+_BEGIN: Final = "<!-- The tables below"
+_END: Final = "## Sections that do not act yet\n"
+SECTIONS: dict[str, SectionSpec] = {
+    "[mcu], [mcu NAME]": read_nodes.MCU,
+    "[printer]": read_printer.PRINTER,
+    **{f"[printer] with kinematics {name}": spec for name, spec in PRINTER_SPECS.items()},
+    "[stepper_x], [stepper_y], [stepper_z], [stepper_arm]": read_rails.RAIL,
+    "[stepper_x1], [stepper_z1], [stepper_z2] …": read_rails.EXTRA_STEPPER,
+    "[stepper_a], [stepper_b], [stepper_c] of a delta": read_delta.TOWER,
+    "[stepper_left], [stepper_right] of a deltesian": read_deltesian.SIDE,
+    "[stepper_bed] of a polar machine": read_polar.BED,
+    "[stepper_a], [stepper_b], [stepper_c] of a rotary delta": read_rotary_delta.ARM,
+    "[stepper_a], [stepper_b], [stepper_c] … of winches": read_winch.WINCH,
+    "[carriage NAME]": read_generic.CARRIAGE,
+    "[stepper NAME]": read_generic.STEPPER,
+    "[extra_carriage NAME]": read_generic.EXTRA_CARRIAGE,
+    "[dual_carriage NAME]": read_generic.DUAL_CARRIAGE,
+    "[dual_carriage]": read_dual.DUAL_CARRIAGE,
+    "[extruder], [extruder1] …": read_extruder.EXTRUDER,
+    "[extruder_stepper NAME]": read_extruder.EXTRUDER_STEPPER,
+    "[input_shaper]": read_shaper.INPUT_SHAPER,
+    "[axis_tables]": read_tables.AXIS_TABLES,
+    "[board_pins], [board_pins NAME]": read_nodes.BOARD_PINS,
+    "[duplicate_pin_override]": read_nodes.DUPLICATE_PIN_OVERRIDE,
+}
+MOST_NUMBERED = 3
+"""Options that differ in their number are shown so far; the help says how many there are."""
+
+
+def sections() -> list[str]:
+    """Return the titles of all sections: the machine's own, then those of our modules."""
+    return [*SECTIONS, *_module_sections()]
+
+
+def _module_sections() -> dict[str, SectionSpec]:
+    beside = {f"{title}, further options": module.SPEC for title, module in own_beside()}
+    return beside | {title: module.SPEC for title, module in own_modules()}
+
+
+def _spec(title: str) -> SectionSpec:
+    return SECTIONS.get(title) or _module_sections()[title]
+
+
+def section_json(title: str) -> dict[str, object]:
+    """Return one section's purpose and options."""
+    spec = _spec(title)
+    return {
+        "help": spec.help,
+        "options": [
+            {
+                "name": option.name,
+                "value": option.rule(),
+                "unit": option.unit,
+                "default": option.default,
+                "help": option.help,
+            }
+            for option in spec.options
+        ],
+    }
+
+
+def section_table(title: str) -> str:
+    """Return one section's heading, purpose and options in Markdown."""
+    spec = _spec(title)
+    lines = [
+        f"### `{title}`",
+        "",
+        f"{spec.help}.",
+        "",
+        "| option | value | default | what it is |",
+        "|---|---|---|---|",
+    ]
+    lines += [_row(option) for option in spec.options if not _is_one_of_many(option)]
+    if spec.family is not None:
+        lines.append(_row(replace(spec.family, name=f"{spec.family.name}NAME")))
+    if spec.later:
+        names = ", ".join(f"`{name}`" for name in spec.later)
+        lines += ["", f"Recognised, not yet acting: {names}."]
+    return "\n".join(lines) + "\n"
+
+
+def later_sections() -> str:
+    """Return the first words of all sections that do not act yet."""
+    return ", ".join(f"`{name}`" for name in sorted(LATER_SECTIONS)) + ".\n"
+
+
+def _is_one_of_many(option: Option[object]) -> bool:
+    """Whether OPTION is as those of lower numbers before it (``voltage17``)."""
+    number = option.name.lstrip("abcdefghijklmnopqrstuvwxyz_")
+    return number.isdecimal() and int(number) > MOST_NUMBERED
+
+
+def _row(option: Option[object]) -> str:
+    default = option.default
+    if isinstance(default, tuple):
+        default = ", ".join(default)
+    text = "" if default is None else f"{default:g}" if isinstance(default, float) else str(default)
+    return f"| `{option.name}` | {option.rule()} | {text} | {option.help} |"
+
+
+def with_tables(page: str) -> str:
+    """Return the text of a page, which has the marks of docs/configuration.md, with the tables of now."""
+    head, _, rest = page.partition(_BEGIN)
+    mark, _, rest = rest.partition("\n")
+    _, _, rest = rest.partition(_END)
+    told = rest[: rest.index("\n`")]
+    tables = "\n".join(section_table(title) for title in sections())
+    return f"{head}{_BEGIN}{mark}\n\n{tables}\n{_END}{told}\n{later_sections()}"
+
+
+def main() -> None:
+    """Print all tables, or put them into the pages that are named."""
+    if len(sys.argv) == 1:
+        sys.stdout.write("\n".join(section_table(title) for title in sections()) + "\n" + later_sections())
+    for path in map(Path, sys.argv[1:]):
+        path.write_text(with_tables(path.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The command ``canductor``: entry point, parser, arguments and commands."""

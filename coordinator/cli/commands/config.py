@@ -1,0 +1,113 @@
+"""What ``canductor config`` does."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from coordinator.assembly import reference as tables
+from coordinator.assembly.check import check_config
+from coordinator.assembly.consequences import meaning
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import NotYetActing
+from coordinator.config.errors import ConfigError
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
+
+
+@record
+class CheckReport:
+    """What is wrong with a configuration."""
+
+    path: str
+    problems: Sequence[CanductorError]
+    notices: Sequence[str]
+    """What is worth knowing, when nothing is wrong."""
+    not_acting: Sequence[NotYetActing] = ()
+    """What is right but does not act, when nothing is wrong."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the machine can be brought up with it, as far as is known without the machine."""
+        return not self.problems
+
+    def to_json(self) -> Mapping[str, Any]:
+        """Return it for --json."""
+        return {
+            "problems": [
+                {"file": place.path, "line": place.line, "sentence": str(problem)}
+                if (place := problem.place if isinstance(problem, ConfigError) else None) is not None
+                else {"file": self.path, "line": 0, "sentence": str(problem)}
+                for problem in self.problems
+            ],
+            "notices": list(self.notices),
+            "not_acting": [
+                {
+                    "section": entry.section,
+                    "options": list(entry.options),
+                    "file": entry.place.path,
+                    "line": entry.place.line,
+                    "reason": entry.reason,
+                    "meaning": meaning(entry),
+                }
+                for entry in self.not_acting
+            ],
+        }
+
+    def to_text(self) -> str:
+        """Return a line for each."""
+        count = len(self.problems)
+        end = f"{self.path}: {count or 'no'} mistake{'' if count == 1 else 's'}"
+        return "\n".join([*map(str, self.problems), *self.notices, end, *self._not_acting_lines()])
+
+    def _not_acting_lines(self) -> list[str]:
+        """Return the list of what will not act, and what that means for a print."""
+        if not self.not_acting:
+            return []
+        return [
+            "",
+            "What will not act, and what that means for a print:",
+            *(f"  {entry}: {meaning(entry)}" for entry in self.not_acting),
+        ]
+
+
+def check(path: str) -> CheckReport:
+    """Find everything that is wrong with the configuration PATH."""
+    problems = check_config(path)
+    if problems:
+        return CheckReport(path, problems, ())
+    described = load_machine(path)
+    return CheckReport(path, problems, described.notes, described.not_yet_acting)
+
+
+@record
+class Reference:
+    """Tables of sections and their options."""
+
+    sections: Sequence[str]
+
+    @property
+    def ok(self) -> bool:
+        """It always is."""
+        return True
+
+    def to_json(self) -> Mapping[str, Any]:
+        """Return it for --json."""
+        return {"sections": {title: tables.section_json(title) for title in self.sections}}
+
+    def to_text(self) -> str:
+        """Return Markdown."""
+        return "\n".join(map(tables.section_table, self.sections)).rstrip()
+
+
+def reference(beginnings: Sequence[str]) -> Reference:
+    """Return the tables of all sections, or of those whose name begins with one of BEGINNINGS."""
+    wanted = [word.strip("[]") for word in beginnings]
+    titles = [
+        title
+        for title in tables.sections()
+        if not wanted or any(title.lstrip("[").startswith(word) for word in wanted)
+    ]
+    if not titles:
+        raise CanductorError(
+            f"no section begins with {' or '.join(wanted)}; 'canductor config reference' prints all"
+        )
+    return Reference(titles)

@@ -1,0 +1,140 @@
+"""``canductor run``: brings up a configured machine and prints a file, or what comes on standard input."""
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+
+from coordinator.support.command_options import RunOptions, machine_name
+from coordinator.streaming.compensation import kept_compensation
+from coordinator.gcode.program import Program
+from coordinator.runtime.host import Computer, LinuxHost
+from coordinator.support.interrupts import run_to_end
+from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.support.progress import Progress, ProgressDisplay
+from coordinator.streaming.job_runner import NodeOutcome, Outcome, run_job
+from coordinator.tables.store import table_folder
+from nodes.dictionary.cache import DictionaryCache
+
+
+@dataclass(frozen=True, slots=True)
+class RunReport:
+    """What became of a job; ``ok`` only when every node counted the steps that it was sent."""
+
+    gcode: str
+    outcome: Outcome
+
+    @property
+    def ok(self) -> bool:
+        """Whether every stepper stands where its commands add up to."""
+        return not self._astray()
+
+    def _astray(self) -> list[str]:
+        outcome = self.outcome
+        return [name for name, steps in outcome.positions.items() if steps != outcome.issued[name]]
+
+    def to_json(self) -> Mapping[str, object]:
+        """Return the figures by name."""
+        outcome = self.outcome
+        return {
+            "gcode": self.gcode,
+            "moves": outcome.moves,
+            "print_time_s": round(outcome.print_time_s, 3),
+            "steps": outcome.steps,
+            "queue_steps": outcome.queue_steps,
+            "bytes_to_nodes": sum(node.link.bytes_sent for node in outcome.nodes),
+            "retransmitted_bytes": sum(node.link.bytes_repeated for node in outcome.nodes),
+            "steppers": {
+                name: {"steps_moved": steps, "steps_sent": outcome.issued[name]}
+                for name, steps in outcome.positions.items()
+            },
+            "nodes": {node.name: _node_json(node) for node in outcome.nodes},
+        }
+
+    def to_text(self) -> str:
+        """Return the same for a reader."""
+        outcome = self.outcome
+        moved = f"{outcome.moves:,} moves in {outcome.print_time_s:.1f} s, {outcome.steps:,} steps"
+        lines = [f"{self.gcode}: {moved} in {outcome.queue_steps:,} queue_step commands"]
+        lines += [
+            f"  {name}: moved by {steps:+,} steps, as its node counts them"
+            for name, steps in outcome.positions.items()
+        ]
+        lines += [_node_line(node) for node in outcome.nodes]
+        if astray := self._astray():
+            lines.append(
+                f"FAILED: {', '.join(astray)} moved by another number of steps than was sent; "
+                "home the machine before it moves again, and please report this"
+            )
+        return "\n".join(lines)
+
+
+def _node_json(node: NodeOutcome) -> Mapping[str, object]:
+    link = node.link
+    return {
+        "bytes_sent": link.bytes_sent,
+        "retransmitted_bytes": link.bytes_repeated,
+        "min_lead_ms": None if link.min_lead_s is None else round(link.min_lead_s * 1e3, 1),
+        "round_trip_us": round(link.srtt_s * 1e6, 2),
+        "motion_queue_max": link.motion_commands_max,
+        "clock_error_us": round(node.clock_error_s * 1e6, 2),
+    }
+
+
+def _node_line(node: NodeOutcome) -> str:
+    link = node.link
+    lead = "no motion" if link.min_lead_s is None else f"lead at least {link.min_lead_s * 1e3:.0f} ms"
+    return (
+        f"  node {node.name}: {link.bytes_sent:,} bytes sent, {link.bytes_repeated:,} of them again, {lead}, "
+        f"round trip {link.srtt_s * 1e3:.2f} ms, clock known to {node.clock_error_s * 1e6:.1f} µs"
+    )
+
+
+def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
+    """Run OPTIONS.gcode, or standard input as it comes, on the machine of OPTIONS.config and HOST.
+
+    HOST: this computer if None. Replies and notices go to standard output as they come. Raises
+    CanductorError, KeyboardInterrupt.
+    """
+    host = host or LinuxHost()
+    description = load_machine(str(options.config))
+    with ExitStack() as stack:
+        program = stack.enter_context(
+            Program.typed() if options.gcode is None else Program.open(options.gcode)
+        )
+        _announce(description)
+        show = stack.enter_context(_progress(options, program))
+        compensation = kept_compensation(description, table_folder(machine_name(options.config)), _say)
+        outcome = run_to_end(
+            lambda: run_job(
+                description,
+                program,
+                show,
+                on_told=lambda told: _say(told.text),
+                cache=DictionaryCache.of_user(),
+                compensation=compensation,
+                host=host,
+            ),
+            host.make_loop,
+        )
+        return RunReport(program.name, outcome)
+
+
+def _announce(description: MachineDescription) -> None:
+    for line in (*description.not_yet_acting, *description.notes):
+        _say(str(line))
+
+
+@contextmanager
+def _progress(options: RunOptions, program: Program) -> Iterator[Callable[[Progress], None]]:
+    """Show how a file goes on; who types sees the replies, undisturbed."""
+    if options.gcode is None:
+        yield lambda _: None
+        return
+    with ProgressDisplay(f"printing {program.name}", quiet=options.json) as display:
+        yield display.update
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()

@@ -1,0 +1,137 @@
+"""The command ``canductor``: reads the command line, starts the part that does the work, tells the end.
+
+``read_words`` only turns words into a job. ``main`` runs the job, so that every failure ends in one place:
+one sentence on stderr, with --json also one object on stdout.
+"""
+
+import os
+import select
+import signal
+import sys
+from collections.abc import Callable, Mapping, Sequence
+
+from coordinator.cli.parser import Answered, Job, help_of, print_help, read_words, version
+from coordinator.support.command_options import Report, Terminated
+from nodes.support.errors import CanductorError
+from nodes.support.option_values import UsageError
+
+EXIT_OK = 0
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+EXIT_BUG = 70
+EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141
+EXIT_TERMINATED = 143
+
+
+def main(arguments: Sequence[str] | None = None, read: Callable[[Sequence[str]], Job] = read_words) -> int:
+    """Run one command and return the exit status; never raises but for SystemExit.
+
+    READ makes a job of the words of the command line.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    as_json = "--json" in words
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        status = _run(words, as_json, read) if words else _no_words()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        if not _stdout_is_gone():
+            return _report_bug(as_json)
+        _drop_stdout()
+        return EXIT_BROKEN_PIPE
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    return status
+
+
+def _terminate(*_: object) -> None:
+    raise Terminated
+
+
+def _no_words() -> int:
+    print_help()
+    return EXIT_USAGE
+
+
+def _run(words: list[str], as_json: bool, read: Callable[[Sequence[str]], Job]) -> int:
+    try:
+        return _show(read(words)(), as_json)
+    except Answered:
+        return EXIT_OK
+    except CanductorError as error:
+        return _fail(str(error), EXIT_FAILED, as_json)
+    except UsageError as error:
+        return _fail(f"{' '.join(str(error).split())} (see '{help_of(words)}')", EXIT_USAGE, as_json)
+    except KeyboardInterrupt as error:
+        terminated = isinstance(error, Terminated)
+        return _fail(
+            "stopped by SIGTERM" if terminated else "stopped by Ctrl-C",
+            EXIT_TERMINATED if terminated else EXIT_INTERRUPTED,
+            as_json,
+        )
+    except BrokenPipeError:
+        raise
+    except Exception:  # noqa: BLE001 (the last line of defence: whatever comes here is a bug, and is told so)
+        return _report_bug(as_json)
+
+
+def _show(report: Report, as_json: bool) -> int:
+    if as_json:
+        _say_json({"ok": report.ok, **report.to_json()})
+    elif text := report.to_text():
+        _say(text)
+    return EXIT_OK if report.ok else EXIT_FAILED
+
+
+def _fail(sentence: str, status: int, as_json: bool) -> int:
+    sys.stderr.write(f"canductor: {sentence}\n")
+    if as_json:
+        _say_json({"ok": False, "error": sentence})
+    return status
+
+
+def _say_json(values: Mapping[str, object]) -> None:
+    import json  # noqa: PLC0415 (start-up time)
+
+    _say(json.dumps(values, allow_nan=False))
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+
+
+def _report_bug(as_json: bool) -> int:
+    """Keep the traceback in a file: on the terminal it helps nobody."""
+    import tempfile  # noqa: PLC0415 (start-up time)
+    import traceback  # noqa: PLC0415 (start-up time)
+
+    error = sys.exception() if sys.version_info >= (3, 12) else sys.exc_info()[1]
+    with tempfile.NamedTemporaryFile(
+        "w", prefix="canductor-", suffix=".log", delete=False, encoding="utf-8"
+    ) as log:
+        log.write(f"canductor {version()}, Python {sys.version}\n{' '.join(sys.argv)}\n\n")
+        log.write(traceback.format_exc())
+    sentence = f"internal error: {type(error).__name__}: {error}; please report it with {log.name}"
+    return _fail(" ".join(sentence.split()), EXIT_BUG, as_json)
+
+
+def _stdout_is_gone() -> bool:
+    """Tell a closed reader of our output from a broken pipe elsewhere, which would be a bug."""
+    try:
+        poll = select.poll()
+        poll.register(sys.stdout.fileno(), select.POLLOUT)
+        return any(events & (select.POLLERR | select.POLLHUP) for _, events in poll.poll(0))
+    except (OSError, ValueError):  # not a file: nobody can close its other end
+        return False
+
+
+def _drop_stdout() -> None:
+    """Let what is still buffered go nowhere, or the interpreter complains when it ends."""
+    devnull = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(devnull, sys.stdout.fileno())
+    os.close(devnull)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

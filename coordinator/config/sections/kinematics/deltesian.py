@@ -1,0 +1,91 @@
+"""A deltesian: the towers [stepper_left] and [stepper_right], and [stepper_y]."""
+
+import math
+
+from coordinator.kinematics.base import linear
+from coordinator.kinematics.deltesian import Arm, Deltesian
+from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of, tidy
+from coordinator.config.model import RailDescription
+from coordinator.config.options import FloatOption, SectionReader, SectionSpec
+from coordinator.config.sections.kinematics.printer_options import MIN_ANGLE, MINIMUM_Z, PRINT_WIDTH
+from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, read_tower_homing
+from coordinator.config.sections.rails import read_extra_steppers, read_rail
+from coordinator.config.sections.steppers import MAX_POSITION, MOTOR, read_stepper
+from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.kinematics.tower_checks import check_height
+from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.motion.specs import AXIS_RANGE_OPTIONS
+
+ARM_LENGTH = FloatOption(
+    name="arm_length",
+    help="length of the rod, from joint to joint; by default that of stepper_left",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+ARM_X_LENGTH = FloatOption(
+    name="arm_x_length",
+    help="level distance between tower and head with the head in the middle; by default that of stepper_left",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+SIDE = SectionSpec(
+    help="A tower of a deltesian. position_endstop is Z of the head in the middle when the endstop switches;"
+    " by default that of stepper_left",
+    options=(*MOTOR, ARM_LENGTH, ARM_X_LENGTH, *HOMING),
+    later=LATER_STEPPER_OPTIONS,
+)
+WHY = "a deltesian has the towers stepper_left and stepper_right"
+RANGE_OPTIONS = (
+    "print_width and min_angle of [printer]",
+    AXIS_RANGE_OPTIONS[1],
+    "minimum_z_position of [printer] and position_endstop of [stepper_left]",
+)
+
+
+def read_deltesian(reading: Reading, printer: SectionReader) -> Frame:
+    """Return the frame of a deltesian; raises ConfigError."""
+    min_z, min_angle = printer.get(MINIMUM_Z), math.radians(printer.get(MIN_ANGLE))
+    width = printer.find(PRINT_WIDTH)
+    readers = [SectionReader(reading.get(f"stepper_{side}", WHY), SIDE) for side in ("left", "right")]
+    left, right = (
+        _read_side(reader, readers[0], sign) for reader, sign in zip(readers, (-1.0, 1.0), strict=True)
+    )
+    y = read_rail(reading, "y", linear(y=1))
+    deltesian = Deltesian(left, right, axis_range(y), min_z, min_angle, width)
+    _check_width(printer, readers[0], deltesian)
+    check_height(printer, deltesian.work_space.high[2], min_z)
+    rails = []
+    for reader, arm, function in zip(readers, (left, right), deltesian.step_functions()[:2], strict=True):
+        homing = read_tower_homing(reader, arm.endstop_height, reading.pins)
+        first = read_stepper(reader, function, reading.pins)
+        steppers = (first, *read_extra_steppers(reading, reader.name, function))
+        reading.finish(reader)
+        name = reader.name.removeprefix("stepper_")
+        rails.append(RailDescription(name, steppers, None, None, homing, reader.place))
+    home = deltesian.forward((*deltesian.endstop_positions, home_of(y)))
+    return Frame(deltesian, (*rails, y), tidy(home), range_options=RANGE_OPTIONS)
+
+
+def _read_side(reader: SectionReader, first: SectionReader, sign: float) -> Arm:
+    rod, x, height = (
+        first.get(option) if (own := reader.find(option)) is None else own
+        for option in (ARM_LENGTH, ARM_X_LENGTH, POSITION_ENDSTOP)
+    )
+    if rod <= x:
+        raise reader.bad(ARM_LENGTH, f"must be above arm_x_length ({x:g} mm): the rod would not reach")
+    return Arm(sign * x, rod, height)
+
+
+def _check_width(printer: SectionReader, left: SectionReader, deltesian: Deltesian) -> None:
+    widest = deltesian.widest
+    if widest <= 0:
+        raise left.bad(
+            ARM_LENGTH,
+            "so short that the rod lies below min_angle already with the head in the middle; correct it",
+        )
+    if deltesian.print_width is not None and deltesian.print_width > 2 * widest:
+        raise printer.bad(
+            PRINT_WIDTH, f"but rods would lie below min_angle; it can be at most {2 * widest:.5g} mm"
+        )

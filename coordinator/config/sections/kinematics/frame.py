@@ -1,0 +1,50 @@
+"""What the reader of a kinematics gives."""
+
+from coordinator.kinematics.base import Kinematics, Point, WorkSpace
+from coordinator.config.model import DualCarriageDescription, RailDescription, StepperDescription
+from coordinator.motion.specs import AXIS_RANGE_OPTIONS
+from nodes.support.records import record
+
+
+@record
+class Frame:
+    """All that moves the head."""
+
+    kinematics: Kinematics
+    rails: tuple[RailDescription, ...]
+    home: Point
+    """Where the head is after homing."""
+    motors: tuple[StepperDescription, ...] = ()
+    """Empty: the steppers of the rails, in order."""
+    dual_carriage: DualCarriageDescription | None = None
+    range_options: tuple[str, str, str] = AXIS_RANGE_OPTIONS
+    """Which options say how far X, Y and Z may go."""
+
+    @property
+    def steppers(self) -> tuple[StepperDescription, ...]:
+        """All steppers, each once."""
+        return self.motors or tuple(stepper for rail in self.rails for stepper in rail.steppers)
+
+
+def axis_range(rail: RailDescription) -> tuple[float, float]:
+    """Return how far a rail with position_min and position_max goes."""
+    assert rail.position_min is not None
+    assert rail.position_max is not None
+    return rail.position_min, rail.position_max
+
+
+def box_of(x: RailDescription, y: RailDescription, z: RailDescription) -> WorkSpace:
+    """Return the box that three axes span."""
+    ranges = [axis_range(rail) for rail in (x, y, z)]
+    return WorkSpace((ranges[0][0], ranges[1][0], ranges[2][0]), (ranges[0][1], ranges[1][1], ranges[2][1]))
+
+
+def tidy(point: Point) -> Point:
+    """Return a point that was calculated without its rounding errors: to the picometre."""
+    x, y, z = (round(value, 9) + 0.0 for value in point)
+    return (x, y, z)
+
+
+def home_of(rail: RailDescription) -> float:
+    """Return where an axis is after homing, mm."""
+    return rail.homing.position_endstop or 0.0

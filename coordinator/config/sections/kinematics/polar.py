@@ -1,0 +1,35 @@
+"""A polar machine: the turning bed [stepper_bed], the arm [stepper_arm], and [stepper_z]."""
+
+from coordinator.kinematics.polar import Polar
+from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of
+from coordinator.config.model import NO_ENDSTOP, RailDescription
+from coordinator.config.options import SectionReader, SectionSpec
+from coordinator.config.sections.homing import WAITING
+from coordinator.config.sections.rails import POSITION_MAX, read_extra_steppers, read_rail
+from coordinator.config.sections.steppers import TURNING_MOTOR, read_stepper
+from coordinator.config.sections.reading import Reading
+from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.motion.specs import AXIS_RANGE_OPTIONS
+
+BED = SectionSpec(
+    help="The motor that turns the bed of a polar machine", options=TURNING_MOTOR, later=LATER_STEPPER_OPTIONS
+)
+ARM_RANGE = "position_min and position_max of [stepper_arm]"
+RANGE_OPTIONS = (ARM_RANGE, ARM_RANGE, AXIS_RANGE_OPTIONS[2])
+
+
+def read_polar(reading: Reading, _printer: SectionReader) -> Frame:
+    """Return the frame of a polar machine; raises ConfigError."""
+    turn, radius, up = Polar((0.0, 1.0), (0.0, 1.0)).step_functions()
+    section = reading.get("stepper_bed", "a polar machine has stepper_bed, stepper_arm and stepper_z")
+    reader = SectionReader(section, BED)
+    motors = (read_stepper(reader, turn, reading.pins), *read_extra_steppers(reading, reader.name, turn))
+    reading.finish(reader, waiting=WAITING)
+    bed = RailDescription("bed", motors, None, None, NO_ENDSTOP, reader.place)
+    arm, z = read_rail(reading, "arm", radius), read_rail(reading, "z", up)
+    low, high = axis_range(arm)
+    if high <= 0:
+        option = reading.config.sections["stepper_arm"]
+        raise SectionReader(option, SectionSpec("", ())).bad(POSITION_MAX, "must be above 0")
+    home = (home_of(arm), 0.0, home_of(z))
+    return Frame(Polar((low, high), axis_range(z)), (bed, arm, z), home, range_options=RANGE_OPTIONS)

@@ -1,0 +1,107 @@
+"""A rotary delta: [printer] shoulder_radius and shoulder_height, and the arms [stepper_a], …_b and …_c."""
+
+import math
+
+from coordinator.kinematics.rotary_delta import Arm, RotaryDelta
+from coordinator.config.sections.kinematics.frame import Frame, tidy
+from coordinator.config.model import RailDescription
+from coordinator.config.options import FloatOption, SectionReader, SectionSpec
+from coordinator.config.sections.kinematics.printer_options import (
+    ARMS_PRINT_RADIUS,
+    MINIMUM_Z,
+    ROUND_RANGE_OPTIONS,
+    SHOULDER_HEIGHT,
+    SHOULDER_RADIUS,
+)
+from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, WAITING, read_tower_homing
+from coordinator.config.sections.rails import read_extra_steppers
+from coordinator.config.sections.steppers import MAX_POSITION, TURNING_MOTOR, read_stepper
+from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.kinematics.tower_checks import check_directions, check_height
+from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+
+UPPER_LENGTH = FloatOption(
+    name="upper_arm_length",
+    help="length of the upper arm, from shoulder to elbow; by default that of stepper_a",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+LOWER_LENGTH = FloatOption(
+    name="lower_arm_length",
+    help="length of the lower arm, from elbow to head; by default that of stepper_a",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+ANGLE = FloatOption(
+    name="angle",
+    help="direction in which the arm stands, from X towards Y; by default 30 for a, 150 for b, 270 for c",
+    unit="°",
+    minimum=-360,
+    maximum=720,
+)
+ARM = SectionSpec(
+    help="An arm of a rotary delta. position_endstop is Z of the head in the middle when the endstop"
+    " switches; by default that of stepper_a",
+    options=(*TURNING_MOTOR, UPPER_LENGTH, LOWER_LENGTH, ANGLE, *HOMING),
+    later=LATER_STEPPER_OPTIONS,
+)
+WHY = "a rotary delta has the arms stepper_a, stepper_b and stepper_c"
+_ANGLES = (30.0, 150.0, 270.0)
+
+
+def read_rotary_delta(reading: Reading, printer: SectionReader) -> Frame:
+    """Return the frame of a rotary delta; raises ConfigError."""
+    radius, height = printer.get(SHOULDER_RADIUS), printer.get(SHOULDER_HEIGHT)
+    min_z, print_radius = printer.get(MINIMUM_Z), printer.find(ARMS_PRINT_RADIUS)
+    readers = [SectionReader(reading.get(f"stepper_{name}", WHY), ARM) for name in "abc"]
+    arms, ends = [], []
+    for reader, default in zip(readers, _ANGLES, strict=True):
+        arms.append(_read_arm(reader, readers[0], default))
+        end = reader.find(POSITION_ENDSTOP)
+        ends.append(readers[0].get(POSITION_ENDSTOP) if end is None else end)
+    check_directions(readers, ANGLE, tuple(arm.angle for arm in arms))
+    machine = RotaryDelta(
+        (arms[0], arms[1], arms[2]), radius, height, (ends[0], ends[1], ends[2]), min_z, print_radius
+    )
+    _check_reach(printer, readers[0], machine)
+    rails = []
+    for reader, end, function in zip(readers, ends, machine.step_functions(), strict=True):
+        homing = read_tower_homing(reader, end, reading.pins)
+        first = read_stepper(reader, function, reading.pins)
+        steppers = (first, *read_extra_steppers(reading, reader.name, function))
+        reading.finish(reader, waiting=WAITING if homing.waits else ())
+        rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
+    home = tidy(machine.forward(machine.endstop_angles))
+    return Frame(machine, tuple(rails), home, range_options=ROUND_RANGE_OPTIONS)
+
+
+def _read_arm(reader: SectionReader, first: SectionReader, angle: float) -> Arm:
+    upper, lower = (
+        first.get(option) if (own := reader.find(option)) is None else own
+        for option in (UPPER_LENGTH, LOWER_LENGTH)
+    )
+    given = reader.find(ANGLE)
+    return Arm(upper, lower, math.radians(angle if given is None else given))
+
+
+def _check_reach(printer: SectionReader, first: SectionReader, machine: RotaryDelta) -> None:
+    try:
+        widest = machine.widest_radius
+    except ValueError:
+        raise first.bad(
+            POSITION_ENDSTOP,
+            "where the arms do not reach in the middle; correct it, the arms or the shoulders",
+        ) from None
+    if widest < 1.0:
+        raise printer.bad(
+            SHOULDER_HEIGHT,
+            f"but then the arms do not reach down to Z {machine.min_z:g} mm; correct it, the arms, or"
+            " minimum_z_position",
+        )
+    if machine.print_radius is not None and machine.print_radius > widest:
+        raise printer.bad(
+            ARMS_PRINT_RADIUS, f"but the arms reach only to {widest:.5g} mm from the middle; reduce it"
+        )
+    check_height(printer, machine.work_space.high[2], machine.min_z)

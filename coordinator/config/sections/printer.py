@@ -1,0 +1,156 @@
+"""The section [printer], and how it and [extruder] limit every move."""
+
+from collections.abc import Mapping
+
+from coordinator.config.file import RawSection
+from coordinator.config.options import ChoiceOption, FloatOption, SectionReader, SectionSpec, one_of
+from coordinator.config.errors import ConfigError
+from nodes.support.records import record
+
+# Far above any machine, low enough that squares and sums stay exact and a slipped digit group is seen.
+MAX_SPEED = 100_000.0
+MAX_ACCEL = 10_000_000.0
+
+KINEMATICS = ChoiceOption(
+    name="kinematics",
+    help="how the steppers move the head",
+    choices=(
+        "cartesian",
+        "corexy",
+        "corexz",
+        "delta",
+        "deltesian",
+        "generic_cartesian",
+        "hybrid_corexy",
+        "hybrid_corexz",
+        "none",
+        "polar",
+        "rotary_delta",
+        "winch",
+    ),
+)
+MAX_VELOCITY = FloatOption(
+    name="max_velocity", help="highest speed of the head", unit="mm/s", above=0, maximum=MAX_SPEED
+)
+MAX_ACCEL_OPTION = FloatOption(
+    name="max_accel", help="highest acceleration of the head", unit="mm/s²", above=0, maximum=MAX_ACCEL
+)
+
+
+def _axis_velocity(axis: str) -> FloatOption:
+    return FloatOption(
+        name=f"max_{axis}_velocity",
+        help=f"highest speed along {axis.upper()}; by default max_velocity",
+        unit="mm/s",
+        above=0,
+        maximum=MAX_SPEED,
+    )
+
+
+def _axis_accel(axis: str) -> FloatOption:
+    return FloatOption(
+        name=f"max_{axis}_accel",
+        help=f"highest acceleration along {axis.upper()}; by default max_accel",
+        unit="mm/s²",
+        above=0,
+        maximum=MAX_ACCEL,
+    )
+
+
+AXIS_VELOCITIES = tuple(_axis_velocity(axis) for axis in "xyz")
+AXIS_ACCELS = tuple(_axis_accel(axis) for axis in "xyz")
+SQUARE_CORNER_VELOCITY = FloatOption(
+    name="square_corner_velocity",
+    help="speed at which a right-angled corner may be taken",
+    default=5.0,
+    unit="mm/s",
+    minimum=0,
+    maximum=MAX_SPEED,
+)
+MINIMUM_CRUISE_RATIO = FloatOption(
+    name="minimum_cruise_ratio",
+    help="share of a short move that is to be cruise, which limits zig-zag",
+    default=0.5,
+    minimum=0,
+    below=1,
+)
+MAX_ACCEL_TO_DECEL = FloatOption(
+    name="max_accel_to_decel",
+    help="older form of minimum_cruise_ratio, which becomes 1 - max_accel_to_decel / max_accel",
+    unit="mm/s²",
+    above=0,
+    maximum=MAX_ACCEL,
+)
+PRINTER = SectionSpec(
+    help="The machine as a whole, whatever its kinematics",
+    options=(
+        KINEMATICS,
+        MAX_VELOCITY,
+        MAX_ACCEL_OPTION,
+        *AXIS_VELOCITIES,
+        *AXIS_ACCELS,
+        SQUARE_CORNER_VELOCITY,
+        MINIMUM_CRUISE_RATIO,
+        MAX_ACCEL_TO_DECEL,
+    ),
+)
+
+
+@record
+class PrinterSection:
+    """[printer] as read; units as in MotionLimits."""
+
+    max_velocity: float
+    max_accel: float
+    axis_velocity: tuple[float | None, ...]
+    """Of X, Y and Z; None: no limit of its own."""
+    axis_accel: tuple[float | None, ...]
+    square_corner_velocity: float
+    minimum_cruise_ratio: float
+
+
+def open_printer(section: RawSection, specs: Mapping[str, SectionSpec]) -> tuple[str, SectionReader]:
+    """Return the kinematics, and a reader of [printer] with its options; raises ConfigError.
+
+    SPECS: what [printer] may contain besides for some kinematics.
+    """
+    names = {k: (*spec.later, *(option.name for option in spec.options)) for k, spec in specs.items()}
+    every = tuple({name: None for owned in names.values() for name in owned})
+    kinematics = SectionReader(section, SectionSpec(PRINTER.help, PRINTER.options, every)).get(KINEMATICS)
+    for name, option in section.options.items():
+        owners = [owner for owner, owned in names.items() if name in owned]
+        if owners and kinematics not in owners:
+            raise ConfigError(
+                option.place,
+                f"option '{name}' of [{section.name}] belongs to kinematics {one_of(owners)}, but this"
+                f" machine is {kinematics}; remove it",
+            )
+    own = specs.get(kinematics, SectionSpec("", ()))
+    spec = SectionSpec(PRINTER.help, (*PRINTER.options, *own.options), own.later)
+    reader = SectionReader(section, spec)
+    reader.get(KINEMATICS)
+    return kinematics, reader
+
+
+def read_printer(reader: SectionReader) -> PrinterSection:
+    """Return the limits of the whole machine; raises ConfigError."""
+    max_accel = reader.get(MAX_ACCEL_OPTION)
+    return PrinterSection(
+        max_velocity=reader.get(MAX_VELOCITY),
+        max_accel=max_accel,
+        axis_velocity=tuple(reader.find(option) for option in AXIS_VELOCITIES),
+        axis_accel=tuple(reader.find(option) for option in AXIS_ACCELS),
+        square_corner_velocity=reader.get(SQUARE_CORNER_VELOCITY),
+        minimum_cruise_ratio=_cruise_ratio(reader, max_accel),
+    )
+
+
+def _cruise_ratio(reader: SectionReader, max_accel: float) -> float:
+    if reader.has(MINIMUM_CRUISE_RATIO):
+        return reader.get(
+            MINIMUM_CRUISE_RATIO
+        )  # then an older max_accel_to_decel beside it has no effect: finish tells
+    max_accel_to_decel = reader.find(MAX_ACCEL_TO_DECEL)
+    if max_accel_to_decel is None:
+        return reader.get(MINIMUM_CRUISE_RATIO)
+    return 1 - min(1.0, max_accel_to_decel / max_accel)

@@ -1,0 +1,57 @@
+"""``endstop_pin: tmc2209_stepper_x:virtual_endstop``: an endstop that a stepper's driver feels.
+
+The driver raises its DIAG, so the endstop's pin is ``diag_pin`` of the driver's section, on whatever node.
+"""
+
+from typing import Final
+
+from coordinator.config.file import ConfigFile
+from coordinator.config.options import BadValue, SectionReader
+from coordinator.config.pins import PinName, PinOption, PinRegistry
+from coordinator.config.errors import nearest, shown
+
+STALL_KINDS: Final = ("tmc2209",)
+"""First words of the sections of drivers that can feel the end of an axis."""
+NUMB_KINDS: Final = ("tmc2208",)
+"""Of those that cannot."""
+NAME: Final = "virtual_endstop"
+_DIAG: Final = PinOption(name="diag_pin", help="", pullable=True)
+
+
+def note_diag_pins(config: ConfigFile, pins: PinRegistry) -> None:
+    """Have PINS know the diag_pin of every driver's section that CONFIG has."""
+    for section in config.sections.values():
+        if section.kind not in STALL_KINDS:
+            continue
+        given = section.options.get(_DIAG.name)
+        try:
+            found = None if given is None else _DIAG.parse(given.value)
+        except BadValue:
+            found = None  # its own section tells
+        pins.diag_pins[f"{section.kind}_{section.instance}"] = found
+
+
+def find_diag_pin(
+    reader: SectionReader, option: PinOption, pin: PinName, pins: PinRegistry
+) -> PinName | None:
+    """Return the pin of the virtual endstop that OPTION names by PIN; None: no module offers it yet.
+
+    Raises ConfigError for a driver that does not exist or has no diag_pin.
+    """
+    kind, _, stepper = pin.node.partition("_")
+    if kind in NUMB_KINDS:
+        raise reader.bad(option, f"but a {kind.upper()} cannot feel the end of an axis; use a switch")
+    if kind not in STALL_KINDS:
+        return None
+    section = f"[{kind} {stepper}]"
+    if pin.node not in pins.diag_pins:
+        hint = nearest(pin.node, pins.diag_pins, pattern=f"'{{}}:{NAME}'") or f"; add {section}"
+        raise reader.bad(option, f"but there is no section {section}{hint}")
+    if pin.name != NAME:
+        raise reader.bad(option, f"but what {section} has is called {NAME}")
+    if pin.invert or pin.pull:
+        raise reader.bad(option, f"which takes no marks: put them before the diag_pin of {section}")
+    found = pins.diag_pins[pin.node]
+    if found is None:
+        raise reader.bad(option, f"but {section} has no diag_pin; add it, or correct {shown(pin.node)}")
+    return found

@@ -1,0 +1,38 @@
+"""Names users bring along: sections and options of modules that are not built yet.
+
+Recognising them keeps a printer.cfg usable unchanged, and keeps a typo a typo. When a module is built, its
+names leave this table.
+"""
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(text.split())
+
+
+LATER_SECTIONS = frozenset(
+    (
+        *_words("manual_stepper delta_calibrate"),
+        *_words("homing_heaters temperature_probe adc_scaled ads1x1x ads1118"),
+        *_words("probe bltouch smart_effector probe_eddy_current axis_twist_compensation load_cell"),
+        *_words("load_cell_probe"),
+        *_words("dockable_probe z_calibration tools_calibrate"),
+        *_words("bed_mesh bed_tilt bed_screws screws_tilt_adjust z_tilt z_tilt_ng quad_gantry_level"),
+        *_words("z_thermal_adjust endstop_phase"),
+        *_words("gcode_shell_command sdcard_loop"),
+        *_words("resonance_tester shaketune adxl345 icm20948 lis2dw lis3dh bmi160 mpu9250 angle"),
+        *_words("tmc2130 tmc2240 tmc2660 tmc5160 autotune_tmc ad5206 mcp4451 mcp4728 mcp4018 dac084S085"),
+        *_words("led neopixel dotstar pca9533 pca9632 led_effect servo pwm_tool pwm_cycle_time"),
+        *_words("static_pwm_clock multi_pin sx1509 samd_sercom replicape"),
+        *_words("display display_data display_template display_glyph menu palette2"),
+        *_words("filament_motion_sensor"),
+        *_words("tsl1401cl_filament_width_sensor hall_filament_width_sensor"),
+        *_words("canbus_stats statistics danger_options constants trad_rack belay mixing_extruder"),
+        *_words("heated_fan indx"),
+    )
+)
+"""First words of sections that are recognised and reported as not yet acting."""
+
+LATER_EXTRUDER_OPTIONS = _words("per_move_pressure_advance shared_heater")
+"""Those of its heater and sensor that do not act yet: coordinator/config/sections/heater_options.py."""
+LATER_MCU_OPTIONS = _words("is_non_critical reconnect_interval max_stepper_error")
+LATER_STEPPER_OPTIONS = _words("homing_current min_home_dist use_sensorless_homing")

@@ -1,0 +1,1 @@
+"""The commands that every machine has, apart from those that modules add."""

@@ -1,0 +1,319 @@
+"""The commands that every machine has: modes, dwells, homing, limits. The hot path of moves is in C."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from coordinator.gcode.builtins import machine as machine_commands, state as state_commands
+from coordinator.gcode.commands import AtRest, Done
+from coordinator.gcode.events import Emergency, Reply, Wait
+from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.gcode.parser import Command, WordError, number
+from coordinator.motion.planner.language import ARC_LETTERS, Plane
+from coordinator.motion.planner.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from coordinator.gcode.interpreter import Job
+
+    Handler = Callable[[Job, Command], bool]
+    """Acts on a command; False when the planner must be emptied first and the line comes again. Before it
+    returns False it changes nothing but the planner's queue."""
+
+MAX_DWELL_S = 86400.0
+
+
+def _numbers(command: Command, allowed: str) -> dict[str, float]:
+    """Read COMMAND's words of ALLOWED, all with numbers; others are ignored."""
+    words = command.only_words(allowed)
+    return {letter: number(command.name, words, letter) for letter in words}
+
+
+def _positive(command: Command, words: Mapping[str, float]) -> None:
+    for letter, value in words.items():
+        if value <= 0:
+            raise WordError(f"{letter} of {command.name} is {value:g}; it must be above 0")
+
+
+def _move(job: Job, command: Command) -> bool:
+    """G0, G1 that the hot path refused: unusual words, or numbers of many digits."""
+    words = command.words()
+    for letter in words.keys() - set(MOVE_LETTERS):
+        job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
+    numbers = {letter: number(command.name, words, letter) for letter in words if letter in MOVE_LETTERS}
+    status = job.planner.move(numbers)
+    if status is FeedStatus.LIMIT:
+        raise WordError(str(job.planner.fault))
+    return status is not FeedStatus.FULL
+
+
+def _dwell(job: Job, command: Command) -> bool:
+    words = _numbers(command, "PS")
+    seconds = words.get("P", 0.0) / 1000 + words.get("S", 0.0)
+    if not 0 <= seconds <= MAX_DWELL_S:
+        raise WordError(f"G4 is to wait {seconds:g} s; 0 to {MAX_DWELL_S:g} s are possible")
+    if not job.planner.flush():
+        return False
+    job.planner.dwell(seconds)
+    return True
+
+
+def _unit(unit_mm: float) -> Handler:
+    def handle(job: Job, _command: Command) -> bool:
+        job.planner.unit_mm = unit_mm
+        return True
+
+    return handle
+
+
+def _relative(*, relative: bool) -> Handler:
+    def handle(job: Job, _command: Command) -> bool:
+        job.planner.relative = relative
+        return True
+
+    return handle
+
+
+def _relative_extrusion(*, relative: bool) -> Handler:
+    def handle(job: Job, _command: Command) -> bool:
+        job.planner.relative_extrusion = relative
+        return True
+
+    return handle
+
+
+def _home(job: Job, command: Command) -> bool:
+    named = [axis for axis in command.words() if axis in "XYZ"]
+    axes = "".join(sorted(named or job.homed_position))
+    for axis in axes:
+        if axis not in job.homed_position:
+            raise WordError(f"G28 names the axis {axis}, which this machine does not have")
+    if not machine_commands.come_to_rest(job):
+        return False
+    x, y, z, e = (
+        job.homed_position[letter] if letter in axes else now
+        for letter, now in zip(AXIS_LETTERS, job.planner.toolhead_position, strict=True)
+    )
+    home = Done(position=(x, y, z, e), homed=axes)
+    if job.vocabulary.home is None:
+        job.notice("G28", "there are no endstops to look for; the axes are taken as already home")
+        job.take(home)
+        return True
+    reading = job.vocabulary.home(job.call(command), axes)
+    return job.follow(command, AtRest(reading.perform, home) if isinstance(reading, AtRest) else reading)
+
+
+def _set_origin(job: Job, command: Command) -> bool:
+    words = _numbers(command, AXIS_LETTERS)
+    if command.text and not words:
+        return True  # only what has no meaning: that is not the bare G92
+    job.planner.set_gcode_position(words or dict.fromkeys(AXIS_LETTERS, 0.0))
+    return True
+
+
+def _set_accel(job: Job, command: Command) -> bool:
+    """M204 that the hot path refused: above what is configured, or of unusual words."""
+    words = _numbers(command, "SPTR")
+    words.pop("R", None)
+    _positive(command, words)
+    if "S" in words:
+        words = {"S": words["S"]}
+    elif len(words) == 1:
+        return True  # P or T alone has no effect, as users of such programs know it
+    for accel in words.values():
+        _cap(job, "the acceleration", accel, job.planner.limits.max_accel)
+    job.planner.set_accel_words(words)
+    return True
+
+
+def _limit_axes(what: str) -> Handler:
+    def handle(job: Job, command: Command) -> bool:
+        """M201, M203: what slicers write as the machine's limits; those of the configuration hold, too."""
+        words = _numbers(command, AXIS_LETTERS)
+        _positive(command, words)
+        job.planner.limit_axes(what, words)
+        return True
+
+    return handle
+
+
+def _set_jerk(job: Job, command: Command) -> bool:
+    """M205: the lesser of X and Y is the speed at a right-angled corner; the rest means nothing here."""
+    words = _numbers(command, "XYZEBSTJ")
+    corner = [words[letter] for letter in "XY" if letter in words]
+    if corner:
+        _positive(command, {"X or Y": min(corner)})
+        job.planner.square_corner_velocity = min(*corner, job.planner.limits.square_corner_velocity)
+    return True
+
+
+def _cap(job: Job, what: str, asked: float, limit: float) -> None:
+    if asked > limit:
+        job.notice(f"{what} {asked:g} is above the configured {limit:g}", f"{limit:g} is used")
+
+
+def _set_velocity_limit(job: Job, command: Command) -> bool:
+    planner, limits = job.planner, job.planner.limits
+    values = command.only_parameters(("VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"))
+    numbers = {key: number(command.name, values, key) for key in values}
+    for key, value in numbers.items():
+        low = 0.0 if key in {"SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"} else 1e-3
+        high = 0.999 if key == "MINIMUM_CRUISE_RATIO" else 1e9
+        if not low <= value <= high:
+            raise WordError(f"{key} of SET_VELOCITY_LIMIT is {value:g}; {low:g} to {high:g} are possible")
+    if "VELOCITY" in numbers:
+        _cap(job, "the velocity", numbers["VELOCITY"], limits.max_velocity)
+        planner.max_velocity = numbers["VELOCITY"]
+    if "ACCEL" in numbers:
+        _cap(job, "the acceleration", numbers["ACCEL"], limits.max_accel)
+        planner.accel = numbers["ACCEL"]
+    if "SQUARE_CORNER_VELOCITY" in numbers:
+        asked = numbers["SQUARE_CORNER_VELOCITY"]
+        _cap(job, "the square corner velocity", asked, limits.square_corner_velocity)
+        planner.square_corner_velocity = asked
+    if "MINIMUM_CRUISE_RATIO" in numbers:
+        planner.minimum_cruise_ratio = numbers["MINIMUM_CRUISE_RATIO"]
+    return True
+
+
+def _factor(job: Job, command: Command) -> bool:
+    """M220, M221: percent in S; without it, nothing changes."""
+    percent = _numbers(command, "S").get("S")
+    if percent is None:
+        return True
+    if not 1 <= percent <= 1000:
+        raise WordError(f"S of {command.name} is {percent:g} %; 1 to 1000 % are possible")
+    if command.name == "M220":
+        job.planner.speed_factor = percent / 100
+    else:
+        job.planner.extrude_factor = percent / 100
+    return True
+
+
+def _wait_for_moves(job: Job, _command: Command) -> bool:
+    if not job.planner.flush():
+        return False
+    job.emit(Wait(job.line, job.planner.print_time_end_s))
+    return True
+
+
+def _tell_position(job: Job, _command: Command) -> bool:
+    position = zip(AXIS_LETTERS, job.planner.gcode_position, strict=True)
+    job.emit(
+        Reply(job.line, " ".join(f"{letter}:{value:.3f}" for letter, value in position), ReplyKind.PLAIN)
+    )
+    return True
+
+
+def _emergency(job: Job, _command: Command) -> bool:
+    job.end_with(Emergency(job.line))
+    return True
+
+
+def _without_module(what: str) -> Handler:
+    def handle(job: Job, command: Command) -> bool:
+        job.record(command)
+        job.notice(what, "accepted and recorded, but without effect: no module acts on them yet")
+        return True
+
+    return handle
+
+
+def _ignore(_job: Job, _command: Command) -> bool:
+    return True
+
+
+def _say(job: Job, command: Command) -> bool:
+    job.emit(Reply(job.line, f"echo: {command.text.strip()}", ReplyKind.PLAIN))
+    return True
+
+
+def _refuse_spline(_job: Job, command: Command) -> bool:
+    raise WordError(f"{command.name} curves are not supported; have the slicer write straight moves (G1)")
+
+
+def _arc(job: Job, command: Command) -> bool:
+    """G2, G3 that the hot path refused: unusual words, an impossible arc."""
+    planner = job.planner
+    if not planner.arc_open:
+        words = command.words()
+        for letter in words.keys() - set(ARC_LETTERS):
+            job.notice(f"word {letter} of {command.name}", "it has no meaning here and is ignored")
+        numbers = {letter: number(command.name, words, letter) for letter in words if letter in ARC_LETTERS}
+        fault = planner.begin_arc(numbers, clockwise=command.name.startswith("G2"))
+        if fault is not None:
+            raise WordError(f"{command.name} {fault}")
+    status = planner.go_on_with_arc()
+    if status is FeedStatus.LIMIT:
+        raise WordError(str(planner.fault))
+    return status is not FeedStatus.FULL
+
+
+def _plane(plane: Plane) -> Handler:
+    def handle(job: Job, _command: Command) -> bool:
+        job.planner.plane = plane
+        return True
+
+    return handle
+
+
+_HEATS = ("M104", "M109", "M140", "M190")
+_told_heat = _without_module("heater and fan commands")
+
+
+def _heat(job: Job, command: Command) -> bool:
+    """Accept what is for a heater or fan that the machine does not have, not for one that does not act."""
+    why = job.vocabulary.not_acting.get(command.name)
+    if why is None:
+        return _told_heat(job, command)
+    words = command.words()
+    asks = [letter for letter in "SR" if letter in words and number(command.name, words, letter) > 0]
+    if command.name in _HEATS and asks:
+        job.refuse_skipping(command, f"heats, but {why}")
+    else:
+        job.notice(command.name, why)
+    return True
+
+
+_motors_off = _without_module("motor-off commands")
+BESIDE = frozenset(
+    (
+        *("M73", "M105", "M112", "M114", "M117", "M118", "M204", "M220", "M221"),
+        *("GET_POSITION", "SET_GCODE_OFFSET", "SET_PRESSURE_ADVANCE", "SET_VELOCITY_LIMIT"),
+    )
+)
+"""Commands that neither move nor wait: a client may give them while a job prints."""
+HANDLERS: Mapping[str, Handler] = {
+    "G0": _move,
+    "G1": _move,
+    **dict.fromkeys(("G2", "G3"), _arc),
+    "G5": _refuse_spline,
+    "G4": _dwell,
+    "G17": _plane(Plane.XY),
+    "G18": _plane(Plane.ZX),
+    "G19": _plane(Plane.YZ),
+    "G20": _unit(25.4),
+    "G21": _unit(1.0),
+    "G28": _home,
+    "G90": _relative(relative=False),
+    "G91": _relative(relative=True),
+    "G92": _set_origin,
+    **dict.fromkeys(("M18", "M84"), _motors_off),
+    **dict.fromkeys(("M73", "M117"), _ignore),
+    "M118": _say,
+    "M82": _relative_extrusion(relative=False),
+    "M83": _relative_extrusion(relative=True),
+    **dict.fromkeys(("M104", "M105", "M106", "M107", "M109", "M140", "M190"), _heat),
+    "M112": _emergency,
+    "M114": _tell_position,
+    "M201": _limit_axes("accel"),
+    "M203": _limit_axes("velocity"),
+    "M204": _set_accel,
+    "M205": _set_jerk,
+    **dict.fromkeys(("M220", "M221"), _factor),
+    "M400": _wait_for_moves,
+    "SET_VELOCITY_LIMIT": _set_velocity_limit,
+    **machine_commands.HANDLERS,
+    **state_commands.HANDLERS,
+}

@@ -1,0 +1,362 @@
+"""Commands that change the machine while a program runs: pressure advance, shapers, carriages, extruders.
+
+What changes the moves themselves (ADVANCE, limits) acts on the planner from the next line on. What changes
+the steps made of them (shapers, windows, who follows whom) comes to a standstill first and goes to step
+generation as an event with its print time.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from coordinator.gcode.events import PositionSet, Reply, ShaperChange, SmoothTimeChange, WeightsChange
+from coordinator.gcode.machine_state import SHAPER_AXES, Extruder, MachineState, Shaper
+from coordinator.gcode.parser import Command, WordError, number, quoted
+from coordinator.kinematics.dual_carriage import CarriageMode, CarriageState, DualCarriage
+from coordinator.motion.steps.shapers import split_kind
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+    from coordinator.gcode.interpreter import Job
+
+MAX_FREQUENCY_HZ = 1000.0
+MAX_ADVANCE_S = 10.0
+MAX_SMOOTH_S = 0.2
+NO_TOOLS_FROM = 100
+"""Numbers of tools from here on stand for none in what slicers write: T255, T1000."""
+_TOOL = re.compile(r"T\d{1,9}")
+
+
+def come_to_rest(job: Job, settle_s: float = 0.0) -> bool:
+    """Plan to a standstill of at least SETTLE_S, after which no step is left; False: call again."""
+    if not job.planner.flush():
+        return False
+    job.planner.dwell(max(settle_s, job.machine.settle_s()))
+    return True
+
+
+def begin(job: Job) -> None:
+    """Let JOB's planner begin as its machine's state says."""
+    if job.machine.active is not None:
+        _use_extruder(job, job.machine.active)
+    _keep_apart(job)
+
+
+def home_carriages(job: Job, axes: str, second_mm: float | None = None) -> None:
+    """After homing, the first carriage is the head and the second is parked; the machine is at rest.
+
+    SECOND_MM: where the second one stands, if that is not exactly its home.
+    """
+    machine = job.machine
+    if (
+        machine.carriages is None
+        or machine.carriage_state is None
+        or "XYZ"[machine.carriages.axis] not in axes
+    ):
+        return
+    changed = machine.carriage_state.modes != machine.carriages.home.modes
+    home = machine.carriages.home
+    second_mm = home.positions[1] if second_mm is None else second_mm
+    machine.carriage_state = replace(home, positions=(home.positions[0], second_mm))
+    _keep_apart(job)
+    if changed:
+        weights = machine.carriages.weights(machine.carriage_state)
+        job.emit(WeightsChange(job.line, weights, job.planner.print_time_end_s))
+
+
+# ---- Parameters ------------------------------------------------------------------------------------------
+
+
+def _parameters(command: Command, known: Collection[str]) -> Mapping[str, str]:
+    """Read NAME=VALUE parameters, of which KNOWN are the names; others are ignored."""
+    return command.only_parameters(known)
+
+
+def _needed(command: Command, values: Mapping[str, str], key: str) -> str:
+    if key not in values:
+        raise WordError(f"{command.name} has no {key}; add {key}=...")
+    return values[key]
+
+
+def _number(command: Command, values: Mapping[str, str], key: str, high: float) -> float | None:
+    """Read a number from 0 to HIGH; None when it is not given."""
+    if key not in values:
+        return None
+    value = number(command.name, values, key)
+    if not 0 <= value <= high:
+        raise WordError(f"{key} of {command.name} is {value:g}; 0 to {high:g} are possible")
+    return value
+
+
+def _extruder(job: Job, command: Command, name: str | None) -> Extruder:
+    """Return the extruder NAME, without a name the active one."""
+    extruders = job.machine.extruders
+    chosen = job.machine.active if name is None else extruders.get(name)
+    if chosen is None:
+        what = f"names the extruder {quoted(name)}" if name is not None else "needs an extruder"
+        has = f"has {', '.join(extruders)}" if extruders else "has no extruder"
+        raise WordError(f"{command.name} {what}; this machine {has}")
+    return chosen
+
+
+# ---- Extruders -------------------------------------------------------------------------------------------
+
+
+def set_pressure_advance(job: Job, command: Command) -> bool:
+    """ADVANCE holds for the moves to come; SMOOTH_TIME, where it changes, from a standstill on.
+
+    So does the first ADVANCE above 0, which needs the window.
+    """
+    values = _parameters(command, ("ADVANCE", "SMOOTH_TIME", "EXTRUDER"))
+    name = values.get("EXTRUDER")
+    filament = job.machine.filament
+    if name is not None and name not in job.machine.extruders and filament is not None:
+        # One motion has one advance: a stepper that follows an extruder has that of the extruder.
+        name = filament.followed.get(name, name)
+        if not name:
+            job.notice(f"{command.name} of {values['EXTRUDER']}", "it follows no extruder: without effect")
+            return True
+    extruder = _extruder(job, command, name)
+    advance = _number(command, values, "ADVANCE", MAX_ADVANCE_S)
+    smooth = _number(command, values, "SMOOTH_TIME", MAX_SMOOTH_S)
+    needed = smooth if smooth is not None else extruder.smooth_s
+    window = needed if advance or extruder.window_s else 0.0
+    if window != extruder.window_s:
+        if job.beside:
+            raise WordError(
+                f"{command.name} needs a standstill for the first ADVANCE, and for another SMOOTH_TIME; pause"
+                " the job first"
+            )
+        if not come_to_rest(job, window):
+            return False
+        extruder.window_s = window
+        job.emit(SmoothTimeChange(job.line, extruder.name, window, job.planner.print_time_end_s))
+    extruder.smooth_s = needed
+    if advance is not None:
+        extruder.pressure_advance_s = advance
+        if extruder is job.machine.active:
+            job.planner.pressure_advance = advance
+    if advance is None and smooth is None:
+        text = f"{extruder.name}: ADVANCE={extruder.pressure_advance_s:g} SMOOTH_TIME={extruder.smooth_s:g}"
+        job.emit(Reply(job.line, text))
+    return True
+
+
+def activate_extruder(job: Job, command: Command) -> bool:
+    """ACTIVATE_EXTRUDER EXTRUDER=name: from now on E moves this one, and reads where this one stands."""
+    values = _parameters(command, ("EXTRUDER",))
+    return _activate(job, _extruder(job, command, _needed(command, values, "EXTRUDER")))
+
+
+def is_tool(name: str) -> bool:
+    """Whether NAME is T0, T1 and so on."""
+    return _TOOL.fullmatch(name) is not None
+
+
+def select_tool(job: Job, command: Command) -> bool:
+    """T0, T1, ...: the extruders in their order."""
+    extruders = job.machine.extruders
+    if not extruders and command.name == "T0":
+        return True
+    number_of_tool = int(command.name[1:])
+    tool = job.machine.tool(number_of_tool)
+    if tool is None and number_of_tool >= NO_TOOLS_FROM:
+        job.notice(command.name, "means no tool, as slicers write it, and is ignored")
+        return True
+    if tool is None:
+        last = max(len(extruders) - 1, 0)
+        has = f"T0 to T{last}" if last else "only T0"
+        raise WordError(f"{command.name} selects a tool that does not exist; this machine has {has}")
+    return _activate(job, tool)
+
+
+def _activate(job: Job, extruder: Extruder) -> bool:
+    motion = job.machine.filament
+    if motion is None or motion.active == extruder.name:
+        return True
+    if not come_to_rest(job):
+        return False
+    _change_places(job, job.machine.active, extruder)
+    job.machine.filament = motion.activate(extruder.name)
+    _use_extruder(job, extruder)
+    _follow(job)
+    return True
+
+
+def _change_places(job: Job, before: Extruder | None, after: Extruder) -> None:
+    """Let E read where AFTER was left; the machine's E axis goes on from where BEFORE has brought it."""
+    planner = job.planner
+    if before is not None:
+        before.place_mm = planner.gcode_position[3] * planner.unit_mm
+    planner.set_gcode_position({"E": after.place_mm / planner.unit_mm})
+
+
+def _use_extruder(job: Job, extruder: Extruder) -> None:
+    job.planner.set_extruder_limits(extruder.limits)
+    job.planner.pressure_advance = extruder.pressure_advance_s
+
+
+def _follow(job: Job) -> None:
+    if job.machine.filament is not None:
+        job.emit(WeightsChange(job.line, job.machine.filament.weights(), job.planner.print_time_end_s))
+
+
+def sync_extruder_motion(job: Job, command: Command) -> bool:
+    """EXTRUDER: a filament stepper; MOTION_QUEUE: the extruder it moves with, empty for none."""
+    values = _parameters(command, ("EXTRUDER", "MOTION_QUEUE"))
+    stepper, queue = (_needed(command, values, key) for key in ("EXTRUDER", "MOTION_QUEUE"))
+    motion = job.machine.filament
+    if motion is None:
+        raise WordError("SYNC_EXTRUDER_MOTION needs an extruder; this machine has none")
+    after = motion.sync(stepper, queue)
+    if after == motion:
+        return True
+    if not come_to_rest(job):
+        return False
+    job.machine.filament = after
+    _follow(job)
+    return True
+
+
+# ---- Shapers ---------------------------------------------------------------------------------------------
+
+
+def set_input_shaper(job: Job, command: Command) -> bool:
+    """SHAPER_TYPE of all axes; SHAPER_TYPE_X, SHAPER_FREQ_X (0: not shaped), DAMPING_RATIO_X of one."""
+    words = ("SHAPER_TYPE", "SHAPER_FREQ", "DAMPING_RATIO")
+    values = _parameters(command, ("SHAPER_TYPE", *(f"{w}_{axis}" for w in words for axis in SHAPER_AXES)))
+    before = {axis: job.machine.shapers.get(axis, Shaper()) for axis in SHAPER_AXES}
+    after = {axis: _shaper(command, values, axis, shaper) for axis, shaper in before.items()}
+    if not values:
+        job.emit(Reply(job.line, " ".join(_told(axis, shaper) for axis, shaper in after.items())))
+        return True
+    # An axis that is not shaped stays so whatever its kind would be.
+    changed = [a for a in SHAPER_AXES if after[a] != before[a] and (before[a].width_s or after[a].width_s)]
+    if changed and not come_to_rest(job, job.machine.settle_s(after)):
+        return False
+    job.machine.shapers = after
+    for axis in changed:
+        new = after[axis]
+        change = (new.kind, new.frequency_hz, new.damping_ratio, job.planner.print_time_end_s)
+        job.emit(ShaperChange(job.line, axis, *change))
+    return True
+
+
+def _shaper(command: Command, values: Mapping[str, str], axis: str, before: Shaper) -> Shaper:
+    kind = values.get(f"SHAPER_TYPE_{axis}", values.get("SHAPER_TYPE", before.kind)).lower()
+    try:
+        split_kind(kind)
+    except ValueError as problem:
+        raise WordError(f"{command.name} names the shaper {quoted(kind)}; {problem}") from None
+    frequency = _number(command, values, f"SHAPER_FREQ_{axis}", MAX_FREQUENCY_HZ)
+    damping = _number(command, values, f"DAMPING_RATIO_{axis}", 0.999)
+    if frequency is not None and 0 < frequency < 1:
+        raise WordError(f"SHAPER_FREQ_{axis} of {command.name} is {frequency:g}; give 0 or 1 Hz and more")
+    return Shaper(
+        kind,
+        before.frequency_hz if frequency is None else frequency,
+        before.damping_ratio if damping is None else damping,
+    )
+
+
+def _told(axis: str, shaper: Shaper) -> str:
+    return (
+        f"SHAPER_TYPE_{axis}={shaper.kind} SHAPER_FREQ_{axis}={shaper.frequency_hz:g} "
+        f"DAMPING_RATIO_{axis}={shaper.damping_ratio:g}"
+    )
+
+
+# ---- Carriages -------------------------------------------------------------------------------------------
+
+
+def set_dual_carriage(job: Job, command: Command) -> bool:
+    """CARRIAGE 0 or 1; MODE is PRIMARY where it is not given."""
+    values = _parameters(command, ("CARRIAGE", "MODE"))
+    carriages, state = job.machine.carriages, job.machine.carriage_state
+    if carriages is None or state is None:
+        raise WordError("SET_DUAL_CARRIAGE needs a second carriage; this machine has no [dual_carriage]")
+    which = _needed(command, values, "CARRIAGE")
+    if which not in {"0", "1"}:
+        raise WordError(f"CARRIAGE of {command.name} is {quoted(which)}; give 0 or 1")
+    word = values.get("MODE", CarriageMode.PRIMARY.value).upper()
+    modes = [mode.value for mode in CarriageMode]
+    if word not in modes:
+        raise WordError(f"MODE of {command.name} is {quoted(word)}; there are {' '.join(modes)}")
+    if "XYZ"[carriages.axis] not in job.planner.homed:
+        raise WordError(f"{command.name} comes before {'XYZ'[carriages.axis]} is homed; home with G28 first")
+    position = job.planner.toolhead_position[carriages.axis]
+    after = carriages.set_mode(state, position, int(which), CarriageMode(word))
+    if not come_to_rest(job):
+        return False
+    _take_carriages(job, carriages, after)
+    return True
+
+
+def save_dual_carriage_state(job: Job, command: Command) -> bool:
+    """NAME: keep what both carriages do."""
+    carriages, state, name = _dual(job, command)
+    position = job.planner.toolhead_position[carriages.axis]
+    job.machine.saved_carriages[name] = replace(state, positions=state.at(position))
+    return True
+
+
+def restore_dual_carriage_state(job: Job, command: Command) -> bool:
+    """NAME: let both carriages do what they did then; with MOVE=0 only, they stay where they are."""
+    carriages, state, name = _dual(job, command)
+    values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
+    saved = job.machine.saved_carriages.get(name)
+    if saved is None:
+        raise WordError(f"{command.name} names the state {quoted(name)}, which is not saved")
+    if values.get("MOVE", "1") != "0":
+        raise WordError(f"{command.name} cannot move the carriages back; give MOVE=0, and move them by G1")
+    if "XYZ"[carriages.axis] not in job.planner.homed:
+        raise WordError(f"{command.name} comes before {'XYZ'[carriages.axis]} is homed; home with G28 first")
+    if not come_to_rest(job):
+        return False
+    position = job.planner.toolhead_position[carriages.axis]
+    after = carriages.set_mode(state, position, saved.primary, CarriageMode.PRIMARY)
+    other = saved.modes[1 - saved.primary]
+    if other in {CarriageMode.COPY, CarriageMode.MIRROR}:
+        after = carriages.set_mode(after, after.position, 1 - saved.primary, other)
+    _take_carriages(job, carriages, after)
+    return True
+
+
+def _dual(job: Job, command: Command) -> tuple[DualCarriage, CarriageState, str]:
+    values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
+    carriages, state = job.machine.carriages, job.machine.carriage_state
+    if carriages is None or state is None:
+        raise WordError(f"{command.name} needs a second carriage; this machine has no [dual_carriage]")
+    return carriages, state, values.get("NAME", "default")
+
+
+def _take_carriages(job: Job, carriages: DualCarriage, after: CarriageState) -> None:
+    planner, axis = job.planner, carriages.axis
+    job.machine.carriage_state = after
+    job.emit(WeightsChange(job.line, carriages.weights(after), planner.print_time_end_s))
+    position = planner.toolhead_position
+    if after.position != position[axis]:  # the other carriage is the head now
+        x, y, z, e = (after.position if i == axis else value for i, value in enumerate(position))
+        planner.set_position((x, y, z, e))
+        job.emit(PositionSet(job.line, "XYZ"[axis], (x, y, z, e), planner.print_time_end_s))
+    _keep_apart(job)
+
+
+def _keep_apart(job: Job) -> None:
+    machine: MachineState = job.machine
+    if machine.carriages is not None and machine.carriage_state is not None:
+        job.planner.set_range(machine.carriages.axis, *machine.carriages.limits(machine.carriage_state))
+
+
+HANDLERS = {
+    "ACTIVATE_EXTRUDER": activate_extruder,
+    "RESTORE_DUAL_CARRIAGE_STATE": restore_dual_carriage_state,
+    "SAVE_DUAL_CARRIAGE_STATE": save_dual_carriage_state,
+    "SET_DUAL_CARRIAGE": set_dual_carriage,
+    "SET_INPUT_SHAPER": set_input_shaper,
+    "SET_PRESSURE_ADVANCE": set_pressure_advance,
+    "SYNC_EXTRUDER_MOTION": sync_extruder_motion,
+}

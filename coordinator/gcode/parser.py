@@ -1,0 +1,165 @@
+"""Reads one G-code line that the hot path left to Python. Never raises anything but WordError."""
+
+import math
+import re
+from collections.abc import Container, Iterable, Mapping
+from functools import lru_cache, reduce
+from operator import xor
+
+from nodes.support.records import record
+
+_CODE = re.compile(r"([GMTgmt])(\d{1,9})(\.\d{1,9})?(?![\d_.])", re.ASCII)
+_NAME = re.compile(r"[A-Za-z_]\w*(?=[ \t;]|$)", re.ASCII)
+_BARE_WORD = re.compile(r"[XYZEFxyzef][+-]?\.?\d", re.ASCII)
+_LINE_NUMBER = re.compile(rb"[Nn]\d+[ \t]*")
+_CHECKSUM = re.compile(rb"\*[ \t]*(\S*)[ \t]*$")
+_WORD = re.compile(r"\s*([A-Za-z])([+-]?(?:\d+\.?\d*|\.\d+)|(?=\s|$))\s*", re.ASCII)
+_PARAMETER = re.compile(r"\s*([A-Za-z_]\w*)=(\"[^\"]*\"|'[^']*'|\S*)(?:\s+|$)", re.ASCII)
+_QUOTED_MAX = 40
+_LINE_MAX = 4096
+
+
+class WordError(ValueError):
+    """What is wrong with a line, as the end of a sentence."""
+
+
+@record
+class Command:
+    """One command: its NAME (``G1``, ``M204``, ``SET_VELOCITY_LIMIT``) and the text of its parameters."""
+
+    name: str
+    text: str
+    written: str = ""
+    """In capitals as it stands in the line, where that is not NAME: ``G00``, ``M104.0``."""
+    ignored: list[str] | None = None
+    """Takes in the parameters that had no meaning for who read them, for a notice; None: nobody asks."""
+
+    def called(self, name: str) -> "Command":
+        """Return the same command under another NAME."""
+        return Command(name, self.text, ignored=self.ignored)
+
+    def only_words(self, known: str) -> dict[str, str]:
+        """Read the parameters as letters with numbers; what is none of KNOWN is ignored."""
+        return self._only(self.words(), known)
+
+    def only_parameters(self, known: Iterable[str]) -> dict[str, str]:
+        """Read the parameters as NAME=VALUE; what is none of KNOWN is ignored."""
+        return self._only(self.parameters(), tuple(known))
+
+    def _only(self, found: dict[str, str], known: Container[str]) -> dict[str, str]:
+        if self.ignored is not None:
+            self.ignored.extend(key for key in found if key not in known)
+        return {key: text for key, text in found.items() if key in known}
+
+    def words(self) -> dict[str, str]:
+        """Read the parameters as letters with numbers (or without: ``G28 X``)."""
+        words: dict[str, str] = {}
+        at = 0
+        while at < len(self.text):
+            match = _WORD.match(self.text, at)
+            if not match:
+                raise WordError(
+                    f"{self.name} has {quoted(self.text[at:])} where a letter and a number belong"
+                )
+            letter = match[1].upper()
+            if letter in words:
+                raise WordError(f"{self.name} has {letter} twice; leave one")
+            words[letter] = match[2]
+            at = match.end()
+        return words
+
+    def parameters(self) -> dict[str, str]:
+        """Read the parameters as NAME=VALUE."""
+        parameters: dict[str, str] = {}
+        at = 0
+        while at < len(self.text):
+            match = _PARAMETER.match(self.text, at)
+            if not match:
+                raise WordError(f"{self.name} has {quoted(self.text[at:])} where NAME=VALUE belongs")
+            parameters[match[1].upper()] = _unquoted(match[2])
+            at = match.end()
+        return parameters
+
+
+def _unquoted(text: str) -> str:
+    return text[1:-1] if len(text) > 1 and text[0] in "\"'" and text[-1] == text[0] else text.strip('"')
+
+
+def quoted(text: str) -> str:
+    """Return TEXT in quotes, short and printable."""
+    return ascii(text if len(text) <= _QUOTED_MAX else text[:_QUOTED_MAX] + "...")
+
+
+def number(what: str, words: Mapping[str, str], key: str) -> float:
+    """Return the number of WORDS[KEY]; WHAT is the command's name."""
+    text = words[key]
+    if not text:
+        raise WordError(f"{key} of {what} has no number; write {key} and a decimal number")
+    try:
+        value = float(text)
+    except ValueError:
+        raise WordError(f"{key} of {what} is {quoted(text)}, which is not a number") from None
+    if not math.isfinite(value):
+        raise WordError(f"{key} of {what} is {quoted(text)}, which is out of range")
+    return value
+
+
+@lru_cache(maxsize=256)  # slicers repeat few different lines, thousands of times
+def parse(line: bytes) -> Command | None:
+    """Read LINE; None when there is nothing to do. Raises WordError."""
+    if len(line) > _LINE_MAX:
+        raise WordError(f"this command is longer than {_LINE_MAX} bytes; is this a G-code file?")
+    text = _without_frame(line.strip(b" \t\r\n")).decode("utf-8", "replace")
+    if text.startswith("("):
+        text = _without_comments(text)
+    text = text.strip()
+    if not text or text[0] in ";%":
+        return None
+    if match := _CODE.match(text):
+        fraction = (match[3] or "").rstrip("0").rstrip(".")
+        rest = text[match.end() :]
+        name, written = match[1].upper() + str(int(match[2])) + fraction, match[0].upper()
+        # Display texts (M117, M118) are not words and may hold anything.
+        return Command(
+            name,
+            rest if match[1] in "Mm" and match[2] in {"117", "118"} else _without_comments(rest).strip(),
+            written if written != name else "",
+        )
+    if _BARE_WORD.match(text):
+        raise WordError(f"{quoted(text)} has no command; write G0 or G1 before the axes")
+    if match := _NAME.match(text):
+        return Command(match[0].upper(), text[match.end() :].split(";")[0].strip())
+    raise WordError(f"cannot read {quoted(text)}; it is neither a G-code command nor a comment")
+
+
+def _without_comments(text: str) -> str:
+    """Cut ``; ...`` and ``(...)`` out."""
+    kept: list[str] = []
+    at = 0
+    while True:
+        open_, semicolon = text.find("(", at), text.find(";", at)
+        if semicolon >= 0 and (open_ < 0 or semicolon < open_):
+            return "".join([*kept, text[at:semicolon]])
+        if open_ < 0:
+            return "".join([*kept, text[at:]])
+        close = text.find(")", open_)
+        if close < 0:
+            raise WordError(f"the comment {quoted(text[open_:])} does not end; close the parenthesis")
+        kept += [text[at:open_], " "]
+        at = close + 1
+
+
+def _without_frame(line: bytes) -> bytes:
+    """Strip the line number and check the checksum, if any."""
+    numbered = _LINE_NUMBER.match(line)
+    code = line.split(b";")[0]
+    is_code = numbered or (line[:1] in b"GMTgmt" and line[1:2].isdigit())
+    if is_code and (star := _CHECKSUM.search(code)):
+        expected = reduce(xor, code[: star.start()], 0)
+        told = star[1].decode("ascii", "replace")
+        if told != str(expected):
+            raise WordError(
+                f"the checksum is {quoted(told)}, but the line adds up to {expected}; copy the file again"
+            )
+        line = code[: star.start()]
+    return line[numbered.end() :] if numbered else line

@@ -1,0 +1,92 @@
+"""How a program's moves stand while it is read, for macros: ``printer.toolhead``, ``printer.gcode_move``."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple, cast
+
+if TYPE_CHECKING:
+    from coordinator.gcode.interpreter import Job
+    from coordinator.gcode.machine_state import MachineState
+    from coordinator.motion.planner.planner import Planner
+
+
+class Place(NamedTuple):
+    """A position by its letters, mm."""
+
+    x: float
+    y: float
+    z: float
+    e: float
+
+
+def gcode_figures(job: "Job") -> Mapping[str, Mapping[str, object]]:
+    """Return where the moves read so far lead to, and what holds for those to come; mm, mm/s, mm/s²."""
+    return motion_figures(job.planner, job.machine)
+
+
+def motion_figures(planner: "Planner", machine: "MachineState") -> Mapping[str, Mapping[str, object]]:
+    """Return the same of PLANNER and MACHINE; in the thread that reads programs."""
+    limits = planner.limits
+    active = machine.active
+    toolhead = {
+        "position": Place(*planner.toolhead_position),
+        "homed_axes": planner.homed.lower(),
+        "extruder": "" if active is None else active.name,
+        "axis_minimum": Place(*limits.position_min, 0.0),
+        "axis_maximum": Place(*limits.position_max, 0.0),
+        "max_velocity": planner.max_velocity,
+        "max_accel": planner.accel,
+        "minimum_cruise_ratio": planner.minimum_cruise_ratio,
+        "square_corner_velocity": planner.square_corner_velocity,
+        "print_time": planner.print_time_end_s,
+        "estimated_print_time": planner.print_time_end_s,
+        "stalls": 0,
+        "extra_axes": {},
+    }
+    gcode_move = {
+        "gcode_position": Place(*planner.gcode_position),
+        "position": Place(*planner.toolhead_position),
+        "base": Place(*planner.gcode_base),
+        "homing_origin": Place(*planner.gcode_offset),
+        "speed": planner.speed_mm_s * 60.0,
+        "speed_factor": planner.speed_factor,
+        "extrude_factor": planner.extrude_factor,
+        "absolute_coordinates": not planner.relative,
+        "absolute_extrude": not planner.relative_extrusion,
+        "axis_map": {"X": 0, "Y": 1, "Z": 2, "E": 3},
+    }
+    return {"toolhead": toolhead, "gcode_move": gcode_move, **_extruders(machine), **_carriages(machine)}
+
+
+def _extruders(machine: "MachineState") -> Mapping[str, Mapping[str, object]]:
+    followed = {} if machine.filament is None else machine.filament.followed
+    told: dict[str, dict[str, object]] = {}
+    for stepper, queue in followed.items():
+        name = stepper if stepper in machine.extruders else f"extruder_stepper {stepper}"
+        told[name] = {"motion_queue": queue or None}
+    for name, extruder in machine.extruders.items():
+        told[name] |= {"pressure_advance": extruder.pressure_advance_s, "smooth_time": extruder.smooth_s}
+    return told
+
+
+def _carriages(machine: "MachineState") -> Mapping[str, Mapping[str, object]]:
+    state = machine.carriage_state
+    if state is None:
+        return {}
+    first, second = (mode.value for mode in state.modes)
+    return {"dual_carriage": {"carriage_0": first, "carriage_1": second}}
+
+
+def frames(figures: Mapping[str, Mapping[str, object]]) -> tuple[str, ...]:
+    """Return the frames that a program has, each as a line: GET_POSITION."""
+    at = figures["gcode_move"]
+    return (
+        f"toolhead: {_axes(at['position'], 'XYZE')}",
+        f"gcode: {_axes(at['gcode_position'], 'XYZE')}",
+        f"gcode base: {_axes(at['base'], 'XYZE')}",
+        f"gcode homing: {_axes(at['homing_origin'], 'XYZ')}",
+    )
+
+
+def _axes(place: object, letters: str) -> str:
+    values = zip(letters, cast("Place", place), strict=False)
+    return " ".join(f"{letter}:{value:.6f}" for letter, value in values)

@@ -1,0 +1,1 @@
+"""G-code templates of macros, rendered in a sandbox with limits."""

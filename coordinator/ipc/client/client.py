@@ -1,0 +1,387 @@
+"""A program's side of the interface: calls, watches and notifications; comes back when the machine does."""
+
+import asyncio
+import contextlib
+import ssl
+from collections.abc import AsyncGenerator, Coroutine, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+from coordinator.ipc.protocol.address import Address, read_address
+from coordinator.ipc.client.feeds import Event, Feed, Update, Watch
+from coordinator.ipc.protocol.methods import ApiError, Scope, Value
+from coordinator.ipc.client.connect_errors import doubt, why_no_answer, why_refused
+from coordinator.ipc.server.session_methods import API_VERSION
+from coordinator.ipc.server.settings import Limits
+from coordinator.ipc.protocol.messages import LENGTH_MAX, Encoder, Encoding, Fault, WireReader
+from nodes.support.errors import CanductorError
+
+__all__ = ["Client", "ConnectionLost", "Event", "Hello", "Refused", "Update"]
+
+READ_BYTES: Final = 65_536
+RETRY_S: Final = (0.1, 0.2, 0.5, 1.0, 2.0)
+"""Pauses between attempts to come back; the last one repeats."""
+FINAL: Final = ("bad_token", "no_token", "bad_version", "not_allowed")
+"""Reasons to be cut off for which another attempt would end alike."""
+LIMITS: Final = Limits(message_bytes=LENGTH_MAX, nesting=32, items=2_000_000, message_timeout_s=30.0)
+"""What is taken from a server: it is trusted more than a client is."""
+
+
+class ConnectionLost(CanductorError):  # noqa: N818
+    """The connection ended before the answer came: whether the call was carried out is not known."""
+
+
+class Refused(ApiError):  # noqa: N818
+    """The server ended the connection and said why; a new attempt would end alike."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """What the server said about itself and this client."""
+
+    version: int
+    session: int
+    scope: Scope
+
+
+class Client:
+    """One machine at ADDRESS. ``async with Client.connect(…) as client``; lives on the loop that enters it.
+
+    When the connection is lost, calls under way raise ConnectionLost; watches and notifications go on as soon
+    as the machine is back, watches with a snapshot; new calls wait for that, up to TIMEOUT_S.
+    """
+
+    def __init__(
+        self,
+        address: Address,
+        *,
+        token: str | None,
+        name: str,
+        scope: Scope | None,
+        tls: ssl.SSLContext | None,
+        encoding: Encoding,
+        timeout_s: float,
+    ) -> None:
+        self.address = address
+        self.hello: Hello | None = None
+        """Of the connection that is open; None while there is none."""
+        self._introduction: dict[str, Value] = {"version": API_VERSION, "client": name}
+        if token is not None:
+            self._introduction["token"] = token
+        if scope is not None:
+            self._introduction["scope"] = scope.word
+        self._tls = tls
+        self._encoding = encoding
+        self._timeout_s = timeout_s
+        self._encoder = Encoder()
+        self._reader: asyncio.StreamReader
+        self._writer: asyncio.StreamWriter | None = None
+        self._wire = WireReader(LIMITS, checked=False)
+        self._last_id = 0
+        self._answers: dict[int, asyncio.Future[Value]] = {}
+        self._begun: dict[int, Watch] = {}  # by the id of the request that begins it
+        self._watches: set[Watch] = set()
+        self._feeds: set[Feed] = set()
+        self._connected = asyncio.Event()
+        self._refusal: Refused | None = None
+        self._keeper: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    @classmethod
+    def connect(
+        cls,
+        address: str | None = None,
+        *,
+        token: str | None = None,
+        name: str = "",
+        scope: Scope | None = None,
+        tls: ssl.SSLContext | None = None,
+        encoding: Encoding = Encoding.MSGPACK,
+        timeout_s: float = 5.0,
+    ) -> Self:
+        """Return a client of the machine at ADDRESS (see ``read_address``) to be entered.
+
+        TLS: None trusts what this computer trusts. TIMEOUT_S: for connecting, and for calls while it is not
+        connected. Raises CanductorError for what is no address; entering raises it when nobody answers there.
+        """
+        return cls(
+            read_address(address),
+            token=token,
+            name=name,
+            scope=scope,
+            tls=tls,
+            encoding=encoding,
+            timeout_s=timeout_s,
+        )
+
+    async def __aenter__(self) -> Self:
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                await self._open()
+        except TimeoutError:
+            await self._hang_up()
+            raise ConnectionLost(f"{self.address} did not answer within {self._timeout_s:g} s") from None
+        except CanductorError:
+            await self._hang_up()
+            raise
+        self._keeper = asyncio.create_task(self._keep())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        if self._keeper is not None:
+            self._keeper.cancel()
+            for task in self._tasks:
+                task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._keeper
+        await self._hang_up()
+
+    # ------------------------------------------------------------------------------------------ calls
+
+    async def call(self, method: str, params: Mapping[str, Value] | None = None) -> Any:
+        """Call METHOD with PARAMS and return its result; cancelling this cancels the call in the machine.
+
+        Raises ApiError as the machine does, ConnectionLost.
+        """
+        await self._be_connected()
+        return await self._ask(method, params or {})
+
+    async def _be_connected(self) -> None:
+        if self._connected.is_set():
+            return
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                await self._connected.wait()
+        except TimeoutError:
+            raise ConnectionLost(f"{self.address} is not there; waited {self._timeout_s:g} s") from None
+        if self._refusal is not None:
+            raise self._refusal.with_traceback(None)
+
+    async def _ask(self, method: str, params: Mapping[str, Value], begins: Watch | None = None) -> Any:
+        assert self._writer is not None
+        self._last_id += 1
+        request_id = self._last_id
+        try:
+            data = self._encoder.message(
+                self._encoding, {"id": request_id, "method": method, "params": dict(params)}
+            )
+        except ValueError as error:
+            raise ApiError("bad_params", f"{method}: the parameters cannot be sent: {error}") from None
+        answer = self._answers[request_id] = asyncio.get_running_loop().create_future()
+        try:
+            if begins is not None:
+                self._begun[request_id] = begins
+            self._writer.write(data)
+            await self._writer.drain()
+            return await answer
+        except OSError as error:
+            raise ConnectionLost(f"{self.address} is gone: {error.strerror or error}") from None
+        except asyncio.CancelledError:
+            self._tell("api.cancel", {"id": request_id})
+            raise
+        finally:
+            answer.cancel()
+            self._answers.pop(request_id, None)
+            self._begun.pop(request_id, None)
+
+    def _tell(self, method: str, params: dict[str, Value]) -> None:
+        """Send a request without wanting an answer."""
+        if self._writer is not None and not self._writer.is_closing():
+            self._writer.write(self._encoder.message(self._encoding, {"method": method, "params": params}))
+
+    # ----------------------------------------------------------------------------------------- feeds
+
+    async def watch(
+        self, fields: Iterable[str] = ("*",), rate_hz: float = 10.0
+    ) -> AsyncGenerator[Update, None]:
+        """Yield fields that match the globs FIELDS: a snapshot, then changes, RATE_HZ times a second.
+
+        Updates that come while the last one is looked at are merged. Raises ApiError, ConnectionLost.
+        """
+        watch = Watch(list(fields), rate_hz)
+        await self._be_connected()
+        await self._begin_watch(watch)
+        self._watches.add(watch)
+        try:
+            while True:
+                yield await watch.next()
+        finally:
+            self._watches.discard(watch)
+            if watch.number is not None:
+                self._tell("api.unwatch", {"subscription": watch.number})
+
+    async def events(self, names: Iterable[str] = ("*",)) -> AsyncGenerator[Event, None]:
+        """Yield the notifications that match the globs NAMES; when not taken, the oldest are dropped."""
+        feed = Feed(tuple(names))
+        self._feeds.add(feed)
+        try:
+            await self._be_connected()
+            await self._listen()
+            while True:
+                yield await feed.next()
+        finally:
+            self._feeds.discard(feed)
+
+    async def _begin_watch(self, watch: Watch) -> None:
+        watch.number = None
+        await self._ask("api.watch", {"fields": list(watch.fields), "rate_hz": watch.rate_hz}, watch)
+
+    async def _listen(self) -> None:
+        names = sorted({name for feed in self._feeds for name in feed.names})
+        await self._ask("api.listen", {"events": list(names)})
+
+    # ------------------------------------------------------------------------------------- connection
+
+    async def _open(self) -> None:
+        """Connect and say hello; raises CanductorError."""
+        address = self.address
+        try:
+            if address.path is not None:
+                self._reader, self._writer = await asyncio.open_unix_connection(str(address.path))
+            else:
+                tls = (self._tls or ssl.create_default_context()) if address.tls else None
+                self._reader, self._writer = await asyncio.open_connection(
+                    address.host, address.port, ssl=tls
+                )
+        except OSError as error:
+            raise ConnectionLost(why_no_answer(address, error)) from None
+        self._wire = WireReader(LIMITS, checked=False)
+        hello = asyncio.create_task(self._ask("api.hello", self._introduction))
+        try:
+            while not hello.done():
+                await self._read_some(doubt(address))
+                await asyncio.sleep(0)
+            told = hello.result()
+        finally:
+            hello.cancel()
+        self.hello = Hello(told["version"], told["session"], Scope[told["scope"].upper()])
+        self._connected.set()
+
+    async def _keep(self) -> None:
+        """Read for as long as there is a connection, and get a new one when it is lost."""
+        while True:
+            with contextlib.suppress(ConnectionLost):
+                while True:
+                    await self._read_some()
+            await self._hang_up()
+            if not await self._come_back():
+                return
+
+    async def _come_back(self) -> bool:
+        """Connect again, with all feeds; return False when that is refused."""
+        attempt = 0
+        while True:
+            await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
+            attempt += 1
+            try:
+                async with asyncio.timeout(self._timeout_s):
+                    await self._open()
+            except (ConnectionLost, TimeoutError):
+                await self._hang_up()
+                continue
+            except ApiError as error:
+                await self._hang_up()
+                self._refuse(error)
+                return False
+            self._begin(self._resume_feeds())
+            return True
+
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _resume_feeds(self) -> None:
+        for watch in list(self._watches):
+            await self._resume_watch(watch)
+        if self._feeds:
+            with contextlib.suppress(ConnectionLost):  # the next connection listens again
+                await self._listen()
+
+    async def _resume_watch(self, watch: Watch) -> None:
+        try:
+            await self._begin_watch(watch)
+        except ConnectionLost:
+            pass  # the next connection begins it again
+        except ApiError as error:
+            watch.fail(error)
+
+    def _refuse(self, error: ApiError) -> None:
+        self._refusal = Refused(error.code, error.sentence)
+        self._connected.set()  # so that nobody waits
+        for watch in self._watches:
+            watch.fail(self._refusal)
+        for feed in self._feeds:
+            feed.fail(self._refusal)
+
+    async def _hang_up(self) -> None:
+        self._connected.clear()
+        self.hello = None
+        writer, self._writer = self._writer, None
+        for answer in self._answers.values():
+            if not answer.done():
+                answer.set_exception(ConnectionLost(f"{self.address} is gone, the answer did not come"))
+        if writer is not None:
+            writer.close()
+            with contextlib.suppress(OSError, ssl.SSLError):
+                await writer.wait_closed()
+
+    # ---------------------------------------------------------------------------------------- reading
+
+    async def _read_some(self, addition: str = "") -> None:
+        """Take what comes next; raises ConnectionLost. ADDITION: to be added when the server says nothing."""
+        try:
+            data = await self._reader.read(READ_BYTES)
+        except OSError as error:
+            raise ConnectionLost(f"{self.address} is gone{addition}: {error.strerror or error}") from None
+        if not data:
+            raise ConnectionLost(f"{self.address} has closed the connection{addition}")
+        self._wire.feed(data, 0.0)
+        while (message := self._wire.next_message()) is not None:
+            if isinstance(message, Fault):
+                raise ConnectionLost(f"{self.address} sent what is no message: {message.sentence}")
+            self._take(message)
+
+    def _take(self, message: dict[str, Any]) -> None:
+        if "event" in message:
+            self._take_event(message)
+            return
+        failure: ApiError | None = None
+        if "error" in message:
+            told = message["error"]
+            failure = ApiError(str(told.get("code")), str(told.get("message")))
+        if "id" not in message:
+            if failure is not None:
+                self._take_fault(failure)
+            return
+        answer = self._answers.get(message["id"])
+        if answer is None or answer.done():
+            return
+        if failure is not None:
+            answer.set_exception(failure)
+            return
+        result: Any = message.get("result")
+        if (watch := self._begun.get(message["id"])) is not None:
+            watch.begin(
+                result["subscription"], result["sequence"], result["values"]
+            )  # its updates may follow
+        answer.set_result(result)
+
+    def _take_fault(self, fault: ApiError) -> None:
+        """Tell whoever waits for an answer why there will be none."""
+        sentence = why_refused(self.address, fault)
+        refused = ConnectionLost(sentence) if fault.code == "closing" else Refused(fault.code, sentence)
+        for answer in self._answers.values():
+            if not answer.done():
+                answer.set_exception(refused)
+
+    def _take_event(self, message: dict[str, Any]) -> None:
+        if message["event"] != "state":
+            event = Event(message["event"], message.get("values", {}))
+            for feed in self._feeds:
+                feed.put(event)
+            return
+        for watch in self._watches:
+            if watch.number == message["subscription"] and not watch.take(message):
+                self._tell("api.unwatch", {"subscription": watch.number})
+                self._begin(self._resume_watch(watch))

@@ -1,0 +1,1 @@
+"""Announcing a machine on the network and finding machines (DNS-SD)."""

@@ -1,0 +1,1 @@
+"""Messages and methods of the IPC; sans-IO."""

@@ -1,0 +1,70 @@
+"""Where a machine is found: its address in words."""
+
+import socket
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from nodes.support.errors import CanductorError
+from nodes.support.host_sockets import host_sockets, socket_folder
+from nodes.support.records import record
+
+
+@record
+class Address:
+    """A Unix socket (PATH) or a TCP port (HOST, PORT), with or without TLS."""
+
+    path: Path | None = None
+    host: str = ""
+    port: int = 0
+    tls: bool = False
+
+    def __str__(self) -> str:
+        if self.path is not None:
+            return str(self.path)
+        return f"{'tls' if self.tls else 'tcp'}://{self.host}:{self.port}"
+
+
+def read_address(text: str | None) -> Address:
+    """Read a path, ``tcp://HOST:PORT`` or ``tls://HOST:PORT``; None: the only machine of this user.
+
+    Raises CanductorError.
+    """
+    if text is None:
+        return _only_machine()
+    scheme, separator, _ = text.partition("://")
+    if not separator:
+        return Address(path=Path(text.removeprefix("unix:")))
+    try:
+        parts = urlsplit(text)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host, port = None, None
+    if scheme not in ("tcp", "tls") or not host or not port:
+        raise CanductorError(f"'{text}' is no address; it must be a path, tcp://HOST:PORT or tls://HOST:PORT")
+    return Address(host=host, port=port, tls=scheme == "tls")
+
+
+def _only_machine() -> Address:
+    folder, found = socket_folder(), host_sockets()
+    if len(found) > 1:  # one is taken as it is: connecting tells the same, and a stop shall not wait
+        found = [path for path in found if _is_served(path)] or found[:1]
+    if len(found) == 1:
+        return Address(path=found[0])
+    if not found:
+        raise CanductorError(
+            f"no machine runs here: there is no socket in {folder}; name one with --at ADDRESS"
+        )
+    raise CanductorError(f"several machines run here; name one with --at: {', '.join(map(str, found))}")
+
+
+def _is_served(path: Path) -> bool:
+    """Return whether somebody may be there: only a socket that a program left behind refuses. Never waits."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except OSError:  # too many wait there, or it may not be asked: it is up to the user to choose
+            return True
+    return True

@@ -1,0 +1,1 @@
+"""The server: sockets, sessions, state tree, uploads, authentication."""

@@ -1,0 +1,246 @@
+"""One client's socket: moves bytes between it and its session, and calls methods (asyncio)."""
+
+import asyncio
+import select
+import socket
+from collections.abc import Awaitable, Callable
+from typing import Final
+
+from coordinator.ipc.protocol.methods import ApiError, Value
+from coordinator.ipc.server.session import Request, Session
+from coordinator.ipc.server.fair_scheduler import Turns
+from nodes.support.errors import CanductorError
+
+REQUESTS_PER_TURN: Final = 64
+"""Requests of one client that are called before others get their turn."""
+UNREAD_BYTES: Final = 65_536
+"""From so many on no more is read for a client that waits for its turn. With less, the calls of the system
+to stop and to go on would cost as much as a request."""
+LINGER_S: Final = 2.0
+"""For a client that is cut off to take the reason. What it still sends is read and dropped meanwhile: closing
+a socket with unread bytes in it would reset it, and the reason would be lost."""
+HANG_UP_CHECK_S: Final = 0.5
+"""Between looks at whether a client that has closed its side is still there for its answers."""
+
+
+class Connection(asyncio.BufferedProtocol):
+    """A client; ADMIT makes its session once it is there, ON_GONE hears when it has left."""
+
+    def __init__(
+        self,
+        admit: Callable[[asyncio.Transport, "Connection"], Session],
+        on_gone: Callable[["Connection"], None],
+        turns: Turns,
+    ) -> None:
+        self._admit = admit
+        self._on_gone = on_gone
+        self._turns = turns
+        self._loop = asyncio.get_running_loop()
+        self._tasks: dict[Request, asyncio.Task[None]] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._linger: asyncio.TimerHandle | None = None
+        self._half_closed = False
+        self._ended = False
+        self.session: Session
+        self.transport: asyncio.Transport
+
+    # ----------------------------------------------------------------------- asyncio.BufferedProtocol
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin."""
+        assert isinstance(transport, asyncio.Transport)
+        self.transport = transport
+        self.session = self._admit(transport, self)
+        self.transport.set_write_buffer_limits(high=self.session.common.limits.output_bytes)
+        self._turn()
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Tell where to put what comes: memory of its own for each message would cost as much as the rest."""
+        del sizehint
+        return self._turns.received
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Take what has come there."""
+        self.receive(self._turns.received[:nbytes])
+
+    def receive(self, data: bytes | memoryview) -> None:
+        """Take DATA."""
+        self.session.receive(data, self._loop.time())
+        self._turn()
+
+    def eof_received(self) -> bool:
+        """Answer what was asked before the client closed its side; on TCP this counts as leaving."""
+        if self._ended or self._has_left():
+            return False
+        self._half_closed = True
+        self._turn()
+        self._check_hang_up()
+        return not self.transport.is_closing()
+
+    def _has_left(self) -> bool:
+        opened = self.transport.get_extra_info("socket")
+        if opened.family != socket.AF_UNIX:
+            return True
+        poll = select.poll()
+        poll.register(opened.fileno(), 0)
+        return any(events & select.POLLHUP for _, events in poll.poll(0))
+
+    def _check_hang_up(self) -> None:
+        if self.transport.is_closing():
+            return
+        if self._has_left():
+            self.transport.abort()
+            return
+        self._linger = self._loop.call_later(HANG_UP_CHECK_S, self._check_hang_up)
+
+    def pause_writing(self) -> None:
+        """Stop sending: the client does not read."""
+        self.session.writable = False
+
+    def resume_writing(self) -> None:
+        """Go on."""
+        self.session.writable = True
+        self._turn()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """End whatever still runs for the client."""
+        del exc
+        for handle in (self._timer, self._linger):
+            if handle is not None:
+                handle.cancel()
+        self._timer = self._linger = None
+        for task in self._tasks.values():
+            task.cancel()
+        self._turns.leave(self)
+        if (caller := self.session.caller) is not None:
+            for leave in caller.at_end:
+                leave(caller)
+        self._on_gone(self)
+
+    # ------------------------------------------------------------------------------------------- work
+
+    def _turn(self) -> None:
+        if not self.transport.is_closing():
+            self._turns.ask(self)
+
+    def hold(self) -> None:
+        """Wait for the next turn; take no more in meanwhile than what may be unread."""
+        if self.session.unread_bytes >= UNREAD_BYTES and not self._half_closed:
+            self.transport.pause_reading()
+
+    def work(self, until_s: float) -> bool:
+        """Do the work there is, at most until UNTIL_S; return whether there is more."""
+        session, now_s = self.session, self._loop.time()
+        for request in session.read(now_s) if session.should_read else ():
+            self._call(request)
+        for _ in range(REQUESTS_PER_TURN):
+            waiting = session.next_request(now_s)
+            if waiting is None:
+                break
+            self._call(waiting)
+            if self._loop.time() >= until_s:
+                break
+        for request in session.take_cancelled():
+            if request in self._tasks:
+                self._tasks[request].cancel()
+        self.flush()
+        more = session.has_work
+        if self.transport.is_closing():
+            return False
+        if more:
+            self.hold()
+        elif not self._half_closed:
+            self.transport.resume_reading()
+        return more
+
+    def flush(self) -> None:
+        """Send what the session has to say, as far as the client reads."""
+        session, transport = self.session, self.transport
+        if transport.is_closing() or self._ended:
+            return
+        if (session.writable or session.fault is not None) and (data := session.take_output()):
+            transport.write(data)
+        if session.fault is not None:
+            self._cut_off()
+        elif self._half_closed and session.is_idle:
+            transport.close()
+        else:
+            self._set_timer()
+
+    def _cut_off(self) -> None:
+        """Give the client a moment to take the reason, and go."""
+        self._ended = True
+        for task in self._tasks.values():
+            task.cancel()
+        try:
+            if self.transport.can_write_eof() and not self._half_closed:
+                self.transport.write_eof()
+            else:
+                self.transport.close()
+        except OSError:  # it has left already
+            self.transport.abort()
+        self._linger = self._loop.call_later(LINGER_S, self.transport.abort)
+
+    def _set_timer(self) -> None:
+        deadline_s = self.session.next_deadline()
+        if deadline_s is None or (self._timer is not None and self._timer.when() <= deadline_s):
+            return  # one that is early finds nothing to do, and sets the next
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._loop.call_at(deadline_s, self._handle_timer)
+
+    def _handle_timer(self) -> None:
+        self._timer = None
+        self.session.handle_timer(self._loop.time())
+        self.flush()
+
+    # ---------------------------------------------------------------------------------------- methods
+
+    def _call(self, request: Request) -> None:
+        caller = self.session.caller
+        assert caller is not None
+        try:
+            result = request.method.call(caller, request.params)
+        except Exception as error:  # noqa: BLE001 (a bug of one method must not end the machine; it is reported)
+            self._fail(request, error)
+            return
+        if isinstance(result, Awaitable):
+            task = self._loop.create_task(self._finish(request, result))
+            self._tasks[request] = task
+            task.add_done_callback(lambda task: self._check_begun(task, request, result))
+        else:
+            self.session.answer(request, result)
+
+    def _check_begun(self, task: asyncio.Task[None], request: Request, result: Awaitable[Value]) -> None:
+        """End REQUEST when its TASK was cancelled before its first step, unheard by ``_finish``."""
+        if not task.cancelled():
+            return
+        if asyncio.iscoroutine(result):
+            result.close()
+        del self._tasks[request]
+        self.session.fail(request, ApiError("cancelled", f"{request.method.name} was cancelled"))
+        self._turn()
+
+    async def _finish(self, request: Request, result: Awaitable[Value]) -> None:
+        try:
+            self.session.answer(request, await result)
+        except asyncio.CancelledError:
+            self.session.fail(request, ApiError("cancelled", f"{request.method.name} was cancelled"))
+        except Exception as error:  # noqa: BLE001 (as above)
+            self._fail(request, error)
+        del self._tasks[request]
+        if not self.transport.is_closing():
+            self._turn()
+
+    def _fail(self, request: Request, error: Exception) -> None:
+        name = request.method.name
+        if isinstance(error, ApiError):
+            self.session.fail(request, error)
+        elif isinstance(error, CanductorError):
+            self.session.fail(request, ApiError("failed", str(error)))
+        else:
+            sentence = f"{name} failed by a mistake of the program: {type(error).__name__}; please report it"
+            self.session.fail(request, ApiError("internal", sentence))
+            self._loop.call_exception_handler(
+                {"message": f"canductor: the method {name} failed", "exception": error}
+            )

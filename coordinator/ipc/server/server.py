@@ -1,0 +1,356 @@
+"""The server's sockets: where it listens, and whom it lets in (asyncio)."""
+
+import asyncio
+import contextlib
+import ssl
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Final
+
+from coordinator.ipc.server.auth import FailureBrake, Grant, Tokens, digest_of, stamp_of
+from coordinator.ipc.server.connection import Connection
+from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, Door
+from coordinator.ipc.protocol.methods import ApiError, Registry, Value
+from coordinator.ipc.server.publisher import Publisher
+from coordinator.ipc.server.session import Common, Session, SessionCounters
+from coordinator.ipc.server.session_methods import add_session_methods
+from coordinator.ipc.server.settings import IpcSettings, Limits, TcpSettings
+from coordinator.ipc.server.state import StateTree
+from coordinator.ipc.server.fair_scheduler import Turns
+from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
+from coordinator.ipc.protocol.messages import Encoder, Encoding, Fault
+from nodes.support.errors import CanductorError
+
+TOKENS_LOOK_S: Final = 1.0
+"""Between looks at whether the tokens' file has changed."""
+REFUSALS_MAX: Final = 32
+"""Connections beyond the most that are still told so; further ones are just closed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Adopted:
+    """What a client may do that came by another way."""
+
+    grant: Grant
+    token: bytes | None
+    """Digest of the token behind it: when that is taken away the client is let go. None: there is none."""
+
+
+def _ignore(_: str) -> None:
+    pass
+
+
+class IpcServer:
+    """Serves the methods of REGISTRY, and STATE, to front ends; lives on the loop that starts it.
+
+    ON_NOTICE gets sentences for the machine's owner.
+    """
+
+    def __init__(
+        self,
+        registry: Registry,
+        state: StateTree,
+        settings: IpcSettings,
+        *,
+        on_notice: Callable[[str], None] = _ignore,
+    ) -> None:
+        add_session_methods(registry)
+        self._settings = settings
+        self._encoder = Encoder()
+        self._common = Common(registry, Publisher(state, self._encoder), settings.limits)
+        self._servers: list[asyncio.AbstractServer] = []
+        self._door: Door | None = None
+        self._connections: set[Connection] = set()
+        self._brake = FailureBrake()
+        self._on_notice = on_notice
+        self._tokens: Tokens | None = None
+        self._shown: dict[Connection, bytes] = {}  # digests of the tokens that clients came in with
+        self._tcp: set[Connection] = set()
+        """Connections that count against ``tcp_connections_max``."""
+        self._watch: asyncio.Task[None] | None = None
+        self._turns: Turns | None = None
+        self._sessions = 0
+        self._refused = 0
+        self._unsendable = 0  # notifications that no message can carry
+        self._gone = SessionCounters()
+        self.tcp_port: int | None = None
+        """The port, once open; of use where the settings say 0, any port."""
+        self.tcp_addresses: list[str] = []
+        """The IP addresses that the port is open on; 0.0.0.0 and :: stand for all."""
+
+    # ------------------------------------------------------------------------------------------- life
+
+    async def start(self) -> None:
+        """Open the sockets; raises CanductorError with all closed."""
+        turns = self._turns = Turns()
+        try:
+            if self._settings.tokens is not None:
+                self._tokens = await asyncio.to_thread(Tokens.read, self._settings.tokens)
+            if self._settings.unix_path is not None:
+                await self._open_unix(self._settings.unix_path, turns)
+            if self._settings.tcp is not None:
+                await self._open_tcp(self._settings.tcp, turns)
+            path = self._settings.tokens if self._settings.tcp is None else self._settings.tcp.tokens
+            if path is not None and self._tokens is not None:
+                self._watch = asyncio.ensure_future(self._watch_tokens(path, self._tokens))
+        except BaseException:
+            await self.close()
+            raise
+
+    async def close(self) -> None:
+        """Let go of every client and close the sockets."""
+        if self._watch is not None:
+            self._watch.cancel()
+        for server in self._servers:
+            server.close()
+        if self._door is not None:
+            self._door.close()
+        for connection in list(self._connections):
+            connection.session.end(Fault("closing", "the server ends"))
+            connection.flush()
+            connection.transport.close()
+        if self._servers and self._settings.unix_path is not None:
+            with contextlib.suppress(OSError):
+                self._settings.unix_path.unlink()
+        self._servers.clear()
+        await asyncio.sleep(0)
+
+    def notify(self, event: str, values: Mapping[str, Value]) -> None:
+        """Send EVENT ("log", "gcode.reply") to every client that listens to it; never blocks."""
+        message: dict[str, Value] = {"event": event, "values": dict(values)}
+        encoded: dict[Encoding, bytes] = {}
+        for connection in self._connections:
+            session = connection.session
+            if not session.listens.matches(event):
+                continue
+            if session.encoding not in encoded:
+                try:
+                    encoded[session.encoding] = self._encoder.message(session.encoding, message)
+                except ValueError:  # who notifies has other things to do than to fail for this
+                    self._unsendable += 1
+                    return
+            session.notify(event, encoded[session.encoding])
+            connection.flush()
+
+    def figures(self) -> dict[str, Value]:
+        """Return how many clients there are, and what became of all messages since the start."""
+        counted = asdict(self._gone)
+        for connection in self._connections:
+            for name, value in asdict(connection.session.counters).items():
+                counted[name] += value
+        return {
+            "connections": len(self._connections),
+            "refused_connections": self._refused + (0 if self._door is None else self._door.refused),
+            "unsendable": self._unsendable + self._common.publisher.unsendable,
+            **counted,
+        }
+
+    # ---------------------------------------------------------------------------------------- sockets
+
+    async def _open_unix(self, path: Path, turns: Turns) -> None:
+        listener = await listen_at(path)
+        server = await asyncio.get_running_loop().create_unix_server(
+            lambda: Connection(self._admit_unix, self._drop, turns), sock=listener, backlog=BACKLOG
+        )
+        self._servers.append(server)
+
+    async def _open_tcp(self, tcp: TcpSettings, turns: Turns) -> None:
+        context = await asyncio.to_thread(_tls_of_tcp, tcp)
+        self._tokens = await asyncio.to_thread(Tokens.read, tcp.tokens)
+        most = self._settings.tcp_connections_max
+        door = self._door = Door(
+            lambda: Connection(self._admit_tcp, self._drop, turns),
+            context,
+            handshakes_max=min(HANDSHAKES_MAX, most),
+            may_enter=lambda entering: entering + len(self._tcp) < most + REFUSALS_MAX,
+        )
+        try:
+            await door.open(tcp.host, tcp.port)
+        except OSError as error:
+            raise CanductorError(
+                f"port {tcp.port} of {tcp.host} cannot be opened: {error.strerror}"
+            ) from None
+        self.tcp_port = door.names[0][1]
+        self.tcp_addresses = [address for address, _ in door.names]
+
+    # ----------------------------------------------------------------------------------------- tokens
+
+    async def _watch_tokens(self, path: Path, tokens: Tokens) -> None:
+        """Read PATH again when it changes. While it cannot be read no token lets anybody in."""
+        known, told = tokens.stamp, ""
+        while True:
+            await asyncio.sleep(TOKENS_LOOK_S)
+            if await asyncio.to_thread(stamp_of, path) == known and not told:
+                continue
+            try:
+                tokens = await asyncio.to_thread(Tokens.read, path)
+            except CanductorError as error:
+                if str(error) != told:
+                    self._on_notice(f"{error}; until then no token lets anybody in")
+                self._tokens, told = None, str(error)
+                continue
+            self._tokens, known, told = tokens, tokens.stamp, ""
+            self._on_notice(f"the tokens of {path.name} were read again")
+            self._part_from(tokens)
+
+    def _part_from(self, tokens: Tokens) -> None:
+        """End the clients whose token is not in TOKENS any more, or has a lower scope."""
+        for connection, token in list(self._shown.items()):
+            grant, caller = tokens.grant_of(token), connection.session.caller
+            if caller is not None and (grant is None or grant.scope < caller.scope):
+                connection.session.end(Fault("bad_token", "the token was taken away"))
+                connection.flush()
+
+    # ---------------------------------------------------------------------------------------- clients
+
+    @property
+    def limits(self) -> Limits:
+        """What one client may cost."""
+        return self._common.limits
+
+    def adopt(
+        self, transport: asyncio.Transport, address: str, check_key: Callable[[str], Adopted | None]
+    ) -> Connection:
+        """Take a client that came by another way, such as the live page's; TRANSPORT carries JSON lines.
+
+        What it gives as its token in the hello goes to CHECK_KEY, which returns what it may do.
+        """
+
+        def admit(_: asyncio.Transport, connection: Connection) -> Session:
+            def check(key: str) -> Grant | None:
+                adopted = check_key(key)
+                if adopted is None:
+                    return None
+                if adopted.token is not None:
+                    self._shown[connection] = adopted.token
+                return adopted.grant
+
+            return self._session(connection, address, check)
+
+        assert self._turns is not None, "the server is not started"
+        connection = Connection(admit, self._drop, self._turns)
+        connection.connection_made(transport)
+        return connection
+
+    def check_token(self, token: str, address: str) -> Grant:
+        """Return what TOKEN gives to somebody at ADDRESS; counts failures.
+
+        Raises ApiError ``too_many_failures``, ``bad_token``.
+        """
+        if (wait_s := self._shut_out_s(address)) > 0:
+            raise ApiError("too_many_failures", _shut_out_sentence(address, wait_s))
+        grant = self._grant(token, address)
+        if grant is None:
+            raise ApiError("bad_token", "the token is not known here")
+        return grant
+
+    def grant_of(self, token: bytes) -> Grant | None:
+        """Return what the token with the digest TOKEN gives now, None if nothing."""
+        return None if self._tokens is None else self._tokens.grant_of(token)
+
+    def _grant(self, token: str, address: str) -> Grant | None:
+        """Return what TOKEN gives; None: nothing, which counts as a failure of ADDRESS if it has one."""
+        if self._tokens is None:
+            return None
+        grant = self._tokens.check(token)
+        if grant is None and address:
+            self._brake.failed(address, asyncio.get_running_loop().time())
+        return grant
+
+    def _shut_out_s(self, address: str) -> float:
+        return self._brake.shut_out_s(address, asyncio.get_running_loop().time())
+
+    def _admit_unix(self, transport: asyncio.Transport, connection: Connection) -> Session:
+        pid, uid = peer_of(transport.get_extra_info("socket"))
+        session = self._session(connection, f"uid {uid}, pid {pid}", self._token_check(connection, ""))
+        session.granted = self._settings.unix_scope
+        if not may_use(uid):
+            self._refuse(session, Fault("not_allowed", f"this socket is not for the user with uid {uid}"))
+        return session
+
+    def _admit_tcp(self, transport: asyncio.Transport, connection: Connection) -> Session:
+        address = str((transport.get_extra_info("peername") or ("unknown",))[0])
+        session = self._session(connection, address, self._token_check(connection, address))
+        wait_s = self._shut_out_s(address)
+        if len(self._tcp) >= self._settings.tcp_connections_max:
+            self._refuse(session, Fault("busy", "there are too many connections over TCP; close others"))
+        elif wait_s > 0:
+            self._refuse(session, Fault("too_many_failures", _shut_out_sentence(address, wait_s)))
+        self._tcp.add(connection)
+        return session
+
+    def _token_check(self, connection: Connection, address: str) -> Callable[[str], Grant | None]:
+        """Return what looks at the token of CONNECTION's hello; failures count for ADDRESS, if it has one."""
+
+        def check(token: str) -> Grant | None:
+            grant = self._grant(token, address)
+            if grant is not None:
+                self._shown[connection] = digest_of(token)
+            return grant
+
+        return check
+
+    def _session(self, connection: Connection, peer: str, check: Callable[[str], Grant | None]) -> Session:
+        self._sessions += 1
+        now_s = asyncio.get_running_loop().time()
+        session = Session(
+            self._common, now_s, number=self._sessions, peer=peer, granted=None, check_token=check
+        )
+        self._connections.add(connection)
+        if len(self._connections) > self._settings.connections_max:
+            self._refuse(session, Fault("busy", "there are too many connections; close others"))
+        if len(self._connections) > self._settings.connections_max + REFUSALS_MAX:
+            connection.transport.abort()
+        return session
+
+    def _refuse(self, session: Session, fault: Fault) -> None:
+        self._refused += 1
+        session.end(fault)
+
+    def _drop(self, connection: Connection) -> None:
+        self._connections.discard(connection)
+        self._tcp.discard(connection)
+        self._shown.pop(connection, None)
+        for field in fields(SessionCounters):
+            total = getattr(self._gone, field.name) + getattr(connection.session.counters, field.name)
+            setattr(self._gone, field.name, total)
+
+
+def _shut_out_sentence(address: str, wait_s: float) -> str:
+    return f"too many wrong tokens from {address}; wait {wait_s:.0f} s"
+
+
+# ------------------------------------------------------------------------------------------------- opening
+
+
+def _tls_of_tcp(tcp: TcpSettings) -> ssl.SSLContext | None:
+    """Return how TCP is kept secret, None for plain loopback; raises CanductorError."""
+    if tcp.certificate is not None and tcp.private_key is not None:
+        return tls_context(tcp.certificate, tcp.private_key)
+    if not tcp.plain_on_loopback:
+        raise CanductorError("TCP needs a certificate and its private key, or plain_on_loopback")
+    if not _is_loopback(tcp.host):
+        raise CanductorError(
+            f"TCP without TLS is for loopback only, and {tcp.host} is not: 127.0.0.1 or ::1 is"
+        )
+    return None
+
+
+def tls_context(certificate: Path, private_key: Path) -> ssl.SSLContext:
+    """Return TLS 1.2 or later with the chain and key of two PEM files; raises CanductorError."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(certificate, private_key)
+    except (OSError, ssl.SSLError) as error:
+        raise CanductorError(f"the certificate {certificate} or its key cannot be used: {error}") from None
+    return context
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return False  # a name may come to mean another address

@@ -1,0 +1,420 @@
+"""One client as the server sees it; sans-IO: bytes and times in, requests and bytes out.
+
+The way of a request: ``receive`` takes bytes, ``read`` turns some of them into requests and returns the
+urgent ones, ``next_request`` gives the others in order, and ``answer`` or ``fail`` ends each. What is to be
+told to the client collects for ``take_output``. While the client does not read (``writable`` is False)
+requests wait, updates merge and notifications are dropped, but reading never stops: behind whatever waits
+there may be an emergency stop.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from coordinator.ipc.server import session_methods
+from coordinator.ipc.server.auth import Grant
+from coordinator.ipc.protocol.methods import ApiError, Caller, Method, Registry, Scope, Value, shown
+from coordinator.ipc.server.publisher import Publisher, Subscription
+from coordinator.ipc.server.settings import Limits
+from coordinator.ipc.server.state import FieldFilter
+from coordinator.ipc.protocol.messages import Encoding, Fault, WireReader
+
+MESSAGES_PER_TURN: Final = 64
+"""Messages taken from the bytes before others get their turn."""
+BYTES_PER_TURN: Final = 65_536
+"""Likewise; the message that reaches it is the last one."""
+ID_MAX: Final = 2**53 - 1
+"""Every JSON library can carry it exactly."""
+METHOD_LENGTH_MAX: Final = 128
+PHASES: Final = 8
+"""Watchers of one rate are spread over so many groups, or all updates would be due at one instant."""
+
+
+@dataclass(slots=True, eq=False)
+class Request:
+    """A request with its parameters, checked. ID is None when no answer is wanted.
+
+    IGNORED tells what was wrong with an urgent one, which is carried out all the same; empty: nothing.
+    """
+
+    id: int | None
+    method: Method
+    params: dict[str, Any]
+    ignored: str = ""
+
+
+@dataclass(slots=True)
+class SessionCounters:
+    """What became of a client's messages."""
+
+    requests: int = 0
+    failed: int = 0
+    refused_busy: int = 0
+    updates: int = 0
+    updates_skipped: int = 0
+    notifications_dropped: int = 0
+    bytes_out: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Common:
+    """What all sessions of a server share."""
+
+    registry: Registry
+    publisher: Publisher
+    limits: Limits
+
+
+class Session:
+    """One client. PEER tells people who it is; GRANTED is what it may do without a token.
+
+    CHECK_TOKEN is None where there are no tokens. Times are seconds of one clock.
+    """
+
+    def __init__(
+        self,
+        common: Common,
+        now_s: float,
+        *,
+        number: int,
+        peer: str,
+        granted: Scope | None,
+        check_token: Callable[[str], Grant | None] | None = None,
+    ) -> None:
+        self.common = common
+        self.number = number
+        self.peer = peer
+        self.granted = granted
+        self.check_token = check_token
+        self.caller: Caller | None = None
+        """Set by the hello."""
+        self.fault: Fault | None = None
+        """Why the session has ended; what is left to send tells the client."""
+        self.writable = True
+        """Whether the client takes what is sent; set by the driver."""
+        self.counters = SessionCounters()
+        self.subscriptions: dict[int, Subscription] = {}
+        self.listens = FieldFilter(())
+        self._limits = common.limits
+        self._encoder = common.publisher.encoder
+        self._reader = WireReader(common.limits)
+        self._hello_until_s = now_s + common.limits.message_timeout_s
+        self._waiting: deque[Request] = deque()
+        self._running: set[Request] = set()
+        self._cancelled: list[Request] = []
+        self._ids: dict[int, Request] = {}
+        self._out: list[bytes] = []
+        self._out_bytes = 0
+        self._notifications: deque[bytes] = deque()
+        self._lost = 0  # notifications, and not told yet
+        self._last_subscription = 0
+
+    # ------------------------------------------------------------------------------------------- time
+
+    def next_deadline(self) -> float | None:
+        """Return when ``handle_timer`` has something to do."""
+        if self.fault is not None:
+            return None
+        times = [subscription.next_s for subscription in self.subscriptions.values()]
+        if self.caller is None:
+            times.append(self._hello_until_s)
+        if (deadline_s := self._reader.next_deadline()) is not None:
+            times.append(deadline_s)
+        return min(times, default=None)
+
+    def handle_timer(self, now_s: float) -> None:
+        """Send what is due, end what took too long."""
+        if self.fault is not None:
+            return
+        if (fault := self._reader.handle_timer(now_s)) is not None:
+            self.end(fault)
+            return
+        if self.caller is None and now_s >= self._hello_until_s:
+            self.end(Fault("timeout", f"no api.hello within {self._limits.message_timeout_s:g} s"))
+            return
+        for subscription in self.subscriptions.values():
+            if now_s >= subscription.next_s:
+                self._send_update(subscription)
+                subscription.schedule(now_s)
+
+    def _send_update(self, subscription: Subscription) -> None:
+        if self.congested:
+            subscription.skipped += 1
+            self.counters.updates_skipped += 1
+            return
+        update = subscription.update(self.common.publisher, self.encoding)
+        if update is not None:
+            self.counters.updates += 1
+            self._put(update)
+
+    # ------------------------------------------------------------------------------------------ bytes
+
+    @property
+    def encoding(self) -> Encoding:
+        """How the client writes; JSON until it has written."""
+        return self._reader.encoding or Encoding.JSON
+
+    @property
+    def congested(self) -> bool:
+        """Whether the client is behind with reading."""
+        return not self.writable or self._out_bytes > self._limits.output_bytes
+
+    @property
+    def unread_bytes(self) -> int:
+        """Bytes that wait for ``read``."""
+        return self._reader.waiting_bytes
+
+    @property
+    def output_bytes(self) -> int:
+        """Bytes that wait for ``take_output``."""
+        return self._out_bytes
+
+    def receive(self, data: bytes | memoryview, now_s: float) -> None:
+        """Take DATA that has arrived; ``read`` looks at it."""
+        self._reader.feed(data, now_s)
+
+    def take_output(self) -> bytes:
+        """Return what to send, in order."""
+        self._move_notifications()
+        data = b"".join(self._out)
+        self._out.clear()
+        self._out_bytes = 0
+        self.counters.bytes_out += len(data)
+        return data
+
+    def _put(self, data: bytes) -> None:
+        if self._out_bytes + len(data) > self._limits.output_bytes_max:
+            self._out.clear()  # it would not be read
+            self._out_bytes = 0
+            self.end(Fault("not_reading", "answers are not read; read them, or ask less"))
+            return
+        self._out.append(data)
+        self._out_bytes += len(data)
+
+    def _send(self, message: dict[str, Value]) -> None:
+        self._put(self._encoder.message(self.encoding, message))
+
+    def end(self, fault: Fault) -> None:
+        """End the session for FAULT and tell the client."""
+        if self.fault is not None:
+            return
+        self.fault = fault
+        self._waiting.clear()
+        self._notifications.clear()
+        self.subscriptions.clear()
+        self._send({"error": {"code": fault.code, "message": fault.sentence}})
+
+    # --------------------------------------------------------------------------------------- requests
+
+    def read(self, now_s: float) -> list[Request]:
+        """Turn a bounded part of the bytes into requests; return the urgent ones, to be called at once."""
+        urgent: list[Request] = []
+        stop_at = self._reader.waiting_bytes - BYTES_PER_TURN
+        for _ in range(MESSAGES_PER_TURN):
+            if self.fault is not None:
+                break
+            message = self._reader.next_message()
+            if isinstance(message, Fault):
+                self.end(message)
+            elif message is None:
+                break
+            else:
+                self._take(message, urgent, now_s)
+            if self._reader.waiting_bytes <= stop_at:
+                break
+        return urgent
+
+    @property
+    def has_work(self) -> bool:
+        """Whether ``read`` or ``next_request`` may have more at once."""
+        if self.fault is not None:
+            return False
+        unread = self._reader.waiting_bytes > 0 and self._reader.next_deadline() is None
+        return unread or (bool(self._waiting) and self._may_start)
+
+    @property
+    def should_read(self) -> bool:
+        """Whether it is time for ``read``: not while half of all that may wait does, and can be started."""
+        return not self._may_start or 2 * len(self._waiting) < self._limits.pending_requests
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing the client has asked for is without answer."""
+        return not self._waiting and not self._running and not self.has_work
+
+    @property
+    def _may_start(self) -> bool:
+        return len(self._running) < self._limits.running_requests and not self.congested
+
+    def next_request(self, now_s: float) -> Request | None:
+        """Return the next request to call, None while there is none or none may start."""
+        while self._waiting and self._may_start and self.fault is None:
+            request = self._waiting.popleft()
+            own = session_methods.HANDLERS.get(request.method.name)
+            if own is None:
+                self._running.add(request)
+                return request
+            self._perform(request, own, now_s)
+        return None
+
+    def take_cancelled(self) -> list[Request]:
+        """Return the running requests that the client has cancelled meanwhile."""
+        cancelled, self._cancelled = self._cancelled, []
+        return cancelled
+
+    def answer(self, request: Request, result: Value) -> None:
+        """End REQUEST with its RESULT."""
+        self._forget(request)
+        if request.id is None or self.fault is not None:
+            return
+        if request.ignored and isinstance(result, dict):
+            result = result | {"ignored": request.ignored}
+        try:
+            self._send({"id": request.id, "result": result})
+        except ValueError as error:
+            name = request.method.name
+            self.fail(request, ApiError("internal", f"{name} has a result that cannot be sent: {error}"))
+
+    def fail(self, request: Request, error: ApiError) -> None:
+        """End REQUEST with ERROR."""
+        self._forget(request)
+        self._refuse(request.id, error)
+
+    def _forget(self, request: Request) -> None:
+        self._running.discard(request)
+        if request.id is not None and self._ids.get(request.id) is request:
+            del self._ids[request.id]
+
+    def _refuse(self, request_id: int | None, error: ApiError) -> None:
+        self.counters.failed += 1
+        if request_id is not None and self.fault is None:
+            self._send({"id": request_id, "error": {"code": error.code, "message": error.sentence}})
+
+    def _take(self, message: dict[str, Any], urgent: list[Request], now_s: float) -> None:
+        request_id, name = message.get("id"), message.get("method")
+        if type(name) is not str:
+            self.end(Fault("bad_message", "a request must be a map with method, and with id and params"))
+            return
+        if len(name) > METHOD_LENGTH_MAX:
+            self.end(Fault("bad_message", f"the name of a method has at most {METHOD_LENGTH_MAX} characters"))
+            return
+        is_id = request_id is None or (type(request_id) is int and 0 <= request_id <= ID_MAX)
+        if not is_id and not self._is_urgent(name):
+            self._end_for_id(request_id)
+            return
+        self.counters.requests += 1
+        try:
+            request = self._request(request_id if is_id else None, name, message.get("params"))
+        except ApiError as error:
+            self._refuse(request_id, error)
+            if self.caller is None:
+                self.end(Fault(error.code, error.sentence))
+            return
+        self._sort(request, urgent, now_s)
+        if not is_id:
+            self._end_for_id(request_id, f"; {name} was carried out all the same")
+
+    def _end_for_id(self, request_id: object, addition: str = "") -> None:
+        sentence = f"an id is a whole number from 0 to 2^53 - 1, not {shown(request_id)}{addition}"
+        self.end(Fault("bad_message", sentence))
+
+    def _is_urgent(self, name: str) -> bool:
+        try:
+            return self._method(name).urgent
+        except ApiError:
+            return False
+
+    def _request(self, request_id: int | None, name: str, params: object) -> Request:
+        """Return the request; an urgent one whatever is wrong with it, if the client may. Raises ApiError."""
+        method = self._method(name)
+        taken = ""
+        if request_id is not None and request_id in self._ids:
+            taken = f"the id {request_id} is that of a request without answer yet"
+        if method.urgent:
+            usable, wrong = method.check_urgent(params)
+            return Request(request_id, method, usable, "; ".join(filter(None, (taken, wrong))))
+        if taken:
+            raise ApiError("bad_params", taken)
+        return Request(request_id, method, method.check(params))
+
+    def _method(self, name: str) -> Method:
+        """Return the method NAME if this client may call it now; raises ApiError."""
+        if self.caller is None and name != session_methods.HELLO:
+            raise ApiError("no_hello", "the first request must be api.hello")
+        method = self.common.registry.methods.get(name)
+        if method is None:
+            raise ApiError("no_such_method", f"there is no method {shown(name)}; api.methods lists them")
+        if self.caller is not None and method.scope > self.caller.scope:
+            needed, has = method.scope.word, self.caller.scope.word
+            raise ApiError("not_allowed", f"{name} needs the scope {needed}, this client has {has}")
+        return method
+
+    def _sort(self, request: Request, urgent: list[Request], now_s: float) -> None:
+        """Put REQUEST where it belongs: done at once, urgent, or waiting."""
+        at_once = session_methods.AT_ONCE.get(request.method.name)
+        if at_once is not None:
+            self._perform(request, at_once, now_s)
+        elif request.method.urgent:
+            urgent.append(request)
+        elif len(self._waiting) >= self._limits.pending_requests:
+            self.counters.refused_busy += 1
+            most = self._limits.pending_requests
+            self._refuse(request.id, ApiError("busy", f"{most} requests of this client wait; await answers"))
+        else:
+            self._waiting.append(request)
+            if request.id is not None:
+                self._ids[request.id] = request
+
+    def _perform(self, request: Request, handler: session_methods.Handler, now_s: float) -> None:
+        try:
+            result = handler(self, request.params, now_s)
+        except ApiError as error:
+            self.fail(request, error)
+        else:
+            self.answer(request, result)
+
+    # ------------------------------------------------------------------ what session_methods build on
+
+    def cancel(self, request_id: int) -> bool:
+        """Cancel the request REQUEST_ID; return whether there was one."""
+        request = self._ids.get(request_id)
+        if request is None:
+            return False
+        if request in self._running:
+            self._cancelled.append(request)
+        else:
+            self._waiting.remove(request)
+            self.fail(request, ApiError("cancelled", f"{request.method.name} was cancelled"))
+        return True
+
+    def subscribe(self, wanted: FieldFilter, period_s: float, sequence: int, now_s: float) -> int:
+        """Begin a subscription of what changes after SEQUENCE; return its number."""
+        self._last_subscription += 1
+        subscription = Subscription(
+            self._last_subscription, wanted, period_s, self.number % PHASES / PHASES, sequence
+        )
+        subscription.schedule(now_s)
+        self.subscriptions[subscription.number] = subscription
+        return subscription.number
+
+    # ---------------------------------------------------------------------------------- notifications
+
+    def notify(self, event: str, data: bytes) -> None:
+        """Send DATA, the notification EVENT as this client writes, if it listens and as far as it reads."""
+        if self.fault is not None or not self.listens.matches(event):
+            return
+        self._notifications.append(data)
+        if len(self._notifications) > self._limits.notifications:
+            self._notifications.popleft()
+            self._lost += 1
+            self.counters.notifications_dropped += 1
+        self._move_notifications()
+
+    def _move_notifications(self) -> None:
+        """Send what waits, and before it how many were lost."""
+        while self._notifications and not self.congested:
+            if self._lost:
+                lost, self._lost = self._lost, 0
+                self._send({"event": "api.lost", "values": {"count": lost}})
+            self._put(self._notifications.popleft())

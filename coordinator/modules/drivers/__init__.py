@@ -1,0 +1,1 @@
+"""Stepper drivers: enable pins and TMC chips."""

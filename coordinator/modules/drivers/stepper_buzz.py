@@ -1,0 +1,63 @@
+"""STEPPER_BUZZ: one motor goes a little way to and fro, to see which one it is and that it is wired."""
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.parser import WordError, quoted
+from coordinator.config.options import SectionSpec
+from coordinator.modules.base import Build, Module
+
+if TYPE_CHECKING:
+    from coordinator.config.model import StepperDescription
+    from coordinator.runtime.module_context import Live
+
+TIMES: Final = 10
+WAY_MM: Final = 1.0
+WAY_RAD: Final = math.radians(1.0)
+"""Of a motor that turns something."""
+THERE_S: Final = 0.25
+"""One way takes about so long."""
+
+
+class StepperBuzz(Module):
+    """The command."""
+
+    SPEC = SectionSpec(help="Motors to and fro", options=())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._steppers = {stepper.name: stepper for stepper in build.machine.steppers}
+        self._live: Live | None = None
+        build.add_command(
+            GCodeCommand("STEPPER_BUZZ", "Move the motor STEPPER to and fro ten times, by 1 mm", self._read)
+        )
+
+    async def connect(self, live: "Live") -> None:
+        """Take over the machine."""
+        self._live = live
+
+    def _read(self, call: Call) -> Reading:
+        name = call.parameters("STEPPER").get("STEPPER", "")
+        stepper = self._steppers.get(name)
+        if stepper is None:
+            raise WordError(
+                f"STEPPER_BUZZ names the motor {quoted(name)}; there are {' '.join(self._steppers)}"
+            )
+        done = Done(position=call.position, moved=True)  # it ends where it began, to the step
+
+        async def buzz() -> Done:
+            await self._buzz(stepper)
+            return done
+
+        return AtRest(buzz, done)
+
+    async def _buzz(self, stepper: "StepperDescription") -> None:
+        from coordinator.runtime.moves.single import Ramp, SingleMove  # noqa: PLC0415 (planning needs no asyncio)
+
+        assert self._live is not None
+        way = WAY_RAD if stepper.function.turns else WAY_MM
+        speed = 2 * way / THERE_S
+        ramp = Ramp(way, speed, 4 * speed / THERE_S)
+        for direction in (1.0, -1.0) * TIMES:
+            await SingleMove(self._live.machine, ramp, ways={stepper.name: direction}).run()

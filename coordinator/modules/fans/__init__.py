@@ -1,0 +1,1 @@
+"""Fans, by hand, automatic, or holding a temperature."""

@@ -1,0 +1,1 @@
+"""Heaters: control, tuning, safety, and the sections that have one."""

@@ -1,0 +1,354 @@
+"""One heater: sensor, controller, output, and what watches over them.
+
+Three nets, each without the one before it: the controller and the watch over the heater here; the node's own
+limits of what its sensor may read; and the node's max_duration, within which it has to hear from the host.
+The host renews the output with every measurement and with nothing else: no measurements, no heat. Without
+them it ends the heat a moment before the node would have to stop, since the node may have other tasks.
+"""
+
+import contextlib
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Final, Protocol
+
+from coordinator.gcode.parser import WordError
+from coordinator.heat.controller import Controller
+from coordinator.heat.holding import Held, Holding
+from coordinator.heat.mpc import Mpc
+from coordinator.heat.verify import HeaterCheck
+from coordinator.modules.base import Build, Modules, Value
+from coordinator.modules.fans.fan_unit import FanModule
+from coordinator.modules.heaters.control import ControlSettings
+from coordinator.config.sections.heater_options import (
+    AMBIENT_SENSOR,
+    COOLING_FAN,
+    CYCLE_TIME,
+    HEATER_PIN,
+    MAX_DURATION,
+)
+from coordinator.modules.pinned import AHEAD_S, add_pinned
+from coordinator.modules.sensors.temperature_input import SensorModule, TemperatureInput
+from coordinator.modules.heaters.verify_heater import VerifyHeater, usual
+from nodes.devices.analog_in import RANGE_CHECKS
+from nodes.devices.pwm_out import PwmOut
+from nodes.support.errors import CanductorError
+from nodes.node.states import NodeState
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+LOOK_S: Final = 1.0
+"""How often it is looked whether there still are measurements."""
+SILENT_LOOKS: Final = 2
+"""So many looks in a row may find none; looks and not seconds, as the host itself may have stood still."""
+
+STALE_LOOK_S: Final = 0.1
+"""How often it is looked whether the power rests upon a measurement that is too old."""
+STALE_SPARE_S: Final = 0.2
+"""So long before the node would stop such a power is switched off: two looks."""
+
+COMING_S: Final = 1.0
+"""Of filament that is going to pass, this long from when a power acts is provided for."""
+BAD_MEASUREMENTS: Final = RANGE_CHECKS + 2
+"""So many out of range, and the node should have stopped by itself."""
+
+
+class Tuning(Protocol):
+    """A controller that finds out about its heater."""
+
+    @property
+    def watched_c(self) -> float: ...  # noqa: D102
+    def power(self, now_s: float, measured_c: float, target_c: float = ..., /) -> float: ...  # noqa: D102
+    def settled(self, measured_c: float, target_c: float, /) -> bool: ...  # noqa: D102
+
+
+class HeaterUnit:
+    """The heater of section BUILD, which programs call KEY."""
+
+    def __init__(self, build: Build, key: str) -> None:
+        self.key = key
+        self.name = build.name
+        pin = build.pin(HEATER_PIN)
+        self.input = TemperatureInput(build)
+        self.input.on_measured = self._measured
+        self.settings = ControlSettings(build)
+        self.target_c = 0.0
+        self.power = 0.0
+        """What is applied now, 0..1."""
+        self.controller: Controller | None = self.settings.controller()
+        self.node = pin.node
+        self._output = PwmOut(
+            f"the heater of [{build.name}]",
+            pin=pin.name,
+            cycle_s=build.get(CYCLE_TIME),
+            invert=pin.invert,
+            # Counted from when a value takes effect, which is so long after it was sent.
+            max_duration_s=build.get(MAX_DURATION) - AHEAD_S,
+        )
+        add_pinned(build, self._output, pin)
+        self._find_fan = build.needed(COOLING_FAN, FanModule) if build.find(COOLING_FAN) else None
+        ambient = build.find(AMBIENT_SENSOR)
+        self._find_ambient = build.needed(AMBIENT_SENSOR, SensorModule) if ambient else None
+        self.fan: FanModule | None = None
+        """What cools it, where the section says so."""
+        self._ambient: SensorModule | None = None
+        self.calibrated: dict[str, str] = {}
+        """Options of the section and their values, as calibration found them."""
+        self._check = HeaterCheck(usual(key))
+        self._holding = Holding()
+        self.on_held: Callable[[Held], None] | None = None
+        """Called at the end of each steady state."""
+        self._tuning: Tuning | None = None
+        self._tuning_failure: CanductorError | None = None
+        self._live: Live | None = None
+        self._on = False
+        self._applied_s = 0.0
+        """When power was applied last, host's time."""
+        self._stale_s = build.get(MAX_DURATION) - AHEAD_S - STALE_SPARE_S
+        self._gone: str | None = None
+        """Why the target was forgotten; None: it was not."""
+        self._bad = 0
+        self._told_s = 0.0
+
+    # ---------------------------------------------------------------------------------------------- life
+
+    def link(self, modules: Modules) -> None:
+        """Find what belongs to it; raises ConfigError."""
+        self.input.link(modules)
+        verify = modules.find(f"verify_heater {self.key}", VerifyHeater)
+        if verify is not None:
+            self._check = HeaterCheck(verify.options)
+        if self._find_fan is not None:
+            self.fan = self._find_fan(modules)
+        if self._find_ambient is not None:
+            self._ambient = self._find_ambient(modules)
+
+    async def connect(self, live: "Live") -> None:
+        """Begin to act."""
+        self._live = live
+        if self.settings.kind == "mpc":
+            live.machine.filament.want(self.name)
+        await self.input.connect(live)
+        live.every(LOOK_S, self._look)
+        live.every(STALE_LOOK_S, self._end_stale_heat)
+
+    def keep(self, found: dict[str, str]) -> None:
+        """Have SAVE_CONFIG write what calibration FOUND: options of the section and their values."""
+        self.calibrated = found
+        if self._live is not None:
+            for option, text in found.items():
+                self._live.save(self.name, option, text)
+
+    def end(self, cause: str) -> None:
+        """Act no more: the nodes have their outputs off."""
+        self._live = None
+        self.target_c = self.power = 0.0
+        self._tell_held(self._holding.end())
+        self.input.end(cause)
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell how it is."""
+        status: dict[str, Value] = {
+            "temperature": _rounded(self.input.celsius),
+            "target": self.target_c,
+            "power": round(self.power, 4),
+            **_band(self._holding.held),
+        }
+        if isinstance(self.controller, Mpc):
+            status["control_stats"] = {
+                "temp_block": _rounded(self.controller.block_c),
+                "temp_sensor": _rounded(self.controller.sensor_c),
+                "temp_ambient": _rounded(self.controller.ambient_c),
+                "filament_mm_per_s": round(self.controller.filament_mm_per_s, 2),
+            }
+        return status
+
+    # ------------------------------------------------------------------------------------------- targets
+
+    def check_target(self, celsius: float) -> None:
+        """Raise WordError unless CELSIUS is a target it may have, or 0 for off."""
+        if celsius and not self.input.min_c <= celsius <= self.input.max_c:
+            raise WordError(
+                f"{celsius:g} °C is outside what [{self.name}] allows, {self.input.min_c:g} to"
+                f" {self.input.max_c:g} °C; correct the program, or min_temp and max_temp"
+            )
+        if celsius and self.controller is None:
+            raise WordError(
+                f"[{self.name}] has to be calibrated before it heats: MPC_CALIBRATE HEATER={self.key}"
+            )
+
+    def set_target(self, celsius: float) -> None:
+        """Heat to CELSIUS, 0: not at all. Off at once, on with the next measurement.
+
+        A calibration ends when its heater is switched off.
+        """
+        self.target_c, self._gone = celsius, None
+        if celsius <= 0:
+            if self._tuning is not None:
+                self._end_tuning("it was switched off")
+            self._apply(0.0)
+
+    @property
+    def settled(self) -> bool:
+        """Whether who waits for the target may go on."""
+        if self.target_c <= 0 or self.controller is None or self.input.celsius is None:
+            return True
+        return self.input.is_sound and self.controller.settled(self.input.celsius, self.target_c)
+
+    async def reach(self) -> None:
+        """Wait until the target is reached; raises CanductorError when the heater ends before."""
+        await self._next()  # with the target in force
+        while not self.settled:
+            await self._next()
+
+    async def _next(self) -> None:
+        """Wait for the next measurement; raises CanductorError when a node went away meanwhile."""
+        await self.input.next()
+        if self._gone is not None:
+            raise CanductorError(self._gone)
+
+    async def tune(self, tuning: Tuning, each: Callable[[], None] = lambda: None) -> None:
+        """Let TUNING have the heater until it is done, EACH after every measurement; it is off then."""
+        if self._tuning is not None:
+            raise CanductorError(f"[{self.name}] is being calibrated already; wait for its end")
+        self._tuning, self._tuning_failure, self._gone = tuning, None, None
+        try:
+            while not tuning.settled(0.0, 0.0):
+                await self._next()
+                each()
+                if self._tuning_failure is not None:
+                    raise self._tuning_failure
+        finally:
+            self._tuning = self._tuning_failure = None
+            self.set_target(0.0)
+
+    def _end_tuning(self, why: str) -> None:
+        """Have the calibration fail, and heat no more."""
+        self._tuning_failure = CanductorError(f"the calibration of [{self.name}] ended: {why}")
+        self.input.wake()
+
+    def use(self, controller: Controller) -> None:
+        """Be controlled by another controller from now on."""
+        self.controller = controller
+
+    # ------------------------------------------------------------------------------------------- control
+
+    def _measured(self, at_s: float, celsius: float) -> None:
+        live = self._live
+        if live is None:
+            return
+        if not self.input.min_c <= celsius <= self.input.max_c:
+            self._out_of_range(live, celsius)
+            return
+        self._bad = 0
+        watched_c = self.target_c if self._tuning is None else self._tuning.watched_c
+        fault = self._check.check(at_s, celsius, watched_c, self.power)
+        if fault is not None:
+            live.stop(f"heater {self.key} {fault}")
+            return
+        self._apply(self._wanted(at_s, celsius))
+        ended = self._holding.measured(at_s, celsius, self.target_c, self.power, settled=self.settled)
+        self._tell_held(ended)
+
+    def _tell_held(self, held: Held | None) -> None:
+        if held is not None and self.on_held is not None:
+            self.on_held(held)
+
+    def _out_of_range(self, live: "Live", celsius: float) -> None:
+        """Heat no more while what is measured cannot be; its node stops by itself a moment later."""
+        self._bad += 1
+        self._apply(0.0)
+        if self._bad > BAD_MEASUREMENTS:
+            live.stop(
+                f"heater {self.key}: its sensor tells {celsius:.0f} °C, outside {self.input.min_c:g} to"
+                f" {self.input.max_c:g} °C; check the sensor and its wires"
+            )
+
+    def _wanted(self, at_s: float, celsius: float) -> float:
+        if self._gone is not None or self._tuning_failure is not None:
+            return 0.0
+        if self._tuning is not None:
+            try:
+                return self._tuning.power(at_s, celsius)
+            except CanductorError as error:
+                self._tuning_failure = error
+                return 0.0
+        if self.controller is None:
+            return 0.0
+        if isinstance(self.controller, Mpc):
+            self._tell_model(self.controller, at_s)
+        return self.controller.power(at_s, celsius, self.target_c)
+
+    def _tell_model(self, model: Mpc, at_s: float) -> None:
+        if self.fan is not None:
+            model.set_fan(self.fan.unit.speed)
+        if self._ambient is not None and self._ambient.input.celsius is not None:
+            model.set_ambient(self._ambient.input.celsius)
+        if self._live is not None and model.model.filament_j_per_mm_k > 0:
+            forecast = self._live.machine.filament
+            acts_s = at_s + AHEAD_S
+            model.set_filament(
+                forecast.mm_per_s(self.name, self._told_s, at_s),
+                forecast.mm_per_s(self.name, acts_s, acts_s + COMING_S),
+            )
+            self._told_s = at_s
+
+    def _apply(self, power: float) -> None:
+        """Have POWER on the node; off needs no renewal."""
+        live, self.power = self._live, power
+        if live is None or (power <= 0 and not self._on):
+            return
+        node = live.node(self.node)
+        try:
+            clock = live.ticks_at(self.node, live.print_time_now() + AHEAD_S)
+            self._output.set(node, clock, power)
+        except CanductorError as error:
+            self._let_go(str(error))
+            return
+        self._on, self._applied_s = power > 0, live.now_s()
+
+    def _end_stale_heat(self) -> None:
+        """Switch off when no measurement has renewed the power for long: nobody knows how hot it is."""
+        live = self._live
+        if live is not None and self._on and live.now_s() - self._applied_s > self._stale_s:
+            self._apply(0.0)
+
+    def _look(self) -> None:
+        """Notice that there are no measurements any more, and what that means."""
+        live = self._live
+        if live is None or (self.target_c <= 0 and self._tuning is None):
+            return
+        for name in (self.input.node, self.node):
+            if live.node(name).state is not NodeState.READY:
+                self._let_go(f"node {name} is {live.node(name).state.value}")
+                return
+        missed = self.input.missed()
+        if missed > SILENT_LOOKS:
+            live.stop(
+                f"heater {self.key}: its sensor has not said anything for some {missed * LOOK_S:g} s;"
+                f" check node {self.input.node} and its wires"
+            )
+
+    def _let_go(self, why: str) -> None:
+        """Forget the target: a node that may be absent is away, its own or that of its sensor."""
+        live, was, on = self._live, self.target_c, self._on
+        self.target_c, self.power, self._on = 0.0, 0.0, False
+        self._gone = f"heater {self.key} went off: {why}"
+        if on and live is not None and live.node(self.node).state is NodeState.READY:
+            with contextlib.suppress(CanductorError):  # then its own max_duration ends it
+                clock = live.ticks_at(self.node, live.print_time_now() + AHEAD_S)
+                self._output.set(live.node(self.node), clock, 0.0)
+        self.input.wake()
+        if was > 0 and live is not None:
+            live.say(f"heater {self.key} is off, its target of {was:g} °C is forgotten: {why}")
+
+
+def _band(held: Held | None) -> dict[str, Value]:
+    return {
+        "held_s": None if held is None else round(held.seconds, 1),
+        "held_low": None if held is None else round(held.low_c, 2),
+        "held_high": None if held is None else round(held.high_c, 2),
+    }
+
+
+def _rounded(celsius: float | None) -> Value:
+    return None if celsius is None else round(celsius, 2)

@@ -1,0 +1,187 @@
+"""What all heaters and sensors have in common: their names, and the commands for any of them."""
+
+from collections.abc import Awaitable, Callable, Mapping
+from typing import ClassVar, Final
+
+from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, InTime, Reading
+from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.gcode.parser import WordError
+from coordinator.config.options import SectionSpec
+from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.heaters.heater import HeaterUnit
+from coordinator.modules.sensors.temperature_source import TemperatureSource
+from coordinator.modules.words import numbers, one, parameters, value
+
+FAN_STEPS_MAX: Final = 12
+
+
+class Heaters(Module):
+    """The heaters and sensors of the machine."""
+
+    SPEC: ClassVar = SectionSpec(help="What all heaters have in common", options=())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.units: dict[str, HeaterUnit] = {}
+        """By what programs call them: extruder, heater_bed, NAME of heater_generic."""
+        self.sensors: dict[str, TemperatureSource] = {}
+        """By what programs call them: heaters and the sections of sensors."""
+        self._tags: dict[str, HeaterUnit | TemperatureSource] = {}
+        for name, help_, read in (
+            ("M105", "Tell all temperatures", self._tell),
+            ("TURN_OFF_HEATERS", "Let all heaters cool down", self._turn_off),
+            ("SET_HEATER_TEMPERATURE", "Set a heater's target: HEATER= TARGET=", self._set),
+        ):
+            build.add_command(GCodeCommand(name, help_, read, beside=True))
+        for name, help_, read in (
+            (
+                "TEMPERATURE_WAIT",
+                "Wait until a temperature is in a range: SENSOR= MINIMUM= MAXIMUM=",
+                self._wait,
+            ),
+            ("QUERY_ADC", "Tell what a sensor's converter reads: NAME= PULLUP=", self._query),
+            ("PID_CALIBRATE", "Find a heater's PID constants: HEATER= TARGET=", self._pid),
+            (
+                "MPC_CALIBRATE",
+                "Find a heater's model: HEATER= TARGET= FAN_BREAKPOINTS=",
+                self._mpc,
+            ),
+        ):
+            build.add_command(GCodeCommand(name, help_, read))
+
+    def add(self, unit: HeaterUnit, tag: str = "") -> None:
+        """Take a heater on; TAG is what M105 calls it."""
+        self.units[unit.key] = unit
+        self.sensors[unit.key] = unit.input
+        if unit.name != unit.key:
+            self.sensors[unit.name] = unit.input
+        self._tags[tag or unit.key] = unit
+
+    def add_sensor(self, source: TemperatureSource, tag: str = "") -> None:
+        """Take a sensor on that belongs to no heater."""
+        self.sensors[source.name] = source
+        if tag:
+            self._tags[tag] = source
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell what there is."""
+        calibrated: dict[str, Value] = {
+            unit.name: dict(unit.calibrated) for unit in self.units.values() if unit.calibrated
+        }
+        return {
+            "available_heaters": list(self.units),
+            "available_sensors": list(self.sensors),
+            "available_monitors": [],
+            "calibrated": calibrated,
+        }
+
+    # ------------------------------------------------------------------------------------------ commands
+
+    def temperatures(self) -> str:
+        """Return all temperatures as hosts ask for them: ``B:60.0 /60.0 T0:200.1 /200.0``."""
+        parts = []
+        for tag in sorted(self._tags):
+            found = self._tags[tag]
+            source = found.input if isinstance(found, HeaterUnit) else found
+            celsius = 0.0 if source.celsius is None else source.celsius
+            target = found.target_c if isinstance(found, HeaterUnit) else 0.0
+            parts.append(f"{tag}:{celsius:.1f} /{target:.1f}")
+        return " ".join(parts) or "T:0"
+
+    def set_in_time(self, unit: HeaterUnit, celsius: float) -> InTime:
+        """Return what sets a target without waiting; WordError for one it cannot have."""
+        unit.check_target(celsius)
+        return InTime(lambda _: unit.set_target(celsius))
+
+    def set_and_wait(self, unit: HeaterUnit, celsius: float) -> AtRest:
+        """Return what sets a target and waits for it; WordError for one it cannot have."""
+        unit.check_target(celsius)
+
+        async def perform() -> Done | None:
+            unit.set_target(celsius)
+            if celsius > 0:
+                await unit.reach()
+            return Done((self.temperatures(),), kind=ReplyKind.PLAIN)
+
+        return AtRest(perform)
+
+    def _tell(self, call: Call) -> Reading:
+        numbers(call.command, "T")
+        return AtOnce((self.temperatures(),), kind=ReplyKind.PLAIN)
+
+    def _turn_off(self, call: Call) -> Reading:
+        parameters(call.command, ())
+
+        def act(_: float) -> None:
+            for unit in self.units.values():
+                unit.set_target(0.0)
+
+        return InTime(act)
+
+    def _unit(self, call: Call, given: Mapping[str, str]) -> HeaterUnit:
+        names = {name: unit for unit in self.units.values() for name in (unit.key, unit.name)}
+        return names[one(call.command, given, "HEATER", names)]
+
+    def _set(self, call: Call) -> Reading:
+        given = parameters(call.command, ("HEATER", "TARGET"))
+        return self.set_in_time(self._unit(call, given), value(call.command, given, "TARGET", 0.0))
+
+    def _wait(self, call: Call) -> Reading:
+        command = call.command
+        given = parameters(command, ("SENSOR", "MINIMUM", "MAXIMUM"))
+        source = self.sensors[one(command, given, "SENSOR", self.sensors)]
+        if not given.keys() & {"MINIMUM", "MAXIMUM"}:
+            raise WordError("TEMPERATURE_WAIT needs MINIMUM= or MAXIMUM=, or both")
+        low = value(command, given, "MINIMUM", float("-inf"))
+        high = value(command, given, "MAXIMUM", float("inf"))
+        if low > high:
+            raise WordError(f"TEMPERATURE_WAIT: MINIMUM={low:g} is above MAXIMUM={high:g}")
+
+        async def perform() -> None:
+            await source.next()
+            while source.celsius is None or not (source.is_sound and low <= source.celsius <= high):
+                await source.next()
+
+        return AtRest(perform)
+
+    def _query(self, call: Call) -> Reading:
+        given = parameters(call.command, ("NAME", "PULLUP"))
+        names = [name for name, source in self.sensors.items() if source.ratio is not None]
+        if "NAME" not in given:
+            return AtOnce((f"sensors with a converter: {', '.join(names) or 'none has read anything yet'}",))
+        name = one(call.command, given, "NAME", names)
+        ratio = self.sensors[name].ratio or 0.0
+        told = f"{name}: {ratio:.6f} of full scale"
+        if "PULLUP" in given:
+            ohms = value(call.command, given, "PULLUP")
+            below = f"{ohms * ratio / (1 - ratio):.1f} Ω" if ratio < 1 else "no resistor"
+            told += f", with {ohms:g} Ω above it {below}"
+        return AtOnce((told,))
+
+    def _pid(self, call: Call) -> Reading:
+        given = parameters(call.command, ("HEATER", "TARGET", "WRITE_FILE", "TOLERANCE"))
+        unit, target = self._unit(call, given), value(call.command, given, "TARGET")
+        from coordinator.modules.heaters.tuning import calibrate_pid  # noqa: PLC0415 (start-up time)
+
+        return self._calibration(unit, target, lambda: calibrate_pid(unit, target))
+
+    def _mpc(self, call: Call) -> Reading:
+        given = parameters(call.command, ("HEATER", "TARGET", "FAN_BREAKPOINTS"))
+        unit, target = self._unit(call, given), value(call.command, given, "TARGET", 200.0)
+        steps = round(value(call.command, given, "FAN_BREAKPOINTS", 3.0))
+        if not 2 <= steps <= FAN_STEPS_MAX:
+            raise WordError(f"FAN_BREAKPOINTS of MPC_CALIBRATE must be 2 to {FAN_STEPS_MAX}")
+        if unit.settings.heater_w is None:
+            raise WordError(f"MPC_CALIBRATE needs the option heater_power of [{unit.name}], in W")
+        from coordinator.modules.heaters.tuning import calibrate_mpc  # noqa: PLC0415 (start-up time)
+
+        return self._calibration(unit, target, lambda: calibrate_mpc(unit, target, steps))
+
+    @staticmethod
+    def _calibration(unit: HeaterUnit, target: float, run: Callable[[], Awaitable[Done]]) -> Reading:
+        if not unit.input.min_c < target <= unit.input.max_c:
+            raise WordError(
+                f"TARGET={target:g} is outside what [{unit.name}] allows, {unit.input.min_c:g} to"
+                f" {unit.input.max_c:g} °C"
+            )
+        return AtRest(run)

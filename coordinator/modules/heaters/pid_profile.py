@@ -1,0 +1,197 @@
+"""[pid_profile HEATER NAME]: PID constants for other circumstances; PID_PROFILE loads and saves them."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.parser import WordError, quoted
+from coordinator.heat.pid import Pid, PidGains
+from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
+from coordinator.config.errors import ConfigError, nearest, shown
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.heaters.heater import HeaterUnit
+from coordinator.config.sections.heater_options import PID_KD, PID_KI, PID_KP
+from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.words import one, parameters, value
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+KIND: Final = "pid_profile"
+DEFAULT: Final = "default"
+"""The profile that is the heater's own section."""
+PROFILES_MAX: Final = 100
+"""For one heater."""
+CONTROL: Final = ChoiceOption(
+    name="control", help="what it is for", default="pid", choices=("pid",), later=("pid_v", "mpc")
+)
+PID_TARGET: Final = FloatOption(
+    name="pid_target", help="the temperature it was found at; told only", unit="°C", minimum=0, maximum=1500
+)
+ACTIONS: Final = ("LOAD", "SAVE", "SET_VALUES", "GET_VALUES", "REMOVE")
+GAINS: Final = ("KP", "KI", "KD")
+
+
+class PidProfiles(Module):
+    """The profiles of all heaters, and PID_PROFILE."""
+
+    SPEC: ClassVar = SectionSpec(help="What profiles have in common", options=())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.name = "pid_profile"
+        self._heaters = build.shared(Heaters)
+        self._of: dict[str, dict[str, PidGains]] = {}
+        self._loaded: dict[str, str] = {}
+        self._live: Live | None = None
+        build.add_command(
+            GCodeCommand(
+                "PID_PROFILE",
+                "LOAD=, SAVE= or SET_VALUES= a profile of HEATER=, or GET_VALUES=1",
+                self._read,
+            )
+        )
+
+    def add(self, heater: str, name: str, gains: PidGains) -> None:
+        """Take a profile on; HEATER is what programs call it."""
+        self._of.setdefault(heater, {})[name] = gains
+
+    def heater(self, name: str) -> HeaterUnit | None:
+        """Return the heater that programs or sections call NAME."""
+        units = self._heaters.units.values()
+        return next((unit for unit in units if name in (unit.key, unit.name)), None)
+
+    async def connect(self, live: "Live") -> None:
+        """Begin to act."""
+        self._live = live
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell which profile each heater has; those that have none are left out."""
+        return {"loaded": dict(self._loaded)}
+
+    def _read(self, call: Call) -> Reading:
+        command = call.command
+        known = (*ACTIONS, *GAINS, "HEATER", "KEEP_TARGET", "VERBOSE", "DEFAULT", "TARGET", "TOLERANCE")
+        given = parameters(command, known)
+        actions = [action for action in ACTIONS if action in given]
+        if len(actions) != 1:
+            raise WordError(f"PID_PROFILE needs one of {', '.join(ACTIONS)}")
+        unit = self._heaters.units[one(command, given, "HEATER", self._heaters.units)]
+        (action,) = actions
+        name = given[action]
+        if action == "GET_VALUES":
+            return AtOnce((self._told(unit),))
+        if action == "REMOVE":
+            raise WordError("a profile is removed by hand: delete its section from the configuration")
+        if unit.settings.kind != "pid":
+            raise WordError(f"[{unit.name}] has no PID: its control is {unit.settings.kind}")
+        if action == "LOAD":
+            return self._load(call, given, unit, name)
+        if action == "SET_VALUES":
+            gains = PidGains(*(value(command, given, letter) for letter in GAINS))
+            if min(gains.kp, gains.ki, gains.kd) < 0:
+                raise WordError("KP, KI and KD of PID_PROFILE must not be below 0")
+            return self._use(call, given, unit, name, gains)
+        return self._save(unit, name)
+
+    def _load(self, call: Call, given: Mapping[str, str], unit: HeaterUnit, name: str) -> Reading:
+        gains = self._find(unit, name)
+        if gains is None and "DEFAULT" in given:
+            name = given["DEFAULT"]
+            gains = self._find(unit, name)
+        if gains is None:
+            names = [DEFAULT, *self._of.get(unit.key, {})]
+            hint = nearest(name, names) or f"; there is {', '.join(names)}"
+            raise WordError(f"PID_PROFILE: {unit.key} has no profile {quoted(name)}{hint}")
+        return self._use(call, given, unit, name, gains)
+
+    def _find(self, unit: HeaterUnit, name: str) -> PidGains | None:
+        return unit.settings.gains if name == DEFAULT else self._of.get(unit.key, {}).get(name)
+
+    def _use(
+        self, call: Call, given: Mapping[str, str], unit: HeaterUnit, name: str, gains: PidGains
+    ) -> InTime:
+        keep = value(call.command, given, "KEEP_TARGET", 0.0) > 0
+        self._check_room(unit, name)
+
+        def act(_: float) -> None:
+            if not keep:
+                unit.set_target(0.0)
+            controller = unit.settings.by_pid(gains)
+            if isinstance(unit.controller, Pid):
+                controller.go_on_from(unit.controller)
+            unit.use(controller)
+            if name != DEFAULT:
+                self.add(unit.key, name, gains)
+            self._loaded[unit.key] = name
+
+        return InTime(act)
+
+    def _save(self, unit: HeaterUnit, name: str) -> InTime:
+        if name == DEFAULT:
+            raise WordError(f"'{DEFAULT}' is the section [{unit.name}] itself; choose another name")
+        if " ".join(name.split()) != name or not name:
+            raise WordError("SAVE= of PID_PROFILE needs a name without white space at its ends")
+        self._check_room(unit, name)
+
+        def act(_: float) -> None:
+            controller, live = unit.controller, self._live
+            if not isinstance(controller, Pid) or live is None:
+                return
+            self.add(unit.key, name, controller.gains)
+            texts = {"control": "pid", **_texts(controller.gains)}
+            for option, text in texts.items():
+                live.save(f"{KIND} {unit.key} {name}", option, text)
+            live.say(f"profile {name} of {unit.key} is there from now on; SAVE_CONFIG writes it")
+
+        return InTime(act)
+
+    def _check_room(self, unit: HeaterUnit, name: str) -> None:
+        own = self._of.get(unit.key, {})
+        if name not in own and len(own) >= PROFILES_MAX:
+            raise WordError(f"{unit.key} has {PROFILES_MAX} profiles already; load one of them")
+
+    def _told(self, unit: HeaterUnit) -> str:
+        if not isinstance(unit.controller, Pid):
+            return f"{unit.key} is not controlled by PID"
+        values = " ".join(f"{option}: {text}" for option, text in _texts(unit.controller.gains).items())
+        return f"{unit.key} has profile {self._loaded.get(unit.key, DEFAULT)}: {values}"
+
+
+def _texts(gains: PidGains) -> dict[str, str]:
+    values = (("pid_kp", gains.kp), ("pid_ki", gains.ki), ("pid_kd", gains.kd))
+    return {option: f"{number:.6g}" for option, number in values}
+
+
+class PidProfile(Module):
+    """One profile of one heater."""
+
+    NAMED: ClassVar = True
+    SPEC: ClassVar = SectionSpec(
+        help="PID constants of a heater for other circumstances: [pid_profile HEATER NAME], and PID_PROFILE"
+        " LOAD=NAME HEATER=HEATER",
+        options=(CONTROL, PID_KP, PID_KI, PID_KD, PID_TARGET),
+        later=("pid_version", "pid_tolerance", "smooth_time"),
+    )
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        build.get(CONTROL)
+        build.find(PID_TARGET)
+        self._gains = PidGains(*(build.get(option) for option in (PID_KP, PID_KI, PID_KD)))
+        self._place = build.place
+        self._heater, _, self._profile = build.instance.partition(" ")
+        self._profiles = build.shared(PidProfiles)
+
+    def link(self, modules: Modules) -> None:
+        """Find its heater."""
+        del modules
+        name = self._profile.strip()
+        unit = self._profiles.heater(self._heater)
+        if unit is None or not name or name == DEFAULT:
+            raise ConfigError(
+                self._place,
+                f"[{self.name}] must be named after a heater and itself, as in [pid_profile extruder fast];"
+                f" {shown(self._heater)} and {shown(name)} are not that",
+            )
+        self._profiles.add(unit.key, name, self._gains)

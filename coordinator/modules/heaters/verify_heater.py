@@ -1,0 +1,82 @@
+"""[verify_heater NAME]: how strict the watch over a heater is."""
+
+from typing import ClassVar, Final
+
+from coordinator.heat.verify import VerifyOptions
+from coordinator.config.options import FloatOption, SectionSpec
+from coordinator.config.errors import ConfigError, NotActing, nearest
+from coordinator.modules.base import Build, Module, Modules
+
+MAX_ERROR: Final = FloatOption(
+    name="max_error",
+    help="how much K·s below the range of the target may gather before all is stopped",
+    default=120.0,
+    unit="K·s",
+    minimum=0,
+    maximum=1e9,
+)
+CHECK_GAIN_TIME: Final = FloatOption(
+    name="check_gain_time",
+    help="while heating up, the temperature has to rise by heating_gain in every such time; by default 20 s,"
+    " and 60 s for heater_bed",
+    unit="s",
+    minimum=1,
+    maximum=1e9,
+)
+HYSTERESIS: Final = FloatOption(
+    name="hysteresis",
+    help="this near to its target a heater is in range",
+    default=5.0,
+    unit="K",
+    minimum=0,
+    maximum=500,
+)
+HEATING_GAIN: Final = FloatOption(
+    name="heating_gain",
+    help="how much hotter it has to get in check_gain_time",
+    default=2.0,
+    unit="K",
+    above=0,
+    maximum=500,
+)
+GAIN_TIME_S: Final = 20.0
+BED_GAIN_TIME_S: Final = 60.0
+
+
+def usual(heater: str) -> VerifyOptions:
+    """Return how a heater is watched that has no section of its own."""
+    return VerifyOptions(check_gain_s=BED_GAIN_TIME_S if heater == "heater_bed" else GAIN_TIME_S)
+
+
+class VerifyHeater(Module):
+    """How the heater of the section's instance is watched."""
+
+    NAMED: ClassVar = True
+    SPEC: ClassVar = SectionSpec(
+        help="The watch over a heater (extruder, heater_bed or the name of a heater_generic); every heater"
+        " has it, the section only changes its values",
+        options=(MAX_ERROR, CHECK_GAIN_TIME, HYSTERESIS, HEATING_GAIN),
+    )
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.place = build.place
+        self.heater = build.instance
+        self.options = VerifyOptions(
+            max_error_ks=build.get(MAX_ERROR),
+            check_gain_s=build.find(CHECK_GAIN_TIME) or usual(self.heater).check_gain_s,
+            hysteresis_k=build.get(HYSTERESIS),
+            heating_gain_k=build.get(HEATING_GAIN),
+        )
+
+    def link(self, modules: Modules) -> None:
+        """Make sure that there is such a heater."""
+        from coordinator.modules.heaters.heaters import Heaters  # noqa: PLC0415 (heaters know this section)
+
+        heaters = modules.find("heaters", Heaters)
+        known = () if heaters is None else tuple(heaters.units)
+        if self.heater not in known:
+            if modules.is_left_out(self.heater):
+                raise NotActing(self.place, f"the heater {self.heater} does not act yet")
+            hint = nearest(self.heater, known) or f"; there is {', '.join(known) or 'none'}"
+            raise ConfigError(self.place, f"[{self.name}] is for no heater{hint}")

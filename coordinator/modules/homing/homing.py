@@ -1,0 +1,268 @@
+"""G28 with endstops: rails are moved towards them, in the order that the kinematics asks for.
+
+Each rail goes to its endstop at homing_speed, back by homing_retract_dist, and there again at
+second_homing_speed. Where it stands then follows from where the endstop is and from the steps made since it
+switched, so how far it overshot does not matter; sides of an axis that have endstops of their own are brought
+level. A rail without an endstop on a pin is taken as home. What moves when is in homing_plan.py.
+"""
+
+import contextlib
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.config.options import SectionSpec
+from coordinator.config.errors import ConfigError
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.homing.homing_plan import AXES, Approach, approaches, landed, second_landed
+from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
+from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.runtime.machine import Machine
+    from coordinator.runtime.moves.homing import HomingResult
+    from coordinator.kinematics.base import Point
+    from coordinator.config.model import RailDescription
+    from coordinator.runtime.module_context import Live
+
+AWAY_MM: Final = 5.0
+"""How far a rail that stands on its endstop goes away first, where homing_retract_dist is 0."""
+
+
+STRAIGHT: Final = frozenset(
+    ("cartesian", "corexy", "corexz", "hybrid_corexy", "hybrid_corexz", "generic_cartesian")
+)
+"""Kinematics whose steppers' ways add up: the head may be moved before it is known where it is."""
+ReadHome = Callable[[Call, str], Reading]
+
+
+class Homing(Module):
+    """Homes the machine that it is built for."""
+
+    SPEC = SectionSpec(help="Homing", options=())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.name = "query_endstops"
+        self._described = build.machine
+        self._last_query: dict[str, bool] = {}
+        self._approaches = approaches(build.machine)
+        self._live: Live | None = None
+        self._feelers: dict[str, StallEndstop] = {}
+        """By virtual endstop."""
+        self.instead: Callable[[Call, str], Reading] | None = None
+        """Reads G28 in its place; a G28 among the lines that it stands for is homing again."""
+        self.corrected: Callable[[ReadHome], ReadHome] | None = None
+        """What homing finds, for programs whose X Y Z are not those of the axes."""
+        build.add_command(GCodeCommand("M119", "Tell which endstops are pressed", self._read_query))
+        build.add_command(GCodeCommand("QUERY_ENDSTOPS", "Tell which endstops are pressed", self._read_query))
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell which endstops were pressed when somebody asked last."""
+        return {"last_query": dict(self._last_query)}
+
+    @property
+    def acts(self) -> bool:
+        """Whether there is any endstop that it can look for."""
+        return self.instead is not None or any(
+            approach.possible or self._refusal(approach) for approach in self._approaches
+        )
+
+    def replace_by(self, read: Callable[[Call, str], Reading], build: Build) -> None:
+        """Have READ read G28, for the section that BUILD is of; raises ConfigError when another does."""
+        if self.instead is not None:
+            raise ConfigError(
+                build.place,
+                f"[{build.name}] and another section both say what G28 does; remove one:"
+                " [homing_override] can do what [safe_z_home] does",
+            )
+        self.instead = read
+
+    def link(self, modules: Modules) -> None:
+        """Find the drivers that are to feel the end of an axis."""
+        for rail in (rail for approach in self._approaches for rail in approach.rails):
+            virtual = rail.homing.virtual_endstop
+            found = modules.find(section_of(virtual), StallEndstop) if virtual else None
+            if found is not None:
+                self._feelers[virtual] = found
+
+    async def connect(self, live: "Live") -> None:
+        """Take over the machine."""
+        self._live = live
+
+    def read(self, call: Call, axes: str) -> Reading:
+        """Read G28 of AXES (letters)."""
+        if self.instead is not None and "G28" not in call.callers:
+            return self.instead(call, axes)
+        return AtRest(lambda: self.home(call, axes))
+
+    # ---------------------------------------------------------------------------------------------- homing
+
+    def check(self, axes: str) -> None:
+        """Raise CanductorError, before anything moves, if one of AXES (letters) cannot be homed."""
+        for approach in self._approaches:
+            if set(approach.letters) & set(axes.upper()) and (why := self._refusal(approach)):
+                raise CanductorError(f"G28 of {approach.letters} is refused: {why}")
+
+    def _refusal(self, approach: Approach) -> str:
+        """Say why nobody would know where the axes of APPROACH are after it; empty: it may be."""
+        for rail in approach.rails:
+            if rail.homing.refused:
+                return rail.homing.refused
+            if rail.homing.waits:
+                return (
+                    f"the endstop {rail.homing.virtual_endstop} ({rail.place}) does not act yet; give the"
+                    " axis a switch as its endstop_pin"
+                )
+        for stepper in self._described.motors:
+            if stepper.name in approach.ways and stepper.unpowered:
+                return f"{stepper.unpowered}, so the motor {stepper.name} cannot be switched on"
+        return ""
+
+    async def home(self, call: Call, axes: str) -> Done:
+        """Home AXES (letters) from where CALL says that the machine stands; raises CanductorError."""
+        self.check(axes)
+        described = self._described
+        home = dict(zip("XYZ", described.home, strict=True))
+        x, y, z, e = call.position
+        place = (x, y, z)
+        homed, second_mm = set(axes.upper()), None
+        for approach in self._approaches:
+            if not set(approach.letters) & set(axes.upper()):
+                continue
+            homed |= set(approach.letters)
+            if not approach.possible:
+                x, y, z = (
+                    home[letter] if letter in approach.letters else at
+                    for letter, at in zip("XYZ", place, strict=True)
+                )
+                place = (x, y, z)
+                continue
+            beyond_mm = await self._approach(approach)
+            y = place[1] if "Y" in call.homed else home["Y"]  # of a Y that towers do not move
+            found = landed(described, approach, beyond_mm, place, y)
+            if approach.is_second_carriage:
+                second_mm = second_landed(approach, beyond_mm)
+            else:
+                place = found
+        letters = "".join(letter for letter in "XYZ" if letter in homed)
+        place = await self._come_within(place, letters)
+        return Done(position=(*place, e), homed=letters, moved=True, second_carriage_mm=second_mm)
+
+    async def _approach(self, approach: Approach) -> list[float]:
+        """Go to the endstops, twice if so configured; return how far beyond each trigger the rails stand."""
+        rail = approach.rails[0]
+        homing = rail.homing
+        if await self._any_pressed([rail for rail in approach.rails if not self._feels(rail)]):
+            await self._go_back(approach)
+        results = await self._move(approach, approach.most_mm, homing.speed)
+        if homing.retract_distance:
+            await self._go_back(approach)
+            most_mm = 2 * homing.retract_distance + AWAY_MM
+            results = await self._move(approach, most_mm, homing.second_speed)
+        beyond_mm = [result.beyond_trigger_mm for result in results]
+        if rail.axis in AXES:
+            await self._align(approach, beyond_mm)
+        return beyond_mm
+
+    async def _come_within(self, place: "Point", letters: str) -> "Point":
+        """Move axes that stopped behind their endstop beyond their range back into it; return where they are.
+
+        By a step more than needed, as a way is made in whole steps. Towers and arms end within their space.
+        """
+        described = self._described
+        if self._live is None or not STRAIGHT & {described.kinematics.name}:
+            return place
+        from coordinator.runtime.moves.straight import move_by  # noqa: PLC0415 (planning needs no asyncio)
+
+        for axis, letter in enumerate("XYZ"):
+            way_mm = self._way_within(axis, place[axis]) if letter in letters else 0.0
+            if not way_mm:
+                continue
+            x, y, z = (way_mm if number == axis else 0.0 for number in range(3))
+            rail = next(rail for rail in described.rails if rail.axis == letter.lower())
+            speed, accel = rail.homing.retract_speed, self._accel(rail.axis, rail)
+            made = await move_by(self._machine, (x, y, z), speed, accel)
+            place = (place[0] + made[0], place[1] + made[1], place[2] + made[2])
+        return place
+
+    def _way_within(self, axis: int, at_mm: float) -> float:
+        space, motors = self._described.kinematics.work_space, self._described.motors
+        low, high = space.low[axis], space.high[axis]
+        if low <= at_mm <= high:
+            return 0.0
+        step_mm = max(m.step_distance / abs(m.weights[axis]) for m in motors if m.weights[axis])
+        return low - at_mm + step_mm if at_mm < low else high - at_mm - step_mm
+
+    async def _align(self, approach: Approach, beyond_mm: Sequence[float]) -> None:
+        """Bring the sides of an axis as far beyond their endstops as its first one is."""
+        for rail, beyond in zip(approach.rails[1:], beyond_mm[1:], strict=True):
+            way_mm = beyond_mm[0] - beyond
+            ways = {
+                stepper.name: math.copysign(approach.ways[stepper.name], way_mm * approach.ways[stepper.name])
+                for stepper in rail.steppers
+            }
+            if abs(way_mm) >= rail.steppers[0].step_distance / 2:
+                await self._go(approach, ways, abs(way_mm))
+
+    async def _move(self, approach: Approach, way_mm: float, speed: float) -> "Sequence[HomingResult]":
+        from coordinator.runtime.moves.homing import HomingMove  # noqa: PLC0415 (planning needs no asyncio)
+
+        async with contextlib.AsyncExitStack() as stack:
+            for rail in approach.rails:
+                if (feeler := self._feels(rail)) is not None:
+                    await stack.enter_async_context(feeler.feeling(speed))
+            return await HomingMove(
+                self._machine,
+                approach.rails,
+                ways=approach.ways,
+                way_mm=way_mm,
+                speed=speed,
+                accel=self._accel(approach.axis, approach.rails[0]),
+            ).run()
+
+    def _feels(self, rail: "RailDescription") -> StallEndstop | None:
+        return self._feelers.get(rail.homing.virtual_endstop)
+
+    async def _go_back(self, approach: Approach) -> None:
+        ways = {name: -way for name, way in approach.ways.items()}
+        await self._go(approach, ways, approach.rails[0].homing.retract_distance or AWAY_MM)
+
+    async def _go(self, approach: Approach, ways: Mapping[str, float], way_mm: float) -> None:
+        from coordinator.runtime.moves.single import Ramp, SingleMove  # noqa: PLC0415 (as above)
+
+        rail = approach.rails[0]
+        ramp = Ramp(way_mm, rail.homing.retract_speed, self._accel(approach.axis, rail))
+        await SingleMove(self._machine, ramp, ways=ways).run()
+
+    def _accel(self, axis: str, rail: "RailDescription") -> float:
+        limits = self._described.limits
+        most = min(limits.max_accel, limits.max_z_accel) if axis == "z" else limits.max_accel
+        return min(most, rail.homing.accel or most)
+
+    # ------------------------------------------------------------------------------------------- endstops
+
+    def _read_query(self, _: Call) -> Reading:
+        return AtRest(self._query)
+
+    async def _query(self) -> Done:
+        rails = self._described.stops
+        self._last_query = {rail.axis: await self._pressed(rail) for rail in rails}
+        told = [f"{axis}:{'pressed' if pressed else 'open'}" for axis, pressed in self._last_query.items()]
+        return Done((" ".join(told) or "this machine has no endstops on pins",), kind=ReplyKind.PLAIN)
+
+    async def _any_pressed(self, rails: Sequence["RailDescription"]) -> bool:
+        return any([await self._pressed(rail) for rail in rails])
+
+    async def _pressed(self, rail: "RailDescription") -> bool:
+        devices = self._machine.devices
+        state = await devices.endstops[rail.axis].state(self._machine.nodes[devices.endstop_node(rail)])
+        return state.pressed
+
+    @property
+    def _machine(self) -> "Machine":
+        if self._live is None:
+            raise CanductorError("homing needs a machine that is connected")
+        return self._live.machine

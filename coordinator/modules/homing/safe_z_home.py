@@ -1,0 +1,158 @@
+"""[safe_z_home]: Z is homed at a place of its own, with the head lifted before anything moves sideways."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtRest, Call, Done, Reading
+from coordinator.gcode.parser import WordError
+from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
+from coordinator.config.errors import ConfigError
+from coordinator.config.sections.printer import MAX_SPEED
+from coordinator.modules.base import Build, Module
+from coordinator.modules.homing.homing import STRAIGHT, Homing
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+HOP_MAX_MM: Final = 1000.0
+
+
+@record(kw_only=True)
+class PlaceOption(Option[tuple[float, float]]):
+    """X and Y."""
+
+    def parse(self, text: str) -> tuple[float, float]:
+        """Return both."""
+        number = FloatOption(name="", help="", minimum=-100_000, maximum=100_000)
+        parts = [part.strip() for part in text.split(",")]
+        if len(parts) != 2:
+            raise BadValue
+        return number.parse(parts[0]), number.parse(parts[1])
+
+    def rule(self) -> str:
+        """Return what is allowed."""
+        return "X and Y in mm with a comma between them, as in 100, 100"
+
+    def stand_in(self) -> tuple[float, float]:
+        """Return any place."""
+        return (0.0, 0.0)
+
+
+PLACE: Final = PlaceOption(name="home_xy_position", help="where the head is when Z is homed", unit="mm")
+SPEED: Final = FloatOption(
+    name="speed", help="of the way there", default=50.0, unit="mm/s", above=0, maximum=MAX_SPEED
+)
+Z_HOP: Final = FloatOption(
+    name="z_hop",
+    help="how far the head is lifted before any axis is homed, and its height afterwards; 0: not at all",
+    default=0.0,
+    unit="mm",
+    minimum=0,
+    maximum=HOP_MAX_MM,
+)
+Z_HOP_SPEED: Final = FloatOption(
+    name="z_hop_speed", help="of the lift", default=15.0, unit="mm/s", above=0, maximum=MAX_SPEED
+)
+BACK: Final = BoolOption(
+    name="move_to_previous",
+    help="whether X and Y go back to where they were before Z was homed",
+    default=False,
+)
+
+
+class SafeZHome(Module):
+    """What G28 does in its place."""
+
+    SPEC = SectionSpec(
+        "G28 homes Z at one place of the bed, behind X and Y",
+        (PLACE, SPEED, Z_HOP, Z_HOP_SPEED, BACK),
+        later=("home_y_before_x",),
+    )
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._place = build.get(PLACE)
+        self._speed, self._hop_speed = build.get(SPEED), build.get(Z_HOP_SPEED)
+        self._hop_mm, self._back = build.get(Z_HOP), build.get(BACK)
+        self._limits = build.machine.limits
+        self._live: Live | None = None
+        kinematics = build.machine.kinematics.name
+        if kinematics not in STRAIGHT:
+            raise ConfigError(
+                build.place, f"[{build.name}] has no use on a machine of kinematics {kinematics}; remove it"
+            )
+        self._outside = self._find_outside()
+        if self._outside:
+            build.note(PLACE, f"is {self._outside}: G28 of Z is refused until it names a place within")
+        self._homing = build.shared(Homing)
+        self._homing.replace_by(self._read, build)
+
+    def _find_outside(self) -> str:
+        """Say what is wrong with the place for Z; empty: nothing."""
+        for axis, value in enumerate(self._place):
+            low, high = self._limits.position_min[axis], self._limits.position_max[axis]
+            if not low <= value <= high:
+                x, y = self._place
+                return f"{x:g}, {y:g}, but {'XY'[axis]} goes from {low:g} to {high:g} mm"
+        return ""
+
+    async def connect(self, live: "Live") -> None:
+        """Take over the machine."""
+        self._live = live
+
+    def _read(self, call: Call, axes: str) -> Reading:
+        missing = "".join(axis for axis in "XY" if axis not in call.homed + axes)
+        if "Z" in axes and missing:
+            raise WordError(f"G28 of Z comes before {missing[0]} is homed; home with G28 first")
+        return AtRest(lambda: self._home(call, axes))
+
+    async def _home(self, call: Call, axes: str) -> Done:
+        if "Z" in axes and self._outside:
+            raise CanductorError(
+                f"G28 of Z is refused: home_xy_position of [{self.name}] is {self._outside}; correct it"
+            )
+        self._homing.check(axes)
+        before = call.position
+        call = await self._lift(call)
+        done = Done()
+        if others := axes.replace("Z", ""):
+            done = await self._homing.home(call, others)
+            call = _after(call, done)
+        if "Z" in axes:
+            known = before if "X" in call.homed and not others else call.position
+            call = await self._go(call, *self._place)
+            call = _after(call, await self._homing.home(call, "Z"))
+            call = await self._lift(call)
+            if self._back:
+                call = await self._go(call, known[0], known[1])
+        return replace(done, position=call.position, homed=axes, moved=True)
+
+    async def _lift(self, call: Call) -> Call:
+        """Lift the head to the height of the hop, or by as much where its height is not known."""
+        way_mm = self._hop_mm - (call.position[2] if "Z" in call.homed else 0.0)
+        if way_mm <= 0:
+            return call
+        accel = min(self._limits.max_accel, self._limits.max_z_accel)
+        speed = min(self._hop_speed, self._limits.max_z_velocity)
+        return await self._move(call, (0.0, 0.0, way_mm), speed, accel)
+
+    async def _go(self, call: Call, x: float, y: float) -> Call:
+        way = (x - call.position[0], y - call.position[1], 0.0)
+        speed = min(self._speed, self._limits.max_velocity)
+        return await self._move(call, way, speed, self._limits.max_accel)
+
+    async def _move(self, call: Call, way: tuple[float, float, float], speed: float, accel: float) -> Call:
+        """Move by WAY; return CALL with the place that this led to, by the steps that were made."""
+        from coordinator.runtime.moves.straight import move_by  # noqa: PLC0415 (planning needs no asyncio)
+
+        assert self._live is not None
+        x, y, z = await move_by(self._live.machine, way, speed, accel)
+        at = call.position
+        return replace(call, position=(at[0] + x, at[1] + y, at[2] + z, at[3]))
+
+
+def _after(call: Call, done: Done) -> Call:
+    assert done.position is not None
+    return replace(call, position=done.position, homed=call.homed + done.homed)

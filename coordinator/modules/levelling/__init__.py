@@ -1,0 +1,1 @@
+"""Corrections of a machine's geometry."""

@@ -1,0 +1,275 @@
+"""[skew_correction]: axes that do not stand at right angles to each other.
+
+What a program calls X Y Z is made by axes that lean: X = x + xy·y + xz·z, Y = y + yz·z for steppers that
+believe to be at x, y, z. So steppers follow the other way round: it is a change of what each of them follows.
+"""
+
+import math
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Position, Reading, ToProgram
+from coordinator.gcode.events import PositionSet, WeightsChange
+from coordinator.gcode.builtins.machine import come_to_rest
+from coordinator.gcode.parser import Command, WordError, quoted
+from coordinator.config.options import FloatOption, SectionSpec
+from coordinator.config.errors import ConfigError
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.homing.homing import Homing
+from coordinator.modules.words import flag, one, parameters, value
+from coordinator.motion.specs import StepKinematics
+from nodes.support.records import record
+
+if TYPE_CHECKING:
+    from coordinator.gcode.interpreter import Job
+    from coordinator.runtime.module_context import Live
+
+SKEW_MAX: Final = 0.2
+"""Of any plane: some 11 degrees. More is a mistake of who measured."""
+RESTORE: Final = "_SET_SKEW"
+_PLANES: Final = ("XY", "XZ", "YZ")
+
+
+def _option(plane: str) -> FloatOption:
+    first, second = plane[0], plane[1]
+    return FloatOption(
+        name=f"{plane.lower()}_skew",
+        help=f"How far {first} goes with each mm of {second}, of a profile; SKEW_PROFILE SAVE finds it",
+        default=0.0,
+        minimum=-SKEW_MAX,
+        maximum=SKEW_MAX,
+    )
+
+
+OPTIONS: Final = {plane: _option(plane) for plane in _PLANES}
+
+
+@record
+class Skew:
+    """How axes lean: mm of the first axis of a plane with each mm of the second."""
+
+    xy: float = 0.0
+    xz: float = 0.0
+    yz: float = 0.0
+
+    def made(self, at: Position) -> Position:
+        """Return where the head is when steppers believe to be AT."""
+        x, y, z, e = at
+        return (x + self.xy * y + self.xz * z, y + self.yz * z, z, e)
+
+    def wanted(self, at: Position) -> Position:
+        """Return where steppers have to believe to be for the head to be AT."""
+        x, y, z, e = at
+        y -= self.yz * z
+        return (x - self.xy * y - self.xz * z, y, z, e)
+
+    def weights(self, straight: Position) -> Position:
+        """Return what a stepper follows that followed STRAIGHT axes."""
+        x, y, z, e = straight
+        return (x, y - x * self.xy, z - y * self.yz - x * (self.xz - self.xy * self.yz), e)
+
+
+class SkewCorrection(Module):
+    """A profile; the plain section has none."""
+
+    SPEC = SectionSpec(
+        "Axes that are not at right angles; [skew_correction NAME] is a profile", tuple(OPTIONS.values())
+    )
+    NAMED = True
+    NAMELESS = True
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.profile = build.reader.section.instance
+        self.skew = Skew(**{plane.lower(): build.get(option) for plane, option in OPTIONS.items()})
+        motors = build.machine.motors
+        if build.machine.dual_carriage is not None or any(
+            motor.function.kinematics is not StepKinematics.LINEAR for motor in motors
+        ):
+            raise ConfigError(
+                build.place,
+                f"[{build.name}] needs a machine whose motors move along X, Y and Z or sums of them, with one"
+                " carriage; remove it",
+            )
+        build.shared(Skews).straight = {motor.name: motor.weights for motor in motors}
+
+
+class Skews(Module):
+    """The commands, and what holds."""
+
+    SPEC = SectionSpec("Commands about skew", ())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.name = "skew_correction"
+        self.straight: Mapping[str, Position] = {}
+        """What each motor follows without any correction."""
+        self.now = Skew()
+        """What holds for the lines to come."""
+        self._profile = ""
+        self._profiles: dict[str, Skew] = {}
+        self._live: Live | None = None
+        build.shared(Homing).corrected = self.home
+        for name, help_, read in (
+            ("SET_SKEW", "Correct what was measured: XY=AC,BD,AD XZ= YZ=, or CLEAR=1", self._set),
+            ("GET_CURRENT_SKEW", "Tell what is corrected", self._tell),
+            ("CALC_MEASURED_SKEW", "Tell what AC BD AD mean", self._calculate),
+            ("SKEW_PROFILE", "LOAD or SAVE a profile by its name", self._manage),
+            (RESTORE, "Let hold what held before a crash", self._restore),
+        ):
+            build.add_command(GCodeCommand(name, help_, read))
+
+    def link(self, modules: Modules) -> None:
+        """Find the profiles."""
+        for name in modules.names(SkewCorrection):
+            found = modules.find(name, SkewCorrection)
+            assert found is not None
+            if found.profile:
+                self._profiles[found.profile] = found.skew
+
+    async def connect(self, live: "Live") -> None:
+        """Take over the machine."""
+        self._live = live
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell the profile that was loaded last, and what holds."""
+        factors = {f"{plane.lower()}_skew": getattr(self.now, plane.lower()) for plane in _PLANES}
+        return {"current_profile_name": self._profile, **factors}
+
+    def take(self, job: "Job", skew: Skew, profile: str = "") -> bool:
+        """Let SKEW hold from here on; the head stays. False: the planner has to be emptied first."""
+        if not come_to_rest(job):
+            return False
+        planner = job.planner
+        believed = self.now.wanted(planner.toolhead_position)
+        self.now, self._profile = skew, profile
+        position = skew.made(believed)
+        planner.set_position(position)
+        at_s = planner.print_time_end_s
+        job.emit(PositionSet(job.line, "", position, at_s))
+        follows = {name: skew.weights(straight) for name, straight in self.straight.items()}
+        job.machine.follows = follows
+        job.emit(WeightsChange(job.line, follows, at_s))
+        return True
+
+    def home(self, read: Callable[[Call, str], Reading]) -> Callable[[Call, str], Reading]:
+        """Return what reads G28 as READ does, whose endstops tell what steppers have to believe."""
+
+        def homing(call: Call, axes: str) -> Reading:
+            reading = read(call, axes)
+            return AtRest(self._corrected(reading.perform, call)) if isinstance(reading, AtRest) else reading
+
+        return homing
+
+    def _corrected(
+        self, perform: Callable[[], Awaitable[Done | None]], call: Call
+    ) -> Callable[[], Awaitable[Done | None]]:
+        async def corrected() -> Done | None:
+            done = await perform()
+            if done is None or done.position is None:
+                return done
+            before = self.now.wanted(call.position)
+            believed = [
+                new if letter in done.homed else old
+                for letter, old, new in zip("XYZE", before, done.position, strict=True)
+            ]
+            x, y, z, _ = self.now.made((believed[0], believed[1], believed[2], 0.0))
+            return replace(done, position=(x, y, z, done.position[3]))
+
+        return corrected
+
+    @property
+    def restoring(self) -> str:
+        """The line that brings about what holds; empty: nothing is corrected."""
+        if self.now == Skew():
+            return ""
+        return " ".join((RESTORE, *(f"{plane}={getattr(self.now, plane.lower()):.12g}" for plane in _PLANES)))
+
+    # ------------------------------------------------------------------------------------------ commands
+
+    def _restore(self, call: Call) -> Reading:
+        given = parameters(call.command, _PLANES)
+        skew = Skew(**{plane.lower(): value(call.command, given, plane, 0.0) for plane in _PLANES})
+        return ToProgram(lambda job: self.take(job, skew))
+
+    def _set(self, call: Call) -> Reading:
+        given = parameters(call.command, (*_PLANES, "CLEAR"))
+        if flag(call.command, given, "CLEAR"):
+            return ToProgram(lambda job: self.take(job, Skew()))
+        measured = {
+            plane: measured_skew(call.command, plane, text)
+            for plane, text in given.items()
+            if plane in _PLANES
+        }
+        if not measured:
+            raise WordError("SET_SKEW has nothing to set; give XY=AC,BD,AD as measured, or CLEAR=1")
+
+        def act(job: "Job") -> bool:
+            return self.take(job, replace(self.now, **{plane.lower(): t for plane, t in measured.items()}))
+
+        return ToProgram(act)
+
+    def _tell(self, call: Call) -> Reading:
+        parameters(call.command, ())
+        return AtOnce(tuple(f"{plane}: {_told(getattr(self.now, plane.lower()))}" for plane in _PLANES))
+
+    def _calculate(self, call: Call) -> Reading:
+        given = parameters(call.command, ("AC", "BD", "AD"))
+        ac, bd, ad = (value(call.command, given, name) for name in ("AC", "BD", "AD"))
+        return AtOnce((f"Calculated skew: {_told(skew_of(call.command, ac, bd, ad))}",))
+
+    def _manage(self, call: Call) -> Reading:
+        given = parameters(call.command, ("LOAD", "SAVE"))
+        if len(given) != 1:
+            raise WordError("SKEW_PROFILE takes LOAD=name or SAVE=name; to remove one, remove its section")
+        if "LOAD" in given:
+            name = one(call.command, given, "LOAD", self._profiles)
+            return ToProgram(lambda job: self.take(job, self._profiles[name], name))
+        name = given["SAVE"]
+        if not name.isidentifier():
+            raise WordError(
+                f"SKEW_PROFILE: {quoted(name)} cannot be a profile's name; take letters, digits and _"
+            )
+        return AtOnce((f"skew profile {name} is saved; SAVE_CONFIG writes it",), lambda: self._save(name))
+
+    def _save(self, name: str) -> None:
+        skew = self._profiles[name] = self.now
+        if (live := self._live) is not None:
+            live.soon_on_loop(lambda: _keep(live, name, skew))
+
+
+def _keep(live: "Live", name: str, skew: Skew) -> None:
+    for plane, option in OPTIONS.items():
+        live.save(f"skew_correction {name}", option.name, f"{getattr(skew, plane.lower()):.6f}")
+
+
+def measured_skew(command: Command, plane: str, text: str) -> float:
+    """Return what ``AC,BD,AD`` of a PLANE means; raises WordError."""
+    parts = text.split(",")
+    if len(parts) != 3:
+        raise WordError(f"{plane} of {command.name} is {quoted(text)}; give AC,BD,AD in mm, as measured")
+    given = dict(zip(("AC", "BD", "AD"), parts, strict=True))
+    ac, bd, ad = (value(command, given, name) for name in ("AC", "BD", "AD"))
+    return skew_of(command, ac, bd, ad)
+
+
+def skew_of(command: Command, ac: float, bd: float, ad: float) -> float:
+    """Return how far a square leans whose diagonals are AC, BD and whose side is AD; raises WordError.
+
+    AC² + BD² = 2 (AB² + AD²) gives the other side, and AC² - BD² = 4 AB AD sin δ the angle.
+    """
+    other = (ac * ac + bd * bd) / 2 - ad * ad
+    sine = (ac * ac - bd * bd) / (4 * ad * math.sqrt(other)) if ad > 0 and other > 0 else math.inf
+    tangent = sine / math.sqrt(1 - sine * sine) if abs(sine) < 1 else math.inf
+    if not abs(tangent) <= SKEW_MAX:
+        raise WordError(
+            f"{command.name}: AC={ac:g} BD={bd:g} AD={ad:g} is no square that leans a little; measure both"
+            " diagonals and a side again"
+        )
+    return tangent
+
+
+def _told(tangent: float) -> str:
+    angle = math.atan(tangent)
+    return f"{angle:.6f} radians, {math.degrees(angle):.2f} degrees"

@@ -1,0 +1,1 @@
+"""Commands that move: force move, firmware retraction, arcs."""

@@ -1,0 +1,140 @@
+"""[firmware_retraction]: G10 draws the filament back, G11 pushes it forward again."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
+from coordinator.gcode.parser import WordError
+from coordinator.config.options import FloatOption, SectionSpec
+from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.words import bounded, parameters
+
+LENGTH = FloatOption(
+    name="retract_length", help="How far G10 draws back", default=0.0, unit="mm", minimum=0.0, maximum=100.0
+)
+SPEED = FloatOption(
+    name="retract_speed", help="How fast", default=20.0, unit="mm/s", minimum=1.0, maximum=1000.0
+)
+EXTRA = FloatOption(
+    name="unretract_extra_length",
+    help="By how much more G11 pushes forward than G10 has drawn back",
+    default=0.0,
+    unit="mm",
+    minimum=0.0,
+    maximum=100.0,
+)
+BACK_SPEED = FloatOption(
+    name="unretract_speed", help="How fast", default=10.0, unit="mm/s", minimum=1.0, maximum=1000.0
+)
+HOP = FloatOption(
+    name="z_hop_height",
+    help="How far the nozzle is lifted while the filament is drawn back",
+    default=0.0,
+    unit="mm",
+    minimum=0.0,
+    maximum=10.0,
+)
+_STATE: Final = "_retraction"
+
+
+@dataclass(frozen=True)
+class _Settings:
+    retract_length: float
+    retract_speed: float
+    unretract_extra_length: float
+    unretract_speed: float
+    z_hop_height: float
+
+
+class FirmwareRetraction(Module):
+    """Its commands; how far the filament is drawn back is what G10 did, also when settings change."""
+
+    SPEC = SectionSpec(
+        "Retraction by G10 and G11", (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP), later=("clear_zhop_on_z_moves",)
+    )
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        get = build.get
+        self._settings = self._configured = _Settings(
+            get(LENGTH), get(SPEED), get(EXTRA), get(BACK_SPEED), get(HOP)
+        )
+        self._retracted: _Settings | None = None
+        """What G10 went by."""
+        build.add_command(GCodeCommand("G10", "Draw the filament back", self._retract))
+        build.add_command(GCodeCommand("G11", "Push the filament forward again", self._unretract))
+        for name, help_, read in (
+            ("SET_RETRACTION", "Change how G10 and G11 act", self._set),
+            ("GET_RETRACTION", "Tell how G10 and G11 act", self._get),
+            ("CLEAR_RETRACTION", "Forget that the filament is drawn back, and all changes", self._clear),
+        ):
+            build.add_command(GCodeCommand(name, help_, read, beside=True))
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell the settings, and whether the filament is drawn back."""
+        return {**vars(self._settings), "retracted": self._retracted is not None}
+
+    def _retract(self, _call: Call) -> Reading:
+        s = self._settings
+        if self._retracted is not None or s.retract_length == 0:
+            return AtOnce()
+        self._retracted = s
+        hop = [f"SET_GCODE_OFFSET Z_ADJUST={s.z_hop_height:g} MOVE=1"] if s.z_hop_height else []
+        return self._lines([_extrude(-s.retract_length, s.retract_speed), *hop])
+
+    def _unretract(self, _call: Call) -> Reading:
+        s, self._retracted = self._retracted, None
+        if s is None:
+            return AtOnce()
+        hop = [f"SET_GCODE_OFFSET Z_ADJUST={-s.z_hop_height:g} MOVE=1"] if s.z_hop_height else []
+        now = self._settings
+        length = s.retract_length + now.unretract_extra_length
+        return self._lines([*hop, _extrude(length, now.unretract_speed)])
+
+    @staticmethod
+    def _lines(lines: list[str]) -> Lines:
+        """Return LINES within the modes that they need, and without any trace in those of the program."""
+        moves = [line for line in lines if line.startswith("G1")]
+        others = [line for line in lines if not line.startswith("G1")]
+        framed = [
+            f"SAVE_GCODE_STATE NAME={_STATE}",
+            "G21",
+            "M83",
+            *moves,
+            f"RESTORE_GCODE_STATE NAME={_STATE}",
+        ]
+        first = lines[0] == moves[0]
+        return Lines("\n".join([*framed, *others] if first else [*others, *framed]))
+
+    def _set(self, call: Call) -> Reading:
+        command = call.command
+        options = {option.name.upper(): option for option in (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP)}
+        values = parameters(command, options)
+        if not values:
+            raise WordError(f"SET_RETRACTION names nothing; it takes {' '.join(options)}")
+        changes = {}
+        for name, option in options.items():
+            low, high = option.minimum or 0.0, option.maximum or 0.0
+            value = bounded(command, values, name, None, low=low, high=high)
+            if value is not None:
+                changes[option.name] = value
+
+        def act() -> None:
+            self._settings = replace(self._settings, **changes)
+
+        return AtOnce(act=act)
+
+    def _get(self, _call: Call) -> Reading:
+        told = [f"{name.upper()}={value:g}" for name, value in vars(self._settings).items()]
+        return AtOnce((" ".join(told),))
+
+    def _clear(self, _call: Call) -> Reading:
+        def act() -> None:
+            self._settings, self._retracted = self._configured, None
+
+        return AtOnce(act=act)
+
+
+def _extrude(length_mm: float, speed_mm_s: float) -> str:
+    return f"G1 E{length_mm:.6f} F{speed_mm_s * 60:.3f}"

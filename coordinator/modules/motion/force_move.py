@@ -1,0 +1,129 @@
+"""[force_move]: moving one motor without homing, and saying where the head is. For trying out and for macros.
+
+Nothing keeps these moves within the machine, so the section has to allow them. A motor of the head that was
+moved alone leaves all axes unknown.
+"""
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.parser import WordError, quoted
+from coordinator.config.options import BoolOption, SectionSpec
+from coordinator.modules.base import Build, Module
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+ENABLE: Final = BoolOption(
+    name="enable_force_move",
+    help="whether there are FORCE_MOVE and SET_KINEMATIC_POSITION, which no limit of the machine applies to",
+    default=False,
+)
+DISTANCE_MAX_MM: Final = 1000.0
+SPEED_MAX: Final = 10_000.0
+ACCEL_MAX: Final = 1_000_000.0
+_AXES: Final = "XYZ"
+
+
+class ForceMove(Module):
+    """The commands."""
+
+    SPEC = SectionSpec("Commands that move past all limits", (ENABLE,))
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._machine = build.machine
+        self._live: Live | None = None
+        if not build.get(ENABLE):
+            return
+        build.add_command(
+            GCodeCommand(
+                "FORCE_MOVE",
+                "Move the motor STEPPER by DISTANCE mm at VELOCITY mm/s, with ACCEL mm/s² if given",
+                self._read_move,
+            )
+        )
+        build.add_command(
+            GCodeCommand(
+                "SET_KINEMATIC_POSITION",
+                "Say where the head is: X Y Z in mm; SET_HOMED and CLEAR_HOMED name axes",
+                self._read_position,
+            )
+        )
+
+    async def connect(self, live: "Live") -> None:
+        """Take over the machine."""
+        self._live = live
+
+    # ----------------------------------------------------------------------------------------------- moving
+
+    def _read_move(self, call: Call) -> Reading:
+        values = call.parameters("STEPPER", "DISTANCE", "VELOCITY", "ACCEL")
+        name = values.get("STEPPER", "")
+        names = [stepper.name for stepper in self._machine.steppers]
+        if name not in names:
+            raise WordError(f"FORCE_MOVE names the motor {quoted(name)}; there are {' '.join(names)}")
+        distance = _number(call, values, "DISTANCE", -DISTANCE_MAX_MM, DISTANCE_MAX_MM)
+        speed = _number(call, values, "VELOCITY", 1e-3, SPEED_MAX)
+        limits = self._machine.limits
+        accel = _number(call, values, "ACCEL", 0.0, ACCEL_MAX) if "ACCEL" in values else 0.0
+        of_head = name in [motor.name for motor in self._machine.motors]
+        done = Done(position=call.position, unhomed=_AXES if of_head else "", moved=True)
+
+        async def move() -> Done:
+            await self._move(name, distance, speed, accel or min(limits.max_accel, limits.max_z_accel))
+            return done
+
+        return AtRest(move, done)
+
+    async def _move(self, name: str, distance_mm: float, speed: float, accel: float) -> None:
+        from coordinator.runtime.moves.single import Ramp, SingleMove  # noqa: PLC0415 (planning needs no asyncio)
+
+        assert self._live is not None
+        if distance_mm:
+            ramp = Ramp(abs(distance_mm), speed, accel)
+            ways = {name: math.copysign(1.0, distance_mm)}
+            await SingleMove(self._live.machine, ramp, ways=ways).run()
+
+    # -------------------------------------------------------------------------------------------- positions
+
+    @staticmethod
+    def _read_position(call: Call) -> Reading:
+        values = call.parameters(*_AXES, "SET_HOMED", "CLEAR_HOMED")
+        limit = 100_000.0
+        x, y, z = (
+            _number(call, values, axis, -limit, limit) if axis in values else at
+            for axis, at in zip(_AXES, call.position[:3], strict=True)
+        )
+        known = _letters(call, values, "SET_HOMED", _AXES)
+        unknown = _letters(call, values, "CLEAR_HOMED", "")
+        homed = "".join(axis for axis in known if axis not in unknown)
+        done = Done(position=(x, y, z, call.position[3]), homed=homed, unhomed=unknown)
+
+        async def take() -> Done:
+            return done
+
+        return AtRest(take, done)
+
+
+def _number(call: Call, values: dict[str, str], key: str, low: float, high: float) -> float:
+    try:
+        value = float(values[key])
+    except KeyError:
+        raise WordError(f"{call.command.name} lacks {key}=…") from None
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise WordError(
+            f"{key} of {call.command.name} is {quoted(values[key])}; it must be a number from {low:g} to"
+            f" {high:g}"
+        )
+    return value
+
+
+def _letters(call: Call, values: dict[str, str], key: str, default: str) -> str:
+    letters = values.get(key, default).upper().replace(",", "")
+    if set(letters) - set(_AXES):
+        raise WordError(f"{key} of {call.command.name} is {quoted(values[key])}; it must be letters of X Y Z")
+    return letters

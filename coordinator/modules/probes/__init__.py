@@ -1,0 +1,1 @@
+"""Finding a height: by hand, later by probes."""

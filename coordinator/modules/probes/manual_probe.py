@@ -1,0 +1,196 @@
+"""Finding a height by hand: MANUAL_PROBE, Z_ENDSTOP_CALIBRATE; TESTZ moves, ACCEPT and ABORT end it.
+
+TESTZ also halves: between the height at hand and the next one that was tried above (``+``) or below (``-``).
+"""
+
+from bisect import insort
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading, ToProgram
+from coordinator.gcode.events import Reply
+from coordinator.gcode.builtins.state import go
+from coordinator.gcode.parser import Command, WordError, number, quoted
+from coordinator.config.options import SectionSpec
+from coordinator.modules.base import Build, Module, Value
+
+if TYPE_CHECKING:
+    from coordinator.gcode.interpreter import Job
+    from coordinator.runtime.module_context import Live
+
+SPEED: Final = 5.0
+"""mm/s of TESTZ, unless the beginning says otherwise."""
+HALVED_MM: Final = 0.5
+"""``+`` and ``-`` where nothing was tried yet on that side, halved."""
+SAME_MM: Final = 1e-6
+_BEGUN: Final = "now move with TESTZ Z=-0.1 (+, -, ++, --) until it fits; end with ACCEPT or ABORT"
+
+
+class ManualProbe(Module):
+    """The commands; one search at a time."""
+
+    SPEC = SectionSpec(help="Heights by hand", options=())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.name = "manual_probe"
+        self._machine = build.machine
+        self._live: Live | None = None
+        self._accepted: Callable[[float], tuple[str, ...]] | None = None
+        """What a height that is accepted leads to; None: nothing is looked for."""
+        self._speed = SPEED
+        self._tried: list[float] = []
+        for name, text, read in (
+            ("MANUAL_PROBE", "Begin to look for a height by hand; SPEED in mm/s", self._read_probe),
+            ("Z_ENDSTOP_CALIBRATE", "Find position_endstop of stepper_z by hand", self._read_calibrate),
+            (
+                "TESTZ",
+                "Move by Z mm on the way to a height; + - ++ -- halve and go back",
+                self._read_move,
+            ),
+            ("ACCEPT", "Take the height that was found by hand", self._read_accept),
+            ("ABORT", "End the search for a height without a result", self._read_abort),
+            (
+                "Z_OFFSET_APPLY_ENDSTOP",
+                "Make the offset of Z part of position_endstop",
+                self._read_apply,
+            ),
+        ):
+            build.add_command(GCodeCommand(name, text, read))
+
+    async def connect(self, live: "Live") -> None:
+        """Take over the machine."""
+        self._live = live
+
+    def status(self) -> dict[str, Value]:
+        """Tell whether a height is looked for."""
+        return {"is_active": self._accepted is not None}
+
+    # ----------------------------------------------------------------------------------------------- begin
+
+    def _read_probe(self, call: Call) -> Reading:
+        return self._begin(call, lambda z: (f"Z position is {z:.3f}",))
+
+    def _read_calibrate(self, call: Call) -> Reading:
+        endstop = self._endstop(call)
+        return self._begin(call, lambda z: self._keep(endstop - z))
+
+    def _read_apply(self, call: Call) -> Reading:
+        call.parameters()
+        endstop = self._endstop(call)
+        offset = call.figures()["gcode_move"]["homing_origin"].z  # type: ignore[attr-defined]
+
+        async def apply() -> Done:
+            return Done(self._keep(endstop - offset) if offset else ("the offset of Z is 0",))
+
+        return AtRest(apply)
+
+    def _endstop(self, call: Call) -> float:
+        """Return position_endstop of stepper_z; raises WordError where there is none."""
+        for rail in self._machine.rails:
+            if rail.axis == "z" and rail.steppers[0].name == "stepper_z":
+                found = rail.homing.position_endstop
+                if found is not None:
+                    return found
+        raise WordError(f"{call.command.name} needs a position_endstop of [stepper_z]; this machine has none")
+
+    def _begin(self, call: Call, accepted: Callable[[float], tuple[str, ...]]) -> Reading:
+        values = call.parameters("SPEED")
+        speed = number(call.command.name, values, "SPEED") if "SPEED" in values else SPEED
+        if not 0 < speed <= self._machine.limits.max_z_velocity:
+            raise WordError(
+                f"SPEED of {call.command.name} is {speed:g}; it must be above 0 and at most"
+                f" {self._machine.limits.max_z_velocity:g} mm/s"
+            )
+        if "Z" not in call.homed:
+            raise WordError(f"{call.command.name} comes before Z is homed; home with G28 first")
+        if self._accepted is not None:
+            raise WordError(f"{call.command.name}: a height is looked for already; ACCEPT or ABORT that")
+
+        def act(job: "Job") -> bool:
+            self._accepted, self._speed, self._tried = accepted, speed, []
+            job.emit(Reply(job.line, _BEGUN))
+            self._tell(job)
+            return True
+
+        return ToProgram(act)
+
+    # ------------------------------------------------------------------------------------------------ search
+
+    def _read_move(self, call: Call) -> Reading:
+        self._check_active(call)
+        word = call.parameters("Z").get("Z")
+        if word is None:
+            raise WordError("TESTZ has no Z; add Z=-0.1 or Z=+, -, ++, --")
+
+        def act(job: "Job") -> bool:
+            x, y, z, e = job.planner.toolhead_position
+            target = self._target(call.command, word, z)
+            if not go(job, [x, y, target, e], self._speed):
+                return False
+            if z not in self._tried:
+                insort(self._tried, z)
+            self._tell(job)
+            return True
+
+        return ToProgram(act)
+
+    def _target(self, command: Command, word: str, z: float) -> float:
+        below, above = self._beside(z)
+        match word:
+            case "+":
+                return (z + above) / 2 if above is not None else z + HALVED_MM / 2
+            case "-":
+                return (z + below) / 2 if below is not None else z - HALVED_MM / 2
+            case "++" | "--":
+                found = above if word == "++" else below
+                if found is None:
+                    raise WordError(f"TESTZ Z={word}: none was tried {'above' if word == '++' else 'below'}")
+                return found
+        return z + number(command.name, {"Z": word}, "Z")
+
+    def _beside(self, z: float) -> tuple[float | None, float | None]:
+        """Return the nearest heights that were tried, below and above Z."""
+        below = [tried for tried in self._tried if tried < z - SAME_MM]
+        above = [tried for tried in self._tried if tried > z + SAME_MM]
+        return (below[-1] if below else None), (above[0] if above else None)
+
+    def _tell(self, job: "Job") -> None:
+        z = job.planner.toolhead_position[2]
+        below, above = ("?" if tried is None else f"{tried:.3f}" for tried in self._beside(z))
+        job.emit(Reply(job.line, f"Z position: {below} --> {z:.3f} <-- {above}"))
+
+    # -------------------------------------------------------------------------------------------------- end
+
+    def _read_accept(self, call: Call) -> Reading:
+        call.parameters()
+        accepted = self._check_active(call)
+
+        async def accept() -> Done:
+            self._accepted = None
+            return Done(accepted(call.position[2]))
+
+        return AtRest(accept)
+
+    def _read_abort(self, call: Call) -> Reading:
+        call.parameters()
+        self._check_active(call)
+
+        async def abort() -> Done:
+            self._accepted = None
+            return Done((f"nothing is kept; Z stays at {call.position[2]:.3f}",))
+
+        return AtRest(abort)
+
+    def _check_active(self, call: Call) -> Callable[[float], tuple[str, ...]]:
+        if self._accepted is None:
+            raise WordError(
+                f"{call.command.name} is for looking for a height; begin with {quoted('MANUAL_PROBE')} or"
+                f" {quoted('Z_ENDSTOP_CALIBRATE')}"
+            )
+        return self._accepted
+
+    def _keep(self, endstop: float) -> tuple[str, ...]:
+        assert self._live is not None
+        self._live.save("stepper_z", "position_endstop", f"{endstop:.3f}")
+        return (f"stepper_z: position_endstop: {endstop:.3f}; SAVE_CONFIG writes it and begins anew",)

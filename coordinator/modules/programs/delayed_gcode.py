@@ -1,0 +1,131 @@
+"""[delayed_gcode NAME]: g-code that is run after a while, by itself; and again, if it says so."""
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.parser import Command, WordError, quoted
+from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
+from coordinator.config.errors import nearest
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.programs.gcode_macro import GCodeTemplate
+from coordinator.modules.words import bounded, needed, parameters
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+GCODE = GCodeOption(name="gcode", help="What is done: g-code, with Jinja2 between { and {% %}")
+INITIAL = FloatOption(
+    name="initial_duration",
+    help="How long after the start it runs; 0: only when UPDATE_DELAYED_GCODE says so",
+    default=0.0,
+    unit="s",
+    minimum=0.0,
+    maximum=1e9,
+)
+DURATION_MAX_S: Final = 1e6
+SHORTEST_S: Final = 0.05
+"""However short a duration, others get their turn between two runs."""
+_COMMAND: Final = "_RUN_DELAYED_GCODE"
+
+
+class DelayedGCode(Module):
+    """One of them; a service runs its lines as those of a client."""
+
+    SPEC = SectionSpec("G-code that runs by itself after a while", (GCODE, INITIAL), later=("description",))
+    NAMED = True
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.id = build.instance
+        self.template = GCodeTemplate(build, GCODE)
+        self._initial_s = build.get(INITIAL)
+        self._live: Live | None = None
+        self._call_off: Callable[[], None] | None = None
+        build.shared(DelayedGCodes)
+
+    async def connect(self, live: "Live") -> None:
+        """Take the clock."""
+        self._live = live
+
+    def ready(self) -> None:
+        """Begin to wait."""
+        self.wait(self._initial_s)
+
+    def stopped(self, cause: str) -> None:  # noqa: ARG002
+        """Run no more."""
+        self.close()
+
+    def close(self) -> None:
+        """Run no more."""
+        self.wait(0)
+        self._live = None
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell whether it is going to run."""
+        return {"waits": self._call_off is not None}
+
+    def wait(self, duration_s: float) -> None:
+        """Run after DURATION_S; 0: not at all. On the control loop."""
+        if self._call_off is not None:
+            self._call_off()
+            self._call_off = None
+        if duration_s and self._live is not None:
+            self._call_off = self._live.after(max(duration_s, SHORTEST_S), self._run)
+
+    def wait_from_program(self, duration_s: float) -> None:
+        """Do the same, from the reader's thread; without a machine nothing."""
+        if (live := self._live) is not None:
+            live.soon_on_loop(lambda: self.wait(duration_s))
+
+    def _run(self) -> None:
+        self._call_off = None
+        if self._live is None:
+            return
+        runner = self._live.machine.runner
+        if runner is None:
+            self._live.say(f"[{self.name}] does not run: only a service (canductor run) runs it")
+        else:
+            runner.run_lines(self.name, [f"{_COMMAND} ID={self.id}"])
+
+
+class DelayedGCodes(Module):
+    """The commands of all."""
+
+    SPEC = SectionSpec("Commands about delayed g-code", ())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._all: dict[str, DelayedGCode] = {}
+        build.add_command(
+            GCodeCommand(
+                "UPDATE_DELAYED_GCODE", "Have the delayed g-code ID run after DURATION; 0: not at all",
+                self._update, beside=True,
+            )
+        )  # fmt: skip
+        build.add_command(GCodeCommand(_COMMAND, "What a delayed g-code does", self._run, beside=True))
+
+    def link(self, modules: Modules) -> None:
+        """Find them."""
+        for name in modules.names(DelayedGCode):
+            found = modules.find(name, DelayedGCode)
+            assert found is not None
+            self._all[found.id] = found
+
+    def _named(self, command: Command, values: Mapping[str, str]) -> DelayedGCode:
+        name = needed(command, values, "ID")
+        found = self._all.get(name)
+        if found is None:
+            hint = nearest(name, self._all) or f"; there is {', '.join(self._all)}"
+            raise WordError(f"{command.name} names the delayed g-code {quoted(name)}, of which none{hint}")
+        return found
+
+    def _update(self, call: Call) -> Reading:
+        values = parameters(call.command, ("ID", "DURATION"))
+        found = self._named(call.command, values)
+        needed(call.command, values, "DURATION")
+        duration_s = bounded(call.command, values, "DURATION", 0.0, low=0.0, high=DURATION_MAX_S)
+        return AtOnce(act=lambda: found.wait_from_program(duration_s))
+
+    def _run(self, call: Call) -> Reading:
+        return self._named(call.command, parameters(call.command, ("ID",))).template.lines(call, {})

@@ -1,0 +1,231 @@
+"""[exclude_object]: objects of a program that need not be printed to their end.
+
+A slicer says where each object begins and ends. Moves of one that is excluded are followed but not made; the
+filament then is where the next object expects it, neither further forward nor further back.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, ToProgram
+from coordinator.gcode.parser import Command, WordError, number, quoted
+from coordinator.config.options import SectionSpec
+from coordinator.config.errors import nearest
+from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.words import flag, needed, parameters
+from coordinator.motion.planner.planner import FeedStatus
+
+if TYPE_CHECKING:
+    from coordinator.gcode.interpreter import Job
+    from coordinator.motion.planner.planner import Planner
+
+OBJECTS_MAX: Final = 1000
+POINTS_MAX: Final = 1000
+_SPEED_MM_S: Final = 30.0
+"""At which filament is drawn back or pushed forward behind an excluded object."""
+
+
+@dataclass(frozen=True)
+class _Object:
+    name: str
+    center: tuple[float, float] | None = None
+    polygon: tuple[tuple[float, float], ...] = ()
+
+
+class ExcludeObject(Module):
+    """The objects of the program that is being read."""
+
+    SPEC = SectionSpec("Leaving out single objects of a print", (), later=("enable_exclude_object",))
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._objects: dict[str, _Object] = {}
+        self._excluded: set[str] = set()
+        self._current: str | None = None
+        self._retracted_mm: float | None = None
+        """While moves are left out: by how much the filament was drawn back when that began."""
+        self.only_looks = False
+        """Whether no moves are left out, whatever is excluded: a program is read again up to where it was."""
+        for name, help_, read, beside in (
+            ("EXCLUDE_OBJECT_DEFINE", "Tell of an object", self._define, False),
+            ("EXCLUDE_OBJECT_START", "An object begins", self._start, False),
+            ("EXCLUDE_OBJECT_END", "An object ends", self._end, False),
+            ("EXCLUDE_OBJECT", "Leave out an object from here on", self._exclude, True),
+        ):
+            build.add_command(GCodeCommand(name, help_, read, beside=beside))
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell the objects, which of them are left out, and which one is being read."""
+        return {
+            "objects": [_told(found) for found in tuple(self._objects.values())],
+            "excluded_objects": [*sorted(self._excluded)],
+            "current_object": self._current,
+        }
+
+    def job_begins(self) -> None:
+        """Forget the objects of another program."""
+        self.forget()
+
+    @property
+    def leaves_out(self) -> bool:
+        """Whether what is being read is an excluded object."""
+        return self._current in self._excluded
+
+    def take_over(self, other: "ExcludeObject", excluded: Iterable[str]) -> None:
+        """Know what OTHER has read of the program, and leave out EXCLUDED as well; before the first move."""
+        self._objects = dict(other._objects)  # noqa: SLF001 (one of its kind)
+        self._excluded = (other._excluded | set(excluded)) & self._objects.keys()  # noqa: SLF001
+        self._current = other._current  # noqa: SLF001
+
+    def begin_leaving_out(self, planner: "Planner") -> None:
+        """Take note that PLANNER leaves out moves: the program was in an excluded object before."""
+        self._retracted_mm = planner.retracted_mm
+
+    def forget(self) -> None:
+        """Forget all objects."""
+        self._objects.clear()
+        self._excluded.clear()
+        self._current = self._retracted_mm = None
+
+    # ---- What a program tells ----
+
+    def _define(self, call: Call) -> Reading:
+        values = parameters(call.command, ("NAME", "CENTER", "POLYGON", "RESET", "JSON"))
+        if flag(call.command, values, "RESET"):
+            return ToProgram(self._reset)
+        if "NAME" not in values:
+            return AtOnce((f"Known objects: {' '.join(self._objects) or 'none'}",))
+        found = _Object(
+            values["NAME"].upper(),
+            _point(call.command, values["CENTER"].split(",")) if "CENTER" in values else None,
+            _polygon(call.command, values.get("POLYGON", "[]")),
+        )
+        return AtOnce(act=lambda: self._know(found))
+
+    def _know(self, found: _Object) -> None:
+        if found.name not in self._objects and len(self._objects) >= OBJECTS_MAX:
+            raise WordError(f"the program has more than {OBJECTS_MAX} objects; leave some undefined")
+        self._objects[found.name] = found
+
+    def _reset(self, job: "Job") -> bool:
+        done = self._make_moves(job)
+        if done:
+            self.forget()
+        return done
+
+    def _start(self, call: Call) -> Reading:
+        name = needed(call.command, parameters(call.command, ("NAME",)), "NAME").upper()
+
+        def act(job: "Job") -> bool:
+            if name not in self._objects:
+                self._know(_Object(name))
+            if not self._make_moves(job):
+                return False
+            self._current = name
+            self._look(job)
+            return True
+
+        return ToProgram(act)
+
+    def _end(self, call: Call) -> Reading:
+        parameters(call.command, ("NAME",))
+
+        def act(job: "Job") -> bool:
+            done = self._make_moves(job)
+            if done:
+                self._current = None
+            return done
+
+        return ToProgram(act)
+
+    # ---- What the user wants ----
+
+    def _exclude(self, call: Call) -> Reading:
+        command = call.command
+        values = parameters(command, ("NAME", "CURRENT", "RESET"))
+        name = values.get("NAME", "").upper()
+        if flag(command, values, "RESET"):
+            return ToProgram(lambda job: self._take_back(job, name))
+        if flag(command, values, "CURRENT"):
+            name = self._current or ""
+            if not name:
+                raise WordError("EXCLUDE_OBJECT CURRENT=1 comes where no object is; name one by NAME=...")
+        if not name:
+            return AtOnce((f"Excluded objects: {' '.join(sorted(self._excluded)) or 'none'}",))
+        if name not in self._objects:
+            hint = nearest(name, self._objects) or f"; there is {', '.join(self._objects) or 'none'}"
+            raise WordError(f"EXCLUDE_OBJECT names {quoted(name)}, which is no object of this program{hint}")
+
+        def act(job: "Job") -> bool:
+            self._excluded.add(name)
+            self._look(job)
+            return True
+
+        return ToProgram(act)
+
+    def _take_back(self, job: "Job", name: str) -> bool:
+        if (not name or name == self._current) and not self._make_moves(job):
+            return False
+        if name:
+            self._excluded.discard(name)
+        else:
+            self._excluded.clear()
+        return True
+
+    # ---- What becomes of the moves ----
+
+    def _look(self, job: "Job") -> None:
+        """Leave out moves from here on, if this is an object to be left out."""
+        if self.leaves_out and self._retracted_mm is None and not self.only_looks:
+            self._retracted_mm = job.planner.retracted_mm
+            job.planner.excluded = True
+
+    def _make_moves(self, job: "Job") -> bool:
+        """Make moves again; False: the planner has to be emptied first."""
+        if self._retracted_mm is None:
+            return True
+        if not job.planner.excluded:  # the program that left them out is over
+            self._retracted_mm = None
+            return True
+        status = job.planner.end_exclusion(self._retracted_mm, _SPEED_MM_S)
+        if status is FeedStatus.LIMIT:
+            raise WordError(str(job.planner.fault))
+        if status is FeedStatus.FULL:
+            return False
+        self._retracted_mm = None
+        return True
+
+
+def _told(found: _Object) -> Value:
+    told: dict[str, Value] = {"name": found.name}
+    if found.center is not None:
+        told["center"] = list(found.center)
+    if found.polygon:
+        told["polygon"] = [list(point) for point in found.polygon]
+    return told
+
+
+def _point(command: Command, words: "list[str]") -> tuple[float, float]:
+    if len(words) != 2:
+        raise WordError(f"a point of {command.name} has {len(words)} numbers; give X and Y")
+    x, y = (number(command.name, {"CENTER": word}, "CENTER") for word in words)
+    return (x, y)
+
+
+def _polygon(command: Command, text: str) -> tuple[tuple[float, float], ...]:
+    try:
+        points = json.loads(text)
+    except (ValueError, RecursionError):
+        points = None
+    if not isinstance(points, list) or len(points) > POINTS_MAX:
+        raise WordError(
+            f"POLYGON of {command.name} is {quoted(text)}; write [[x,y],[x,y],...] without blanks, at most"
+            f" {POINTS_MAX} points"
+        )
+    return tuple(_point(command, [str(value) for value in point]) for point in points if _is_list(point))
+
+
+def _is_list(point: object) -> bool:
+    return isinstance(point, list)

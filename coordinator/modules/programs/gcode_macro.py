@@ -1,0 +1,253 @@
+"""[gcode_macro NAME]: a command that stands for lines of g-code, made by a template when it is called."""
+
+import ast
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
+from coordinator.gcode.templates.templates import Asked, Template, TemplateError, line_of
+from coordinator.gcode.parser import Command, WordError, parse, quoted
+from coordinator.config.options import GCodeOption, Option, SectionSpec, TextOption
+from coordinator.config.errors import ConfigError, Place, nearest
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.status.printer_status import PrinterStatus
+
+GCODE = GCodeOption(name="gcode", help="What is done: g-code, with Jinja2 between { } and {% %}")
+RENAME = TextOption(
+    name="rename_existing",
+    help="Name for the command that had this macro's name before, such as M109.1 or BASE_PAUSE",
+    pattern=r"\S+",
+    pattern_rule="one word",
+)
+DESCRIPTION = TextOption(
+    name="description",
+    help="A sentence about it, also over several lines",
+    default="G-Code macro",
+    pattern=r"(?s).*",
+    pattern_rule="text",
+)
+VARIABLE = TextOption(
+    name="variable_", help="First value of a variable, as Python writes it: 1, 0.5, 'text', True, [1, 2]"
+)
+_NAMES = re.compile(r"[A-Za-z_][\w.]*", re.ASCII)
+VALUE_MAX: Final = 10_000
+"""Characters of a variable's value."""
+
+
+class GCodeTemplate:
+    """An option with lines of g-code: a template, and where each of its lines stands; raises ConfigError."""
+
+    def __init__(self, build: Build, option: Option[str]) -> None:
+        text = self.text = build.get(option)
+        raw = build.reader.section.options.get(option.name)
+        self.section = build.name
+        self._path = build.reader.place_of(option).path
+        self._numbers = raw.numbers if raw is not None else ()
+        self._status = build.shared(PrinterStatus)
+        try:
+            self._template = Template(text)
+        except TemplateError as error:
+            place = Place(self._path, line_of(self._numbers, error.line))
+            raise ConfigError(place, f"the template of [{build.name}]: {error}") from None
+
+    def lines(self, call: Call, values: Mapping[str, object]) -> Lines:
+        """Render it for CALL with further VALUES; raises WordError."""
+        replies: list[str] = []
+
+        def respond(text: object) -> str:
+            replies.append(str(text))
+            return ""
+
+        def fail(text: object) -> str:
+            raise Asked(str(text))
+
+        def call_remote(method: object, **values: object) -> str:
+            if not self._status.call_remote(str(method), values):
+                replies.append(f"the remote method {method} was not called: no client has registered one")
+            return ""
+
+        def stop(text: object = "") -> str:
+            raise Asked(str(text), emergency=True)
+
+        try:
+            made = self._template.render(
+                {
+                    **values,
+                    "printer": self._status.view(call),
+                    "action_respond_info": respond,
+                    "action_call_remote_method": call_remote,
+                    "action_raise_error": fail,
+                    "action_emergency_stop": stop,
+                }
+            )
+        except Asked as asked:
+            if asked.emergency:
+                return Lines("M112", (*replies, *([str(asked)] if str(asked) else [])))
+            raise WordError(str(asked)) from None
+        except TemplateError as error:
+            raise WordError(f"{self._place((error.line,), 1)}: {error}") from None
+        return Lines(made.text, tuple(replies), lambda line: self._place(made.lines, line))
+
+    def _place(self, lines: tuple[int, ...], line: int) -> str:
+        """Name where LINE of a rendered text comes from."""
+        number = line_of(self._numbers, line_of(lines, line))
+        return f"{Place(self._path, number)}: [{self.section}]"
+
+
+class GCodeMacro(Module):
+    """One macro."""
+
+    SPEC = SectionSpec(
+        "A command of its own: NAME, in capitals, stands for lines of g-code",
+        (GCODE, RENAME, DESCRIPTION),
+        family=VARIABLE,
+    )
+    NAMED = True
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.command = build.instance.upper()
+        if not _is_command(self.command):
+            raise ConfigError(
+                build.place, f"[{build.name}] has no name that can be a command; give one of letters and _"
+            )
+        self._template = GCodeTemplate(build, GCODE)
+        self.variables = {name: _first_value(build, name, raw.value) for name, raw in _family(build)}
+        rename = (build.find(RENAME) or "").upper()
+        if rename and not _is_command(rename):
+            raise build.reader.bad(RENAME, "is no name that a command can have")
+        help_ = " ".join(build.get(DESCRIPTION).split()) or "G-Code macro"
+        build.replace_command(GCodeCommand(self.command, help_, self._read, beside=True), rename)
+        build.shared(Variables)
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell the variables."""
+        return {name: plain(value) for name, value in dict(self.variables).items()}
+
+    def stands_for(self) -> Mapping[str, set[str]]:
+        """Tell which words its lines have."""
+        return {self.command: words_in(self.text)}
+
+    @property
+    def text(self) -> str:
+        """What it stands for, as it is written."""
+        return self._template.text
+
+    def _read(self, call: Call) -> Reading:
+        values = {"params": parameters(call.command), "rawparams": call.command.text.strip()}
+        return self._template.lines(call, {**self.variables, **values})
+
+
+class Variables(Module):
+    """What all macros have in common."""
+
+    SPEC = SectionSpec("Commands about macros", ())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._macros: dict[str, GCodeMacro] = {}
+        build.add_command(
+            GCodeCommand(
+                "SET_GCODE_VARIABLE", "Give a macro's variable another value", self._set, beside=True
+            )
+        )
+
+    def link(self, modules: Modules) -> None:
+        """Find the macros."""
+        for name in modules.names(GCodeMacro):
+            macro = modules.find(name, GCodeMacro)
+            assert macro is not None
+            self._macros[macro.command] = macro
+
+    def _set(self, call: Call) -> Reading:
+        words = call.command.parameters()
+        for key in ("MACRO", "VARIABLE", "VALUE"):
+            if key not in words:
+                raise WordError(f"SET_GCODE_VARIABLE has no {key}; add {key}=...")
+        macro = self._macros.get(words["MACRO"].upper())
+        if macro is None:
+            hint = nearest(words["MACRO"], self._macros)
+            raise WordError(
+                f"SET_GCODE_VARIABLE names the macro {quoted(words['MACRO'])}, of which none{hint}"
+            )
+        name = words["VARIABLE"].lower()
+        if name not in macro.variables:
+            has = ", ".join(macro.variables) or "none"
+            raise WordError(f"the macro {macro.command} has no variable {quoted(name)}; it has {has}")
+        try:
+            value = literal(words["VALUE"])
+        except ValueError as problem:
+            if "VALUE='" not in call.command.text.upper():
+                raise WordError(f"VALUE of SET_GCODE_VARIABLE {problem}") from None
+            value = words["VALUE"]  # 'a text', whose quotes the parameters have lost
+
+        def act() -> None:
+            macro.variables[name] = value
+
+        return AtOnce(act=act)
+
+
+def words_in(text: str) -> set[str]:
+    """Return what may be names of commands in TEXT, in capitals."""
+    return {word.upper() for word in _NAMES.findall(text)}
+
+
+def parameters(command: Command) -> dict[str, str]:
+    """Return what a macro gets as ``params``; raises WordError."""
+    if not _is_code(command.name):
+        return command.parameters()
+    try:
+        return command.words()
+    except WordError:
+        try:
+            return command.parameters()
+        except WordError:
+            return {}  # free text, as behind M117
+
+
+def literal(text: str) -> Any:
+    """Return the value that TEXT writes as Python does; raises ValueError: the end of a sentence."""
+    if len(text) > VALUE_MAX:
+        raise ValueError(f"is longer than {VALUE_MAX} characters")
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError):
+        raise ValueError(
+            f"is {quoted(text)}, which is no value: write 1, 0.5, True, 'text', [1, 2] or {{'a': 1}}"
+        ) from None
+
+
+def plain(value: object) -> Value:
+    """Return VALUE of what a status may hold."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, dict):
+        return {str(key): plain(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [plain(inner) for inner in value]
+    return str(value)
+
+
+def _family(build: Build) -> list[tuple[str, Any]]:
+    return list(build.reader.family().items())
+
+
+def _first_value(build: Build, name: str, text: str) -> object:
+    try:
+        return literal(text)
+    except ValueError as problem:
+        place = build.reader.section.options[f"{VARIABLE.name}{name}"].place
+        raise ConfigError(place, f"option 'variable_{name}' of [{build.name}] {problem}") from None
+
+
+def _is_code(name: str) -> bool:
+    return name[:1] in "GMT" and name[1:2].isdigit()
+
+
+def _is_command(name: str) -> bool:
+    try:
+        command = parse(name.encode())
+    except WordError:
+        return False
+    return command is not None and name in (command.name, command.written) and not command.text

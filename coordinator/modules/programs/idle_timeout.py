@@ -1,0 +1,129 @@
+"""[idle_timeout]: what is done when nothing was done for a while; by default heaters and motors go off.
+
+Every machine has it, with its defaults where there is no such section.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
+from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.programs.gcode_macro import GCodeTemplate
+from coordinator.modules.words import bounded, parameters
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+TIMEOUT = FloatOption(
+    name="timeout",
+    help="How long nothing may happen; a job that is paused counts as nothing",
+    default=600.0,
+    unit="s",
+    above=0.0,
+    maximum=1e9,
+)
+GCODE = GCodeOption(
+    name="gcode",
+    help="What is done then; without it, TURN_OFF_HEATERS and M84, as far as there are heaters and motors",
+    default="",
+)
+OFF: Final = ("TURN_OFF_HEATERS", "M84")
+LOOK_S: Final = 1.0
+
+
+class IdleTimeout(Module):
+    """Watches, and acts."""
+
+    SPEC = SectionSpec("What is done when the machine is left alone", (TIMEOUT, GCODE))
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._configured_s = self._timeout_s = build.get(TIMEOUT)
+        self._template = GCodeTemplate(build, GCODE) if build.find(GCODE) is not None else None
+        self._default: tuple[str, ...] = ()
+        self._live: Live | None = None
+        self._state = "Idle"
+        self._since_s = 0.0
+        self._busy_since_s: float | None = None
+        self._works = 0
+        self._acting = False
+        build.add_command(
+            GCodeCommand("SET_IDLE_TIMEOUT", "Let nothing happen for TIMEOUT", self._set, beside=True)
+        )
+        build.add_command(GCodeCommand("_IDLE_TIMEOUT", "What is done when nothing happens", self._lines))
+
+    def link(self, modules: Modules) -> None:
+        """Find what there is to switch off."""
+        self._default = tuple(name for name in OFF if modules.knows(name))
+
+    async def connect(self, live: "Live") -> None:
+        """Begin to watch."""
+        self._live = live
+        self._since_s = live.now_s()
+        self._state = "Ready"
+        live.every(LOOK_S, self.look)
+
+    def close(self) -> None:
+        """Watch no more."""
+        self._live = None
+
+    def stopped(self, cause: str) -> None:  # noqa: ARG002
+        """Watch no more: all is off."""
+        self._live, self._state = None, "Idle"
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell Printing, Ready or Idle, and for how long it has been printing, s."""
+        printing_s = 0.0
+        if self._live is not None and self._busy_since_s is not None:
+            printing_s = self._live.now_s() - self._busy_since_s
+        return {
+            "state": self._state,
+            "printing_time": round(printing_s, 1),
+            "idle_timeout": self._timeout_s,
+        }
+
+    def look(self) -> None:
+        """See whether anything happens; on the control loop."""
+        live = self._live
+        if live is None or (runner := live.machine.runner) is None:
+            return
+        now_s = live.now_s()
+        if self._acting:  # what it does itself is no sign of life
+            self._acting, self._works = runner.busy, runner.works
+            return
+        works, self._works = self._works, runner.works
+        if runner.busy or runner.works != works:
+            if self._busy_since_s is None:
+                self._busy_since_s = now_s
+            self._since_s, self._state = now_s, "Printing"
+            return
+        self._busy_since_s = None
+        if self._state == "Printing":
+            self._state = "Ready"
+        if self._state == "Ready" and now_s >= self._since_s + self._timeout_s:
+            self._state = "Idle"
+            if self._template is None and not self._default:
+                return
+            live.say(f"nothing happened for {self._timeout_s:g} s: {self._told()}")
+            runner.run_lines("idle_timeout", ["_IDLE_TIMEOUT"])
+            self._acting = True
+
+    def _told(self) -> str:
+        return (
+            "the g-code of [idle_timeout] runs" if self._template is not None else " and ".join(self._default)
+        )
+
+    def _lines(self, call: Call) -> Reading:
+        if self._template is not None:
+            return self._template.lines(call, {})
+        return Lines("\n".join(self._default))
+
+    def _set(self, call: Call) -> Reading:
+        values = parameters(call.command, ("TIMEOUT",))
+        timeout_s = bounded(call.command, values, "TIMEOUT", self._configured_s, low=0.001, high=1e6)
+
+        def act() -> None:
+            self._timeout_s = timeout_s
+
+        return AtOnce((f"idle_timeout: Timeout set to {timeout_s:.2f} s",), act)

@@ -1,0 +1,117 @@
+"""[pause_resume]: PAUSE, RESUME, CANCEL_PRINT and CLEAR_PAUSE, from the job itself or beside it.
+
+PAUSE remembers where the job stands; what its macro does afterwards (parking, drawing filament back) comes
+behind that. RESUME goes back there and lets the job go on.
+"""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import Call, GCodeCommand, Reading, ToProgram
+from coordinator.gcode.events import Reply
+from coordinator.gcode.builtins.state import save_state
+from coordinator.config.options import FloatOption, SectionSpec
+from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.status.print_stats import PrintStats
+from coordinator.modules.words import bounded, parameters
+
+if TYPE_CHECKING:
+    from coordinator.gcode.interpreter import Job
+
+VELOCITY = FloatOption(
+    name="recover_velocity",
+    help="How fast RESUME goes back, unless its VELOCITY says otherwise",
+    default=50.0,
+    unit="mm/s",
+    above=0.0,
+    maximum=10_000.0,
+)
+STATE: Final = "PAUSE_STATE"
+"""The name under which PAUSE saves the state, for macros."""
+
+
+class PauseResume(Module):
+    """The commands."""
+
+    SPEC = SectionSpec("Pausing a job, by g-code", (VELOCITY,))
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._velocity_mm_s = build.get(VELOCITY)
+        self._paused = False
+        """Whether PAUSE was given, and neither RESUME nor an end of the job since."""
+        build.shared(PrintStats)
+        for name, help_, read in (
+            ("PAUSE", "Pause the job", self._pause),
+            ("RESUME", "Go back to where the job was paused, and let it go on", self._resume),
+            ("CANCEL_PRINT", "End the job", self._cancel),
+            ("CLEAR_PAUSE", "Forget that there was a pause", self._clear),
+        ):
+            build.add_command(GCodeCommand(name, help_, read, beside=True))
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell whether there is a pause."""
+        return {"is_paused": self._paused}
+
+    def job_begins(self) -> None:
+        """Forget a pause of another job."""
+        self._paused = False
+
+    def resumed(self) -> None:
+        """Take note that the job goes on, by whatever means."""
+        self._paused = False
+
+    def _pause(self, call: Call) -> Reading:
+        parameters(call.command, ())
+
+        def act(job: "Job") -> bool:
+            if self._paused and (job.prints is None or job.prints.paused):
+                job.emit(Reply(job.line, "the job is paused already"))
+                return True
+            save_state(job, STATE)
+            self._paused = True
+            if job.prints is not None:
+                job.prints.pause_job(job)
+            else:
+                job.notice("PAUSE", "there is no job to pause: only a service (canductor run) has jobs")
+            return True
+
+        return ToProgram(act)
+
+    def _resume(self, call: Call) -> Reading:
+        values = parameters(call.command, ("VELOCITY",))
+        speed = bounded(call.command, values, "VELOCITY", self._velocity_mm_s, low=0.001, high=10_000.0)
+
+        def act(job: "Job") -> bool:
+            prints = job.prints
+            if not self._paused and (prints is None or not prints.paused):
+                job.emit(Reply(job.line, "nothing is paused: RESUME does nothing"))
+                return True
+            if prints is not None and not job.beside and not prints.come_back(job, speed):
+                return False
+            self._paused = False
+            if prints is not None:
+                prints.resume_job()
+            return True
+
+        return ToProgram(act)
+
+    def _cancel(self, call: Call) -> Reading:
+        parameters(call.command, ())
+
+        def act(job: "Job") -> bool:
+            self._paused = False
+            if job.prints is not None:
+                job.prints.cancel_job(job)
+            return True
+
+        return ToProgram(act)
+
+    def _clear(self, call: Call) -> Reading:
+        parameters(call.command, ())
+
+        def act(_job: "Job") -> bool:
+            self._paused = False
+            return True
+
+        return ToProgram(act)

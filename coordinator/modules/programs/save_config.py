@@ -1,0 +1,85 @@
+"""SAVE_CONFIG, RESTART and FIRMWARE_RESTART: what was calibrated is kept, and the machine begins anew."""
+
+from typing import TYPE_CHECKING
+
+from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.config.options import SectionSpec
+from coordinator.modules.base import Build, Module, Value
+from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+
+class SaveConfig(Module):
+    """The commands that end one life of the machine."""
+
+    SPEC = SectionSpec(help="Saving and beginning anew", options=())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.name = "configfile"
+        self._live: Live | None = None
+        for name, text, read in (
+            (
+                "SAVE_CONFIG",
+                "Write what was calibrated into the configuration file, then begin anew",
+                self._read_save,
+            ),
+            (
+                "RESTART",
+                "Read the configuration and start the machine anew",
+                lambda call: self._read_restart(call, firmware=False),
+            ),
+            (
+                "FIRMWARE_RESTART",
+                "Do that with all nodes reset, also those whose configuration is the same",
+                lambda call: self._read_restart(call, firmware=True),
+            ),
+        ):
+            build.add_command(GCodeCommand(name, text, read))
+
+    async def connect(self, live: "Live") -> None:
+        """Take over the machine."""
+        self._live = live
+
+    def status(self) -> dict[str, Value]:
+        """Tell what SAVE_CONFIG would write."""
+        if self._live is None:
+            return {}
+        pending = self._live.machine.unsaved.pending
+        items: dict[str, Value] = {section: dict(options) for section, options in pending.items()}
+        return {"save_config_pending": bool(items), "save_config_pending_items": items}
+
+    def _read_save(self, call: Call) -> Reading:
+        call.parameters()
+        return AtRest(self._save)
+
+    def _read_restart(self, call: Call, *, firmware: bool) -> Reading:
+        call.parameters()
+        return AtRest(lambda: self._restart(firmware=firmware))
+
+    async def _save(self) -> Done | None:
+        import asyncio  # noqa: PLC0415 (planning needs none)
+
+        assert self._live is not None
+        machine = self._live.machine
+        if not machine.unsaved.pending:
+            return Done(("nothing to save: nothing was calibrated since the machine started",))
+        restart = machine.prepare_restart() if machine.prepare_restart is not None else None
+        path = await asyncio.to_thread(machine.unsaved.write)
+        if restart is None:
+            return Done((f"saved into {path}; it counts from the next start on",))
+        self._live.say(f"saved into {path}; the machine begins anew")
+        restart(False)
+        return None
+
+    async def _restart(self, *, firmware: bool) -> None:
+        assert self._live is not None
+        prepare = self._live.machine.prepare_restart
+        if prepare is None:
+            raise CanductorError(
+                "a machine that runs a single file cannot begin anew; start the command again, or serve the"
+                " machine with --ipc"
+            )
+        prepare()(firmware)

@@ -1,0 +1,164 @@
+"""[save_variables]: values that outlive the machine, in a file of their own.
+
+The file is written by a thread, so that neither programs nor the control loop wait for a disk; whole or not
+at all, so that a power cut leaves the old values or the new ones. A machine that is only planned keeps what
+it is told in memory.
+"""
+
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.parser import WordError, quoted
+from coordinator.config.options import SectionSpec, TextOption
+from coordinator.config.errors import ConfigError, shown_path
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.programs.gcode_macro import literal, plain
+from coordinator.modules.words import needed, parameters
+from coordinator.support.atomic_file import write_whole
+from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+FILENAME = TextOption(name="filename", help="The file, relative to that of the configuration; ~ is your home")
+VARIABLES_MAX: Final = 1000
+FILE_BYTES_MAX: Final = 1_000_000
+_HEADER: Final = "[Variables]"
+
+
+class SaveVariables(Module):
+    """The values, and the file that has them."""
+
+    SPEC = SectionSpec("Values that are kept in a file (SAVE_VARIABLE)", (FILENAME,))
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        name = Path(build.get(FILENAME)).expanduser()
+        self.path = Path(build.place.path).parent / name
+        self._place = build.reader.place_of(FILENAME)
+        self._variables: dict[str, Any] = {}
+        self._writer: _Writer | None = None
+        build.add_command(
+            GCodeCommand("SAVE_VARIABLE", "Keep VALUE as VARIABLE in the file", self._save, beside=True)
+        )
+
+    def link(self, modules: Modules) -> None:  # noqa: ARG002
+        """Read the file; raises ConfigError."""
+        try:
+            self._variables = read_variables(self.path)
+        except CanductorError as error:
+            raise ConfigError(self._place, str(error)) from None
+
+    async def connect(self, live: "Live") -> None:
+        """Write the file from now on."""
+        self._writer = _Writer(self.path, live.say)
+
+    def close(self) -> None:
+        """Wait until all is written."""
+        if self._writer is not None:
+            self._writer.close()
+        self._writer = None
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell the values."""
+        return {"variables": {name: plain(value) for name, value in dict(self._variables).items()}}
+
+    def _save(self, call: Call) -> Reading:
+        values = parameters(call.command, ("VARIABLE", "VALUE"))
+        name, text = (needed(call.command, values, key) for key in ("VARIABLE", "VALUE"))
+        if not name.isidentifier() or not name.isascii():
+            raise WordError(f"VARIABLE of SAVE_VARIABLE is {quoted(name)}; write letters, digits and _")
+        name = name.lower()
+        if name not in self._variables and len(self._variables) >= VARIABLES_MAX:
+            raise WordError(f"{VARIABLES_MAX} variables are saved already; use one of their names again")
+        try:
+            value = literal(text)
+        except ValueError as problem:
+            if "VALUE='" not in call.command.text.upper():
+                raise WordError(f"VALUE of SAVE_VARIABLE {problem}") from None
+            value = text
+
+        def act() -> None:
+            self._variables[name] = value
+            if self._writer is not None:
+                self._writer.write(_as_text(self._variables))
+
+        return AtOnce(act=act)
+
+
+def read_variables(path: Path) -> dict[str, Any]:
+    """Return the values in the file PATH, none when there is no file; raises CanductorError."""
+    try:
+        with path.open("rb") as file:
+            data = file.read(FILE_BYTES_MAX + 1)
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise CanductorError(
+            f"the file of variables {shown_path(str(path))} cannot be read: {reason}"
+        ) from None
+    if len(data) > FILE_BYTES_MAX:
+        raise CanductorError(
+            f"the file of variables {shown_path(str(path))} is larger than {FILE_BYTES_MAX} bytes"
+        )
+    found: dict[str, Any] = {}
+    for number, line in enumerate(data.decode("utf-8", "replace").splitlines(), 1):
+        text = line.strip()
+        if not text or text.startswith(("#", ";", "[")):
+            continue
+        name, equals, value = text.partition("=")
+        try:
+            found[name.strip().lower()] = literal(value.strip())
+        except ValueError as problem:
+            raise CanductorError(
+                f"{path}:{number}: the value {problem}; correct or remove the line"
+            ) from None
+        if not equals:
+            raise CanductorError(f"{path}:{number}: there is no = in this line; correct or remove it")
+    return found
+
+
+def _as_text(variables: Mapping[str, Any]) -> str:
+    lines = [f"{name} = {value!r}" for name, value in sorted(variables.items())]
+    return "\n".join([_HEADER, *lines, ""])
+
+
+class _Writer:
+    """Writes the newest text to PATH in a thread of its own; of those that come meanwhile, the last."""
+
+    def __init__(self, path: Path, say: "Any") -> None:
+        self._path = path
+        self._say = say
+        self._changed = threading.Condition()
+        self._text: str | None = None
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="variables", daemon=True)
+        self._thread.start()
+
+    def write(self, text: str) -> None:
+        with self._changed:
+            self._text = text
+            self._changed.notify()
+
+    def close(self) -> None:
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._text is not None or self._closing)
+                text, self._text = self._text, None
+            if text is None:
+                return
+            try:
+                write_whole(self._path, text.encode())
+            except OSError as error:
+                reason = (error.strerror or str(error)).lower()
+                self._say(f"the file of variables {shown_path(str(self._path))} cannot be written: {reason}")

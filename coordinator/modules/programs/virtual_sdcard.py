@@ -1,0 +1,182 @@
+"""[virtual_sdcard]: the job folder as the memory card of old: SDCARD_PRINT_FILE, M20 to M27."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, ToProgram
+from coordinator.gcode.print_control import Recovering
+from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.gcode.parser import WordError
+from coordinator.config.options import GCodeOption, SectionSpec, TextOption
+from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.programs.gcode_macro import GCodeTemplate
+from coordinator.modules.status.print_stats import PrintStats
+from coordinator.modules.words import bounded, flag, needed, parameters
+from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.gcode.interpreter import Job
+
+PATH = TextOption(
+    name="path",
+    help="The job folder, where none is given on the command line; relative to the configuration, ~ is your"
+    " home",
+)
+ON_ERROR = GCodeOption(
+    name="on_error_gcode", help="What is done when a line of a job cannot be carried out", default=""
+)
+_BUSY: Final = "a job is on its way; wait for its end, or cancel it"
+
+
+class VirtualSdcard(Module):
+    """Its commands; the service has the files."""
+
+    SPEC = SectionSpec("Files that are printed", (PATH, ON_ERROR), later=("with_subdirs",))
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.path = Path(build.place.path).parent / Path(build.get(PATH)).expanduser()
+        self.on_error = GCodeTemplate(build, ON_ERROR)
+        self.acts_on_error = bool(build.get(ON_ERROR).strip())
+        self.files: Callable[[], Sequence[tuple[str, int]]] = tuple
+        """Returns names and sizes of the files; by the service. Raises CanductorError."""
+        self.check: Callable[[str], None] = lambda _name: None
+        """Looks whether there is a file of this name; by the service. Raises CanductorError."""
+        self.place: Mapping[str, Value] = {"file_position": 0, "file_size": 0, "progress": 0.0}
+        """How far the job is read; by the service."""
+        self._stats = build.shared(PrintStats)
+        self._selected = ""
+        for name, help_, read, beside in (
+            ("SDCARD_PRINT_FILE", "Print the file FILENAME", self._print, False),
+            ("SDCARD_RESET_FILE", "Forget the file that was printed", self._reset, False),
+            ("M20", "List the files", self._list, False),
+            ("M21", "Say that there are files", self._init, True),
+            ("M23", "Choose a file", self._select, False),
+            ("M24", "Print the chosen file, or let the paused job go on", self._start, True),
+            ("M25", "Pause the job", self._pause, True),
+            ("M26", "Choose where to begin in the file: only S0, its begin", self._seek, False),
+            ("M27", "Tell how far the job is read", self._tell, True),
+            ("RESUME_INTERRUPTED", "Go on with a job that a crash has ended", self._recover, False),
+            ("_ON_ERROR_GCODE", "What is done when a job failed", self._failed, False),
+        ):
+            build.add_command(GCodeCommand(name, help_, read, beside=beside))
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell which file is printed, and how far it is read."""
+        name = self._stats.told["filename"] or None
+        return {
+            **self.place,
+            "file_path": name,
+            "is_active": self._stats.state == "printing",
+        }
+
+    def _print(self, call: Call) -> Reading:
+        values = parameters(call.command, ("FILENAME",))
+        name = needed(call.command, values, "FILENAME").lstrip("/")
+        return ToProgram(lambda job: self._begin(job, name))
+
+    def _begin(self, job: "Job", name: str) -> bool:
+        prints = job.prints
+        if prints is None:
+            job.notice("printing a file", "only a service (canductor run) prints files: it is skipped")
+            return True
+        if prints.job_is_active:
+            raise WordError(_BUSY)
+        self._check(name)
+        prints.start_job(name)
+        return True
+
+    def _check(self, name: str) -> None:
+        try:
+            self.check(name)
+        except CanductorError as error:
+            raise WordError(str(error)) from None
+
+    def _reset(self, call: Call) -> Reading:
+        parameters(call.command, ())
+
+        def act(job: "Job") -> bool:
+            if job.prints is not None and job.prints.job_is_active:
+                raise WordError(_BUSY)
+            self._selected = ""
+            self._stats.forget()
+            return True
+
+        return ToProgram(act)
+
+    def _list(self, _call: Call) -> Reading:
+        try:
+            files = [f"{name} {size}" for name, size in self.files()]
+        except CanductorError as error:
+            raise WordError(str(error)) from None
+        return AtOnce(("Begin file list", *files, "End file list"), kind=ReplyKind.PLAIN)
+
+    def _init(self, _call: Call) -> Reading:
+        return AtOnce(("SD card ok",), kind=ReplyKind.PLAIN)
+
+    def _select(self, call: Call) -> Reading:
+        name = call.command.text.strip().lstrip("/")
+        if not name:
+            raise WordError("M23 names no file; write M23 and its name")
+        self._check(name)
+
+        def act() -> None:
+            self._selected = name
+
+        return AtOnce((f"File selected: {name}",), act, kind=ReplyKind.PLAIN)
+
+    def _start(self, _call: Call) -> Reading:
+        def act(job: "Job") -> bool:
+            if job.prints is not None and job.prints.job_is_active:
+                job.prints.resume_job()
+                return True
+            if not self._selected:
+                raise WordError("M24 comes before a file is chosen; choose one with M23")
+            return self._begin(job, self._selected)
+
+        return ToProgram(act)
+
+    def _pause(self, _call: Call) -> Reading:
+        def act(job: "Job") -> bool:
+            if job.prints is not None:
+                job.prints.pause_job(job)
+            return True
+
+        return ToProgram(act)
+
+    def _seek(self, call: Call) -> Reading:
+        if call.command.words().get("S", "0") not in {"", "0"}:
+            raise WordError(
+                "M26 cannot begin in the middle of a file: temperatures, modes and origin would be missing;"
+                " RESUME_INTERRUPTED goes on with one"
+            )
+        return AtOnce()
+
+    def _tell(self, _call: Call) -> Reading:
+        if self._stats.state not in ("printing", "paused"):
+            return AtOnce(("Not SD printing.",), kind=ReplyKind.PLAIN)
+        place = self.place
+        return AtOnce(
+            (f"SD printing byte {place['file_position']}/{place['file_size']}",), kind=ReplyKind.PLAIN
+        )
+
+    def _recover(self, call: Call) -> Reading:
+        values = parameters(call.command, ("LINE", "HOME", "Z"))
+        line = bounded(call.command, values, "LINE", None, low=1, high=1e9)
+        z_mm = bounded(call.command, values, "Z", None, low=-1e6, high=1e6)
+        how = Recovering(None if line is None else int(line), flag(call.command, values, "HOME"), z_mm)
+
+        def act(job: "Job") -> bool:
+            if job.prints is None:
+                job.notice("RESUME_INTERRUPTED", "only a service (canductor run) keeps a journal of jobs")
+            elif job.prints.job_is_active:
+                raise WordError(_BUSY)
+            else:
+                job.prints.recover_job(how)
+            return True
+
+        return ToProgram(act)
+
+    def _failed(self, call: Call) -> Reading:
+        return self.on_error.lines(call, {})

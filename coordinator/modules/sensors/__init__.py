@@ -1,0 +1,1 @@
+"""Temperature sensors, filament sensors and buttons."""

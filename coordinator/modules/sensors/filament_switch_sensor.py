@@ -1,0 +1,162 @@
+"""[filament_switch_sensor NAME]: a switch that is pressed while there is filament; without it jobs pause."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.config.options import BoolOption, FloatOption, GCodeOption, SectionSpec
+from coordinator.config.pins import PinOption
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.programs.gcode_macro import GCodeTemplate
+from coordinator.modules.pinned import add_pinned
+from coordinator.modules.status.print_stats import PrintStats
+from coordinator.modules.words import flag, needed, one, parameters
+from nodes.devices.button import Button
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+PIN: Final = PinOption(
+    name="switch_pin", help="input of the switch; with filament it is high, with ! low", pullable=True
+)
+PAUSE: Final = BoolOption(
+    name="pause_on_runout",
+    help="whether a job pauses, by PAUSE if there is [pause_resume]; if not, it goes on behind runout_gcode,"
+    " unless that pauses it",
+    default=True,
+)
+RUNOUT: Final = GCodeOption(
+    name="runout_gcode", help="What is done when a job runs out of filament", default=""
+)
+INSERT: Final = GCodeOption(
+    name="insert_gcode", help="What is done when filament comes while no job prints", default=""
+)
+EVENT_DELAY: Final = FloatOption(
+    name="event_delay",
+    help="How long after an event, and after the start, others are passed over",
+    default=3.0,
+    unit="s",
+    minimum=0.0,
+    maximum=1e4,
+)
+LATER: Final = (
+    "pause_delay",
+    "debounce_delay",
+    "immediate_runout_gcode",
+    "smart",
+    "runout_distance",
+    "always_fire_events",
+    "check_on_print_start",
+)
+_RUNOUT: Final = "_FILAMENT_RUNOUT"
+_INSERT: Final = "_FILAMENT_INSERT"
+
+
+class FilamentSwitchSensor(Module):
+    """One sensor."""
+
+    SPEC = SectionSpec(
+        "A switch that tells whether there is filament",
+        (PIN, PAUSE, RUNOUT, INSERT, EVENT_DELAY),
+        later=LATER,
+    )
+    NAMED = True
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.id = build.instance
+        self.enabled = True
+        self.runout = GCodeTemplate(build, RUNOUT)
+        self.insert = GCodeTemplate(build, INSERT)
+        self._pauses = build.get(PAUSE)
+        self._delay_s = build.get(EVENT_DELAY)
+        self._stats = build.shared(PrintStats)
+        self._can_pause = False
+        self._quiet_until_s = 0.0
+        self._live: Live | None = None
+        pin = build.pin(PIN)
+        self.switch = Button(self.name, pin=pin.name, pull=pin.pull, invert=pin.invert)
+        self.switch.on_change = self._changed
+        add_pinned(build, self.switch, pin)
+        build.shared(FilamentSensors)
+
+    def link(self, modules: Modules) -> None:
+        """See whether there is PAUSE."""
+        self._can_pause = modules.knows("PAUSE")
+
+    async def connect(self, live: "Live") -> None:
+        """Act from now on."""
+        self._live = live
+        self._quiet_until_s = live.now_s() + self._delay_s
+
+    def stopped(self, cause: str) -> None:  # noqa: ARG002
+        """Act no more."""
+        self._live = None
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell whether there is filament, and whether that counts."""
+        return {"filament_detected": self.switch.pressed, "enabled": self.enabled}
+
+    def _changed(self, there: bool) -> None:
+        live, prints = self._live, self._stats.state == "printing"
+        if live is None or not self.enabled or live.now_s() < self._quiet_until_s or there is prints:
+            return
+        self._quiet_until_s = live.now_s() + self._delay_s
+        runner = live.machine.runner
+        if runner is None:
+            return
+        if there:
+            runner.run_lines(self.name, [f"{_INSERT} SENSOR={self.id}"], self.insert.text)
+            return
+        live.say(f"{self.name}: there is no filament any more")
+        lines = ["PAUSE"] if self._pauses and self._can_pause else []
+        runner.run_paused(self.name, [*lines, f"{_RUNOUT} SENSOR={self.id}"], stay=self._pauses)
+
+
+class FilamentSensors(Module):
+    """The commands of all."""
+
+    SPEC = SectionSpec("Commands about filament sensors", ())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._all: dict[str, FilamentSwitchSensor] = {}
+        for name, help_, read in (
+            ("QUERY_FILAMENT_SENSOR", "Tell whether SENSOR has filament", self._query),
+            ("SET_FILAMENT_SENSOR", "Let SENSOR count (ENABLE=1) or not (0)", self._set),
+            (_RUNOUT, "What is done when filament runs out", self._runout),
+            (_INSERT, "What is done when filament comes", self._insert),
+        ):
+            build.add_command(GCodeCommand(name, help_, read, beside=True))
+
+    def link(self, modules: Modules) -> None:
+        """Find them."""
+        for name in modules.names(FilamentSwitchSensor):
+            found = modules.find(name, FilamentSwitchSensor)
+            assert found is not None
+            self._all[found.id] = found
+
+    def _sensor(self, call: Call, *others: str) -> tuple[FilamentSwitchSensor, Mapping[str, str]]:
+        given = parameters(call.command, ("SENSOR", *others))
+        return self._all[one(call.command, given, "SENSOR", self._all)], given
+
+    def _query(self, call: Call) -> Reading:
+        sensor, _ = self._sensor(call)
+        found = "detected" if sensor.switch.pressed else "not detected"
+        return AtOnce((f"Filament Sensor {sensor.id}: filament {found}",))
+
+    def _set(self, call: Call) -> Reading:
+        sensor, given = self._sensor(call, "ENABLE")
+        needed(call.command, given, "ENABLE")
+        enabled = flag(call.command, given, "ENABLE")
+
+        def act() -> None:
+            sensor.enabled = enabled
+
+        return AtOnce(act=act)
+
+    def _runout(self, call: Call) -> Reading:
+        return self._sensor(call)[0].runout.lines(call, {})
+
+    def _insert(self, call: Call) -> Reading:
+        return self._sensor(call)[0].insert.lines(call, {})

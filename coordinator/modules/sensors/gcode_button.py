@@ -1,0 +1,94 @@
+"""[gcode_button NAME]: g-code that is run when a button is pressed, or let go."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.config.options import GCodeOption, SectionSpec
+from coordinator.config.pins import PinOption
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.programs.gcode_macro import GCodeTemplate
+from coordinator.modules.pinned import add_pinned
+from coordinator.modules.words import flag, one, parameters
+from nodes.devices.button import Button
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+PIN: Final = PinOption(name="pin", help="input of the button; pressed is high, with ! low", pullable=True)
+PRESS: Final = GCodeOption(name="press_gcode", help="What is done when it is pressed")
+RELEASE: Final = GCodeOption(name="release_gcode", help="What is done when it is let go", default="")
+LATER: Final = ("analog_range", "analog_pullup_resistor", "debounce_delay")
+_COMMAND: Final = "_BUTTON"
+
+
+class GCodeButton(Module):
+    """One button; a service runs its lines as those of a client."""
+
+    SPEC = SectionSpec("A button that runs g-code", (PIN, PRESS, RELEASE), later=LATER)
+    NAMED = True
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.id = build.instance
+        self.press = GCodeTemplate(build, PRESS)
+        self.release = GCodeTemplate(build, RELEASE)
+        pin = build.pin(PIN)
+        self._button = Button(self.name, pin=pin.name, pull=pin.pull, invert=pin.invert)
+        self._button.on_change = self._changed
+        self._live: Live | None = None
+        add_pinned(build, self._button, pin)
+        build.shared(GCodeButtons)
+
+    async def connect(self, live: "Live") -> None:
+        """Act from now on."""
+        self._live = live
+
+    def stopped(self, cause: str) -> None:  # noqa: ARG002
+        """Act no more."""
+        self._live = None
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell whether it is pressed."""
+        return {"state": "PRESSED" if self._button.pressed else "RELEASED"}
+
+    def _changed(self, pressed: bool) -> None:
+        template = self.press if pressed else self.release
+        if self._live is None or not template.text.strip():
+            return
+        runner = self._live.machine.runner
+        if runner is None:
+            self._live.say(f"[{self.name}] does nothing: only a service (canductor run) runs its g-code")
+            return
+        runner.run_lines(self.name, [f"{_COMMAND} BUTTON={self.id} PRESSED={pressed:d}"], template.text)
+
+
+class GCodeButtons(Module):
+    """The commands of all."""
+
+    SPEC = SectionSpec("Commands about buttons", ())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._all: dict[str, GCodeButton] = {}
+        build.add_command(
+            GCodeCommand("QUERY_BUTTON", "Tell whether BUTTON is pressed", self._query, beside=True)
+        )
+        build.add_command(GCodeCommand(_COMMAND, "What a button does", self._run, beside=True))
+
+    def link(self, modules: Modules) -> None:
+        """Find them."""
+        for name in modules.names(GCodeButton):
+            found = modules.find(name, GCodeButton)
+            assert found is not None
+            self._all[found.id] = found
+
+    def _query(self, call: Call) -> Reading:
+        name = one(call.command, parameters(call.command, ("BUTTON",)), "BUTTON", self._all)
+        return AtOnce((f"{name}: {self._all[name].status()['state']}",))
+
+    def _run(self, call: Call) -> Reading:
+        given = parameters(call.command, ("BUTTON", "PRESSED"))
+        found = self._all[one(call.command, given, "BUTTON", self._all)]
+        pressed = flag(call.command, given, "PRESSED")
+        return (found.press if pressed else found.release).lines(call, {})

@@ -1,0 +1,69 @@
+"""[temperature_sensor NAME]: a temperature that is only watched."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from coordinator.config.options import SectionSpec, TextOption
+from coordinator.modules.base import Build, Modules, Value
+from coordinator.modules.sensors.free_temperatures import find_source
+from coordinator.modules.heaters.heaters import Heaters
+from coordinator.config.sections.sensor_options import FREE_SENSOR_OPTIONS, LATER_SENSOR_OPTIONS, SENSOR_OPTIONS
+from coordinator.modules.sensors.temperature_input import SensorModule
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+GCODE_ID: Final = TextOption(
+    name="gcode_id",
+    help="what M105 calls it; without one it does not tell it",
+    pattern=r"[A-Za-z][A-Za-z0-9_]*",
+    pattern_rule="a letter, and letters and digits",
+)
+
+
+class TemperatureSensor(SensorModule):
+    """A sensor of no heater."""
+
+    NAMED: ClassVar = True
+    SPEC: ClassVar = SectionSpec(
+        help="A temperature that is watched; with min_temp or max_temp its node stops all outside them",
+        options=(*SENSOR_OPTIONS, *FREE_SENSOR_OPTIONS, GCODE_ID),
+        later=LATER_SENSOR_OPTIONS,
+    )
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.input = find_source(build, limits_needed=False)
+        self.input.on_measured = self._measured
+        self._extremes: tuple[float, float] | None = None
+        build.shared(Heaters).add_sensor(self.input, build.find(GCODE_ID) or "")
+
+    def link(self, modules: Modules) -> None:
+        """Find the sensor."""
+        self.input.link(modules)
+
+    async def connect(self, live: "Live") -> None:
+        """Begin to measure."""
+        await self.input.connect(live)
+
+    def stopped(self, cause: str) -> None:
+        """Measure no more."""
+        self.input.end(cause)
+
+    def close(self) -> None:
+        """Measure no more."""
+        self.input.end("the machine was closed")
+
+    def _measured(self, _at_s: float, celsius: float) -> None:
+        low, high = self._extremes or (celsius, celsius)
+        self._extremes = min(low, celsius), max(high, celsius)
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell the temperature, and the lowest and highest since the start."""
+        celsius = self.input.celsius
+        low, high = self._extremes or (None, None)
+        return {
+            "temperature": None if celsius is None else round(celsius, 2),
+            "measured_min_temp": None if low is None else round(low, 2),
+            "measured_max_temp": None if high is None else round(high, 2),
+        }

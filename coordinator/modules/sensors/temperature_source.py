@@ -1,0 +1,124 @@
+"""A temperature that is measured again and again, wherever it comes from, and those who wait for it."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from coordinator.modules.base import Modules
+from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    import asyncio  # planning waits for nothing
+
+    from coordinator.runtime.module_context import Live
+
+SILENT_S: Final = 10.0
+"""Who waits for a measurement that should come three times a second gives up after so long; a host may stand
+still for a while."""
+MAX_WAITERS: Final = 64
+BAD_IN_A_ROW: Final = 6
+"""So many measurements outside the limits, where no node watches over them, stop the machine."""
+
+OnMeasured = Callable[[float, float], None]
+"""Print time in s, °C."""
+
+
+def _ignore(_at_s: float, _celsius: float) -> None:
+    pass
+
+
+class TemperatureSource:
+    """The temperature of section NAME, which has to be MIN_C to MAX_C.
+
+    ``on_measured`` is called with every measurement once it is connected.
+    """
+
+    def __init__(self, name: str, min_c: float, max_c: float) -> None:
+        self.name = name
+        self.min_c, self.max_c = min_c, max_c
+        self.celsius: float | None = None
+        """The last measurement; None before the first."""
+        self.sound_c: float | None = None
+        """The last measurement within the limits; one outside is of a broken wire, or of noise."""
+        self.on_measured: OnMeasured = _ignore
+        self.ratio: float | None = None
+        """What its converter read last, 0 to 1; None: nothing yet, or there is none."""
+        self._live: Live | None = None
+        self._looks = 0
+        self._bad = 0
+        self._waiting: list[asyncio.Future[None]] = []
+        self._over: str | None = None
+
+    def link(self, modules: Modules) -> None:
+        """Find what belongs to it; raises ConfigError."""
+
+    async def connect(self, live: "Live") -> None:
+        """Begin to tell what is measured."""
+        self._live = live
+
+    def end(self, cause: str) -> None:
+        """End all waiting for it, because of CAUSE."""
+        self._over = cause
+        self._live = None
+        self.wake()
+
+    @property
+    def node(self) -> str:
+        """The node it is on; empty: on none."""
+        return ""
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether the last measurement is within the limits."""
+        return self.celsius is not None and self.celsius == self.sound_c
+
+    def missed(self) -> int:
+        """Return how often this was called since the last measurement."""
+        self._looks += 1
+        return self._looks - 1
+
+    async def next(self) -> None:
+        """Wait for the next measurement; raises CanductorError when there will be none."""
+        import asyncio  # noqa: PLC0415
+
+        if self._over is not None:
+            raise CanductorError(self._over)
+        if len(self._waiting) >= MAX_WAITERS:
+            raise CanductorError(f"more than {MAX_WAITERS} wait for the temperature of {self.name}; end some")
+        waiter = asyncio.get_running_loop().create_future()
+        self._waiting.append(waiter)
+        try:
+            async with asyncio.timeout(SILENT_S):
+                await waiter
+        except TimeoutError:
+            there = f"; is its node {self.node} there?" if self.node else ""
+            raise CanductorError(f"the sensor of [{self.name}] says nothing any more{there}") from None
+        finally:
+            if waiter in self._waiting:
+                self._waiting.remove(waiter)
+        if self._over is not None:
+            raise CanductorError(self._over)
+
+    def _take(self, celsius: float, at_s: Callable[["Live"], float]) -> None:
+        """Take a measurement; AT_S tells its print time on a machine that lives."""
+        self.celsius = celsius
+        if self.min_c <= celsius <= self.max_c:
+            self.sound_c = celsius
+        self._looks = 0
+        if self._live is not None:
+            self.on_measured(at_s(self._live), celsius)
+        self.wake()
+
+    def _watch(self, live: "Live", celsius: float) -> None:
+        """Stop the machine when CELSIUS stays outside the limits: for sensors that no node watches."""
+        self._bad = 0 if self.min_c <= celsius <= self.max_c else self._bad + 1
+        if self._bad == BAD_IN_A_ROW:
+            live.stop(
+                f"[{self.name}] tells {celsius:.0f} °C, outside its min_temp of {self.min_c:g} and max_temp"
+                f" of {self.max_c:g} °C; find out why, or correct these"
+            )
+
+    def wake(self) -> None:
+        """Let all who wait for a measurement go on and look again."""
+        for waiter in self._waiting:
+            if not waiter.done():
+                waiter.set_result(None)

@@ -1,0 +1,1 @@
+"""What macros and front ends see of the machine."""

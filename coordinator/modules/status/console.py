@@ -1,0 +1,48 @@
+"""What people at a console ask a machine: HELP, STATUS, M115."""
+
+from typing import Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.config.options import SectionSpec
+from coordinator.modules.base import Build, Module, Modules
+from coordinator.modules.status.print_stats import PrintStats
+
+NAME: Final = "canductor"
+
+
+class Console(Module):
+    """The answers."""
+
+    SPEC = SectionSpec("What a console asks", ())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._modules: Modules | None = None
+        for name, help_, read in (
+            ("HELP", "List the commands there are", self._help),
+            ("STATUS", "Tell how the machine is", self._status),
+            ("M115", "Tell what runs the machine", self._identify),
+        ):
+            build.add_command(GCodeCommand(name, help_, read, beside=True))
+
+    def link(self, modules: Modules) -> None:
+        """Remember who there is."""
+        self._modules = modules
+
+    def _help(self, call: Call) -> Reading:
+        call.parameters()
+        helps = {} if self._modules is None else self._modules.helps
+        return AtOnce(tuple(f"{name}: {helps[name]}" for name in sorted(helps) if not name.startswith("_")))
+
+    def _status(self, call: Call) -> Reading:
+        call.parameters()
+        stats = None if self._modules is None else self._modules.find("print_stats", PrintStats)
+        if stats is None or stats.state not in ("printing", "paused"):
+            return AtOnce(("ready",))
+        return AtOnce((f"{stats.state} {stats.told['filename']}",))
+
+    def _identify(self, _call: Call) -> Reading:
+        from importlib.metadata import version  # noqa: PLC0415 (start-up time: it draws in the mail parser)
+
+        return AtOnce((f"FIRMWARE_NAME:{NAME} FIRMWARE_VERSION:{version(NAME)}",), kind=ReplyKind.PLAIN)

@@ -1,0 +1,63 @@
+"""[display_status]: what programs say about themselves: M117 and SET_DISPLAY_TEXT, M73."""
+
+from collections.abc import Mapping
+from typing import Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.parser import WordError, number
+from coordinator.config.options import SectionSpec
+from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.words import parameters
+
+TEXT_MAX: Final = 500
+"""Characters of a message."""
+
+
+class DisplayStatus(Module):
+    """A message, and how far the program believes to be."""
+
+    SPEC = SectionSpec("What programs show: a message (M117) and their progress (M73)", ())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._message: str | None = None
+        self._progress: float | None = None
+        for name, help_, read in (
+            ("M117", "Show a message", self._show),
+            ("SET_DISPLAY_TEXT", "Show MSG; without it, nothing", self._set),
+            ("M73", "Tell how many percent of the program are done", self._tell),
+        ):
+            build.add_command(GCodeCommand(name, help_, read, beside=True))
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell the message, and the progress of 0 to 1; None: not told."""
+        return {"message": self._message, "progress": self._progress}
+
+    def job_begins(self) -> None:
+        """Forget how far another program was."""
+        self._progress = None
+
+    def _show(self, call: Call) -> Reading:
+        return self._message_is(call.command.text.strip())
+
+    def _set(self, call: Call) -> Reading:
+        return self._message_is(parameters(call.command, ("MSG",)).get("MSG", ""))
+
+    def _message_is(self, text: str) -> Reading:
+        def act() -> None:
+            self._message = text[:TEXT_MAX] or None
+
+        return AtOnce(act=act)
+
+    def _tell(self, call: Call) -> Reading:
+        words = call.command.words()
+        if "P" not in words:
+            return AtOnce()  # R alone: the minutes that are left
+        percent = number("M73", words, "P")
+        if not 0 <= percent <= 100:
+            raise WordError(f"P of M73 is {percent:g} %; 0 to 100 % are possible")
+
+        def act() -> None:
+            self._progress = percent / 100
+
+        return AtOnce(act=act)

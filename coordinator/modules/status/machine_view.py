@@ -1,0 +1,106 @@
+"""What macros see of the machine besides its modules: nodes, the computer, the commands there are."""
+
+import os
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.modules.base import Modules
+    from coordinator.runtime.module_context import Live
+    from nodes.node.node import Node
+
+_MEMORY: Final = Path("/proc/meminfo")
+
+
+def machine_view(live: "Live | None") -> Mapping[str, Mapping[str, object]]:
+    """Return it by name; on the control loop. Without LIVE nothing is connected: a program is planned."""
+    nodes = {} if live is None else live.machine.nodes
+    stopped = None if live is None else live.machine.stopped
+    runner = None if live is None else live.machine.runner
+    return {
+        **{name if name == "mcu" else f"mcu {name}": _node(node) for name, node in nodes.items()},
+        "system_stats": _Computer(),
+        "webhooks": {
+            "state": "ready" if stopped is None else "shutdown",
+            "state_message": "Printer is ready" if stopped is None else str(stopped),
+        },
+        # As if there were the section: macros ask whether anything goes on.
+        "idle_timeout": {
+            "state": "Ready" if runner is not None and not runner.busy else "Printing",
+            "printing_time": 0.0,
+        },
+    }
+
+
+def _node(node: "Node") -> Mapping[str, object]:
+    try:
+        dictionary = node.dictionary
+    except CanductorError:  # lost before it was known
+        return {"mcu_version": "", "mcu_build_versions": "", "mcu_constants": {}, "last_stats": {}}
+    load = node.load
+    stats = (
+        {"freq": node.clock_freq_hz}
+        if load is None
+        else {
+            "freq": node.clock_freq_hz,
+            "mcu_awake": round(load.awake, 4),
+            "mcu_task_avg": load.task_s,
+        }
+    )
+    return {
+        "last_stats": stats,
+        "mcu_version": dictionary.version,
+        "mcu_build_versions": dictionary.build_versions,
+        "mcu_constants": dictionary.constants,
+    }
+
+
+class Commands(Mapping[str, Any]):
+    """``printer.gcode.commands``: what MODULES and the machine itself have programs know."""
+
+    def __init__(self, modules: "Modules") -> None:
+        self._modules = modules
+
+    def __getitem__(self, name: str) -> object:
+        if name != "commands":
+            raise KeyError(name)
+        return {command: {"help": text} for command, text in self._modules.helps.items()}
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(("commands",))
+
+    def __len__(self) -> int:
+        return 1
+
+
+class _Computer(Mapping[str, Any]):
+    """``printer.system_stats``, looked at when it is asked for."""
+
+    def __getitem__(self, name: str) -> object:
+        if name == "sysload":
+            return round(os.getloadavg()[0], 3)
+        if name == "cputime":
+            return round(time.process_time(), 3)
+        if name == "memavail":
+            return available_kb()
+        raise KeyError(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(("sysload", "cputime", "memavail"))
+
+    def __len__(self) -> int:
+        return 3
+
+
+def available_kb() -> int:
+    """Return how much memory programs may still get, kB; 0: not known."""
+    try:
+        with _MEMORY.open(encoding="ascii") as file:
+            found = [line.split()[1] for line in file if line.startswith("MemAvailable:")]
+    except OSError:
+        return 0
+    return int(found[0]) if found else 0

@@ -1,0 +1,54 @@
+"""GET_POSITION: where the machine is in all frames, from what the nodes count to the program's numbers."""
+
+from typing import TYPE_CHECKING
+
+from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.status import frames
+from coordinator.config.options import SectionSpec
+from coordinator.modules.base import Build, Module
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_context import Live
+
+
+class Positions(Module):
+    """The command."""
+
+    SPEC = SectionSpec(help="Positions", options=())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self._live: Live | None = None
+        build.add_command(
+            GCodeCommand(
+                "GET_POSITION",
+                "Tell where the machine is in all frames; beside a job in those of its program",
+                self._read,
+                beside=True,
+            )
+        )
+
+    async def connect(self, live: "Live") -> None:
+        """Take over the machine."""
+        self._live = live
+
+    def _read(self, call: Call) -> Reading:
+        told = frames(call.figures())
+        if call.beside:
+            return AtOnce(told)
+        return AtRest(lambda: self._tell(told), Done(told))
+
+    async def _tell(self, told: tuple[str, ...]) -> Done:
+        """Answer with what the nodes count, what follows from that, and what the program was TOLD."""
+        assert self._live is not None
+        machine = self._live.machine
+        counts = await machine.stepper_positions()
+        places = machine.rails.places(counts)
+        head = machine.rails.head(places)
+        mcu = " ".join(f"{name}:{count}" for name, count in counts.items())
+        stepper = " ".join(f"{name}:{place:.6f}" for name, place in places.items())
+        unknown = "unknown; home the machine with G28"
+        kinematic = (
+            unknown if head is None else " ".join(f"{a}:{v:.6f}" for a, v in zip("XYZ", head, strict=True))
+        )
+        return Done((f"mcu: {mcu}", f"stepper: {stepper or unknown}", f"kinematic: {kinematic}", *told))

@@ -1,0 +1,77 @@
+"""``printer.print_stats``: how the job is, for macros and front ends; SET_PRINT_STATS_INFO.
+
+A service tells it; where there is none, nothing is ever printed.
+"""
+
+from collections.abc import Mapping
+from typing import Final
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.config.options import SectionSpec
+from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.words import bounded, parameters
+
+_LAYERS_MAX: Final = 1e6
+NOTHING: Final[Mapping[str, Value]] = {
+    "state": "standby",
+    "filename": "",
+    "total_duration": 0.0,
+    "print_duration": 0.0,
+    "filament_used": 0.0,
+    "message": "",
+}
+
+
+class PrintStats(Module):
+    """What is known of the job; shared by all that look at it."""
+
+    SPEC = SectionSpec("How the job is", ())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        self.name = "print_stats"
+        self.told: Mapping[str, Value] = NOTHING
+        """By the service; replaced, never changed."""
+        self._total: int | None = None
+        self._current: int | None = None
+        build.add_command(
+            GCodeCommand(
+                "SET_PRINT_STATS_INFO",
+                "Tell TOTAL_LAYER and CURRENT_LAYER of the job",
+                self._set,
+                beside=True,
+            )
+        )
+
+    @property
+    def state(self) -> str:
+        """standby, printing, paused, complete, cancelled or error."""
+        return str(self.told["state"])
+
+    def job_begins(self) -> None:
+        """Forget layers."""
+        self._total = self._current = None
+
+    def forget(self) -> None:
+        """Forget a job that has ended; one that has not, the service tells again."""
+        self.told = NOTHING
+        self.job_begins()
+
+    def status(self) -> Mapping[str, Value]:
+        """Tell all."""
+        layers: dict[str, Value] = {"total_layer": self._total, "current_layer": self._current}
+        return {**self.told, "info": layers}
+
+    def _set(self, call: Call) -> Reading:
+        values = parameters(call.command, ("TOTAL_LAYER", "CURRENT_LAYER"))
+        total = bounded(call.command, values, "TOTAL_LAYER", None, low=0, high=_LAYERS_MAX)
+        current = bounded(call.command, values, "CURRENT_LAYER", None, low=0, high=_LAYERS_MAX)
+
+        def act() -> None:
+            if total is not None and total != self._total:
+                self._total = int(total) or None
+                self._current = None if self._total is None else 0
+            if current is not None:
+                self._current = int(current) if self._total is None else min(int(current), self._total)
+
+        return AtOnce(act=act)

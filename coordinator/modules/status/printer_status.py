@@ -1,0 +1,161 @@
+"""What macros see as ``printer``: the status of all modules, the configuration, and the moves read so far.
+
+Macros are rendered where programs are read, beside the control loop that modules live on. So the loop is
+asked for everybody's status, once for each rendering that looks at one; a loop that is late gets no more
+than PATIENCE_S, and the status it gave last is used.
+"""
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from coordinator.gcode.commands import Call
+from coordinator.config.options import SectionSpec
+from coordinator.modules.status.absent_status import absent_statuses
+from coordinator.modules.base import Build, Module, Modules
+from coordinator.modules.status.config_view import ConfigView
+from coordinator.modules.status.machine_view import Commands, machine_view
+from coordinator.modules.status.print_stats import PrintStats
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from jinja2 import ChainableUndefined
+
+    from coordinator.runtime.module_context import Live
+
+PATIENCE_S: Final = 0.2
+Shown = Mapping[str, Mapping[str, object]]
+
+
+class PrinterStatus(Module):
+    """Gathers it; shared by all who render."""
+
+    SPEC = SectionSpec("What macros see of the machine", ())
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        build.shared(PrintStats)
+        self._modules: Modules | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._loop_thread = 0
+        self._last: Shown = {}
+        self._live: Live | None = None
+
+    def link(self, modules: Modules) -> None:
+        """Remember who there is."""
+        self._modules = modules
+
+    async def connect(self, live: "Live") -> None:
+        """Ask the loop from now on."""
+        import asyncio  # noqa: PLC0415 (start-up time)
+
+        self._live = live
+        self._loop, self._loop_thread = asyncio.get_running_loop(), threading.get_ident()
+
+    def close(self) -> None:
+        """Ask the loop no more."""
+        self._loop = self._live = None
+
+    def call_remote(self, name: str, values: Mapping[str, object]) -> bool:
+        """Call clients that registered the method NAME; return whether there are any. From any thread."""
+        live = self._live
+        runner = None if live is None else live.machine.runner
+        if live is None or runner is None or name not in runner.remote_methods:
+            return False
+        live.soon_on_loop(lambda: runner.call_remote(name, values))
+        return True
+
+    def view(self, call: Call) -> "PrinterView":
+        """Return ``printer`` for a rendering of CALL."""
+        return PrinterView(self._look, call.figures)
+
+    def _look(self) -> Shown:
+        modules, loop = self._modules, self._loop
+        if modules is None:
+            return {}
+        if loop is None or threading.get_ident() == self._loop_thread:
+            return self._every(modules)
+        seen = threading.Event()
+
+        def take() -> None:
+            self._last = self._every(modules)
+            seen.set()
+
+        try:
+            loop.call_soon_threadsafe(take)
+        except RuntimeError:  # it has ended meanwhile
+            return self._last
+        seen.wait(PATIENCE_S)
+        return self._last
+
+    def _every(self, modules: Modules) -> Shown:
+        told: dict[str, Mapping[str, object]] = {"gcode": Commands(modules), **machine_view(self._live)}
+        # A section that has nothing to tell is there nevertheless: macros ask whether others are.
+        told.update(absent_statuses(modules.config))
+        told.update((name, {}) for name in modules.names(Module) if name in modules.config)
+        told.update((name, self._for_macros(status)) for name, status in modules.status().items())
+        told["configfile"] = ConfigView(modules.config, modules.settings, told.get("configfile", {}))
+        return told
+
+    def _for_macros(self, status: Mapping[str, object]) -> Mapping[str, object]:
+        """Return STATUS with numbers that macros can compare, also where nothing was measured yet.
+
+        A program that is only planned takes it for granted that all is hot.
+        """
+        if "temperature" not in status:
+            return status
+        planned = {"can_extrude": True} if self._live is None and "can_extrude" in status else {}
+        celsius = status["temperature"]
+        return {**status, **planned, "temperature": 0.0 if celsius is None else celsius}
+
+
+class PrinterView(Mapping[str, Any]):
+    """The status by name, looked at when it is first asked for; then it stays as it is."""
+
+    def __init__(self, look: Callable[[], Shown], figures: Callable[[], Shown]) -> None:
+        self._look = look
+        self._figures = figures
+        self._all: Shown | None = None
+
+    def __getitem__(self, name: str) -> Mapping[str, object]:
+        return self._every()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._every())
+
+    def __len__(self) -> int:
+        return len(self._every())
+
+    def _every(self) -> Shown:
+        if self._all is None:
+            seen = {name: _copy(status) for name, status in self._look().items()}
+            figures = self._figures()
+            every = {**seen, **{name: {**seen.get(name, {}), **told} for name, told in figures.items()}}
+            self._all = {
+                name: Section(name, status) if isinstance(status, dict) else status
+                for name, status in every.items()
+            }
+        return self._all
+
+
+class Section(dict[str, Any]):
+    """The status of a section: what it does not tell is undefined, and so is all of that."""
+
+    def __init__(self, name: str, status: Mapping[str, Any]) -> None:
+        super().__init__(status)
+        self._name = name
+
+    def __missing__(self, field: str) -> "ChainableUndefined":
+        from jinja2 import ChainableUndefined  # noqa: PLC0415 (planning without macros needs none)
+
+        return ChainableUndefined(f"printer[{self._name!r}] has no {field!r}")
+
+
+def _copy(value: Any) -> Any:
+    """Return VALUE with lists and dicts of its own: a macro may change what it gets."""
+    if isinstance(value, dict):
+        return {key: _copy(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_copy(inner) for inner in value]
+    return value

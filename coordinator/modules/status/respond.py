@@ -1,0 +1,48 @@
+"""[respond]: RESPOND shows a line to the user, with a prefix that tells its kind; so does M118."""
+
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.reply_kinds import kind_of_line
+from coordinator.gcode.parser import WordError, quoted
+from coordinator.config.options import ChoiceOption, SectionSpec, TextOption
+from coordinator.modules.base import Build, Module
+from coordinator.modules.words import parameters
+
+PREFIXES = {"echo": "echo:", "command": "//", "error": "!!"}
+TYPE = ChoiceOption(
+    name="default_type", help="Kind of a line without one", default="echo", choices=tuple(PREFIXES)
+)
+PREFIX = TextOption(name="default_prefix", help="Stands before a line, instead of that of default_type")
+
+
+class Respond(Module):
+    """Its commands."""
+
+    SPEC = SectionSpec("Lines that programs show to the user", (TYPE, PREFIX), later=("enable_respond",))
+
+    def __init__(self, build: Build) -> None:
+        super().__init__(build)
+        usual = PREFIXES[build.get(TYPE)]
+        self._prefix = build.find(PREFIX) or usual
+        build.add_command(GCodeCommand("M118", "Show a line", self._echo, beside=True))
+        build.add_command(
+            GCodeCommand("RESPOND", "Show MSG, after PREFIX or that of TYPE", self._respond, beside=True)
+        )
+
+    def _echo(self, call: Call) -> Reading:
+        return _line(f"{self._prefix} {call.command.text.strip()}")
+
+    def _respond(self, call: Call) -> Reading:
+        values = parameters(call.command, ("TYPE", "PREFIX", "MSG"))
+        prefix = self._prefix
+        if "TYPE" in values:
+            kind = values["TYPE"].lower()
+            if kind == "echo_no_space":
+                return _line(PREFIXES["echo"] + values.get("MSG", ""))
+            if kind not in PREFIXES:
+                raise WordError(f"TYPE of RESPOND is {quoted(kind)}; there are {' '.join(PREFIXES)}")
+            prefix = PREFIXES[kind]
+        return _line(f"{values.get('PREFIX', prefix)} {values.get('MSG', '')}")
+
+
+def _line(line: str) -> AtOnce:
+    return AtOnce((line,), kind=kind_of_line(line))

@@ -1,0 +1,371 @@
+"""From G-code text to trapezoids: the Python skin of the look-ahead and the G-code hot path.
+
+Text goes in by ``feed``, trapezoids come out by ``take`` and ``release``; everything between runs in C
+without the interpreter lock. Lengths in mm, times in s, speeds in mm/s, axes in the order X Y Z E.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+from coordinator.motion.planner._planner import ffi, lib
+from coordinator.motion.planner.dynamics import Dynamics
+from coordinator.motion.planner.language import Language, Plane, gcode_words
+from coordinator.motion.planner.values import (
+    SPEED_LIMITS,
+    Fault,
+    FaultKind,
+    Feed,
+    FeedStatus,
+    Position,
+    Slowed,
+    Trapezoids,
+    check_limits,
+    check_number,
+)
+from coordinator.motion.specs import MotionLimits
+
+__all__ = [
+    "AXIS_LETTERS",
+    "DEFAULT_SPEED_MM_S",
+    "MOVE_LETTERS",
+    "RING_TRAPEZOIDS",
+    "Fault",
+    "FaultKind",
+    "Feed",
+    "FeedStatus",
+    "Planner",
+    "Position",
+    "Slowed",
+    "Trapezoids",
+]
+
+AXIS_LETTERS = "XYZE"
+MOVE_LETTERS = "XYZEF"
+_STATUS = tuple(FeedStatus)
+DEFAULT_SPEED_MM_S = 25.0
+"""Speed of moves before the first F word."""
+RING_TRAPEZOIDS = int(lib.PLANNER_RING)
+"""Most trapezoids that can wait for ``take``."""
+
+
+class Planner(Language, Dynamics):
+    """Plans moves with look-ahead; begins at standstill at POSITION, print time 0, nothing homed.
+
+    Not thread-safe; ``feed`` releases the interpreter lock while C works. Raises ValueError when a limit is
+    not a number it can calculate with.
+    """
+
+    def __init__(self, limits: MotionLimits, *, position: Position = (0.0, 0.0, 0.0, 0.0)) -> None:
+        check_limits(limits)
+        self._limits: Any = ffi.new(
+            "struct planner_limits *",
+            {f.name: getattr(limits, f.name) for f in fields(limits) if f.name != "range_options"},
+        )
+        self._core: Any = ffi.new("struct planner *")
+        self._memory: Any = ffi.buffer(self._core)
+        self._address = int(ffi.cast("uintptr_t", self._core))
+        lib.planner_init(self._core, self._limits, position)
+        self._state: Any = ffi.new(
+            "struct gcode_state *",
+            {
+                "position": position,
+                "unit": 1.0,
+                "speed": DEFAULT_SPEED_MM_S,
+                "speed_factor": 1.0,
+                "extrude_factor": 1.0,
+            },
+        )
+        self._offset: Any = ffi.new("size_t *")
+        self._count: Any = ffi.new("uint32_t *")
+        Language.__init__(self, self._state, self._core)
+        Dynamics.__init__(self, limits, self._core)
+
+    # ---- Text in ----
+
+    def feed(self, data: bytes | bytearray | memoryview, start: int, end: int, *, final: bool) -> Feed:
+        """Plan the lines of DATA[start:end] up to the first that is not the planner's.
+
+        FINAL: no more text comes behind END, so the last line may lack its line feed.
+        """
+        if not 0 <= start <= end <= len(data):
+            raise ValueError(f"{start}..{end} is not a range of {len(data)} bytes")
+        self._offset[0] = start
+        with ffi.from_buffer(data) as text:
+            status = lib.gcode_feed(self._state, self._core, text, end, self._offset, final)
+        return Feed(_STATUS[status], self._offset[0], self._state.lines + 1)
+
+    def line_done(self) -> None:
+        """Count a line that the caller consumed."""
+        self._state.lines += 1
+
+    def move(self, words: Mapping[str, float]) -> FeedStatus:
+        """Act on a G1 with these WORDS (letters of MOVE_LETTERS); NEED_DATA says that it was done."""
+        if not lib.planner_ready(self._core):
+            return FeedStatus.FULL
+        refused = lib.gcode_move(self._state, self._core, gcode_words(words))
+        return FeedStatus.LIMIT if refused else FeedStatus.NEED_DATA
+
+    def move_to(self, target: Sequence[float], speed_mm_s: float) -> FeedStatus:
+        """Move to TARGET (X Y Z E, mm) in the machine's frame, whatever the program's frame and modes are.
+
+        Answers as ``move``; the program's own position follows.
+        """
+        if not lib.planner_ready(self._core):
+            return FeedStatus.FULL
+        if lib.planner_add(self._core, target, speed_mm_s):
+            return FeedStatus.LIMIT
+        self._state.position = self.toolhead_position
+        return FeedStatus.NEED_DATA
+
+    @property
+    def fault(self) -> Fault:
+        """Why the last refused move was refused."""
+        fault = self._core.fault
+        options = (*self.limits.range_options, "")[fault.axis]
+        kind, axis = FaultKind(fault.kind), AXIS_LETTERS[fault.axis]
+        return Fault(kind, axis, fault.value, fault.low, fault.high, options)
+
+    def end_exclusion(self, retracted_mm: float, speed_mm_s: float) -> FeedStatus:
+        """Make moves again, after some were left out: the program goes on from where the filament is.
+
+        RETRACTED_MM: by how much it was drawn back when they began to be; it gets drawn back by as much as
+        the program has it now. Answers as ``move``.
+        """
+        if not lib.planner_ready(self._core):
+            return FeedStatus.FULL
+        change = retracted_mm - self.retracted_mm
+        if abs(change) > 1e-9:
+            x, y, z, e = self.toolhead_position
+            if lib.planner_add(self._core, (x, y, z, e + change), speed_mm_s):
+                return FeedStatus.LIMIT
+        self.match_filament()
+        self.excluded = False
+        return FeedStatus.NEED_DATA
+
+    # ---- Trapezoids out ----
+
+    def plan(self) -> None:
+        """Hand out all that no later move can change; ``feed`` does so when it runs out of data."""
+        lib.planner_plan(self._core)
+
+    def take(self) -> Trapezoids:
+        """Return the oldest trapezoids that lie in one piece, without copying them; 0 when none waits."""
+        pointer = lib.planner_peek(self._core, self._count)
+        offset = int(ffi.cast("uintptr_t", pointer)) - self._address
+        return Trapezoids(pointer, self._count[0], self._memory, offset)
+
+    def release(self, count: int) -> None:
+        """Give the oldest COUNT trapezoids back."""
+        if count < 0 or lib.planner_release(self._core, count):
+            raise ValueError(f"{count} trapezoids released, but fewer were waiting")
+
+    # ---- Standstill ----
+
+    def flush(self) -> bool:
+        """Plan all moves to a standstill; False when the ring is full (take some, call again)."""
+        return bool(lib.planner_flush(self._core))
+
+    @property
+    def at_standstill(self) -> bool:
+        """Whether every move is handed out and the last ends at rest."""
+        return bool(self._core.head == self._core.tail)
+
+    def dwell(self, seconds: float) -> None:
+        """Stand still for SECONDS more; ``flush`` first."""
+        self._standing(lib.planner_wait(self._core, check_number("the dwell", seconds, 0)))
+
+    def begin_at(self, print_time_s: float) -> None:
+        """Begin the next move at PRINT_TIME_S, at the earliest ``print_time_end_s``; ``flush`` first."""
+        self._standing(lib.planner_begin_at(self._core, check_number("the print time", print_time_s, 0)))
+
+    def set_position(self, position: Sequence[float]) -> None:
+        """Declare that the machine stands at POSITION (X Y Z E); ``flush`` first."""
+        for value in position:
+            check_number("the position", value, -1e9, 1e9)
+        self._standing(lib.planner_set_position(self._core, position))
+        self._state.position = position
+
+    @staticmethod
+    def _standing(failed: int) -> None:
+        if failed:
+            raise RuntimeError("moves are still queued: flush() first")
+
+    # ---- Time ----
+
+    @property
+    def print_time_end_s(self) -> float:
+        """Print time at which the last trapezoid handed out ends."""
+        return float(self._core.print_time)
+
+    @property
+    def plan_until_s(self) -> float:
+        """Print time beyond which ``feed`` answers FULL although the ring has room; for streaming."""
+        return float(self._core.plan_until)
+
+    @plan_until_s.setter
+    def plan_until_s(self, print_time_s: float) -> None:
+        if math.isnan(print_time_s):
+            raise ValueError("plan_until_s is not a number")
+        self._core.plan_until = print_time_s
+
+    # ---- Where things are ----
+
+    @property
+    def toolhead_position(self) -> Position:
+        """End of the last move added, in the machine's frame."""
+        x, y, z, e = self._core.position
+        return (x, y, z, e)
+
+    @property
+    def gcode_position(self) -> Position:
+        """Last target in the frame and units of the G-code program."""
+        s = self._state
+        scale = (s.unit, s.unit, s.unit, s.unit * s.extrude_factor)
+        x, y, z, e = ((s.position[i] - s.base[i]) / scale[i] for i in range(4))
+        return (x, y, z, e)
+
+    @property
+    def gcode_base(self) -> Position:
+        """Machine position of the G-code origin."""
+        x, y, z, e = self._state.base
+        return (x, y, z, e)
+
+    def set_gcode_position(self, words: Mapping[str, float]) -> None:
+        """G92: the present position shall read as WORDS (axis letter to program units)."""
+        s = self._state
+        for letter, value in words.items():
+            axis = AXIS_LETTERS.index(letter)
+            scale = s.unit * (s.extrude_factor if letter == "E" else 1)
+            s.base[axis] = s.position[axis] - value * scale
+
+    @property
+    def homed(self) -> str:
+        """Letters of the homed axes; only these may move. E needs no homing."""
+        return "".join(letter for i, letter in enumerate("XYZ") if self._core.homed >> i & 1)
+
+    @homed.setter
+    def homed(self, axes: str) -> None:
+        self._core.homed = sum(1 << "XYZ".index(letter) for letter in set(axes))
+
+    # ---- State of the G-code language ----
+
+    @property
+    def unit_mm(self) -> float:
+        """Length of a program unit, mm (G20, G21)."""
+        return float(self._state.unit)
+
+    @unit_mm.setter
+    def unit_mm(self, unit: float) -> None:
+        self._state.unit = check_number("the unit", unit, 0, 1e3, open_low=True)
+
+    @property
+    def relative(self) -> bool:
+        """G91: all axes, E too, count from where they are."""
+        return bool(self._state.relative)
+
+    @relative.setter
+    def relative(self, relative: bool) -> None:
+        self._state.relative = relative
+
+    @property
+    def relative_extrusion(self) -> bool:
+        """M83: E counts from where it is."""
+        return bool(self._state.relative_extrude)
+
+    @relative_extrusion.setter
+    def relative_extrusion(self, relative: bool) -> None:
+        self._state.relative_extrude = relative
+
+    @property
+    def speed_mm_s(self) -> float:
+        """The last F, before the speed factor."""
+        return float(self._state.speed)
+
+    @speed_mm_s.setter
+    def speed_mm_s(self, speed_mm_s: float) -> None:
+        self._state.speed = check_number("the speed", speed_mm_s, 0)
+
+    @property
+    def speed_factor(self) -> float:
+        """M220 / 100."""
+        return float(self._state.speed_factor)
+
+    @speed_factor.setter
+    def speed_factor(self, factor: float) -> None:
+        self._state.speed_factor = check_number("the speed factor", factor, 0, 100, open_low=True)
+
+    @property
+    def extrude_factor(self) -> float:
+        """M221 / 100; changing it leaves the G-code position of E as it reads."""
+        return float(self._state.extrude_factor)
+
+    @extrude_factor.setter
+    def extrude_factor(self, factor: float) -> None:
+        check_number("the extrude factor", factor, 0, 100, open_low=True)
+        reads = self.gcode_position[3]
+        self._state.extrude_factor = factor
+        self.set_gcode_position({"E": reads})
+
+    # ---- Modes ----
+
+    def reset_modes(self) -> None:
+        """Take units, modes, speed and dynamics back to where a program begins.
+
+        Positions, the G-code origin, what is homed and the factors (M220, M221) stay.
+        """
+        self.unit_mm = 1.0
+        self.relative = self.relative_extrusion = False
+        self.drop_exclusion()
+        self.plane = Plane.XY
+        self._state.speed = DEFAULT_SPEED_MM_S
+        self.accel = self.limits.max_accel
+        self.max_velocity = self.limits.max_velocity
+        self.square_corner_velocity = self.limits.square_corner_velocity
+        self.minimum_cruise_ratio = self.limits.minimum_cruise_ratio
+
+    # ---- Counters ----
+
+    @property
+    def lines(self) -> int:
+        """Lines consumed; set it where another program begins or goes on."""
+        return int(self._state.lines)
+
+    @lines.setter
+    def lines(self, lines: int) -> None:
+        self._state.lines = lines
+
+    @property
+    def moves(self) -> int:
+        """Moves added."""
+        return int(self._core.moves_added)
+
+    @property
+    def moves_dropped(self) -> int:
+        """Moves shorter than 1 nm, which were dropped."""
+        return int(self._core.moves_dropped)
+
+    @property
+    def slowed(self) -> tuple[Slowed, ...]:
+        """Moves that the limits made slower than they asked for, by limit; without those that did not."""
+        return tuple(
+            Slowed(name, s.moves, s.first_line, s.worst_line, s.asked, s.allowed)
+            for name, s in zip(SPEED_LIMITS, self._core.slowed, strict=True)
+            if s.moves
+        )
+
+    @property
+    def moves_overflowed(self) -> int:
+        """Moves planned before they were settled because the queue was full."""
+        return int(self._core.moves_overflowed)
+
+    @property
+    def moves_queued(self) -> int:
+        """Moves that are not handed out yet."""
+        return int(self._core.tail - self._core.head)
+
+
+def ffi_memory(trapezoids: Any, count: int) -> Any:
+    """Return the memory of COUNT trapezoids from a pointer to them; valid as long as they are."""
+    return ffi.buffer(trapezoids, count * ffi.sizeof("struct trapezoid"))

@@ -1,0 +1,1 @@
+"""What a plan asks of machine and buses over time (C)."""

@@ -1,0 +1,1 @@
+"""Step generation and compression (C) with their Python face: from trapezoids to commands of nodes."""

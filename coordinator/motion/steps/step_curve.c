@@ -1,0 +1,323 @@
+// SPDX-License-Identifier: Apache-2.0
+// Steps of shaped, smoothed and non-linear steppers. Between the borders of all phases that a stepper sees,
+// its axes are polynomials of time, made afresh from the moves at each piece's begin, so that no error adds
+// up. A piece is cut into spans in which the stepper does not turn. Shaped linear steppers have constant
+// acceleration there: the closed form of step_times.c. The others are solved by safeguarded Newton.
+#include "coordinator/motion/steps/step_internal.h"
+
+#include <string.h>
+
+static const double FURTHEST_STEPS = 1e12;
+static const double JUMP_STEPS = 0.51;
+static const double SPAN_S = 0.002;  // in which a non-linear stepper turns at most once
+static const double EXACT_S = 1e-10; // of a solution
+static const int ITERATIONS = 80;
+static const double CLOSE_S = 1e-8; // a change by Newton after which the next would be far below EXACT_S
+enum { NEWTONS = 4, SOLVED = 256 };
+static const double NOISE_STEPS = 1e-7; // a stepper whose place changes by less in a span stands there
+static const double STANDS_S = 0.001;   // at least, to be sure that it is no turn
+
+struct piece {
+    double begin, seconds;
+    double axis[AXES][3]; // mm; powers of the time since BEGIN
+    double poly[5];       // steps, of a linear stepper
+    bool linear, smooth, still;
+};
+
+// The position since init at TIME after the piece's begin, in steps, and its speed.
+static double evaluate(const struct stepper *s, const struct piece *p, double t, double *speed) {
+    const double *c = p->poly;
+    if (p->linear) {
+        *speed = c[1] + t * (2 * c[2] + t * (3 * c[3] + t * 4 * c[4]));
+        return c[0] + t * (c[1] + t * (c[2] + t * (c[3] + t * c[4])));
+    }
+    double at[AXES], v[AXES];
+    for (int i = 0; i < AXES; i++) {
+        at[i] = p->axis[i][0] + t * (p->axis[i][1] + t * p->axis[i][2]);
+        v[i] = p->axis[i][1] + 2 * t * p->axis[i][2];
+    }
+    const double u = step_kinematic(&s->config, s->angle, at, v, speed);
+    *speed /= s->config.step_distance;
+    return u / s->config.step_distance - s->origin;
+}
+
+// Looks through a tap anew: the weighted sum of the axes that it shows, in steps.
+static void look(const struct step_gen *gen, struct stepper *s, int index, unsigned axes) {
+    const struct tap *tap = &gen->taps[index];
+    struct seen *seen = &s->seen[index];
+    struct motion m;
+    step_locate(gen, &s->cursor[index], s->time - tap->time, &m);
+    *seen = (struct seen){.time = s->time, .border = m.border + tap->time, .still = true};
+    for (int j = 0; j < AXES; j++) {
+        if (!(tap->axes & axes & 1u << j))
+            continue;
+        const double weight = s->config.weights[j] * tap->amplitude[j] / s->config.step_distance;
+        const double v = speed_of(&m, j), a = accel_of(&m, j);
+        seen->poly[0] += weight * place_of(&m, j);
+        seen->poly[1] += weight * v;
+        seen->poly[2] += weight * (a / 2);
+        seen->still &= v == 0 && a == 0;
+    }
+}
+
+// The place of a linear stepper: taps are looked through anew only where their phase is over.
+static double add_taps(const struct step_gen *gen, struct stepper *s, unsigned axes, struct piece *p) {
+    double end = HUGE_VAL;
+    for (int i = 0; i < gen->tap_count; i++) {
+        struct seen *seen = &s->seen[i];
+        if (!(gen->taps[i].axes & axes))
+            continue;
+        if (is_over(seen->border, s->time))
+            look(gen, s, i, axes);
+        const double t = s->time - seen->time, a = seen->poly[2];
+        p->poly[0] += seen->poly[0] + t * (seen->poly[1] + t * a);
+        p->poly[1] += seen->poly[1] + 2 * t * a;
+        p->poly[2] += a;
+        p->still &= seen->still;
+        end = seen->border < end ? seen->border : end;
+        if (seen->border == HUGE_VAL)
+            seen->border = -HUGE_VAL; // a move may be appended at any time
+    }
+    return end;
+}
+
+static double add_axes(const struct step_gen *gen, struct stepper *s, struct piece *p) {
+    double end = HUGE_VAL;
+    for (int i = 0; i < gen->tap_count; i++) {
+        const struct tap *tap = &gen->taps[i];
+        if (!(tap->axes & s->uses))
+            continue;
+        struct motion m;
+        step_locate(gen, &s->cursor[i], s->time - tap->time, &m);
+        end = fmin(end, m.border + tap->time);
+        for (int j = 0; j < AXES; j++) {
+            if (!(s->uses >> j & 1))
+                continue;
+            const double v = speed_of(&m, j), a = accel_of(&m, j);
+            p->axis[j][0] += tap->amplitude[j] * place_of(&m, j);
+            p->axis[j][1] += tap->amplitude[j] * v;
+            p->axis[j][2] += tap->amplitude[j] * a / 2;
+            p->still &= v == 0 && a == 0;
+        }
+    }
+    return end;
+}
+
+static void make_piece(const struct step_gen *gen, struct stepper *s, double until, struct piece *p) {
+    *p = (struct piece){.begin = s->time, .linear = s->config.kinematics == STEP_LINEAR, .still = true};
+    p->smooth = p->linear && s->smooth_s > 0 && s->uses & USES_E;
+    const unsigned axes = p->smooth ? s->uses & ~(unsigned)USES_E : s->uses;
+    double end = fmin(until, p->linear ? add_taps(gen, s, axes, p) : add_axes(gen, s, p));
+    if (p->smooth) {
+        double smooth[5];
+        const double scale = s->config.weights[AXIS_E] / s->config.step_distance;
+        end = fmin(end, step_smooth(gen, s, s->time, smooth));
+        for (int k = 0; k < 5; k++)
+            p->poly[k] += scale * smooth[k];
+        for (int k = 1; k < 5; k++)
+            p->still &= smooth[k] == 0;
+        p->smooth = smooth[3] != 0 || smooth[4] != 0; // else of constant acceleration
+    }
+    if (p->linear)
+        p->poly[0] -= s->origin;
+    p->seconds = fmax(end - s->time, ROUNDING_S / 2);
+}
+
+// The first time after FROM behind which the stepper's speed may behave otherwise.
+static double next_cut(const struct piece *p, double from) {
+    const double *c = p->poly;
+    double cut = p->seconds;
+    if (p->still)
+        return cut;
+    if (!p->linear)
+        return fmin(cut, from + SPAN_S);
+    if (!p->smooth) {
+        const double turn = -c[1] / (2 * c[2]); // not finite in a cruise
+        return turn > from + EXACT_S && turn < cut ? turn : cut;
+    }
+    // The roots of u'' = 2·c2 + 6·c3·t + 12·c4·t²: between them u' is monotone.
+    const double root = sqrt(9 * c[3] * c[3] - 24 * c[2] * c[4]);
+    const double q = -(3 * c[3] + copysign(root, c[3]));
+    const double roots[2] = {q / (12 * c[4]), 2 * c[2] / q};
+    for (int i = 0; i < 2; i++)
+        if (roots[i] > from + EXACT_S && roots[i] < cut)
+            cut = roots[i];
+    return cut;
+}
+
+// Where the speed changes its sign between FROM and TO, or TO.
+static double find_turn(const struct stepper *s, const struct piece *p, double from, double to) {
+    double first, last, speed, low = from, high = to;
+    evaluate(s, p, from, &first);
+    evaluate(s, p, to, &last);
+    if (!(first * last < 0))
+        return to;
+    while (high - low > EXACT_S) {
+        const double middle = 0.5 * (low + high);
+        if (middle <= low || middle >= high)
+            break;
+        evaluate(s, p, middle, &speed);
+        if (speed * first > 0)
+            low = middle;
+        else
+            high = middle;
+    }
+    return high - from > 2 * EXACT_S && to - high > 2 * EXACT_S ? high : to;
+}
+
+// The time in FROM..TO at which the stepper, moving in DIRECTION, is at BOUNDARY; GUESS is any time.
+static double solve(const struct stepper *s, const struct piece *p, double from, double to, double guess,
+                    int direction, double boundary) {
+    double low = from, high = to, t = guess > low && guess < high ? guess : low;
+    for (int i = 0; i < ITERATIONS && high - low > EXACT_S; i++) {
+        double speed;
+        const double off = (evaluate(s, p, t, &speed) - boundary) * direction;
+        if (off > 0)
+            high = t;
+        else
+            low = t;
+        double next = t - off / (speed * direction);
+        if (!(next >= low && next <= high))
+            next = 0.5 * (low + high);
+        const double change = fabs(next - t);
+        t = next;
+        if (change < EXACT_S)
+            break;
+    }
+    return t;
+}
+
+// A quartic that rises from LOW to HIGH: when it is FIRST, FIRST + 1 ..., from a parabola's guesses by
+// Newton. False where that did not get all of the first COUNT right. Writes the whole block.
+STEP_VECTOR
+static bool solve_block(const double c[5], double low, double high, double first, int count,
+                        double t[FILL_BLOCK]) {
+    const double tiny = 1e-300;
+    const double u = c[0] + low * (c[1] + low * (c[2] + low * (c[3] + low * c[4])));
+    const double v = c[1] + low * (2 * c[2] + low * (3 * c[3] + low * 4 * c[4]));
+    const double twice = 4 * c[2] + low * (12 * c[3] + low * 24 * c[4]);
+    double change[FILL_BLOCK];
+    for (int j = 0; j < FILL_BLOCK; j++) {
+        double x = first + j - u, square = v * v + twice * (first + j - u);
+        x = x > 0 ? x : 0;
+        square = square > 0 ? square : 0;
+        const double guess = low + 2 * x / (v + __builtin_sqrt(square) + tiny);
+        t[j] = guess < high ? guess : high;
+    }
+    bool good = false;
+    for (int i = 0; i < NEWTONS && !good; i++) {
+        for (int j = 0; j < FILL_BLOCK; j++) {
+            const double at = t[j];
+            const double off = c[0] - (first + j) + at * (c[1] + at * (c[2] + at * (c[3] + at * c[4])));
+            const double speed = c[1] + at * (2 * c[2] + at * (3 * c[3] + at * 4 * c[4]));
+            double next = at - off / speed;
+            next = next > low ? next : low; // also what is no number
+            next = next < high ? next : high;
+            change[j] = __builtin_fabs(next - at);
+            t[j] = next;
+        }
+        good = true;
+        for (int j = 0; j < count; j++)
+            good &= change[j] < CLOSE_S;
+    }
+    return good;
+}
+
+static void solve_one_by_one(const struct stepper *s, const struct piece *p, double from, double to,
+                             int direction, int64_t position, int count, double *t) {
+    double last = from, guess = from;
+    for (int i = 0; i < count; i++) {
+        const double boundary = (double)(position + (int64_t)i * direction) + 0.5 * direction;
+        t[i] = solve(s, p, last, to, guess, direction, boundary);
+        guess = t[i] + (t[i] - last);
+        last = t[i];
+    }
+}
+
+static int play_solved(struct step_gen *gen, struct stepper *s, const struct piece *p, double from, double to,
+                       int direction, int64_t target) {
+    double t[SOLVED + FILL_BLOCK], c[5];
+    const struct phase flow = {.time = p->begin, .seconds = p->seconds, .solved = t};
+    for (int k = 0; k < 5; k++)
+        c[k] = p->poly[k] * direction;
+    while (s->position != target) {
+        const int64_t left = (target - s->position) * direction;
+        const int count = left < SOLVED ? (int)left : SOLVED;
+        memset(t + count, 0, FILL_BLOCK * sizeof(*t)); // is read, and does not matter
+        for (int i = 0; i < count; i += FILL_BLOCK) {
+            const int n = count - i < FILL_BLOCK ? count - i : FILL_BLOCK;
+            const int64_t position = s->position + (int64_t)i * direction;
+            if (!p->linear || !solve_block(c, from, to, (double)(position * direction) + 0.5, n, t + i))
+                solve_one_by_one(s, p, from, to, direction, position, n, t + i);
+            from = t[i + n - 1];
+        }
+        const int status = step_put(gen, s, &flow, direction, 0, 1, count);
+        if (status)
+            return status;
+    }
+    return STEP_OK;
+}
+
+static int play_span(struct step_gen *gen, struct stepper *s, const struct piece *p, double from, double to) {
+    double v0, v1;
+    const double begin = evaluate(s, p, from, &v0), end = evaluate(s, p, to, &v1);
+    if (!(fabs(begin) < FURTHEST_STEPS && fabs(end) < FURTHEST_STEPS))
+        return step_fail(gen, STEP_BAD_MOVE, s, p->begin, end);
+    const bool stands = p->still || fabs(end - begin) < NOISE_STEPS;
+    if (stands && !p->still && to - from < STANDS_S)
+        return STEP_OK;
+    // Only where the stepper stands does rounding decide: on the way, and at a turn, a boundary is crossed or
+    // not.
+    const int64_t target = stands ? step_nearest(end) : (int64_t)floor(end + 0.5);
+    const int direction = stands ? (target > s->position ? 1 : -1) : end > begin ? 1 : -1;
+    const int64_t count = (target - s->position) * direction;
+    if (count <= 0)
+        return STEP_OK;
+    if (!p->linear || p->smooth)
+        return play_solved(gen, s, p, from, to, direction, target);
+    struct phase span = {.time = p->begin + from, .seconds = to - from, .way = fabs(end - begin)};
+    span.backwards = fabs(v1) < fabs(v0);
+    span.speed = fmin(fabs(v0), fabs(v1));
+    span.accel = 2 * fabs(p->poly[2]);
+    if (span.way < 1e-4) { // no more than what snaps
+        span.backwards = false;
+        span.accel = 0;
+        span.speed = (double)(count + 1) / span.seconds;
+    }
+    const double boundary = (double)s->position + 0.5 * direction;
+    return step_put(gen, s, &span, direction, (boundary - begin) * direction, 1, count);
+}
+
+static int play_piece(struct step_gen *gen, struct stepper *s, const struct piece *p) {
+    double speed;
+    const double off = evaluate(s, p, 0, &speed) - (double)s->position;
+    if (s->time != s->checked && !(fabs(off) <= JUMP_STEPS))
+        return step_fail(gen, STEP_JUMP, s, p->begin, off);
+    s->checked = s->time;
+    for (double from = 0; from < p->seconds;) {
+        double to = next_cut(p, from);
+        if (!p->still && (!p->linear || p->smooth))
+            to = find_turn(s, p, from, to);
+        const int status = play_span(gen, s, p, from, to);
+        if (status)
+            return status;
+        if (s->config.kinematics == STEP_POLAR_ANGLE)
+            s->angle = (evaluate(s, p, to, &speed) + s->origin) * s->config.step_distance;
+        from = to;
+        s->time = s->checked = p->begin + to; // steps up to here are done, whatever comes
+    }
+    return STEP_OK;
+}
+
+int step_curve_advance(struct step_gen *gen, struct stepper *s, double until) {
+    while (s->time < until - ROUNDING_S) {
+        struct piece piece;
+        make_piece(gen, s, until, &piece);
+        const int status = play_piece(gen, s, &piece);
+        if (status)
+            return status;
+        s->time = piece.begin + piece.seconds;
+        s->checked = -1;
+    }
+    return STEP_OK;
+}

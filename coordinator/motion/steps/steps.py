@@ -1,0 +1,411 @@
+"""Step generation: planned moves in, one stream of timed commands per node out (the manual is steps.h)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+from coordinator.motion.steps._steps import ffi, lib
+from coordinator.motion.specs import NodeStreamSpec, StepperSpec
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
+
+MAX_ERROR_S = 12.5e-6
+"""How far a step may be from its true time by default."""
+TABLE_POINTS_MAX = int(lib.STEP_TABLE_POINTS)
+"""Points of one axis table that step generation has room for."""
+Position = tuple[float, float, float, float]
+
+
+class StepError(CanductorError):
+    """Step generation cannot go on; the sentence says where and why."""
+
+    print_time_s: float | None = None
+    """Of the step or move that cannot be; None: it is no matter of time."""
+
+
+@record
+class StepperStats:
+    """What one stepper's stream amounts to so far."""
+
+    name: str
+    position: int
+    """Steps from the start, up to the generated time."""
+    issued: int
+    """Steps from the start that the commands made so far add up to."""
+    steps: int
+    queue_steps: int
+    direction_changes: int
+    commands: int
+    content_bytes: int
+    cancelled: int
+    """Steps left out because their opposite followed too closely."""
+    put_off: int
+    """Steps delayed because their opposite, too close, had been flushed."""
+    worst_error_ticks: float
+    worst_error_s: float
+    max_step_rate: float
+    """Steps/s."""
+
+
+@record
+class AxisCorrection:
+    """What is added to an axis's planned position, at the end of the last move that was appended."""
+
+    points: int
+    """Of its table; 0: it has none."""
+    reverse: bool
+    """Whether the table's side for travel to smaller positions is in use."""
+    offset_mm: float
+    """All that is added."""
+    lag_mm: float
+    """The part of it that the table does not want: it fades along the moves that follow."""
+
+
+@record
+class NodeStats:
+    """What one node's stream amounts to so far."""
+
+    name: str
+    commands: int
+    content_bytes: int
+    framed_bytes: int
+    """Packed into full message blocks, with their headers and trailers."""
+    max_slots: int
+    """Most move-queue slots in use when any command is due."""
+    late_slots: int
+    """Commands whose slot becomes free only after they are due: the node's move_count is too small."""
+    waiting_bytes: int
+    """Bytes of the batch not yet taken."""
+
+
+@record
+class StepStats:
+    """Totals since construction."""
+
+    steppers: tuple[StepperStats, ...]
+    nodes: tuple[NodeStats, ...]
+
+
+def resting_step(spec: StepperSpec, start: Position, position: Position) -> int:
+    """Return the steps a stepper that started at START has done when its axes rest at POSITION (mm).
+
+    This is the rule the generator follows: half a step rounds up, and 1/65536 of a step decides no tie.
+    """
+    begin, end = (_mix(spec, at) / spec.step_distance for at in (start, position))
+    snap = int(lib.STEP_SNAP)
+    return math.floor(round((end - begin) * snap) / snap + 0.5)
+
+
+def _mix(spec: StepperSpec, position: Position) -> float:
+    x, y, z, e = (weight * axis for weight, axis in zip(spec.weights, position, strict=True))
+    return x + y + z + e
+
+
+class StepGenerator:
+    """Turns trapezoids into every node's queue_step stream; one thread at a time.
+
+    START is where the axes X Y Z E stand (mm); steppers count their steps from there. MAX_ERROR_S bounds how
+    far a step may be from its true time. Clocks begin as ticks = print time * clock_freq. After a StepError
+    of append or generate the generator stays failed.
+    """
+
+    def __init__(
+        self,
+        steppers: Sequence[StepperSpec],
+        nodes: Sequence[NodeStreamSpec],
+        *,
+        max_error_s: float = MAX_ERROR_S,
+        start: Position = (0.0, 0.0, 0.0, 0.0),
+    ) -> None:
+        self._steppers, self._nodes = tuple(steppers), tuple(nodes)
+        config = _config(self._steppers, self._nodes, max_error_s, start)
+        size = lib.step_gen_size(config.struct)
+        if not size:
+            raise StepError(
+                f"steppers {[s.name for s in steppers]} on nodes {[n.name for n in nodes]}: a value of the "
+                "motion configuration is out of range; check step_distance, oid, step_pulse, clock "
+                f"frequency, move_count and the step error of {max_error_s} s"
+            )
+        self._memory = ffi.new("char[]", size)
+        self._gen = lib.step_gen_init(self._memory, config.struct)
+
+    def append(self, trapezoids: Any, count: int) -> int:
+        """Take over up to COUNT trapezoids; return how many had room.
+
+        TRAPEZOIDS is a cffi pointer (of any module) or a buffer laid out as struct trapezoid. Take less than
+        COUNT as "generate first". Raises StepError on a move that is illegal or out of order.
+        """
+        pointer = trapezoids
+        if not isinstance(trapezoids, ffi.CData):
+            pointer = ffi.from_buffer(trapezoids)
+            count = min(count, len(pointer) // ffi.sizeof("struct trapezoid"))
+        taken: int = lib.step_append(self._gen, ffi.cast("struct trapezoid *", pointer), count)
+        if taken < 0:
+            raise self._error()
+        return taken
+
+    def generate(self, until: float, *, flush: bool = False) -> bool:
+        """Produce the commands for everything before print time UNTIL (s).
+
+        Every move that begins before UNTIL must have been appended. Without FLUSH the last 0.1 s may be held
+        back. Returns False when batches have to be taken first: take them and call again with the same
+        arguments. Raises StepError.
+        """
+        status = lib.step_generate(self._gen, until, flush)
+        if status not in {lib.STEP_OK, lib.STEP_FULL}:
+            raise self._error()
+        return bool(status == lib.STEP_OK)
+
+    def take_batch(self, node: int, room: int = 1 << 16) -> bytes:
+        """Remove and return up to ROOM bytes of NODE's batch (nodes/link/batch.h), whole records only."""
+        self._check_node(node)
+        out = ffi.new("uint8_t[]", room)
+        taken = lib.step_take_batch(self._gen, node, out, room)
+        return bytes(ffi.buffer(out, taken))
+
+    def add_timed(self, node: int, req_clock: int, finish_clock: int, payload: bytes) -> None:
+        """Merge another timed command into NODE's stream; it holds a queue slot until FINISH_CLOCK.
+
+        PAYLOAD: the encoded command, 1..59 bytes. Raises StepError when too many wait.
+        """
+        self._check_node(node)
+        status = lib.step_add_timed(self._gen, node, req_clock, finish_clock, payload, len(payload))
+        if status == lib.STEP_FULL:
+            raise StepError(
+                f"node {self._nodes[node].name}: {lib.STEP_TIMED} timed commands wait already; "
+                "generate steps up to their time first"
+            )
+        if status:
+            raise StepError(
+                f"node {self._nodes[node].name}: a timed command of {len(payload)} bytes is refused; "
+                f"1 to {lib.STEP_PAYLOAD_MAX} bytes are possible"
+            )
+
+    @property
+    def generated_until(self) -> float:
+        """Print time (s) before which nothing can be changed any more."""
+        return float(lib.step_generated_until(self._gen))
+
+    @property
+    def next_move_s(self) -> float:
+        """Earliest print time (s) at which the next appended move may begin.
+
+        After a flush, and after a change of a shaper or smoothing, the planner has to begin there or later.
+        """
+        return float(lib.step_next_move(self._gen))
+
+    def set_clock_base(self, node: int, print_time: float, ticks: int, ticks_per_s: float) -> None:
+        """Say what NODE's 64-bit clock is at PRINT_TIME and how fast it runs; only while no step waits."""
+        self._check_node(node)
+        status = lib.step_set_clock_base(self._gen, node, print_time, ticks, ticks_per_s)
+        self._check_clock(node, status, ticks_per_s)
+
+    def set_clock(self, node: int, ticks_per_s: float) -> None:
+        """Change the rate of NODE's clock from the generated time on, without a jump there."""
+        self._check_node(node)
+        self._check_clock(node, lib.step_set_clock(self._gen, node, ticks_per_s), ticks_per_s)
+
+    def clock_at(self, node: int, print_time: float) -> int:
+        """Return NODE's 64-bit clock at PRINT_TIME, rounded down."""
+        self._check_node(node)
+        return int(lib.step_clock_at(self._gen, node, print_time))
+
+    def position(self, stepper: int) -> int:
+        """Return where STEPPER stands at the generated time, in steps from the start."""
+        return self._stepper_stats(stepper).position
+
+    def set_axis_position(self, position: Position) -> None:
+        """Declare that the axes X Y Z E stand at POSITION (mm): no steps; the steps' count goes on.
+
+        Raises StepError while appended moves are not yet generated.
+        """
+        if lib.step_set_axis_position(self._gen, ffi.new("double[4]", position)):
+            raise StepError(f"the axes cannot be set to {position} mm while moves wait; generate them first")
+
+    def set_table(
+        self,
+        axis: int,
+        positions: Sequence[float],
+        forward: Sequence[float],
+        reverse: Sequence[float],
+        *,
+        take_up_mm_s: float,
+    ) -> None:
+        """Add to the planned positions of axis 0..2 (X Y Z) what a table says (mm); no points: nothing.
+
+        Not a step is made now: what the correction jumps by is taken up along the moves that follow, at
+        TAKE_UP_MM_S at the most. Only for axes of linear steppers. Raises StepError while appended moves are
+        not yet generated.
+        """
+        status = lib.step_set_table(
+            self._gen, axis, len(positions), list(positions), list(forward), list(reverse), take_up_mm_s
+        )
+        what = f"the table of axis {'XYZ'[axis]}"
+        if status == lib.STEP_NOT_IDLE:
+            raise StepError(f"{what} cannot change while moves wait; generate them first")
+        if status:
+            raise StepError(
+                f"{what} is refused: give 2 to {TABLE_POINTS_MAX} ascending positions, and a take-up speed"
+            )
+
+    @property
+    def corrections(self) -> tuple[AxisCorrection, ...]:
+        """What is added to X, Y and Z."""
+        found: Any = ffi.new("struct step_correction[3]")
+        for axis in range(3):
+            lib.step_get_correction(self._gen, axis, found + axis)
+        return tuple(AxisCorrection(c.points, bool(c.reverse), c.offset, c.lag) for c in found)
+
+    def set_corrections(self, corrections: Sequence[AxisCorrection]) -> None:
+        """Declare that the motors of X, Y, Z stand ``offset_mm`` beyond their axes, on these sides: no steps.
+
+        Raises StepError while appended moves are not yet generated.
+        """
+        offsets = [correction.offset_mm for correction in corrections]
+        if lib.step_set_corrections(self._gen, offsets, [int(c.reverse) for c in corrections]):
+            raise StepError(f"corrections cannot become {offsets} mm while moves wait; generate them first")
+
+    @property
+    def look_ahead_s(self) -> float:
+        """How far step times depend on later moves (s): so much more is held back without a flush."""
+        return float(lib.step_look_ahead(self._gen))
+
+    @property
+    def lag_s(self) -> float:
+        """How long (s) after the end of the last move steps may still come."""
+        return float(lib.step_lag(self._gen))
+
+    def set_shaper(self, axis: int, impulses: Sequence[tuple[float, float]]) -> None:
+        """Shape axis 0..2 (X Y Z) by IMPULSES: (amplitude, time in s) each, centred; none: unshaped.
+
+        Raises StepError unless the machine has been at rest for the lag of all shapers and smoothing.
+        """
+        amplitudes = [amplitude for amplitude, _ in impulses] or [1.0]
+        times = [time_s for _, time_s in impulses] or [0.0]
+        status = lib.step_set_shaper(self._gen, axis, len(times), amplitudes, times)
+        self._check_settled(status, f"the shaper of axis {axis}", f"impulses {list(impulses)}")
+
+    def set_weights(self, stepper: int, weights: Position) -> None:
+        """Let STEPPER (LINEAR) follow other axes from now on; raises StepError unless all has settled."""
+        self._check_stepper(stepper)
+        status = lib.step_set_weights(self._gen, stepper, weights)
+        self._check_settled(status, f"what {self._steppers[stepper].name} follows", f"weights {weights}")
+
+    def set_smooth_time(self, stepper: int, smooth_s: float) -> None:
+        """Smooth STEPPER's E and its pressure advance by a triangle of full width SMOOTH_S; 0: neither.
+
+        Raises StepError unless all has settled.
+        """
+        self._check_stepper(stepper)
+        status = lib.step_set_smooth_time(self._gen, stepper, smooth_s)
+        what = f"the smooth time of {self._steppers[stepper].name}"
+        self._check_settled(status, what, f"a smooth time of {smooth_s} s")
+
+    def index(self, name: str) -> int:
+        """Return the number of the stepper called NAME; raises StepError when there is none."""
+        for number, spec in enumerate(self._steppers):
+            if spec.name == name:
+                return number
+        raise StepError(f"there is no stepper {name}; there is {', '.join(s.name for s in self._steppers)}")
+
+    def _check_settled(self, status: int, what: str, value: str) -> None:
+        if status == lib.STEP_NOT_IDLE:
+            raise StepError(
+                f"{what} cannot change while steps of earlier moves may come; "
+                f"generate until {self.lag_s:.3f} s after the last move first"
+            )
+        if status:
+            raise StepError(f"{what} is refused: {value} is out of range")
+
+    def _check_stepper(self, index: int) -> None:
+        if not 0 <= index < len(self._steppers):
+            raise StepError(f"there is no stepper {index}; the generator has {len(self._steppers)}")
+
+    def stats(self) -> StepStats:
+        """Return the totals of every stepper and node."""
+        return StepStats(
+            tuple(self._stepper_stats(i) for i in range(len(self._steppers))),
+            tuple(self._node_stats(i) for i in range(len(self._nodes))),
+        )
+
+    def _stepper_stats(self, index: int) -> StepperStats:
+        self._check_stepper(index)
+        s = ffi.new("struct step_stepper_stats *")
+        lib.step_stepper_stats(self._gen, index, s)
+        values = (getattr(s, field.name) for field in fields(StepperStats)[1:])
+        return StepperStats(self._steppers[index].name, *values)
+
+    def _node_stats(self, index: int) -> NodeStats:
+        s = ffi.new("struct step_node_stats *")
+        lib.step_node_stats(self._gen, index, s)
+        values = (getattr(s, field.name) for field in fields(NodeStats)[1:])
+        return NodeStats(self._nodes[index].name, *values)
+
+    def _check_node(self, node: int) -> None:
+        if not 0 <= node < len(self._nodes):
+            raise StepError(f"there is no node {node}; the generator has {len(self._nodes)}")
+
+    def _check_clock(self, node: int, status: int, ticks_per_s: float) -> None:
+        name = self._nodes[node].name
+        if status == lib.STEP_NOT_IDLE:
+            raise StepError(f"the clock of node {name} cannot be set while its steps wait; flush them first")
+        if status:
+            raise StepError(f"node {name}: {ticks_per_s} ticks/s is no possible clock")
+
+    def _error(self) -> StepError:
+        e: Any = ffi.new("struct step_error *")
+        lib.step_last_error(self._gen, e)
+        who = self._steppers[e.stepper].name if e.stepper >= 0 else "the plan"
+        error = StepError(f"{who} at print time {e.print_time:.6f} s: {_REASONS[e.status].format(e.value)}")
+        error.print_time_s = e.print_time
+        return error
+
+
+_REASONS = {
+    lib.STEP_BAD_MOVE: "a planned move has impossible numbers; this is a bug of the planner",
+    lib.STEP_BAD_ORDER: (
+        "the time lies before {:.6f} s, up to which all is planned or generated; "
+        "moves must follow each other in time"
+    ),
+    lib.STEP_JUMP: (
+        "the move begins {:+.3f} steps from where the stepper stands; moves must join, or the position be set"
+    ),
+    lib.STEP_TOO_FAST: (
+        "steps follow each other within {:.3g} s, closer than the step pulse allows; "
+        "lower the speed or the microsteps, or shorten step_pulse_duration"
+    ),
+    lib.STEP_TOO_DENSE: (
+        f"more than {lib.STEP_SEGMENTS} step commands at once; lower the speed or the microsteps"
+    ),
+    lib.STEP_NO_FIT: "a step has no legal clock; this is a bug of step compression",
+    lib.STEP_BAD_CHECK: (
+        "compressed steps do not replay to their times ({:.3g} s off); this is a bug of step compression"
+    ),
+}
+
+
+class _Config:
+    """A struct step_config with the arrays it points to kept alive."""
+
+    def __init__(self, struct: Any, keep: tuple[Any, ...]) -> None:
+        self.struct, self.keep = struct, keep
+
+
+def _config(
+    steppers: Sequence[StepperSpec], nodes: Sequence[NodeStreamSpec], max_error_s: float, start: Position
+) -> _Config:
+    c_steppers = ffi.new("struct step_stepper_config[]", max(len(steppers), 1))
+    c_nodes = ffi.new("struct step_node_config[]", max(len(nodes), 1))
+    for c, s in zip(c_steppers, steppers, strict=False):
+        c.node, c.oid, c.weights, c.step_distance = s.node, s.oid, s.weights, s.step_distance
+        c.kinematics, c.params = s.kinematics, s.params
+        c.invert_dir, c.step_pulse_s = s.invert_dir, s.step_pulse_s
+    for c, n in zip(c_nodes, nodes, strict=False):
+        c.clock_freq, c.move_count, c.queue_step_id = n.clock_freq, n.move_count, n.queue_step_id
+        c.set_next_step_dir_id, c.reset_step_clock_id = n.set_next_step_dir_id, n.reset_step_clock_id
+    struct: Any = ffi.new("struct step_config *")
+    struct.stepper_count, struct.node_count = len(steppers), len(nodes)
+    struct.steppers, struct.nodes = c_steppers, c_nodes
+    struct.max_error_s, struct.start = max_error_s, start
+    return _Config(struct, (c_steppers, c_nodes))

@@ -1,0 +1,184 @@
+"""``canductor plan``: plans a program for a machine without its hardware, and tells what it would ask."""
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from coordinator.support.command_options import PlanOptions
+from coordinator.gcode.events import (
+    Emergency,
+    End,
+    Full,
+    Notice,
+    PositionSet,
+    Progress,
+    ShaperChange,
+    SmoothTimeChange,
+    WeightsChange,
+)
+from coordinator.gcode.interpreter import Job
+from coordinator.gcode.program import Program
+from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.runtime.devices import MachineDevices, stream_specs
+from coordinator.motion.planner.planner import Planner
+from coordinator.motion.steps.steps import StepError, StepGenerator
+from coordinator.streaming.pipeline import Pipeline
+from coordinator.planning.figures import PlanFigures
+from coordinator.planning.report import PlanReport
+from coordinator.planning.summary import Made, watched_nodes, write_files
+from coordinator.streaming.program_machine import machine_state
+from coordinator.support.progress import Progress as Shown
+from coordinator.support.progress import ProgressDisplay
+from nodes.dictionary.dictionary import Dictionary
+from nodes.support.errors import CanductorError
+from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary
+
+if TYPE_CHECKING:
+    from coordinator.streaming.compensation import Compensation
+
+ASSUMED_MOVE_COUNT = 1024
+"""Queue slots of a node that is not there to be asked."""
+
+
+def plan_file(options: PlanOptions) -> PlanReport:
+    """Plan OPTIONS.gcode for OPTIONS.config; raises CanductorError."""
+    description = load_machine(str(options.config))
+    modules = description.modules.build(description)
+    devices = MachineDevices(description, modules)
+    dictionaries = _dictionaries(description, options)
+    for node in description.nodes:
+        devices.build_config(node.name, dictionaries[node.name])
+    streams = stream_specs((name, dictionaries[name], ASSUMED_MOVE_COUNT) for name in devices.moving_nodes)
+    specs = devices.stepper_specs()
+    figures = PlanFigures(watched_nodes(description, streams, options.can_bitrate))
+    with ExitStack() as stack:
+        program = stack.enter_context(Program.open(options.gcode))
+        files = [stack.enter_context(f) for f in _output_files(options, devices.moving_nodes)]
+        job = Job(
+            program,
+            Planner(description.limits),
+            description.homed_position,
+            machine_state(description),
+            modules.vocabulary,
+        )
+        pipeline = Pipeline(
+            job,
+            StepGenerator(specs, streams),
+            lambda node, batch: _keep(figures, files, node, batch),
+            nodes=len(streams),
+            watch=figures.moves,
+            compensation=_compensation(description, options) if options.tables else None,
+        )
+        display = stack.enter_context(ProgressDisplay(f"planning {program.name}", quiet=options.json))
+        try:
+            notices, end = _run(pipeline, display)
+        except StepError as error:
+            raise _with_line(error, program.name, figures) from None
+    figures.finish()
+    if figures.bad_records:
+        raise CanductorError(
+            f"{figures.bad_records} emitted commands make no sense; this is a bug of step generation"
+        )
+    chips = {name: dictionary.str_constant("MCU", "") for name, dictionary in dictionaries.items()}
+    made = Made(description, pipeline, figures, streams, specs, chips, notices, end.print_time_s)
+    return write_files(options, made.report())
+
+
+def _compensation(description: MachineDescription, options: PlanOptions) -> "Compensation":
+    """Return what corrects the axes by the tables of OPTIONS; raises TableError."""
+    from coordinator.streaming.compensation import Compensation, why_not_corrected  # noqa: PLC0415 (start-up time)
+    from coordinator.tables.axis_table import TableError  # noqa: PLC0415
+    from coordinator.tables.files import read_table  # noqa: PLC0415
+
+    compensation = Compensation(description.limits)
+    for axis, path in options.tables.items():
+        table = read_table(path, axis=axis)
+        if why := why_not_corrected(description, table):
+            raise TableError(why)
+        compensation.want(axis, table)
+    return compensation
+
+
+def _with_line(error: StepError, program: str, figures: PlanFigures) -> CanductorError:
+    if error.print_time_s is None:
+        return error
+    return CanductorError(f"{program}, near line {figures.line(error.print_time_s)}: {error}")
+
+
+def _dictionaries(description: MachineDescription, options: PlanOptions) -> dict[str, Dictionary]:
+    names = [node.name for node in description.nodes]
+    for name in options.dictionaries:
+        if name not in names:
+            raise CanductorError(
+                f"--dictionary {name}: the machine has no such node; it has {', '.join(names)}"
+            )
+    return {
+        name: _read_dictionary(options.dictionaries[name])
+        if name in options.dictionaries
+        else firmware_dictionary(MAINBOARD if name == names[0] else TOOLHEAD)
+        for name in names
+    }
+
+
+def _read_dictionary(path: Path) -> Dictionary:
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise CanductorError(f"cannot read the dictionary {path}: {error.strerror}; check the path") from None
+    try:
+        return Dictionary.from_json(text)
+    except CanductorError as error:
+        raise CanductorError(f"{path}: {error}") from None
+
+
+def _output_files(options: PlanOptions, nodes: list[str]) -> list[BinaryIO]:
+    if options.output is None:
+        return []
+    try:
+        options.output.mkdir(parents=True, exist_ok=True)
+        return [(options.output / f"{name}.batch").open("wb") for name in nodes]
+    except OSError as error:
+        raise CanductorError(
+            f"cannot write to {options.output}: {error.strerror}; name another folder with -o"
+        ) from None
+
+
+def _keep(figures: PlanFigures, files: list[BinaryIO], node: int, batch: bytes) -> None:
+    figures.batch(node, batch)
+    if files:
+        files[node].write(batch)
+
+
+def _run(pipeline: Pipeline, display: ProgressDisplay) -> tuple[list[str], End]:
+    notices: list[str] = []
+    began = time.monotonic()
+    while True:
+        event = pipeline.job.step()
+        match event:
+            case Full():
+                pipeline.run_through()
+            case PositionSet() | ShaperChange() | WeightsChange() | SmoothTimeChange():
+                pipeline.finish()
+                pipeline.act(event)
+            case Progress():
+                display.update(
+                    Shown(
+                        done=event.done_bytes,
+                        total=event.size_bytes or 0,
+                        print_time_s=pipeline.planner.print_time_end_s,
+                        wall_time_s=time.monotonic() - began,
+                    )
+                )
+            case Notice():
+                notices.append(event.text)
+            case Emergency():
+                raise CanductorError(
+                    f"{pipeline.job.name}:{event.line}: M112 stops the machine here; "
+                    "remove it to plan what follows"
+                )
+            case End():
+                pipeline.finish()
+                return notices, event
+            case _:
+                pass  # waiting costs a plan nothing, and replies are for who asked

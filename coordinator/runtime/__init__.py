@@ -1,0 +1,1 @@
+"""The running machine: host, nodes and devices, time base, node recovery, emergency stop."""

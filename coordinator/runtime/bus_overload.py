@@ -1,0 +1,55 @@
+"""Sees coming that a bus cannot carry the motion that is planned on it, and says so before a step is late."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from nodes.clock.clock import HostTime
+from nodes.support.errors import CanductorError
+from nodes.link import Forecast
+
+PERSISTS_S: Final = 0.15
+"""A forecast counts when it has stood so long: one of a moment of other traffic passes."""
+URGENT_S: Final = 0.2
+"""When the first late command is due so soon, it counts at once."""
+
+
+class BusOverload(CanductorError):  # noqa: N818
+    """A bus is asked for more than it can carry."""
+
+
+LOSSY: Final = 0.15
+"""With more blocks sent again than that it is losses that make motion late; a full bus alone causes a few."""
+
+
+@dataclass(slots=True)
+class LoadWatch:
+    """Watches the forecasts of the bus called NAME."""
+
+    name: str
+    _late_since_ns: int | None = None
+
+    def look(self, forecast: Forecast, now: HostTime, repeated: Callable[[], float]) -> None:
+        """Take the newest forecast; raises BusOverload when motion would be late for certain.
+
+        REPEATED tells the share of the blocks on this bus that had to be sent again, when that matters.
+        """
+        warning_s = forecast.warning_s
+        if warning_s is None:
+            self._late_since_ns = None
+            return
+        if self._late_since_ns is None:
+            self._late_since_ns = now
+        if now - self._late_since_ns < PERSISTS_S * 1e9 and warning_s > URGENT_S:
+            return
+        late = f"the first step commands would be late in {max(warning_s, 0):.1f} s"
+        if (share := repeated()) > LOSSY:
+            raise BusOverload(
+                f"bus {self.name} loses too much: {share:.0%} of the blocks on it had to be sent again, "
+                f"and {late}; check its cable, its termination and the bit rate of all nodes"
+            )
+        raise BusOverload(
+            f"bus {self.name} cannot carry what is planned: its motion needs {forecast.worst_ratio:.0%} of "
+            f"the {forecast.motion_bits_per_s / 1000:.0f} kbit/s there are for it, and {late}; lower the "
+            "speed or the microsteps, take other traffic off the bus, or raise its bit rate"
+        )

@@ -1,0 +1,391 @@
+"""The connected machine, assembled in one place; and what happens to it when a part fails."""
+
+import asyncio
+import contextlib
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from coordinator.streaming.filament_forecast import FilamentForecast
+from coordinator.runtime.host import Host
+from coordinator.runtime.bus_overload import LoadWatch
+from coordinator.assembly.load import (
+    CanConnection,
+    MachineDescription,
+    NodeDescription,
+    NodePolicy,
+    UartConnection,
+)
+from coordinator.config.sections.nodes import check_distinct
+from coordinator.config.saved import PendingConfig
+from coordinator.runtime.devices import MachineDevices, stream_specs
+from coordinator.runtime.module_context import Live
+from coordinator.motion.specs import NodeStreamSpec
+from coordinator.runtime.node_recovery import JobGate, NodeCare
+from coordinator.runtime.stepper_positions import RailPlaces
+from coordinator.runtime.timebase import ClockMap, TimeBase
+from coordinator.runtime.wire import Wire
+from nodes.bus.assign import Uuid
+from nodes.bus.bus import UartBus
+from nodes.bus.can_bus import CanBus
+from nodes.dictionary.dictionary import Dictionary
+from nodes.dictionary.cache import DictionaryCache
+from nodes.support.errors import CanductorError
+from nodes.link import IOStats, Link
+from nodes.node.node import Node
+from nodes.node.config import NodeConfig
+from nodes.node.states import NodeState
+
+if TYPE_CHECKING:
+    from coordinator.runtime.module_runner import Runner
+
+
+class MachineStopped(CanductorError):  # noqa: N818
+    """The machine was stopped for safety; the sentence tells the cause."""
+
+
+CONFIRM_STOP_S = 0.5
+"""How long the nodes have to confirm an emergency stop before the host gives up on them."""
+
+
+@dataclass(frozen=True, slots=True)
+class _OpenBus:
+    bus: CanBus | UartBus
+    wire: Wire
+    watch: LoadWatch
+
+
+def _ignore(_: str) -> None:
+    pass
+
+
+class Machine:
+    """All nodes of DESCRIPTION as one machine, on the ports and in the time of HOST; lives on one loop.
+
+    ``start``, then ``close`` whatever happened. When a node is lost or shuts down whose policy is fatal, all
+    others are stopped at once and ``stopped`` tells why; others are brought back (NodeCare). ON_NOTICE gets
+    sentences for the user; dictionaries are kept in CACHE. RESET_NODES: nodes that are configured as they
+    should be are reset, too. PREPARE_RESTART returns what begins anew (with nodes reset if True), or raises
+    CanductorError when that is not possible; None: nobody begins it anew.
+    """
+
+    def __init__(
+        self,
+        description: MachineDescription,
+        host: Host,
+        *,
+        on_notice: Callable[[str], None] = _ignore,
+        cache: DictionaryCache | None = None,
+        reset_nodes: bool = False,
+        prepare_restart: Callable[[], Callable[[bool], None]] | None = None,
+    ) -> None:
+        self.description = description
+        self.host = host
+        self.policies = {node.name: node.policy for node in description.nodes}
+        self.modules = description.modules.build(description)
+        self.devices = MachineDevices(description, self.modules)
+        self.rails = RailPlaces(description)
+        self.nodes: dict[str, Node] = {}
+        self.stopped: MachineStopped | None = None
+        self.runner: Runner | None = None
+        """The service that runs it; None: a program is all there is."""
+        self.filament = FilamentForecast()
+        """What moves that are planned are going to push; heaters ask."""
+        self.unsaved = PendingConfig(description.source)
+        self.prepare_restart = prepare_restart
+        self._reset_nodes = reset_nodes
+        self._on_notice = on_notice
+        self._cache = cache if cache is not None else DictionaryCache()
+        self._open: list[_OpenBus] = []
+        self._bus_of: dict[Node, CanBus | UartBus] = {}
+        self._care = NodeCare(
+            self.policies, bring_back=self._bring_back, on_notice=on_notice, now_s=lambda: host.now() * 1e-9
+        )
+        self._job: JobGate | None = None
+        self._waking: set[Node] = set()
+        self._failed = asyncio.Event()
+        self._stopped_at_ns = 0
+        self._all_down = asyncio.Event()
+        self._confirmed_s: dict[str, float] = {}
+        self._ready = False
+
+    @property
+    def busy(self) -> bool:
+        """Whether a job has the machine."""
+        return self._job is not None
+
+    # ------------------------------------------------------------------------------------------ life
+
+    async def start(self) -> None:
+        """Open every bus and bring every node to READY; raises CanductorError with all closed."""
+        try:
+            self._open_buses()
+            async with asyncio.TaskGroup() as group:
+                for opened in self._open:
+                    group.create_task(opened.bus.start())
+        except BaseException as error:
+            await self.close()
+            if isinstance(error, BaseExceptionGroup):
+                raise _first_cause(error) from None
+            raise
+        self._ready = True
+        try:
+            await self._begin()
+        except BaseException:
+            await self.close()
+            raise
+
+    async def _begin(self) -> None:
+        for node in self.nodes.values():
+            self._check_gone(node)  # one may have failed while others still started
+        if self.stopped is not None:
+            raise self.stopped
+        await self.modules.connect(Live(self, self._on_notice))
+
+    async def close(self) -> None:
+        """Leave the nodes as they are and release everything."""
+        self._ready = False
+        self.modules.close()
+        await self._care.close()
+        for opened in self._open:
+            await opened.bus.close()
+            opened.wire.close()
+        self._open.clear()
+
+    def stop(self, cause: str) -> None:
+        """Stop every node that can be reached, ahead of everything queued; the first CAUSE is kept."""
+        if self.stopped is not None:
+            return
+        self.stopped = MachineStopped(cause)
+        self._stopped_at_ns = self.host.now()
+        self._care.halt()
+        for opened in self._open:
+            opened.bus.emergency_stop()
+        self._failed.set()
+        self.modules.stopped(cause)
+
+    async def sleep(self, name: str) -> None:
+        """Let go of node NAME, so that its power can be switched off: it is not missed until ``wake``.
+
+        Raises CanductorError when it is needed.
+        """
+        node = self._node(name)
+        if self._job is not None and self.policies[name] is NodePolicy.FATAL:
+            if node is self.primary:
+                raise CanductorError(
+                    f"node {name} cannot sleep while a job runs: its clock is the job's time"
+                )
+            if node in self.moving:
+                raise CanductorError(f"node {name} cannot sleep while a job runs: it carries steppers")
+        await self._care.dismiss(name)
+        await node.sleep()
+
+    async def wake(self, name: str) -> None:
+        """Take a node that sleeps back, with its power on again; raises CanductorError, leaving it asleep."""
+        node = self._node(name)
+        self._waking.add(node)
+        try:
+            if node.state is NodeState.SLEEPING:
+                self._bus_of[node].ensure_open()
+            await node.wake()
+        except CanductorError:
+            if node.state in (NodeState.LOST, NodeState.SHUTDOWN):
+                await node.sleep()
+            raise
+        finally:
+            self._waking.discard(node)
+
+    def _node(self, name: str) -> Node:
+        if name not in self.nodes:
+            raise CanductorError(f"there is no node {name!r}; there are {', '.join(self.nodes)}")
+        return self.nodes[name]
+
+    @contextlib.contextmanager
+    def job(self, gate: JobGate) -> Iterator[None]:
+        """Run a job inside: GATE is held while a node is out whose policy is pause."""
+        self._job = gate
+        self._care.begin_job(gate)
+        try:
+            yield
+        finally:
+            self._job = None
+            self._care.end_job()
+
+    async def wait_stopped(self) -> MachineStopped:
+        """Wait until the machine is stopped; return why."""
+        await self._failed.wait()
+        assert self.stopped is not None
+        return self.stopped
+
+    async def confirm_stop(self) -> dict[str, float]:
+        """Wait until every node that can be reached has reported its shutdown, but not longer than a moment.
+
+        Returns for each that did how long after ``stop`` that was, in s.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(CONFIRM_STOP_S):
+                await self._all_down.wait()
+        return dict(self._confirmed_s)
+
+    # ------------------------------------------------------------------------------------------ parts
+
+    @property
+    def primary(self) -> Node:
+        """The node whose clock is print time."""
+        return self.nodes[self.description.nodes[0].name]
+
+    @property
+    def moving(self) -> list[Node]:
+        """The nodes that carry steppers, in the order in which motion counts them."""
+        return [self.nodes[name] for name in self.devices.moving_nodes]
+
+    def time_base(self) -> TimeBase:
+        """Return print time as the primary node's clock gives it."""
+        return TimeBase(self.primary.clock, self.primary.dictionary.clock_freq_hz)
+
+    def stream_specs(self) -> list[NodeStreamSpec]:
+        """Return how the moving nodes take step commands."""
+        return stream_specs((node.name, node.dictionary, node.step_slots) for node in self.moving)
+
+    def clock_map(self, time_base: TimeBase, node: Node, print_time: float) -> ClockMap:
+        """Return the map from print time to NODE's ticks, beginning at PRINT_TIME."""
+        if node is self.primary:
+            return time_base.primary_map(print_time)
+        return time_base.secondary_map(node.best_clock, node.dictionary.clock_freq_hz, print_time)
+
+    def address(self, node: Node) -> tuple[str, int | None, str | None]:
+        """Return the name of NODE's bus and, on CAN, the id that it has there and its uuid."""
+        bus = self._bus_of[node]
+        described = next(found for found in self.description.nodes if found.name == node.name)
+        if isinstance(bus, CanBus) and isinstance(described.connection, CanConnection):
+            uuid = Uuid.parse(described.connection.uuid)
+            return bus.name, bus.nodeid(uuid), str(uuid)
+        return bus.name, None, None
+
+    def can_bus(self, node: Node) -> CanBus | None:
+        """Return the CAN bus of NODE; None when it is on a serial line."""
+        bus = self._bus_of[node]
+        return bus if isinstance(bus, CanBus) else None
+
+    def bus_stats(self) -> dict[str, IOStats]:
+        """Return the counters of every bus that is open, by its name."""
+        return {o.bus.name: o.bus.io.stats() for o in self._open if o.bus.closed_because is None}
+
+    def check_load(self) -> None:
+        """Raise BusOverload when a bus will not carry the motion queued on it in time."""
+        for opened in self._open:
+            if opened.bus.closed_because is None:
+                opened.watch.look(
+                    opened.bus.io.forecast(), self.host.now(), functools.partial(_repeated, opened.bus)
+                )
+
+    def is_busy(self, load: float) -> bool:
+        """Tell whether a bus has carried more than LOAD lately, a share of its time."""
+        return any(o.bus.closed_because is None and o.bus.io.load().total > load for o in self._open)
+
+    async def stepper_positions(self) -> dict[str, int]:
+        """Ask every node where its steppers stand: steps from where they began, positive as motion counts."""
+        return {
+            stepper.name: (-1 if stepper.dir_pin.invert else 1)
+            * await self.devices.steppers[stepper.name].position(self.nodes[stepper.node])
+            for stepper in self.description.steppers
+        }
+
+    # ------------------------------------------------------------------------------------------ assembly
+
+    def _open_buses(self) -> None:
+        check_distinct(self.description.nodes, UartConnection)
+        can: dict[str, CanBus] = {}
+        for node in self.description.nodes:
+            connection = node.connection
+            if isinstance(connection, UartConnection):
+                self._add_uart(node, connection)
+                continue
+            if connection.interface not in can:
+                can[connection.interface] = self._add_can(connection)
+            bus = can[connection.interface]
+            self._add(
+                bus,
+                bus.add_node(
+                    node.name,
+                    Uuid.parse(connection.uuid),
+                    self._build_config(node),
+                    may_be_absent=node.policy is NodePolicy.OPTIONAL,
+                    on_state=self._node_changed,
+                ),
+            )
+
+    def _add_can(self, connection: CanConnection) -> CanBus:
+        wire = Wire(lambda: self.host.open_can(connection))
+        bus = CanBus(connection.interface, wire.start_io, cache=self._cache, on_notice=self._on_notice)
+        self._open.append(_OpenBus(bus, wire, LoadWatch(bus.name)))
+        return bus
+
+    def _add_uart(self, node: NodeDescription, connection: UartConnection) -> None:
+        wire = Wire(lambda: self.host.open_uart(connection))
+        bus = UartBus(connection.path, wire.start_io, cache=self._cache, on_notice=self._on_notice)
+        self._open.append(_OpenBus(bus, wire, LoadWatch(bus.name)))
+        self._add(
+            bus,
+            bus.add_node(
+                node.name,
+                self._build_config(node),
+                may_be_absent=node.policy is NodePolicy.OPTIONAL,
+                on_state=self._node_changed,
+            ),
+        )
+
+    def _add(self, bus: CanBus | UartBus, node: Node) -> None:
+        node.reset_first = self._reset_nodes
+        self.nodes[node.name] = node
+        self._bus_of[node] = bus
+
+    def _build_config(self, node: NodeDescription) -> Callable[[Dictionary], NodeConfig]:
+        return lambda dictionary: self.devices.build_config(node.name, dictionary)
+
+    async def _bring_back(self, node: Node) -> None:
+        self._bus_of[node].ensure_open()
+        await node.restart()
+
+    def _node_changed(self, node: Node) -> None:
+        if node.state is NodeState.READY:
+            self.modules.node_started(node)
+        self._check_gone(node)
+
+    def _check_gone(self, node: Node) -> None:
+        gone = node.state in (NodeState.LOST, NodeState.SHUTDOWN)
+        if not self._ready or not gone or node in self._waking:
+            return
+        if self.policies[node.name] is not NodePolicy.FATAL and self.stopped is None:
+            self._care.take_on(node)
+            return
+        self.stop(f"{node.failure}; all other nodes were stopped")
+        if node.state is NodeState.SHUTDOWN:
+            self._confirmed_s[node.name] = (self.host.now() - self._stopped_at_ns) * 1e-9
+        if all(other.state in _NOT_RUNNING for other in self.nodes.values()):
+            self._all_down.set()
+
+
+_NOT_RUNNING = (NodeState.LOST, NodeState.SHUTDOWN, NodeState.SLEEPING)
+
+
+def _repeated(bus: CanBus | UartBus) -> float:
+    """Return the share of the blocks sent on BUS that were repeats."""
+    stats = [link_of(node).stats() for node in bus.nodes if node.talks]
+    return sum(s.blocks_repeated for s in stats) / max(1, sum(s.blocks_sent for s in stats))
+
+
+def _first_cause(group: BaseExceptionGroup[BaseException]) -> BaseException:
+    for error in group.exceptions:
+        if not isinstance(error, BaseExceptionGroup):
+            return error
+        return _first_cause(error)
+    return group
+
+
+def link_of(node: Node) -> Link:
+    """Return the node's link with its counters."""
+    link = node.link
+    assert isinstance(link, Link)
+    return link

@@ -1,0 +1,110 @@
+"""The running machine as its modules see it."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from nodes.clock.clock import Ticks, extend32
+from nodes.node.node import Node
+
+if TYPE_CHECKING:
+    from coordinator.runtime.machine import Machine
+
+AHEAD_S: Final = 0.1
+"""What is to happen as soon as possible happens so far ahead of now: commands need their time to the node."""
+
+
+class Live:
+    """MACHINE, connected. SAY shows a sentence to the user. Everything on the control loop."""
+
+    def __init__(self, machine: "Machine", say: Callable[[str], None]) -> None:
+        self.machine = machine
+        """For modules of the project: what others may rely upon are the methods."""
+        self.say = say
+        self._time_base = machine.time_base()
+        self._timers: set[_Timer] = set()
+        self._loop = asyncio.get_running_loop()
+
+    def node(self, name: str) -> Node:
+        """Return a node by its name."""
+        return self.machine.nodes[name]
+
+    def now_s(self) -> float:
+        """Return the host's time in s; only differences mean something."""
+        return self.machine.host.now() * 1e-9
+
+    def print_time_now(self) -> float:
+        """Return the present print time in s."""
+        return self._time_base.print_time_at(self.machine.host.now())
+
+    def soon(self, print_time_s: float = 0.0) -> float:
+        """Return a print time that commands for a node still reach in time, not before PRINT_TIME_S."""
+        return max(print_time_s, self.print_time_now() + AHEAD_S)
+
+    def ticks_at(self, node: str, print_time_s: float) -> int:
+        """Return what the clock of a node shows at a print time; 64 bits."""
+        return self.node(node).best_clock.ticks_at(self._time_base.host_ns_at(print_time_s))
+
+    def print_time_of(self, node: str, clock32: int) -> float:
+        """Return the print time at which a node's clock shows CLOCK32, the nearest one to now."""
+        clock = self.node(node).best_clock
+        now_ns = self.machine.host.now()
+        ticks = extend32(clock32, Ticks(clock.ticks_at(now_ns)))
+        return self._time_base.print_time_at(clock.ns_at(ticks))
+
+    def soon_on_loop(self, call: Callable[[], None]) -> None:
+        """Have CALL called on the control loop; from any thread."""
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self._loop.call_soon_threadsafe(call)
+
+    def every(self, seconds: float, call: Callable[[], None]) -> Callable[[], None]:
+        """Call CALL every so many seconds; returns what ends it. All end when the machine closes."""
+        timer = _Timer(seconds, call, again=True, ended=self._timers.discard)
+        self._timers.add(timer)
+        return timer.end
+
+    def after(self, seconds: float, call: Callable[[], None]) -> Callable[[], None]:
+        """Call CALL once after so many seconds; returns what calls it off."""
+        timer = _Timer(seconds, call, again=False, ended=self._timers.discard)
+        self._timers.add(timer)
+        return timer.end
+
+    def save(self, section: str, option: str, text: str) -> None:
+        """Have SAVE_CONFIG write a value that was calibrated; raises SaveError for a text that it cannot."""
+        self.machine.unsaved.put(section, option, text)
+
+    def stop(self, cause: str) -> None:
+        """Stop the whole machine for safety: CAUSE is a sentence with what to do."""
+        self.machine.stop(cause)
+
+    def close(self) -> None:
+        """End all timers."""
+        for timer in tuple(self._timers):
+            timer.end()
+
+
+class _Timer:
+    def __init__(
+        self, seconds: float, call: Callable[[], None], *, again: bool, ended: Callable[["_Timer"], None]
+    ) -> None:
+        self._seconds = seconds
+        self._call = call
+        self._again = again
+        self._ended = ended
+        self._loop = asyncio.get_running_loop()
+        self._due_s = self._loop.time() + seconds
+        self._handle = self._loop.call_at(self._due_s, self._fire)
+
+    def _fire(self) -> None:
+        if self._again:
+            # Missed turns are not made up for: the loop was busy, or the machine slept.
+            self._due_s = max(self._due_s + self._seconds, self._loop.time())
+            self._handle = self._loop.call_at(self._due_s, self._fire)
+        else:
+            self._ended(self)
+        self._call()
+
+    def end(self) -> None:
+        self._handle.cancel()
+        self._ended(self)

@@ -1,0 +1,106 @@
+"""Where each motor has brought what it moves, by the steps that its node counts.
+
+A count alone says nothing. When a position is declared (homing ends, another carriage is the head), the place
+of each rail follows from it, and with the count at that moment the place that a count of 0 stands for. From
+then on counts of the nodes give places, past all that the host has planned.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+
+from coordinator.kinematics.base import Point, Weights
+from coordinator.kinematics.dual_carriage import CarriageState
+from coordinator.assembly.load import MachineDescription, StepperDescription
+from coordinator.motion.planner.planner import Position
+from coordinator.motion.specs import StepKinematics
+
+_XYZ: Final = 3
+
+
+class RailPlaces:
+    """The places of the machine's motors in mm (rad where they turn something); unknown until declared."""
+
+    def __init__(self, described: MachineDescription) -> None:
+        self._described = described
+        self._at_zero: dict[str, float] = {}
+        self._carriages: CarriageState | None = None
+        dual = described.dual_carriage
+        self._of_carriage: dict[str, tuple[int, Weights]] = {}
+        if dual is not None:
+            for number, carriage in enumerate(dual.carriages.carriages):
+                self._of_carriage |= {name: (number, weights) for name, weights in carriage.steppers}
+
+    def declare(
+        self,
+        position: Position,
+        counts: Mapping[str, int],
+        carriages: CarriageState | None = None,
+        offsets: Sequence[float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Take the axes X Y Z E to be at POSITION when the nodes count COUNTS.
+
+        OFFSETS: how far beyond X, Y and Z their tables have the motors stand.
+        """
+        self._carriages = carriages
+        self._at_zero = {
+            stepper.name: self._place(stepper, position, offsets)
+            - counts[stepper.name] * stepper.step_distance
+            for stepper in self._described.steppers
+        }
+
+    def use(self, carriages: CarriageState | None) -> None:
+        """Take note of which carriage is the head."""
+        self._carriages = carriages
+
+    def places(self, counts: Mapping[str, int]) -> dict[str, float]:
+        """Return the place of every motor; empty: nothing was declared yet."""
+        if not self._at_zero:
+            return {}
+        return {
+            stepper.name: self._at_zero[stepper.name] + counts[stepper.name] * stepper.step_distance
+            for stepper in self._described.steppers
+        }
+
+    def head(self, places: Mapping[str, float]) -> Point | None:
+        """Return where motors at PLACES have the head; None: unknown."""
+        if not places:
+            return None
+        motors = self._described.motors
+        if all(motor.function.kinematics is StepKinematics.LINEAR for motor in motors):
+            return self._head_of_sums(places)
+        rails = {rail.axis: rail.steppers[0].name for rail in self._described.rails}
+        kinematics = self._described.kinematics
+        try:
+            return kinematics.forward(tuple(places[rails[name]] for name in kinematics.rails))
+        except ValueError:
+            return None  # arms that do not meet: one of them was moved alone
+
+    # ---------------------------------------------------------------------------------------------- places
+
+    def _place(self, stepper: StepperDescription, position: Position, offsets: Sequence[float]) -> float:
+        function = stepper.function
+        if function.kinematics is not StepKinematics.LINEAR:
+            rail = next(rail.axis for rail in self._described.rails if stepper in rail.steppers)
+            kinematics = self._described.kinematics
+            return kinematics.inverse(position[:_XYZ])[kinematics.rails.index(rail)]
+        number, weights = self._of_carriage.get(stepper.name, (0, stepper.weights))
+        axes = [at + by for at, by in zip(position, (*offsets, 0.0), strict=True)]
+        dual = self._described.dual_carriage
+        if dual is not None and self._carriages is not None and stepper.name in self._of_carriage:
+            axis = dual.carriages.axis
+            axes[axis] = self._carriages.at(position[axis])[number] + offsets[axis]
+        return float(np.dot(weights, axes))
+
+    def _head_of_sums(self, places: Mapping[str, float]) -> Point:
+        """Return the place that is nearest to what all motors of the head say."""
+        primary = 0 if self._carriages is None else self._carriages.primary
+        rows, sums = [], []
+        for motor in self._described.motors:
+            number, weights = self._of_carriage.get(motor.name, (primary, motor.weights))
+            if number == primary:
+                rows.append(weights[:_XYZ])
+                sums.append(places[motor.name])
+        x, y, z = np.linalg.lstsq(np.array(rows), np.array(sums), rcond=None)[0].tolist()
+        return (x, y, z)

@@ -1,0 +1,1 @@
+"""The methods that front ends call, by subject."""

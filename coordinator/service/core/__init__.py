@@ -1,0 +1,1 @@
+"""The machine service: its life, the feeder, the work of clients."""

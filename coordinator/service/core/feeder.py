@@ -1,0 +1,409 @@
+"""Feeds the streamer with what clients want done: one work after the other, for as long as the machine lives.
+
+While a job is paused, other works come between two of its lines; afterwards it goes on where it was.
+
+Two threads meet here. The control loop submits, pauses and cancels; the motion worker calls ``step``. What
+passes between them are single attributes and deques, whose operations are atomic; nobody waits for anybody.
+"""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Final
+
+from coordinator.gcode.commands import NO_WORDS, Vocabulary
+from coordinator.gcode.events import (
+    AS_SOON_AS_POSSIBLE,
+    Emergency,
+    End,
+    Event,
+    Full,
+    Idle,
+    Notice,
+    Progress,
+    Reply,
+    Resting,
+    Timed,
+)
+from coordinator.gcode.interpreter import Job
+from coordinator.gcode.machine_state import MachineState, SavedState
+from coordinator.gcode.print_control import Recovering
+from coordinator.gcode.builtins.state import come_back, present_state
+from coordinator.gcode.parser import WordError
+from coordinator.motion.planner.planner import Planner
+from coordinator.service.core.work import NO_PROGRESS, LinesWork, Rest, Setting, Work
+from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.motion.planner.language import Aside
+
+WAITING_MAX: Final = 64
+"""Works that may wait; more are refused."""
+ASIDES_MAX: Final = 16
+COME_BACK_MM_S: Final = 50.0
+"""At which a job goes back to where it was paused."""
+TOLD_MAX: Final = 1000
+"""Replies and notices that are kept of one work."""
+
+
+class FeederFull(CanductorError):  # noqa: N818
+    """Too much waits already."""
+
+
+@dataclass(eq=False)
+class Ticket:
+    """A work on its way."""
+
+    work: Work
+    is_job: bool = False
+    told: list[Reply | Notice] = field(default_factory=list)
+    progress: Progress = NO_PROGRESS
+    """How far it is read."""
+    cancelled: bool = False
+    error: CanductorError | None = None
+    """Why it ended before its end."""
+    begun_at_s: float | None = None
+    """Print time up to which all was planned when it began; None: it waits."""
+    read: bool = False
+    """Whether nothing more of it will be planned."""
+    ends_at_s: float | None = None
+    """Print time at which its last move ends, once it is known; 0: there is nothing to wait for."""
+    done: bool = False
+    """Whether that has passed."""
+    resting: Resting | None = None
+    """What it waits for while the machine stands."""
+
+
+class Feeder:
+    """A ``MoveSource`` that never ends until ``close``: idles while nothing is to do."""
+
+    def __init__(
+        self,
+        planner: Planner,
+        homed_position: Mapping[str, float],
+        machine: MachineState,
+        vocabulary: Vocabulary = NO_WORDS,
+    ) -> None:
+        self.planner = planner
+        self.machine = machine
+        self._setting = Setting(planner, machine, dict(homed_position), vocabulary, self)
+        self._waiting: deque[Ticket] = deque()
+        self._asides: deque[Ticket] = deque()
+        self._aside: Ticket | None = None
+        """That is being done, and has to wait for room."""
+        self._aside_events: deque[Event] = deque()
+        self._now: Ticket | None = None
+        self._held: tuple[Ticket, Aside] | None = None
+        """A paused job that others have come between."""
+        self._come_back: SavedState | None = None
+        """Where the paused job has to go on, if something may have moved since."""
+        self._paused = False
+        self._pause_wanted = False
+        self._cancel_wanted = False
+        self._closed = False
+        self.to_recover: deque[Recovering] = deque(maxlen=1)
+        """For the control loop to take: a program wants the interrupted job to go on."""
+        self.to_print: deque[str] = deque(maxlen=WAITING_MAX)
+        """For the control loop to take: files that programs want to have printed."""
+        self.finished: deque[Ticket] = deque(maxlen=WAITING_MAX + ASIDES_MAX + 1)
+        """For the control loop to take: tickets of which everything is read, oldest first."""
+
+    # --------------------------------------------------------------------------- for the control loop
+
+    @property
+    def name(self) -> str:
+        """What is being read."""
+        now = self._now
+        return now.work.name if now is not None else "nothing"
+
+    @property
+    def line(self) -> int:
+        """Number of the line that comes next."""
+        return self.planner.lines + 1
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything is being done or waits."""
+        return self._now is not None or self._held is not None or bool(self._waiting)
+
+    @property
+    def active(self) -> bool:
+        """Whether anything is being done or waits, but for a job that is paused."""
+        now = self._now
+        return bool(self._waiting) or (now is not None and not (self._paused and now.is_job))
+
+    @property
+    def paused(self) -> bool:
+        """Whether works wait."""
+        return self._paused
+
+    @property
+    def axes(self) -> str:
+        """Letters of the axes that G28 homes."""
+        return "".join(self._setting.homed_position)
+
+    @property
+    def vocabulary(self) -> Vocabulary:
+        """What programs know through modules."""
+        return self._setting.vocabulary
+
+    def submit(self, work: Work, *, is_job: bool = False) -> Ticket:
+        """Have WORK done after all that was submitted before; raises FeederFull."""
+        if len(self._waiting) >= WAITING_MAX:
+            raise FeederFull(f"{WAITING_MAX} requests wait for the machine already; wait for their answers")
+        ticket = Ticket(work, is_job)
+        self._waiting.append(ticket)
+        return ticket
+
+    def submit_aside(self, lines: LinesWork) -> Ticket:
+        """Have LINES, none of which moves anything, done between two lines of the work; raises FeederFull."""
+        if len(self._asides) >= ASIDES_MAX:
+            raise FeederFull(f"{ASIDES_MAX} requests wait already; wait for their answers")
+        ticket = Ticket(lines)
+        self._asides.append(ticket)
+        return ticket
+
+    def pause(self) -> None:
+        """Read no further: what is planned is carried out, to a standstill between two moves."""
+        self._paused = True
+
+    def resume(self) -> None:
+        """Go on with the next line."""
+        self._paused = False
+
+    def cancel(self, ticket: Ticket) -> None:
+        """End TICKET before its next line, also while it waits; what is planned of it is carried out."""
+        ticket.cancelled = True
+        if (resting := ticket.resting) is not None:
+            resting.cancelled = True
+
+    def cancel_all(self) -> None:
+        """End what is being done and what waits, each before its next line."""
+        now = self._now
+        for ticket in (*self._waiting, *([now] if now is not None else [])):
+            self.cancel(ticket)
+
+    def close(self) -> None:
+        """End: ``step`` answers End once all is planned."""
+        self._closed = True
+
+    def abandon(self) -> None:
+        """Release what works hold that will not be done any more; the worker has ended."""
+        left = [*self._waiting, *([self._now] if self._now is not None else [])]
+        left += [self._held[0]] if self._held is not None else []
+        self._waiting.clear()
+        self._asides.clear()
+        self._now = self._held = None
+        for ticket in left:
+            ticket.work.close()
+
+    # ------------------------------------------------------------------------- for the worker's thread
+
+    def step(self) -> Event:
+        """Go on with the work at hand, or the next one."""
+        if (event := self._do_asides()) is not None:
+            return event
+        if self._now is None and (event := self._take_next()) is not None:
+            return event
+        ticket = self._now
+        assert ticket is not None
+        if ticket.read or ticket.cancelled:
+            return self._finish(ticket)
+        if self._gives_way(ticket):
+            self._held = (ticket, self.planner.put_aside())
+            self._now = None
+            return ticket.progress
+        try:
+            event = self._step_job(ticket) if ticket.is_job else self._begin_or_step(ticket)
+        except CanductorError as error:
+            ticket.error = error
+            ticket.read = True
+            return self._finish(ticket)
+        return self._pass_on(ticket, event)
+
+    def attend_others(self) -> Event | None:
+        """Act on lines of clients while the work at hand waits for something that is done at rest."""
+        until_s, self.planner.plan_until_s = self.planner.plan_until_s, float("-inf")
+        event = self._do_asides()
+        self.planner.plan_until_s = until_s
+        return None if isinstance(event, Full) else event
+
+    def _take_next(self) -> Event | None:
+        if self._waiting:
+            self._now = self._waiting.popleft()
+        elif self._held is not None and (not self._paused or self._held[0].cancelled):
+            (self._now, aside), self._held = self._held, None
+            self.planner.take_up(aside)
+        elif self._held is None and self._closed:
+            return End(0, self.planner.print_time_end_s) if self.planner.flush() else Full()
+        else:
+            return Idle()
+        return None
+
+    def _gives_way(self, ticket: Ticket) -> bool:
+        """Whether TICKET is a paused job that others may come between now; remember where it stands."""
+        if not (self._paused and ticket.is_job and self._waiting) or not ticket.work.settled:
+            return False
+        if self._come_back is None and ticket.begun_at_s is not None:
+            self._come_back = present_state(self.planner)
+        return True
+
+    def _step_job(self, ticket: Ticket) -> Event:
+        """Go on with a job, unless it is paused; raises CanductorError."""
+        if not self._paused:
+            if self._come_back is not None and (event := self._go_back(self._come_back)) is not None:
+                return event
+            return self._begin_or_step(ticket)
+        if ticket.begun_at_s is not None and (event := ticket.work.pending()) is not None:
+            return event
+        return Idle()
+
+    def _go_back(self, saved: SavedState) -> Event | None:
+        """Go where the job was when it was paused; None when that is done."""
+        lost = [axis for axis in saved.homed if axis not in self.planner.homed]
+        problem, done = "", False
+        aside = self.planner.put_aside()
+        try:
+            done = not lost and come_back(self.planner, saved, COME_BACK_MM_S)
+        except WordError as error:
+            problem = str(error)
+        self.planner.take_up(aside)
+        if lost:
+            problem = f"{' and '.join(lost)} must be homed with G28 before it can go on"
+        if problem:
+            self._paused = True
+            return Notice(self.line, f"{self.name} stays paused: {problem}")
+        if not done:
+            return Full()
+        self._come_back = None
+        return None
+
+    def _begin_or_step(self, ticket: Ticket) -> Event:
+        if ticket.begun_at_s is None:
+            ticket.begun_at_s = self.planner.print_time_end_s
+            ticket.work.begin(self._setting)
+        ticket.resting = None
+        return ticket.work.step()
+
+    def _pass_on(self, ticket: Ticket, event: Event) -> Event:
+        """Keep what is the client's, hand on what is the streamer's."""
+        if isinstance(event, End):
+            ticket.read = True
+            return self._finish(ticket)
+        ticket.progress = ticket.work.progress()
+        if ticket.is_job and ticket.work.at_line:
+            self._paused, self._pause_wanted = self._paused or self._pause_wanted, False
+            ticket.cancelled, self._cancel_wanted = ticket.cancelled or self._cancel_wanted, False
+        if isinstance(event, Resting):
+            ticket.resting = event
+            event.cancelled = ticket.cancelled  # since the last look
+        if isinstance(event, Reply | Notice):
+            _keep(ticket, event)
+        return event
+
+    def _finish(self, ticket: Ticket) -> Event:
+        """Let TICKET go once its moves are planned as far as they have to be."""
+        early = ticket.cancelled or ticket.error is not None
+        if ticket.resting is not None and ticket.resting.moved:
+            self.planner.homed = ""  # nobody takes over any more where that left the machine
+        if (early or ticket.work.rest is Rest.STANDSTILL) and not self.planner.flush():
+            return Full()
+        ticket.read = True
+        end_s = self.planner.print_time_end_s
+        at_once = end_s == ticket.begun_at_s or (ticket.work.rest is Rest.OPEN and not early)
+        ticket.ends_at_s = 0.0 if at_once else end_s
+        ticket.work.close()
+        self._now = None
+        if ticket.is_job:
+            self._come_back, self._pause_wanted, self._cancel_wanted = None, False, False
+        self.finished.append(ticket)
+        return ticket.progress
+
+    def _do_asides(self) -> Event | None:
+        """Act on all lines that neither move nor wait, and tell what comes of it; Full: one needs room."""
+        while self._aside is not None or self._asides:
+            ticket = self._aside = self._aside or self._asides.popleft()
+            aside = self.planner.put_aside(moving=False)
+            done = self._do_aside(ticket)
+            self.planner.take_up(aside)
+            if not done:
+                return Full()
+            self._aside = None
+        return self._aside_events.popleft() if self._aside_events else None
+
+    def _do_aside(self, ticket: Ticket) -> bool:
+        """Go on with lines of a client; False: there is no room."""
+        try:
+            if ticket.begun_at_s is None:
+                ticket.begun_at_s = self.planner.print_time_end_s
+                ticket.work.begin(self._setting)
+            while not isinstance(event := ticket.work.step(), End | Emergency):
+                if isinstance(event, Full):
+                    return False
+                if isinstance(event, Reply | Notice):
+                    _keep(ticket, event)
+                elif isinstance(event, Timed):  # it does not belong to any place among the work's moves
+                    self._aside_events.append(replace(event, after_moves=AS_SOON_AS_POSSIBLE))
+            if isinstance(event, Emergency):
+                self._aside_events.appendleft(event)
+        except CanductorError as error:
+            ticket.error = error
+        ticket.read = True
+        ticket.ends_at_s = 0.0
+        self.finished.append(ticket)
+        return True
+
+    # ------------------------------------------------- for programs (coordinator/gcode/print_control.py)
+
+    @property
+    def job_is_active(self) -> bool:
+        """Whether there is a job that is neither done nor cancelled."""
+        tickets = (self._now, self._held[0] if self._held is not None else None)
+        return any(ticket is not None and ticket.is_job and not ticket.cancelled for ticket in tickets)
+
+    def pause_job(self, program: Job) -> None:
+        """Let the job read no further, by a line of PROGRAM."""
+        if not self.job_is_active:
+            return
+        if self._come_back is None:
+            self._come_back = present_state(self.planner)
+        if self._is_job(program):
+            self._pause_wanted = True
+            program.break_after_line()
+        else:
+            self._paused = True
+
+    def come_back(self, program: Job, speed_mm_s: float) -> bool:  # noqa: ARG002 (whose moves it is)
+        """Go to where the job was paused."""
+        return self._come_back is None or come_back(self.planner, self._come_back, speed_mm_s)
+
+    def resume_job(self) -> None:
+        """Let the job go on when the program at hand has ended."""
+        self._paused = self._pause_wanted = False
+
+    def cancel_job(self, program: Job) -> None:
+        """End the job, by a line of PROGRAM."""
+        if self._is_job(program):
+            self._cancel_wanted = True
+            program.break_after_line()
+        elif self._held is not None:
+            self._held[0].cancelled = True
+        elif self._now is not None and self._now.is_job:
+            self.cancel(self._now)
+
+    def start_job(self, name: str) -> None:
+        """Have the file NAME printed next."""
+        self.to_print.append(name)
+
+    def recover_job(self, how: Recovering) -> None:
+        """Have the interrupted job go on."""
+        self.to_recover.append(how)
+
+    def _is_job(self, program: Job) -> bool:
+        now = self._now
+        return now is not None and now.is_job and not program.beside and self._aside is None
+
+
+def _keep(ticket: Ticket, event: Reply | Notice) -> None:
+    if len(ticket.told) < TOLD_MAX:
+        ticket.told.append(event)

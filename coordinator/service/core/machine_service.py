@@ -1,0 +1,378 @@
+"""The machine's life as a service: it starts, is ready, prints, stops, starts again; clients come and go.
+
+One object owns it. All of it runs on the control loop; clients' methods only change attributes or wait.
+"""
+
+import asyncio
+import contextlib
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+from coordinator.runtime.machine import Machine, MachineStopped
+from coordinator.gcode.events import Notice
+from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.runtime.host import Host
+from coordinator.ipc.protocol.methods import ApiError
+from coordinator.ipc.server.state import StateTree
+from coordinator.assembly.load import MachineDescription
+from coordinator.streaming.move_source import Told
+from coordinator.streaming.pipeline import PlanRecord
+from coordinator.service.jobs.fed import FedJobs
+from coordinator.service.state.figures import Figures
+from coordinator.service.jobs.job_folder import JobFolder
+from coordinator.service.jobs.jobs import JobPhase, JobRun
+from coordinator.service.state.log_ring import Entry, LogRing
+from coordinator.service.core.memory import give_back, keep_small, pass_by_what_stays
+from coordinator.service.core.motion import Motion
+from coordinator.service.core.programs import Programs
+from coordinator.service.jobs.recovery import Recovery
+from coordinator.service.core.tables import TableService
+from coordinator.service.core.work import FileWork
+from coordinator.tables.store import TableStore
+from nodes.dictionary.cache import DictionaryCache
+from nodes.support.errors import CanductorError
+from nodes.node.errors import NodeShutdown
+
+REFRESH_S: Final = 0.1
+"""How often the state tree is brought up to date."""
+BY_USER: Final = "emergency stop by"
+
+
+class ServiceState(StrEnum):
+    """What the machine is doing."""
+
+    STARTUP = "startup"
+    READY = "ready"
+    PRINTING = "printing"
+    PAUSED = "paused"
+    SHUTDOWN = "shutdown"
+    """Stopped for safety; ``machine.restart`` begins anew."""
+    ERROR = "error"
+    """It could not be started; put the cause right, then ``machine.restart``."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServiceSettings:
+    """What the service may do for its clients."""
+
+    name: str
+    jobs: Path | None = None
+    """The folder of files that may be printed; None: there are no jobs."""
+    node_commands: bool = False
+    """Whether ``node.command`` may send raw commands."""
+    id: str = field(default_factory=lambda: secrets.token_hex(8))
+    """Of this life of the service: tells whether two addresses lead to the same one."""
+    tables: Path | None = None
+    """Where accepted axis tables are kept; None: only as long as the service lives."""
+    own_process: bool = False
+    """Whether the process is there for this service alone, which then has its garbage collector to itself."""
+
+
+class MachineService:
+    """Runs the machine that LOAD describes (called again at every restart; CanductorError).
+
+    ``run`` until it is cancelled. ON_LINE hears every line of the log. RECORD keeps all that is planned, for
+    a proof; memory grows with it.
+    """
+
+    def __init__(
+        self,
+        load: Callable[[], MachineDescription],
+        host: Host,
+        state: StateTree,
+        settings: ServiceSettings,
+        *,
+        cache: DictionaryCache | None = None,
+        record: PlanRecord | None = None,
+        on_line: Callable[[Entry], None],
+    ) -> None:
+        self.settings = settings
+        self.state = ServiceState.STARTUP
+        self.cause = ""
+        """Why it is in shutdown or error: a sentence."""
+        self.log = LogRing(on_line)
+        self.folder = None if settings.jobs is None else JobFolder(settings.jobs)
+        self.machine: Machine | None = None
+        self.motion: Motion | None = None
+        self.job: JobRun | None = None
+        """The last one, also when it has ended."""
+        self.confirmed_s: dict[str, float] = {}
+        """By node: how long after the stop it confirmed it."""
+        self.tables = TableService(
+            None if settings.tables is None else TableStore(settings.tables),
+            state,
+            lambda text: self.log.add("notice", text),
+        )
+        self.starts = 0
+        self.cut_off = False
+        """Whether ``run`` was ended while something moved."""
+        self.host = host
+        self._load = load
+        self.tree = state
+        self._cache = cache
+        self._record = record
+        self._figures = Figures(state)
+        self.programs = Programs(self)
+        self.recovery = Recovery(self)
+        self.fed = FedJobs(self)
+        self._restart = asyncio.Event()
+        self._reset_nodes = False
+        """At the next start, whatever their configuration."""
+        self._asked_to_stop: str | None = None
+        """By somebody, while it starts."""
+
+    # ------------------------------------------------------------------------------------------- life
+
+    async def run(self) -> None:
+        """Be the machine. Cancelled while it moves, it stops all nodes, as Ctrl-C does."""
+        if self.settings.own_process:
+            keep_small()
+        refresh = asyncio.ensure_future(self._refresh())
+        try:
+            while True:
+                await self._live_once()
+                await self._restart.wait()
+                self._asked_to_stop = None
+                await self._let_go()
+        except asyncio.CancelledError:
+            await self._stop_if_moving()
+            raise
+        finally:
+            refresh.cancel()
+            await asyncio.gather(refresh, return_exceptions=True)
+            await self._let_go()
+            await asyncio.to_thread(self.recovery.close)
+
+    async def _live_once(self) -> None:
+        """Start, move, and return when that is over, with ``state`` telling why."""
+        self._restart.clear()
+        self.confirmed_s = {}
+        self.starts += 1
+        self._enter(ServiceState.STARTUP)
+        self.machine = None
+        try:
+            description = await asyncio.to_thread(self._load)
+            try:
+                machine = await self._start(description)
+            except NodeShutdown as error:
+                if self._asked_to_stop is not None:
+                    raise
+                # The service before this one was killed a moment ago, and the node misses it.
+                self.log.add("notice", f"{error}; all nodes are reset, and started once more")
+                self._reset_nodes = True
+                machine = await self._start(description)
+        except CanductorError as error:
+            stopped = None if self.machine is None else self.machine.stopped
+            self._enter(ServiceState.SHUTDOWN if stopped else ServiceState.ERROR, str(stopped or error))
+            return
+        await self._move(machine)
+
+    async def _start(self, description: MachineDescription) -> Machine:
+        """Return the machine, ready; raises CanductorError."""
+        machine = self.machine = Machine(
+            description,
+            self.host,
+            on_notice=lambda text: self.log.add("notice", text),
+            cache=self._cache,
+            reset_nodes=self._reset_nodes,
+            prepare_restart=self._prepare_restart,
+        )
+        self._reset_nodes = False
+        if self._asked_to_stop is not None:
+            machine.stop(self._asked_to_stop)
+        await machine.start()
+        return machine
+
+    async def _move(self, machine: Machine) -> None:
+        care = asyncio.ensure_future(self.tables.care(machine, self.stands))
+        try:
+            self.programs.begin(machine)
+            self.recovery.open()
+            compensation = self.tables.compensation_of(machine)
+            self.motion = Motion(
+                machine,
+                on_told=self.tell,
+                on_cycle=self.look,
+                record=self._record,
+                compensation=compensation,
+            )
+            if self.settings.own_process:
+                pass_by_what_stays()
+            self._enter(ServiceState.READY)
+            await self.motion.run()
+        except CanductorError as error:
+            machine.stop(str(error))
+            self._stopped(machine)
+            self.confirmed_s = await machine.confirm_stop()
+        except Exception as bug:
+            machine.stop(f"internal error: {type(bug).__name__}: {bug}; all nodes were stopped")
+            raise
+        finally:
+            care.cancel()
+            (ended,) = await asyncio.gather(care, return_exceptions=True)
+            if isinstance(ended, Exception):
+                raise ended  # a bug of it, which expects all that may happen
+
+    def _stopped(self, machine: Machine) -> None:
+        """Take note that the machine is stopped; again, without effect."""
+        if self.state is ServiceState.SHUTDOWN:
+            return
+        cause = str(machine.stopped)
+        if self.job is not None:
+            self.job.stop(cause, self.now_s)
+            self.fed.look()
+        self._enter(ServiceState.SHUTDOWN, cause)
+
+    async def _stop_if_moving(self) -> None:
+        machine, motion = self.machine, self.motion
+        if machine is not None and motion is not None and machine.stopped is None and not motion.standing:
+            self.cut_off = True
+            machine.stop("stopped by the user")
+            await machine.confirm_stop()
+
+    async def _let_go(self) -> None:
+        machine, self.machine, self.motion = self.machine, None, None
+        if machine is not None:
+            await machine.close()
+
+    # ------------------------------------------------------------------------------------------- doing
+
+    def emergency_stop(self, who: str) -> None:
+        """Stop all nodes, ahead of everything queued; takes effect before this returns."""
+        cause = f"{BY_USER} {who}"
+        if self.state is ServiceState.STARTUP:
+            self._asked_to_stop = cause  # whatever machine is there by then
+        if self.machine is None:
+            return
+        self.machine.stop(cause)
+        if self.motion is not None:
+            self._stopped(self.machine)
+
+    def restart(self, *, firmware: bool = False) -> None:
+        """Begin anew with the configuration read again; raises ApiError while the machine starts or works.
+
+        Nodes are configured anew where they have to be; with FIRMWARE all are reset.
+        """
+        if self.state is ServiceState.STARTUP:
+            raise ApiError("busy", "the machine is starting already")
+        if self.state not in (ServiceState.SHUTDOWN, ServiceState.ERROR):
+            motion = self.ready_motion()
+            if motion.feeder.busy or not motion.standing:
+                raise ApiError("busy", "the machine moves; wait until it stands, or cancel the job first")
+        self._begin_anew(firmware)
+
+    def _begin_anew(self, firmware: bool) -> None:
+        self._reset_nodes = firmware
+        self._restart.set()
+        if self.motion is not None:
+            self.motion.finish_early()
+
+    def _prepare_restart(self) -> Callable[[bool], None]:
+        """Return what a program begins anew with, as its last act; raises ApiError in a job."""
+        if self.active_job is not None:
+            raise ApiError("busy", "a job prints; wait for its end, or cancel it with job.cancel")
+        return self._begin_anew
+
+    def start_job(self, work: FileWork, *, behind_others: bool = False, fed: bool = False) -> JobRun:
+        """Print; raises ApiError unless the machine is ready and idle, or BEHIND_OTHERS without a job.
+
+        FED: its lines come from a client.
+        """
+        motion = self.ready_motion()
+        if motion.feeder.busy and (not behind_others or self.active_job is not None):
+            raise ApiError(
+                "busy", "the machine is busy; wait for its moves, or cancel them, then start the job"
+            )
+        self.up_machine().modules.job_begins()
+        motion.toolpath.clear()
+        self.job = JobRun(motion, work, self.now_s)
+        self.job.lines_fed = 0 if fed else None
+        self.recovery.begin(self.job, work.program)
+        self.log.add("job", f"{self.job.file}: started")
+        self.look()
+        return self.job
+
+    # --------------------------------------------------------------------------------------- looking at
+
+    @property
+    def now_s(self) -> float:
+        """Host time in s."""
+        return self.host.now() * 1e-9
+
+    @property
+    def active_job(self) -> JobRun | None:
+        """The job that is on its way."""
+        return self.job if self.job is not None and self.job.active else None
+
+    def stands(self) -> bool:
+        """Tell whether nothing moves, and nothing is about to."""
+        motion = self.motion
+        return motion is not None and motion.standing and not motion.feeder.busy and self.active_job is None
+
+    def ready_motion(self) -> Motion:
+        """Return what moves the machine; raises ApiError when that is not possible now."""
+        motion = self.motion
+        if self.state is ServiceState.SHUTDOWN:
+            raise ApiError("stopped", f"the machine stopped: {self.cause}; machine.restart begins anew")
+        if motion is None or self.state in (ServiceState.STARTUP, ServiceState.ERROR):
+            told = f": {self.cause}" if self.cause else ""
+            raise ApiError("not_ready", f"the machine is in {self.state}{told}")
+        return motion
+
+    def up_machine(self) -> Machine:
+        """Return the machine, in whatever state; raises ApiError where there is none."""
+        if self.machine is None:
+            raise ApiError(
+                "not_ready", f"the machine is in {self.state}: {self.cause or 'no node is connected'}"
+            )
+        return self.machine
+
+    # ------------------------------------------------------------------------------------------- inside
+
+    def look(self) -> None:
+        """Bring job and state up to date; called every cycle of motion, and before somebody asks."""
+        job = self.job
+        if job is not None and job.active:
+            before = job.phase
+            job.look(self.now_s)
+            if job.phase is not before:
+                self.log.add("job", f"{job.file}: {job.phase}" + (f": {job.message}" if job.message else ""))
+                if not job.active and self.settings.own_process:
+                    give_back()
+        self.fed.look()
+        self.programs.look()
+        self.recovery.look()
+        if self.motion is None or self.state in (ServiceState.SHUTDOWN, ServiceState.ERROR):
+            return
+        held = self.motion.streamer.held
+        wanted = ServiceState.READY
+        if job is not None and job.active:
+            waits = job.phase is JobPhase.PAUSED or (held is not None and self.motion.standing)
+            wanted = ServiceState.PAUSED if waits else ServiceState.PRINTING
+        if wanted is not self.state:
+            self._enter(wanted, held or "")
+        self.tables.show_corrections()
+
+    def _enter(self, state: ServiceState, cause: str = "") -> None:
+        self.state, self.cause = state, cause
+        self.tree.update("machine", {"state": str(state), "cause": cause, "starts": self.starts})
+        self.log.add("state", f"{state}: {cause}" if cause else str(state))
+        self._figures.show(self)
+
+    def tell(self, told: Told) -> None:
+        """Log what a line of g-code answered."""
+        if isinstance(told, Notice):
+            self.log.add("notice", told.text, ReplyKind.INFORMATION)
+        else:
+            self.log.add("reply", told.text, told.kind)
+
+    async def _refresh(self) -> None:
+        while True:
+            with contextlib.suppress(MachineStopped):
+                for _ in self._figures.parts(self):
+                    await asyncio.sleep(0)
+            await asyncio.sleep(REFRESH_S)

@@ -1,0 +1,167 @@
+"""One ready life of the machine: the streamer that runs all along, and who waits for what it does."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Sequence
+
+from coordinator.runtime.machine import Machine
+from coordinator.streaming.compensation import Compensation
+from coordinator.gcode.events import Notice
+from coordinator.motion.planner.planner import Planner
+from coordinator.streaming.move_source import JobState, Planned, Told
+from coordinator.streaming.pipeline import PlanRecord
+from coordinator.streaming.program_machine import machine_state
+from coordinator.service.core.feeder import Feeder, Ticket
+from coordinator.service.core.motion_lead import MotionLead
+from coordinator.service.state.toolpath import Toolpath
+from coordinator.service.state.trace import KEEP_S, Moment, MotionTrace
+from coordinator.service.core.work import LinesWork, Work
+from coordinator.streaming.streamer import Streamer
+
+UNMOVED = Planned((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, "", 1.0, 1.0, 0.0)
+
+
+class Motion:
+    """What moves MACHINE, whose nodes are READY.
+
+    ON_TOLD gets replies and notices, ON_CYCLE is called at the end of every cycle. RECORD keeps all that is
+    planned, for a proof. COMPENSATION has the tables of the axes.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        *,
+        on_told: Callable[[Told], None],
+        on_cycle: Callable[[], None],
+        record: PlanRecord | None = None,
+        compensation: Compensation | None = None,
+    ) -> None:
+        described = machine.description
+        self.feeder = Feeder(
+            Planner(described.limits),
+            described.homed_position,
+            machine_state(described),
+            machine.modules.vocabulary,
+        )
+        self.trace = MotionTrace(len(machine.moving))
+        self.toolpath = Toolpath()
+        self.planned = UNMOVED
+        self.lead = MotionLead()
+        self.streamer = Streamer(
+            machine,
+            self.feeder,
+            record=record,
+            witness=self.trace,
+            compensation=compensation,
+            on_told=on_told,
+            on_state=self._cycle_ended,
+            on_cycle=on_cycle,
+        )
+        self.works = 0
+        """Done so far."""
+        self._ending: list[Ticket] = []
+        self._waited_for: dict[Ticket, asyncio.Future[None]] = {}
+
+    async def run(self) -> None:
+        """Move until ``finish``, or until the machine stops; raises as the streamer does."""
+        try:
+            await self.streamer.run()
+        finally:
+            self.feeder.abandon()
+            for done in self._waited_for.values():
+                done.cancel()
+            self._waited_for.clear()
+
+    def finish(self) -> None:
+        """End at the next standstill."""
+        self.feeder.close()
+
+    def finish_early(self) -> None:
+        """End without another line of what is being done, or waits."""
+        self.feeder.cancel_all()
+        self.feeder.close()
+
+    # ------------------------------------------------------------------------------------------- doing
+
+    async def do(self, work: Work) -> Ticket:
+        """Have WORK done and wait until it is, moves and all; its ``error`` is not raised.
+
+        Cancelled, it ends the work before its next line. Raises FeederFull, MotionOver.
+        """
+        return await self._wait_for(self.feeder.submit(work))
+
+    async def do_aside(self, lines: LinesWork) -> Ticket:
+        """Do the same for lines that may run beside a job."""
+        return await self._wait_for(self.feeder.submit_aside(lines))
+
+    async def _wait_for(self, ticket: Ticket) -> Ticket:
+        done = self._waited_for[ticket] = asyncio.get_running_loop().create_future()
+        try:
+            await asyncio.wait((done,))
+        finally:
+            self._waited_for.pop(ticket, None)
+            self.feeder.cancel(ticket)  # without effect on one that is done
+        if done.cancelled():
+            raise MotionOver
+        return ticket
+
+    @property
+    def standing(self) -> bool:
+        """Whether nothing moves, and nothing planned will."""
+        until = self.planned.stands_from_s
+        return until is not None and self.now_s >= until
+
+    @property
+    def paused(self) -> bool:
+        """Whether a pause has reached its standstill; also one that a missing node caused."""
+        return (self.feeder.paused or self.streamer.held is not None) and self.standing
+
+    @property
+    def now_s(self) -> float:
+        """Print time."""
+        return self.streamer.print_time_now()
+
+    def moment(self) -> Moment:
+        """Return where the machine is now, as its commands say."""
+        now_s = self.now_s
+        if self.standing:
+            found = self.trace.at(now_s)
+            return Moment(self.planned.position, 0.0, found.line if found else 0, moving=False)
+        return self.trace.at(now_s) or Moment(self.planned.position, 0.0, 0, moving=False)
+
+    # ----------------------------------------------------------------------------------- cycle by cycle
+
+    def _cycle_ended(self, state: JobState) -> None:
+        self.planned = state.planned
+        now_s = self.now_s
+        comes_to_rest = state.planned.stands_from_s is not None
+        self.lead.look(now_s, self.streamer.worker.steps.generated_until, comes_to_rest=comes_to_rest)
+        self.trace.forget_before_s = now_s - KEEP_S
+        self.toolpath.add(self.trace.take_fresh())
+        with contextlib.suppress(IndexError):
+            while True:
+                self._ending.append(self.feeder.finished.popleft())
+        self._ending = [ticket for ticket in self._ending if not self._settle(ticket, now_s)]
+
+    def _settle(self, ticket: Ticket, now_s: float) -> bool:
+        """Tell that TICKET is done once its last move is executed; return whether it is."""
+        assert ticket.ends_at_s is not None
+        if now_s < ticket.ends_at_s + self.streamer.worker.steps.lag_s and ticket.ends_at_s:
+            return False
+        ticket.done = True
+        self.works += 1
+        done = self._waited_for.get(ticket)
+        if done is not None and not done.done():
+            done.set_result(None)
+        return True
+
+
+class MotionOver(Exception):  # noqa: N818 (it ended, for whatever reason; its owner knows which)
+    """The machine no longer moves."""
+
+
+def texts(told: Sequence[Told]) -> tuple[list[str], list[str]]:
+    """Return the texts of replies and of notices."""
+    notices = [event.text for event in told if isinstance(event, Notice)]
+    return [event.text for event in told if not isinstance(event, Notice)], notices

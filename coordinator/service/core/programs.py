@@ -1,0 +1,217 @@
+"""What programs and modules want of a service: lines run by themselves, files printed, the job's figures."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from coordinator.gcode.print_control import Recovering
+from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.ipc.protocol.methods import ApiError
+from coordinator.modules.base import Value
+from coordinator.modules.programs.gcode_macro import words_in
+from coordinator.modules.programs.pause_resume import PauseResume
+from coordinator.modules.status.print_stats import PrintStats
+from coordinator.modules.programs.virtual_sdcard import VirtualSdcard
+from coordinator.service.core.feeder import FeederFull
+from coordinator.service.jobs.job_folder import JobFolder
+from coordinator.service.jobs.jobs import JobPhase, JobRun
+from coordinator.service.core.motion import MotionOver
+from coordinator.service.core.work import FileWork, LinesWork, Rest
+from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.runtime.machine import Machine
+    from coordinator.service.core.machine_service import MachineService
+
+_STATES: Final[Mapping[JobPhase, str]] = {
+    JobPhase.NONE: "standby",
+    JobPhase.PRINTING: "printing",
+    JobPhase.PAUSING: "paused",
+    JobPhase.PAUSED: "paused",
+    JobPhase.CANCELLING: "printing",
+    JobPhase.DONE: "complete",
+    JobPhase.CANCELLED: "cancelled",
+    JobPhase.FAILED: "error",
+    JobPhase.STOPPED: "error",
+}
+
+
+class Programs:
+    """Serves the modules of SERVICE's machine (coordinator/runtime/module_runner.py); on the control loop."""
+
+    def __init__(self, service: "MachineService") -> None:
+        self._service = service
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._stats: PrintStats | None = None
+        self._card: VirtualSdcard | None = None
+        self._pauses: PauseResume | None = None
+        self._told: tuple[JobRun, JobPhase] | None = None
+        self.remote_methods: frozenset[str] = frozenset()
+        """Names of what clients have registered; replaced, never changed."""
+        self.on_remote: Callable[[str, Mapping[str, object]], None] | None = None
+        """Calls one of these at those clients."""
+
+    def begin(self, machine: "Machine") -> None:
+        """Serve MACHINE, which has just been made ready."""
+        machine.runner = self
+        self._stats = next(machine.modules.of(PrintStats), None)
+        self._card = next(machine.modules.of(VirtualSdcard), None)
+        self._pauses = next(machine.modules.of(PauseResume), None)
+        # A job of the machine before this one is over: it is told of no more.
+        last = self._service.job
+        self._told = None if last is None or last.active else (last, last.phase)
+        if self._card is None:
+            return
+        if self._service.settings.jobs is None:
+            self._service.folder = JobFolder(self._card.path)
+        folder = self._service.folder
+        assert folder is not None
+        self._card.files = lambda: [(job.name, job.size_bytes) for job in folder.files()]
+        self._card.check = lambda name: folder.open(name).close()
+
+    # ------------------------------------------------------------------------------------ for modules
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything moves, is done or waits; a paused job alone does not count."""
+        motion = self._service.motion
+        return motion is not None and (motion.feeder.active or not motion.standing)
+
+    @property
+    def works(self) -> int:
+        """How much was done so far."""
+        return 0 if self._service.motion is None else self._service.motion.works
+
+    def run_lines(self, name: str, lines: Sequence[str], text: str = "") -> None:
+        """Have g-code LINES done as those of a client."""
+        motion = self._service.motion
+        if motion is not None and words_in(text) & motion.feeder.vocabulary.interrupting:
+            self.run_paused(name, lines, stay=False)
+        else:
+            self._start(self._run(LinesWork(lines, name=name, rest=Rest.OPEN)))
+
+    def call_remote(self, name: str, values: Mapping[str, object]) -> None:
+        """Have every client that registered the method NAME called with VALUES."""
+        if self.on_remote is not None:
+            self.on_remote(name, values)
+
+    def run_paused(self, name: str, lines: Sequence[str], *, stay: bool) -> None:
+        """Have LINES done with the job paused."""
+        self._start(self._run_paused(LinesWork(lines, name=name), stay=stay))
+
+    async def _run_paused(self, work: LinesWork, *, stay: bool) -> None:
+        with self.interrupted(stay=stay):
+            await self._run(work)
+
+    @contextlib.contextmanager
+    def interrupted(self, *, stay: bool) -> Iterator[None]:
+        """Pause a job that prints; it goes on unless something in between paused it, or with STAY."""
+        job = self._service.active_job
+        if job is None or job.gives_way or job.phase is JobPhase.CANCELLING:
+            yield
+            return
+        job.pause()
+        try:
+            yield
+        finally:
+            paused = self._pauses is not None and self._pauses.status()["is_paused"]
+            if not (stay or paused) and job.phase in (JobPhase.PAUSING, JobPhase.PAUSED):
+                job.resume()
+
+    async def _run(self, work: LinesWork) -> None:
+        motion, job = self._service.motion, self._service.active_job
+        if motion is None:
+            return
+        log = self._service.log
+        try:
+            if job is not None and not job.gives_way:
+                work.beside = True
+                ticket = await motion.do_aside(work)
+                for told in ticket.told:
+                    self._service.tell(told)
+            else:
+                ticket = await motion.do(work)
+        except FeederFull as error:
+            log.add("notice", f"{work.name} was left out: {error}", ReplyKind.ERROR)
+        except MotionOver:
+            return
+        else:
+            if ticket.error is not None:
+                log.add("notice", str(ticket.error), ReplyKind.ERROR)
+
+    # ------------------------------------------------------------------------------------ for the job
+
+    def look(self) -> None:
+        """Tell modules how the job is, and start what programs want to have printed."""
+        motion, job = self._service.motion, self._service.job
+        if motion is not None and motion.feeder.to_print:
+            self._start(self._print(motion.feeder.to_print.popleft()))
+        if motion is not None and motion.feeder.to_recover:
+            self._start(self._recover(motion.feeder.to_recover.popleft()))
+        if job is None or not (job.active or (job, job.phase) != self._told):
+            return
+        if (
+            self._pauses is not None
+            and job.phase is JobPhase.PRINTING
+            and self._told == (job, JobPhase.PAUSED)
+        ):
+            self._pauses.resumed()
+        if self._stats is not None:
+            self._stats.told = self._figures(job)
+        if self._card is not None:
+            self._card.place = {
+                "file_position": job.done_bytes,
+                "file_size": job.size_bytes,
+                "progress": job.progress,
+            }
+            if job.phase is JobPhase.FAILED and (job, job.phase) != self._told and self._card.acts_on_error:
+                self.run_lines("on_error_gcode", ["_ON_ERROR_GCODE"])
+        self._told = (job, job.phase)
+
+    def _state(self, job: JobRun) -> str:
+        """Return how JOB is; while it is being cancelled what it was before: it does not go on."""
+        told = "" if self._stats is None else self._stats.state
+        if job.phase is JobPhase.CANCELLING and told in ("printing", "paused"):
+            return told
+        return _STATES[job.phase]
+
+    def _figures(self, job: JobRun) -> Mapping[str, Value]:
+        return {
+            "state": self._state(job),
+            "filename": job.file,
+            "total_duration": round((job.ended_s or self._service.now_s) - job.began_s, 3),
+            "print_duration": round(job.print_duration_s, 3),
+            "filament_used": round(job.filament_mm, 5),
+            "message": job.message,
+        }
+
+    async def _print(self, name: str) -> None:
+        service = self._service
+        if service.folder is None:
+            service.log.add(
+                "notice",
+                f"{name} is not printed: there is no job folder; start with --jobs FOLDER",
+                ReplyKind.ERROR,
+            )
+            return
+        try:
+            program = await asyncio.to_thread(service.folder.open, name)
+            try:
+                service.start_job(FileWork(program), behind_others=True)
+            except BaseException:
+                program.close()
+                raise
+        except (CanductorError, ApiError) as error:
+            service.log.add("notice", f"{name} is not printed: {error}", ReplyKind.ERROR)
+
+    async def _recover(self, how: Recovering) -> None:
+        try:
+            await self._service.recovery.recover(how)
+        except (CanductorError, MotionOver) as error:
+            self._service.log.add("notice", f"RESUME_INTERRUPTED: {error}", ReplyKind.ERROR)
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)

@@ -1,0 +1,287 @@
+"""Serves a machine to front ends until Ctrl-C or SIGTERM: ``canductor run``, ``canductor demo --serve``."""
+
+import platform
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from ipaddress import ip_address
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coordinator.cli.parser import version
+from coordinator.support.command_options import RunOptions, ServeOptions
+from coordinator.runtime.host import LinuxHost
+from coordinator.support.interrupts import run_to_end
+from coordinator.ipc.discovery.announcement import Announcement, bracketed, host_word
+from coordinator.ipc.discovery.announcer import Announcer
+from coordinator.ipc.server.tcp_listener import raise_files_limit
+from coordinator.ipc.protocol.methods import Registry, Scope, Value
+from coordinator.ipc.server.server import IpcServer
+from coordinator.ipc.server.session_methods import API_VERSION
+from coordinator.ipc.server.settings import IpcSettings, TcpSettings
+from coordinator.ipc.server.state import StateTree
+from coordinator.ipc.server.uploads import upload_method
+from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.service.state.log_ring import Entry
+from coordinator.service.core.machine_service import MachineService, ServiceSettings
+from coordinator.service.api.methods import add_methods
+from coordinator.service.core.typed import Typed
+from coordinator.tables.store import table_folder
+from coordinator.web.access import LINK_S
+from coordinator.web.methods import add_page_methods
+from coordinator.web.settings import WebSettings
+from nodes.dictionary.cache import DictionaryCache
+from nodes.support.errors import CanductorError
+from nodes.support.host_sockets import socket_folder
+from nodes.support.state_folder import state_folder
+
+if TYPE_CHECKING:
+    from coordinator.klippy_api.gateway import Gateway
+    from coordinator.metrics.server import MetricsServer
+    from coordinator.web.server import WebServer
+
+
+@dataclass(frozen=True, slots=True)
+class ServeReport:
+    """How a service ended that was asked to."""
+
+    address: str
+    state: str
+
+    @property
+    def ok(self) -> bool:
+        """It did what it was to do."""
+        return True
+
+    def to_json(self) -> Mapping[str, object]:
+        """Return the figures by name."""
+        return {"address": self.address, "state": self.state}
+
+    def to_text(self) -> str:
+        """Return the same for a reader."""
+        return f"served at {self.address} until asked to end; the machine was in {self.state}"
+
+
+def serve_machine(options: RunOptions) -> ServeReport:
+    """Serve the machine of OPTIONS.config. Raises CanductorError, KeyboardInterrupt if motion was cut off."""
+    assert options.serve is not None
+    path = str(options.config)
+    if options.serve.klippy_api is None:
+        load_machine(path)  # a mistake in it ends here, not in a service without a machine
+    return serve(lambda: load_machine(path), options.serve, cache=DictionaryCache.of_user())
+
+
+def serve(
+    load: Callable[[], MachineDescription], options: ServeOptions, *, cache: DictionaryCache | None = None
+) -> ServeReport:
+    """Serve the machine that LOAD describes; raises as ``serve_machine``."""
+    raise_files_limit()
+    hall = _Hall(load, options, cache)
+    try:
+        run_to_end(hall.serve)
+    except KeyboardInterrupt:
+        if hall.cut_off:
+            raise
+    return ServeReport(str(hall.path), str(hall.state))
+
+
+class _Hall:
+    """A service and its server, on one loop."""
+
+    def __init__(
+        self, load: Callable[[], MachineDescription], options: ServeOptions, cache: DictionaryCache | None
+    ) -> None:
+        self.path = options.path or socket_folder() / f"{options.name}.sock"
+        self.state = ""
+        self.cut_off = False
+        """Whether the end came while something moved."""
+        self._load = load
+        self._options = options
+        self._cache = cache
+        self._announcer: Announcer | None = None
+        self._gateway: Gateway | None = None
+
+    async def serve(self) -> None:
+        """Be there for front ends until cancelled."""
+        registry, tree = Registry(), StateTree()
+        settings = ServiceSettings(
+            name=self._options.name,
+            jobs=self._options.jobs,
+            node_commands=self._options.node_commands,
+            tables=table_folder(self._options.name),
+            own_process=True,
+        )
+        service = MachineService(
+            self._load,
+            LinuxHost(),
+            tree,
+            settings,
+            cache=self._cache,
+            on_line=lambda entry: self._tell(service, entry),
+        )
+        add_methods(service, registry)
+        if settings.jobs is not None:
+            registry.add(upload_method(settings.jobs))
+        self._server = IpcServer(
+            registry,
+            tree,
+            _ipc_settings(self._options, self.path),
+            on_notice=lambda text: service.log.add("notice", text),
+        )
+        page = self._page(registry, service)
+        await self._server.start()
+        await self._open_page(page)
+        _say(f"serving at {self.path}")
+        if self._options.tcp is not None:
+            _say(f"serving at {_address(self._options, self._server.tcp_port)}")
+        if page is not None:
+            _say(f"the live page is at {page.url}")
+            _say(
+                f"to get in, open {page.new_link(Scope.OPERATE)} within {LINK_S / 60:.0f} minutes;"
+                " it works once, 'canductor page' prints another"
+            )
+        metrics = await self._open_metrics(tree)
+        await self._open_klippy_api(service)
+        self._announcer = self._announce(service)
+        typed = Typed(service, _say) if sys.stdin is not None and sys.stdin.isatty() else None
+        try:
+            await service.run()
+        finally:
+            if typed is not None:
+                typed.close()
+            self.state = str(service.state)
+            self.cut_off = service.cut_off
+            if self._announcer is not None:
+                await self._announcer.close()
+            if metrics is not None:
+                await metrics.close()
+            if self._gateway is not None:
+                await self._gateway.close()
+            await self._server.close()
+            if page is not None:
+                await page.close()
+
+    async def _open_klippy_api(self, service: MachineService) -> None:
+        """Serve Moonraker if asked for; raises CanductorError with the server closed."""
+        path = self._options.klippy_api
+        if path is None:
+            return
+        from coordinator.klippy_api.gateway import Gateway  # noqa: PLC0415 (if needed)
+
+        self._gateway = Gateway(
+            service, self._options.config, on_notice=lambda text: service.log.add("notice", text)
+        )
+        try:
+            await self._gateway.start(path)
+        except BaseException:
+            await self._server.close()
+            raise
+        _say(f"serving Moonraker at {path}")
+
+    def _page(self, registry: Registry, service: MachineService) -> "WebServer | None":
+        """Return the live page if it is asked for, with its methods in REGISTRY; raises CanductorError."""
+        options = self._options
+        if options.web is None:
+            return None
+        try:
+            from coordinator.web.server import WebServer  # noqa: PLC0415 (the extra web)
+        except ModuleNotFoundError as error:
+            raise CanductorError(
+                f"the live page needs {error.name}, which is not installed; run: pip install {error.name}"
+            ) from None
+        host, port = options.web
+        sessions = state_folder(options.name) / f"page-{port}.json"
+        settings = WebSettings(host=host, port=port, names=options.web_names, sessions=sessions)
+        if not settings.on_loopback and not options.web_without_tls:
+            settings = replace(settings, certificate=options.certificate, private_key=options.private_key)
+        page = WebServer(self._server, settings, on_notice=lambda text: service.log.add("notice", text))
+        add_page_methods(registry, page)
+        return page
+
+    async def _open_page(self, page: "WebServer | None") -> None:
+        """Open PAGE, if there is one; raises CanductorError with the server closed."""
+        try:
+            if page is not None:
+                await page.start()
+        except BaseException:
+            await self._server.close()
+            raise
+
+    async def _open_metrics(self, tree: StateTree) -> "MetricsServer | None":
+        """Open the endpoint for Prometheus if asked for; raises CanductorError with the server closed."""
+        if self._options.metrics is None:
+            return None
+        from coordinator.metrics.server import MetricsServer, MetricsSettings  # noqa: PLC0415 (if needed)
+
+        def fields() -> dict[str, Value]:
+            figures = {f"api.{name}": value for name, value in self._server.figures().items()}
+            return tree.snapshot().values | figures
+
+        host, port = self._options.metrics
+        about = {"name": self._options.name, "version": version(), "api": str(API_VERSION)}
+        metrics = MetricsServer(fields, about, MetricsSettings(host, port, open=self._options.metrics_open))
+        try:
+            await metrics.start()
+        except BaseException:
+            await self._server.close()
+            raise
+        _say(f"metrics are at http://{bracketed(host)}:{metrics.port}/metrics")
+        return metrics
+
+    def _announce(self, service: MachineService) -> Announcer | None:
+        """Have the network told of the machine, if it is to be."""
+        bound, port = self._server.tcp_addresses, self._server.tcp_port
+        wanted = self._options.announce
+        if wanted is None:
+            wanted = not all(ip_address(address.partition("%")[0]).is_loopback for address in bound)
+        if not wanted or port is None:
+            return None
+        machine = Announcement(
+            name=service.settings.name,
+            host=host_word(platform.node()),
+            version=version(),
+            state=str(service.state),
+            api=API_VERSION,
+            tls=self._options.certificate is not None and self._options.private_key is not None,
+            id=service.settings.id,
+            port=port,
+            addresses=(),
+        )
+        announcer = Announcer(machine, bound, lambda sentence: service.log.add("network", sentence))
+        announcer.start()
+        return announcer
+
+    def _tell(self, service: MachineService, entry: Entry) -> None:
+        self._server.notify("log", dict(entry))
+        _say(str(entry["text"]))
+        if self._gateway is not None:
+            self._gateway.note(entry)
+        if self._announcer is not None and entry["kind"] == "state":
+            self._announcer.state(str(service.state))
+
+
+def _ipc_settings(options: ServeOptions, path: Path) -> IpcSettings:
+    tcp = None
+    if options.tcp is not None and options.tokens is not None:
+        host, port = options.tcp
+        tcp = TcpSettings(
+            host=host,
+            port=port,
+            tokens=options.tokens,
+            certificate=options.certificate,
+            private_key=options.private_key,
+            plain_on_loopback=options.plain_on_loopback,
+        )
+    return IpcSettings(unix_path=path, tcp=tcp, tokens=options.tokens)
+
+
+def _address(options: ServeOptions, port: int | None) -> str:
+    assert options.tcp is not None
+    host = options.tcp[0]
+    scheme = "tls" if options.certificate is not None else "tcp"
+    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()

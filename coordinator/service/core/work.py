@@ -1,0 +1,283 @@
+"""What clients can have the machine do: g-code lines, single moves, a job's file.
+
+A work is stepped in the motion worker's thread, where the planner may be touched; the control loop only makes
+it and hears of its end.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Final, Protocol
+
+from coordinator.gcode.commands import Vocabulary
+from coordinator.gcode.events import End, Event, Full, Idle, Progress
+from coordinator.gcode.interpreter import Job
+from coordinator.gcode.machine_state import MachineState
+from coordinator.gcode.print_control import PrintControl
+from coordinator.gcode.program import Program
+from coordinator.gcode.parser import WordError, parse
+from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus, Planner
+from nodes.support.errors import CanductorError
+
+LINES_MAX: Final = 500
+"""Lines a client may send at once: they are looked through on the control loop, in some 2 ms."""
+LINES_BYTES_MAX: Final = 32_768
+EMERGENCY: Final = "M112"
+
+
+class WorkError(CanductorError):
+    """A work that cannot be carried out; what came before it in the same work is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What every work acts on."""
+
+    planner: Planner
+    machine: MachineState
+    homed_position: Mapping[str, float]
+    vocabulary: Vocabulary
+    prints: PrintControl | None = None
+
+    def job(self, program: Program, *, beside: bool = False) -> Job:
+        """Return what reads PROGRAM; BESIDE: between two lines of a job that prints."""
+        return Job(
+            program,
+            self.planner,
+            self.homed_position,
+            self.machine,
+            self.vocabulary,
+            beside=beside,
+            prints=self.prints,
+            strict=True,
+        )
+
+
+class Rest(Enum):
+    """How a work ends."""
+
+    STANDSTILL = "standstill"
+    """With all its moves planned to a standstill."""
+    OPEN = "open"
+    """As soon as it is read: the next work's moves may join without a stop."""
+
+
+class Work(Protocol):
+    """One thing to do; ``step`` answers as a job's does and End when all is read."""
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        ...
+
+    @property
+    def rest(self) -> Rest:
+        """How it ends."""
+        ...
+
+    def begin(self, setting: Setting) -> None:
+        """Get ready; before the first step."""
+
+    def step(self) -> Event:
+        """Go on; raises CanductorError when it cannot."""
+        ...
+
+    def pending(self) -> Event | None:
+        """Tell what is left to tell without going on; raises CanductorError."""
+        ...
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to tell or to take over."""
+        ...
+
+    @property
+    def at_line(self) -> bool:
+        """Whether it stands between two lines."""
+        ...
+
+    def progress(self) -> Progress:
+        """Tell how far it is read."""
+        ...
+
+    def close(self) -> None:
+        """Release what it holds."""
+
+
+NO_PROGRESS: Final = Progress(0, 0, None)
+
+
+class _Text:
+    """Text that was sent, as a source that ends in waiting: what has no end needs no standstill there."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data: bytes | None = data
+
+    def read(self, _size: int, /) -> bytes | None:
+        data, self._data = self._data, None
+        return data
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+@dataclass(slots=True)
+class LinesWork:
+    """G-code LINES of a client, in the modes that the lines before them left."""
+
+    lines: Sequence[str]
+    name: str = "client"
+    rest: Rest = Rest.STANDSTILL
+    beside: bool = False
+    """Whether they come between two lines of a job that prints: then none of them may move."""
+    _job: Job | None = None
+
+    def begin(self, setting: Setting) -> None:
+        """Read the lines as a program of its own."""
+        text = "".join(line.rstrip("\r\n") + "\n" for line in self.lines)
+        program = Program(_Text(text.encode(errors="replace")), self.name, size_bytes=None)
+        setting.planner.lines = 0
+        self._job = setting.job(program, beside=self.beside)
+
+    def pending(self) -> Event | None:
+        """Tell what is left to tell."""
+        return None if self._job is None else self._job.pending()
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to tell or to take over."""
+        return self._job is None or self._job.settled
+
+    @property
+    def at_line(self) -> bool:
+        """Whether it stands between two lines."""
+        return self._job is None or self._job.at_line
+
+    def step(self) -> Event:
+        """Go on."""
+        assert self._job is not None
+        event = self._job.step()
+        return End(self._job.planner.lines, 0.0) if isinstance(event, Idle) else event
+
+    def progress(self) -> Progress:
+        """Tell nothing: it is read at once."""
+        return NO_PROGRESS
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+@dataclass(slots=True)
+class FileWork:
+    """A job's PROGRAM, which begins in the modes that a program begins in, and leaves them so."""
+
+    program: Program
+    rest: Rest = Rest.STANDSTILL
+    _job: Job | None = None
+
+    @property
+    def name(self) -> str:
+        """The file."""
+        return self.program.name
+
+    def begin(self, setting: Setting) -> None:
+        """Begin at the first line."""
+        setting.planner.reset_modes()
+        setting.planner.lines = 0
+        self._job = setting.job(self.program)
+
+    def pending(self) -> Event | None:
+        """Tell what is left to tell."""
+        return None if self._job is None else self._job.pending()
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to tell or to take over."""
+        return self._job is None or self._job.settled
+
+    @property
+    def at_line(self) -> bool:
+        """Whether it stands between two lines."""
+        return self._job is None or self._job.at_line
+
+    def step(self) -> Event:
+        """Go on."""
+        assert self._job is not None
+        return self._job.step()
+
+    def progress(self) -> Progress:
+        """Tell how far the file is read."""
+        lines = 0 if self._job is None else self._job.planner.lines
+        return Progress(lines, self.program.done_bytes, self.program.size_bytes)
+
+    def close(self) -> None:
+        """Close the file; the modes of what follows are not this job's."""
+        if self._job is not None:
+            self._job.planner.reset_modes()
+        self.program.close()
+
+
+@dataclass(slots=True)
+class MoveWork:
+    """One straight move in the machine's frame: AXES (letter to mm), from where it is when RELATIVE."""
+
+    axes: Mapping[str, float]
+    speed_mm_s: float
+    relative: bool
+    name: str = "move"
+    rest: Rest = Rest.STANDSTILL
+    _planner: Planner | None = None
+    target: list[float] = field(default_factory=list)
+    """X Y Z E, once it is begun."""
+
+    def begin(self, setting: Setting) -> None:
+        """Take where the machine will be."""
+        self._planner = setting.planner
+        self.target = list(setting.planner.toolhead_position)
+        for letter, value in self.axes.items():
+            axis = AXIS_LETTERS.index(letter)
+            self.target[axis] = value + (self.target[axis] if self.relative else 0.0)
+
+    def pending(self) -> Event | None:
+        """Tell nothing: it is one move."""
+        return None
+
+    @property
+    def settled(self) -> bool:
+        """Tell that nothing is left to tell."""
+        return True
+
+    @property
+    def at_line(self) -> bool:
+        """Tell that nothing is left of it: it is one move."""
+        return True
+
+    def step(self) -> Event:
+        """Plan it."""
+        assert self._planner is not None
+        status = self._planner.move_to(self.target, self.speed_mm_s)
+        if status is FeedStatus.FULL:
+            return Full()
+        if status is FeedStatus.LIMIT:
+            raise WorkError(str(self._planner.fault))
+        return End(0, 0.0)
+
+    def progress(self) -> Progress:
+        """Tell nothing: it is one move."""
+        return NO_PROGRESS
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def commands_in(lines: Sequence[str]) -> list[str]:
+    """Return the names of the commands in LINES; raises WorkError for a line that cannot be read."""
+    names = []
+    for number, line in enumerate(lines, 1):
+        try:
+            command = parse(line.encode(errors="replace"))
+        except WordError as problem:
+            raise WorkError(f"line {number}: {problem}") from None
+        if command is not None:
+            names.append(command.name)
+    return names

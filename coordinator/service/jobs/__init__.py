@@ -1,0 +1,1 @@
+"""Jobs: the job folder, journal, recovery, jobs that are fed by a client."""

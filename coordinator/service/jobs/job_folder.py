@@ -1,0 +1,130 @@
+"""The job folder: the only files that clients can have printed, whatever names they send."""
+
+import contextlib
+import os
+import stat
+from collections.abc import Iterator
+from io import FileIO
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from coordinator.gcode.program import Program
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
+
+DEPTH_MAX: Final = 8
+FILES_MAX: Final = 10_000
+"""Looked at for one list."""
+NAME_BYTES_MAX: Final = 1024
+_NO_LINK: Final = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
+SUFFIXES: Final = (".gcode", ".gco", ".g", ".nc", ".ngc")
+
+
+class NoSuchJob(CanductorError):  # noqa: N818
+    """There is no such file for a job."""
+
+
+@record
+class JobFile:
+    """A file that can be printed."""
+
+    name: str
+    """Relative to the job folder, parts separated by ``/``."""
+    size_bytes: int
+    modified_s: float
+    """Since the epoch."""
+
+
+class JobFolder:
+    """The files below PATH. Links are not followed, wherever they lead: not to files, not to folders.
+
+    Every method reads a disk: not for the control loop.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def files(self) -> list[JobFile]:
+        """Return the g-code files by name, the first FILES_MAX found; raises NoSuchJob without a folder."""
+        try:
+            root = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        except OSError as error:
+            raise NoSuchJob(_no_folder(self.path, error)) from None
+        found: list[JobFile] = []
+        try:
+            for _, (folder, names, fd) in zip(range(FILES_MAX), _walk(root), strict=False):
+                found += list(_jobs_of(folder, names, fd))[: FILES_MAX - len(found)]
+        finally:
+            os.close(root)
+        return sorted(found, key=lambda job: job.name)
+
+    def open(self, name: str) -> Program:
+        """Open the file NAME, relative to the folder; raises NoSuchJob."""
+        parts = _parts(name)
+        try:
+            fd = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        except OSError as error:
+            raise NoSuchJob(_no_folder(self.path, error)) from None
+        with contextlib.ExitStack() as opened:
+            opened.callback(os.close, fd)
+            try:
+                for folder in parts[:-1]:
+                    fd = os.open(folder, _NO_LINK | os.O_DIRECTORY, dir_fd=fd)
+                    opened.callback(os.close, fd)
+                fd = os.open(parts[-1], _NO_LINK | os.O_NONBLOCK, dir_fd=fd)  # a pipe is not waited for
+            except OSError:
+                raise NoSuchJob(
+                    f"there is no file {_shown(name)} in the job folder; job.list tells which there are"
+                ) from None
+        status = os.fstat(fd)
+        if not stat.S_ISREG(status.st_mode):
+            os.close(fd)
+            raise NoSuchJob(f"{_shown(name)} in the job folder is not a file")
+        return Program(FileIO(fd), "/".join(parts), size_bytes=status.st_size, modified_ns=status.st_mtime_ns)
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """Return the parts of a clean relative path; raises NoSuchJob for any other."""
+    parts = PurePosixPath(name).parts
+    odd = (
+        not parts
+        or len(parts) > DEPTH_MAX
+        or len(name.encode(errors="surrogatepass")) > NAME_BYTES_MAX
+        or not name.isprintable()
+        or "\\" in name
+        or any(part in ("..", "/", "//") or part.startswith(".") for part in parts)
+    )
+    if odd:
+        raise NoSuchJob(
+            f"{_shown(name)} is no name of a job; give a file of the job folder as job.list tells it"
+        )
+    return parts
+
+
+def _shown(name: str) -> str:
+    return ascii(name if len(name) <= 60 else name[:60] + "...")
+
+
+def _no_folder(path: Path, error: OSError) -> str:
+    return f"the job folder {path} cannot be read: {(error.strerror or str(error)).lower()}; make it"
+
+
+def _walk(root: int) -> Iterator[tuple[str, list[str], int]]:
+    """Go through the folders below ROOT: name, entries and descriptor of each."""
+    for folder, folders, names, fd in os.fwalk(".", dir_fd=root, follow_symlinks=False):
+        clean = folder[2:] if folder.startswith("./") else ""
+        depth = clean.count("/") + 1 if clean else 0
+        folders[:] = [] if depth >= DEPTH_MAX - 1 else [f for f in folders if not f.startswith(".")]
+        yield clean, names, fd
+
+
+def _jobs_of(folder: str, names: list[str], fd: int) -> Iterator[JobFile]:
+    for name in names:
+        if name.startswith(".") or not name.lower().endswith(SUFFIXES) or not name.isprintable():
+            continue
+        try:
+            status = os.stat(name, dir_fd=fd, follow_symlinks=False)
+        except OSError:
+            continue  # gone meanwhile
+        if stat.S_ISREG(status.st_mode):
+            yield JobFile(f"{folder}/{name}" if folder else name, status.st_size, status.st_mtime)

@@ -1,0 +1,1 @@
+"""What front ends watch: figures, log, toolpath, trace."""

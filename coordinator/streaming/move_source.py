@@ -1,0 +1,98 @@
+"""What drives the pipeline: a source of moves, and who looks on while they go by."""
+
+from collections.abc import Mapping
+from dataclasses import field
+from typing import Any, Protocol
+
+from coordinator.gcode.events import Event, Notice, Reply
+from coordinator.gcode.machine_state import MachineState
+from coordinator.motion.planner.planner import Planner, Position
+from nodes.support.records import record
+
+Told = Reply | Notice
+
+
+class MoveSource(Protocol):
+    """Plans moves into ``planner`` and tells what its driver has to act on (gcode/events.py).
+
+    A ``Job`` is one that ends; the service's feeder is one that goes on from job to job.
+    """
+
+    @property
+    def planner(self) -> Planner:
+        """Where the moves go."""
+        ...
+
+    @property
+    def machine(self) -> MachineState:
+        """What the lines may change of the machine."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """What is being read, for messages."""
+        ...
+
+    @property
+    def line(self) -> int:
+        """Number of the line that comes next."""
+        ...
+
+    def step(self) -> Event:
+        """Work until there is something to tell; raises GCodeError."""
+        ...
+
+    def attend_others(self) -> Event | None:
+        """Do what may be done while ``step`` must not be called, as the machine rests; nothing is planned.
+
+        Returns what there is to tell, None when that was all.
+        """
+        ...
+
+
+class Witness(Protocol):
+    """Sees what is planned and what is sent."""
+
+    def see_moves(self, trapezoids: Any, count: int) -> None:
+        """Take note of moves (``struct trapezoid *``), in the worker's thread; they are gone afterwards."""
+
+    def see_batch(self, node: int, batch: bytes) -> None:
+        """Take note of commands for a moving node, on the control loop."""
+
+
+@record
+class Planned:
+    """Where the planner was after the latest visit, in mm; X Y Z E."""
+
+    position: Position
+    """The machine's frame: the end of the last move read."""
+    gcode: Position
+    """The same in the frame and the units of the program."""
+    base: Position
+    """The program's origin in the machine's frame."""
+    homed: str
+    """Letters of the homed axes."""
+    speed_factor: float
+    extrude_factor: float
+    stands_from_s: float | None
+    """Print time from which nothing moves any more; None: there is more to plan."""
+    steps_sent: tuple[int, ...] = ()
+    """By stepper: steps from the start that its commands add up to."""
+    offset: Position = (0.0, 0.0, 0.0, 0.0)
+    """SET_GCODE_OFFSET."""
+    figures: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
+    """``toolhead``, ``gcode_move``, extruders and carriages as macros see them (gcode/figures.py)."""
+    unit_mm: float = 1.0
+    """Of the program: 25.4 after G20."""
+
+
+@record
+class JobState:
+    """How far a job is."""
+
+    done_bytes: int
+    size_bytes: int | None
+    print_time_s: float
+    """Seconds of the job executed."""
+    moves: int
+    planned: Planned

@@ -1,0 +1,28 @@
+"""From the configured machine to what a program may change of it."""
+
+from coordinator.gcode.machine_state import Extruder, MachineState, Shaper
+from coordinator.kinematics.extruder import ExtruderMotion
+from coordinator.assembly.load import MachineDescription
+
+
+def machine_state(description: MachineDescription) -> MachineState:
+    """Return the state that a job on this machine begins with; each job needs its own."""
+    extruders = {
+        extruder.name: Extruder(
+            extruder.name, extruder.limits, extruder.pressure_advance, extruder.smooth_time_s
+        )
+        for extruder in description.extruders
+    }
+    motion = None
+    if extruders:
+        followed = {extruder.stepper.name: extruder.name for extruder in description.extruders}
+        followed |= {follower.stepper.name: follower.extruder for follower in description.extruder_steppers}
+        motion = ExtruderMotion(tuple(extruders), description.extruders[0].name, followed)
+    dual = description.dual_carriage
+    return MachineState(
+        extruders,
+        motion,
+        dual.carriages if dual else None,
+        dual.carriages.home if dual else None,
+        {s.axis.upper(): Shaper(s.kind, s.frequency_hz, s.damping_ratio) for s in description.shapers},
+    )

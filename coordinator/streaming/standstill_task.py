@@ -1,0 +1,52 @@
+"""Performs what a program has to be done while the machine stands; the program waits for it."""
+
+import asyncio
+import contextlib
+
+from coordinator.runtime.machine import MachineStopped
+from coordinator.gcode.commands import Done
+from coordinator.gcode.events import Resting
+from nodes.support.errors import CanductorError
+
+
+class RestTask:
+    """EVENT being performed on the running loop; ``look`` until it is over."""
+
+    def __init__(self, event: Resting) -> None:
+        self._event = event
+        self._has_begun = self._is_ending = False
+        self._task = asyncio.ensure_future(self._perform())
+
+    def look(self) -> bool:
+        """End it if nobody wants it any more; return whether it is over, with EVENT telling how.
+
+        Raises what performing it raised, but for a CanductorError, which the program gets. Whoever failed or
+        was ended on the way may have moved something.
+        """
+        if self._event.cancelled and not self._is_ending:
+            self._is_ending = True  # asked once: a second time would interrupt its tidying up
+            self._task.cancel()
+        if not self._task.done():
+            return False
+        event = self._event
+        event.done, event.over = None, True
+        if self._task.cancelled():
+            event.moved = self._has_begun
+        elif (error := self._task.exception()) is not None:
+            if isinstance(error, MachineStopped) or not isinstance(error, CanductorError):
+                raise error
+            event.failure, event.moved = str(error), True
+        else:
+            event.done = self._task.result()
+            event.moved = event.done.moved
+        return True
+
+    async def close(self) -> None:
+        """End it, whatever becomes of it."""
+        self._task.cancel()
+        with contextlib.suppress(asyncio.CancelledError, CanductorError):
+            await self._task
+
+    async def _perform(self) -> Done:
+        self._has_begun = True  # never, where it was ended before its turn
+        return await self._event.perform() or Done()

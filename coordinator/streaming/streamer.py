@@ -1,0 +1,227 @@
+"""Real time: feeds a job's motion to the nodes, early enough and not too early.
+
+The control loop wakes every CYCLE_S. What costs time (the job's g-code, planning, step generation) runs in
+one worker thread (``motion_worker.py``); the loop only hands finished batches to the links.
+"""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Final
+
+from coordinator.runtime.machine import Machine, MachineStopped, link_of
+from coordinator.streaming.timed_events import Due, DueEvents
+from coordinator.gcode.errors import GCodeError
+from coordinator.gcode.events import Emergency, End, Event, Notice, Resting
+from coordinator.streaming.worker import START_LEAD_S, Cycle, MotionWorker
+from coordinator.streaming.move_source import JobState, MoveSource, Planned, Told, Witness
+from coordinator.streaming.pipeline import PlanRecord
+from coordinator.streaming.standstill_task import RestTask
+from nodes.support.errors import CanductorError
+
+if TYPE_CHECKING:
+    from coordinator.streaming.compensation import Compensation
+
+CYCLE_S: Final = 0.05
+BUSY_START_LEAD_S: Final = 0.6
+"""START_LEAD_S on a bus with other traffic, where the first commands, dense as in every ramp, take longer."""
+BUSY_LOAD: Final = 0.3
+"""Share of a bus's time from which it counts as busy."""
+SETTLE_S: Final = 0.05
+"""After the last step is due, before it is believed to be done."""
+CAUSE_WAIT_S: Final = 0.1
+
+
+class Streamer:
+    """Runs one JOB on MACHINE, whose nodes are READY.
+
+    ON_TOLD gets replies and notices, ON_STATE how far it is in every cycle; ON_CYCLE is called at its end.
+    WITNESS sees the moves and the commands go by, COMPENSATION has the tables of the axes.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        job: MoveSource,
+        *,
+        record: PlanRecord | None = None,
+        witness: Witness | None = None,
+        compensation: "Compensation | None" = None,
+        on_told: Callable[[Told], None],
+        on_state: Callable[[JobState], None],
+        on_cycle: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._machine = machine
+        self.worker = MotionWorker(machine, job, record=record, witness=witness, compensation=compensation)
+        """For others to look at from the control loop, not to call."""
+        self._job = job
+        self._on_told = on_told
+        self._on_state = on_state
+        self._on_cycle = on_cycle
+        self._witness = witness
+        self._nodes = machine.moving
+        self._due = DueEvents()
+        self.began_s = 0.0
+        """Print time at which the job began, or went on after something else had moved the machine."""
+        self.ended_s = 0.0
+        self._resting: RestTask | None = None
+
+    def print_time_now(self) -> float:
+        """Return the present print time."""
+        return self.worker.print_time_now()
+
+    def hold(self, cause: str) -> None:
+        """Let the g-code wait, from the control loop: what is planned is carried out, to a standstill.
+
+        CAUSE is a sentence. The end of a job that has been read to its end is not held up.
+        """
+        self.worker.held = cause
+
+    def release(self) -> None:
+        """Let the g-code go on after ``hold``."""
+        self.worker.held = None
+
+    @property
+    def held(self) -> str | None:
+        """Why the g-code waits, or None."""
+        return self.worker.held
+
+    async def run(self) -> None:
+        """Run the job to its end: until the last step is executed.
+
+        Raises MachineStopped when the machine stops meanwhile, CanductorError when the job or a link fails;
+        the machine is stopped then.
+        """
+        self._look_at_load()
+        self.began_s = self.worker.begin()
+        with self._machine.job(self):
+            await self._run()
+
+    async def _run(self) -> None:
+        work = asyncio.ensure_future(self._stream())
+        watch = asyncio.ensure_future(self._machine.wait_stopped())
+        try:
+            await asyncio.wait((work, watch), return_when=asyncio.FIRST_COMPLETED)
+            if not watch.done() and work.exception() is not None:
+                await self._stop_after(work.exception(), watch)
+            if watch.done():
+                raise watch.result()
+            work.result()
+        finally:
+            for task in (work, watch):
+                task.cancel()
+            await asyncio.gather(work, watch, return_exceptions=True)
+            if self._resting is not None:
+                await self._resting.close()
+
+    async def _stop_after(self, error: BaseException | None, watch: asyncio.Future[MachineStopped]) -> None:
+        """Stop the machine after ERROR of the stream, unless it is that of a program and all stands still."""
+        if isinstance(error, GCodeError):
+            return
+        # The link may have failed a moment before its node is known to be lost: that is the better cause.
+        await asyncio.wait((watch,), timeout=CAUSE_WAIT_S)
+        self._machine.stop(f"{error}; all nodes were stopped")
+        await watch
+
+    # ------------------------------------------------------------------------------------------- streaming
+
+    async def _stream(self) -> None:
+        loop = asyncio.get_running_loop()
+        with ThreadPoolExecutor(1, thread_name_prefix="motion") as thread:
+            event: Event | None = None
+            while not isinstance(event, End):
+                cycle = await loop.run_in_executor(thread, self.worker.work, event)
+                event = cycle.event
+                if isinstance(event, Emergency):
+                    self._hand_over(cycle)
+                    self._tell(cycle)
+                    self._machine.stop(f"{self._job.name}:{event.line}: M112 stopped the machine")
+                    return
+                await self._tell_on(cycle)
+                self._hand_over(cycle)  # last: links and buses begin to work then, and the loop rests
+                if isinstance(event, Resting):
+                    await self._attend(event)
+                if event is not None or self.held is not None:
+                    await asyncio.sleep(CYCLE_S)
+            self.ended_s = self._job.planner.print_time_end_s
+            await self._settle(thread)
+        if self.worker.failure is not None:
+            raise self.worker.failure
+
+    async def _attend(self, event: Resting) -> None:
+        """Have EVENT performed once all moves before it are executed."""
+        if self._resting is None:
+            if self.print_time_now() < event.print_time_s + self.worker.steps.lag_s + SETTLE_S:
+                return
+            self._resting = RestTask(event)
+        if self._resting.look():
+            self._resting = None
+            if event.moved:
+                await self._begin_again()
+
+    async def _begin_again(self) -> None:
+        """Go on where something else has left the steppers."""
+        began_at = await self._machine.stepper_positions()
+        self._look_at_load()
+        self.began_s = self.worker.begin_again(began_at)
+
+    def _hand_over(self, cycle: Cycle) -> None:
+        if cycle.batches:
+            self._machine.modules.before_motion(cycle.stepping)
+        for node, batch in cycle.batches:
+            link_of(self._nodes[node]).send_batch(batch)
+            if self._witness is not None:
+                self._witness.see_batch(node, batch)
+        if cycle.batches:
+            self._machine.check_load()
+        self._look_at_load()
+
+    def _tell(self, cycle: Cycle) -> None:
+        for told in cycle.told:
+            self._on_told(told)
+        self._act(self._due.take(self.print_time_now(), cycle.due))
+
+    async def _tell_on(self, cycle: Cycle) -> None:
+        """Tell of CYCLE in steps: whoever else uses the loop waits for the one that runs, not for all."""
+        await asyncio.sleep(0)
+        self._tell(cycle)
+        await asyncio.sleep(0)
+        self._report(cycle.planned)
+        await asyncio.sleep(0)
+        self._on_cycle()
+        await asyncio.sleep(0)
+
+    def _act(self, due: Sequence[Due]) -> None:
+        for print_time_s, timed in due:
+            try:
+                timed.act(print_time_s)
+            except CanductorError as error:  # such as the loss of a node that may be missing
+                self._on_told(Notice(timed.line, f"{self._job.name}:{timed.line}: {error}"))
+
+    def _look_at_load(self) -> None:
+        busy = self._machine.is_busy(BUSY_LOAD)
+        self.worker.start_lead_s = BUSY_START_LEAD_S if busy else START_LEAD_S
+
+    def _report(self, planned: Planned) -> None:
+        now = self.print_time_now()
+        self._on_state(
+            JobState(
+                self.worker.done.done_bytes,
+                self.worker.done.size_bytes,
+                max(0.0, min(now, self.worker.pipeline.appended_until) - self.began_s),
+                self.worker.pipeline.moves,
+                planned,
+            )
+        )
+
+    async def _settle(self, thread: ThreadPoolExecutor) -> None:
+        """Bring what is left to the nodes and wait until the last step is executed."""
+        loop = asyncio.get_running_loop()
+        while self.print_time_now() < self.ended_s + self.worker.steps.lag_s + SETTLE_S:
+            cycle = await loop.run_in_executor(thread, self.worker.rest)
+            self._hand_over(cycle)
+            await self._tell_on(cycle)
+            await asyncio.sleep(CYCLE_S)
+        self._act(self._due.rest())
+        for node in self._nodes:
+            await link_of(node).drained()

@@ -1,0 +1,303 @@
+"""The half of streaming that costs time: the job's g-code, planning, step generation.
+
+A MotionWorker's ``work`` and ``rest`` run in a thread of their own, one at a time, mostly without the
+interpreter lock; the control loop (``streamer.py``) looks at the rest of it only between them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from coordinator.runtime.machine import Machine
+from coordinator.streaming.timed_events import Due
+from coordinator.gcode.errors import GCodeError
+from coordinator.gcode.events import (
+    Emergency,
+    End,
+    Event,
+    Full,
+    MachineChange,
+    Notice,
+    PositionSet,
+    Progress,
+    Reply,
+    Resting,
+    Timed,
+    Wait,
+)
+from coordinator.gcode.status import motion_figures
+from coordinator.motion.planner.planner import Planner
+from coordinator.motion.steps.steps import StepGenerator
+from coordinator.streaming.move_source import MoveSource, Planned, Told, Witness
+from coordinator.streaming.pipeline import Pipeline, PlanRecord
+
+if TYPE_CHECKING:
+    from coordinator.streaming.compensation import Compensation
+    from coordinator.runtime.timebase import ClockMap
+
+PLAN_AHEAD_S: Final = 2.0
+"""Moves are planned so far ahead of now; beyond, the g-code waits. A pause takes so long; what it leaves
+beyond SEND_AHEAD_S is for sources that stall, and for lines that take longer to read than to carry out."""
+SEND_AHEAD_S: Final = 1.2
+"""Step commands are made so far ahead of now; the clocks of the nodes are predicted over this long."""
+START_LEAD_S: Final = 0.25
+"""From standstill, the first move begins so far ahead of now."""
+RUN_DRY_S: Final = 0.8
+"""When what is planned ends so soon and no more comes, it is planned to a standstill."""
+REST_BORDER_S: Final = 0.15
+"""At rest everything up to so far ahead of now counts as generated; below START_LEAD_S."""
+LINES_AT_ONCE: Final = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Cycle:
+    """What one visit to the worker brought."""
+
+    batches: list[tuple[int, bytes]]
+    told: list[Told]
+    event: Event | None
+    """What the job waits for; None: it has more."""
+    planned: Planned
+    due: list[Due]
+    stepping: list[str]
+    """Steppers that have steps in the batches."""
+
+
+class MotionWorker:
+    """Turns JOB into batches of commands for MACHINE's nodes, as time goes by."""
+
+    def __init__(
+        self,
+        machine: Machine,
+        job: MoveSource,
+        *,
+        record: PlanRecord | None,
+        witness: Witness | None,
+        compensation: "Compensation | None",
+    ) -> None:
+        self._machine = machine
+        self._job = job
+        self._record = record
+        self._witness = witness
+        self._compensation = compensation
+        self._nodes = machine.moving
+        self._time_base = machine.time_base()
+        self._batches: list[tuple[int, bytes]] = []
+        self.began_at: dict[str, int] = {}
+        """By stepper: where its node says that it stood when motion was last begun anew."""
+        self.maps: list[ClockMap] = []
+        """Per moving node: print time to ticks, as the steps were timed; without a record only its end."""
+        self.start_lead_s = START_LEAD_S
+        self.held: str | None = None
+        """Why the g-code waits, or None."""
+        self.failure: GCodeError | None = None
+        """Why the job ends early."""
+        self.done = Progress(0, 0, None)
+        self._set_up()
+
+    def _set_up(self) -> None:
+        """Make step generation, which begins anew whenever something else has moved the steppers."""
+        machine, witness = self._machine, self._witness
+        self._made: dict[str, int] = {}
+        self.steps = StepGenerator(machine.devices.stepper_specs(), machine.stream_specs())
+        self.pipeline = Pipeline(
+            self._job,
+            self.steps,
+            lambda n, b: self._batches.append((n, b)),
+            nodes=len(self._nodes),
+            record=self._record,
+            watch=None if witness is None else witness.see_moves,
+            compensation=self._compensation,
+            filament=machine.filament if machine.filament.is_wanted else None,
+        )
+
+    @property
+    def _planner(self) -> Planner:
+        return self._job.planner
+
+    def print_time_now(self) -> float:
+        """Return the present print time."""
+        return self._time_base.print_time_at(self._machine.host.now())
+
+    def begin(self) -> float:
+        """Begin now: set the nodes' clocks; return the print time of the first move."""
+        began_s = self.print_time_now() + self.start_lead_s
+        self._planner.begin_at(began_s)
+        self.maps = []
+        for index, node in enumerate(self._nodes):
+            clock_map = self._machine.clock_map(self._time_base, node, self.print_time_now())
+            piece = clock_map.last
+            self.steps.set_clock_base(index, piece.print_time, round(piece.ticks), piece.ticks_per_s)
+            self.maps.append(clock_map)
+        return began_s
+
+    def begin_again(self, began_at: dict[str, int]) -> float:
+        """Go on where something else has left the steppers, at BEGAN_AT; the rest as ``begin``."""
+        self.began_at = began_at
+        if self._record is not None:
+            self._record.restart()
+        if self._compensation is not None:
+            self._compensation.begin_again(self.steps)
+        self._set_up()
+        return self.begin()
+
+    # ---------------------------------------------------------------------------- in the worker's thread
+
+    def work(self, waiting_for: Event | None) -> Cycle:
+        """Let the job go on as far as it should by now, and make the commands that are due."""
+        now = self.print_time_now()
+        told: list[Told] = []
+        event = waiting_for
+        if self.pipeline.compensation_due and self._all_generated():
+            self.pipeline.compensate()
+        held = self.held is not None and self.failure is None
+        if self.failure is None and not held and not self._still_waiting(waiting_for, now):
+            self._planner.plan_until_s = now + PLAN_AHEAD_S
+            self._begin_anew(now)
+            try:
+                event = self._advance(told)
+            except GCodeError as error:
+                # What came before the bad line is carried out, to a standstill.
+                self.failure = error
+        elif isinstance(waiting_for, Resting) and not waiting_for.over:
+            event = self._beside(waiting_for, told)
+        if self.failure is not None:
+            event = self._end_early()
+        if held or self._runs_dry(now):
+            self._planner.flush()
+        self._generate(now)
+        return self._cycle(told, event)
+
+    def _beside(self, resting: Resting, told: list[Told]) -> Event:
+        """Let others be answered while the job waits, a heater may take minutes; return what to wait for."""
+        while (event := self._job.attend_others()) is not None:
+            if isinstance(event, Reply | Notice):
+                told.append(event)
+            elif isinstance(event, Timed):
+                self.pipeline.at_next_move(event)
+            elif isinstance(event, Emergency):
+                return event
+        return resting
+
+    def _end_early(self) -> Event:
+        return End(self._job.line, self._planner.print_time_end_s) if self._planner.flush() else Full()
+
+    def rest(self) -> Cycle:
+        """Make the commands that are due; the job is over."""
+        self._generate(self.print_time_now())
+        return self._cycle([], None)
+
+    def _cycle(self, told: Sequence[Told], event: Event | None) -> Cycle:
+        batches, self._batches = self._batches, []
+        due, self.pipeline.due = self.pipeline.due, []
+        if self._compensation is not None:
+            self._compensation.note(self.steps)
+        return Cycle(batches, list(told), event, self._planned(), due, self._stepping() if batches else [])
+
+    def _stepping(self) -> list[str]:
+        """Return the steppers for which steps were made since the last time."""
+        made = {s.name: s.steps for s in self.steps.stats().steppers}
+        before, self._made = self._made, made
+        return [name for name, steps in made.items() if steps != before.get(name, 0)]
+
+    def _planned(self) -> Planned:
+        planner = self._planner
+        stands = planner.at_standstill and not planner.take().count
+        return Planned(
+            position=planner.toolhead_position,
+            gcode=planner.gcode_position,
+            base=planner.gcode_base,
+            homed=planner.homed,
+            speed_factor=planner.speed_factor,
+            extrude_factor=planner.extrude_factor,
+            stands_from_s=self.pipeline.moved_until + self.steps.lag_s if stands else None,
+            steps_sent=tuple(self._counts().values()),
+            offset=planner.gcode_offset,
+            figures=motion_figures(planner, self._job.machine),
+            unit_mm=planner.unit_mm,
+        )
+
+    def _still_waiting(self, event: Event | None, now: float) -> bool:
+        if isinstance(event, Wait):
+            return now < event.print_time_s
+        if isinstance(event, PositionSet | MachineChange):
+            return not self._acted(event)
+        if isinstance(event, Resting):
+            return not event.over
+        return False
+
+    def _acted(self, event: PositionSet | MachineChange) -> bool:
+        """Carry out EVENT once all moves before it are generated; return whether it was."""
+        if not self._all_generated():
+            return False
+        self.pipeline.act(event)
+        self._note_places(event)
+        return True
+
+    def _note_places(self, event: PositionSet | MachineChange) -> None:
+        """Let the machine know which counts of its nodes stand for where its rails are now."""
+        carriages = self._job.machine.carriage_state
+        if isinstance(event, PositionSet):
+            offsets = [correction.offset_mm for correction in self.steps.corrections]
+            self._machine.rails.declare(event.position, self._counts(), carriages, offsets)
+        else:
+            self._machine.rails.use(carriages)
+
+    def _counts(self) -> dict[str, int]:
+        """Return where the nodes will count the steppers when all that was made is executed."""
+        return {s.name: s.issued + self.began_at.get(s.name, 0) for s in self.steps.stats().steppers}
+
+    def _all_generated(self) -> bool:
+        return (
+            self._planner.at_standstill
+            and self.pipeline.transfer()
+            and self.steps.generated_until >= self.pipeline.appended_until + self.steps.lag_s
+        )
+
+    def _advance(self, told: list[Told]) -> Event | None:
+        """Step the job until it has to wait for something, or LINES_AT_ONCE are done."""
+        for _ in range(LINES_AT_ONCE):
+            event = self._job.step()
+            if isinstance(event, Reply | Notice):
+                told.append(event)
+            elif isinstance(event, Progress):
+                self.done = event
+            elif isinstance(event, Timed):
+                self.pipeline.at_next_move(event)
+            elif isinstance(event, PositionSet | MachineChange) and self._acted(event):
+                continue
+            else:
+                return event
+        return None
+
+    def _begin_anew(self, now: float) -> None:
+        """After a standstill the next move needs time to reach the nodes, and steps to look ahead to it."""
+        begin = max(now + self.start_lead_s, self.steps.next_move_s)
+        if self._planner.at_standstill and self._planner.print_time_end_s < begin:
+            self._planner.begin_at(begin)
+
+    def _runs_dry(self, now: float) -> bool:
+        return self._planner.print_time_end_s < now + RUN_DRY_S and not self._planner.at_standstill
+
+    def _generate(self, now: float) -> None:
+        """Make the commands up to SEND_AHEAD_S from now, with every node's clock steered first."""
+        while True:
+            complete = self.pipeline.transfer()
+            self._steer()
+            standing = complete and self._planner.at_standstill
+            end = self.pipeline.appended_until
+            until = min(end, now + SEND_AHEAD_S)
+            flush = standing and until >= end
+            # At rest the border moves on with time, so that the clocks are steered at all times.
+            self.pipeline.generate(max(until, now + REST_BORDER_S) if flush else until, flush=flush)
+            if complete or until < end:
+                return
+
+    def _steer(self) -> None:
+        border = self.steps.generated_until
+        for index, (node, clock_map) in enumerate(zip(self._nodes, self.maps, strict=True)):
+            if node is not self._machine.primary and border > clock_map.last.print_time:
+                piece = self._time_base.steer(node.name, clock_map, node.best_clock, border)
+                self.steps.set_clock(index, piece.ticks_per_s)
+                if self._record is None:
+                    clock_map.forget()

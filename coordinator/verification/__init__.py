@@ -1,0 +1,1 @@
+"""The oracles: independent evaluation of a plan, shared by demo, simulation and tests. Nothing of the engine."""

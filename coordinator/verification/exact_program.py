@@ -1,0 +1,31 @@
+"""What a program asks of one stepper: its motion cut where positions are declared or settings change."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from coordinator.verification.exact_path import Leg, Setting
+from coordinator.verification.exact_shapers import impulses
+from coordinator.motion.specs import StepperSpec
+from coordinator.streaming.pipeline import Acting, Stretch
+
+
+def program_legs(spec: StepperSpec, stretches: Sequence[Stretch]) -> list[Leg]:
+    """Return the legs of the stepper SPEC, whose weights hold as long as STRETCHES tell no others."""
+    return [
+        Leg(
+            replace(spec, weights=stretch.acting.weights.get(spec.name, spec.weights)),
+            stretch.start,
+            stretch.moves,
+            _setting(stretch.acting, spec.name),
+            declared=stretch.declared,
+        )
+        for stretch in stretches
+    ]
+
+
+def _setting(acting: Acting, stepper: str) -> Setting:
+    shapers = {
+        axis: impulses(shaper.kind, shaper.frequency_hz, shaper.damping_ratio)
+        for axis, shaper in acting.shapers.items()
+    }
+    return Setting(shapers, acting.windows_s.get(stepper, 0.0))

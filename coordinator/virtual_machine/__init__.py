@@ -1,0 +1,1 @@
+"""A configured machine on virtual nodes, with the plant around their pins."""

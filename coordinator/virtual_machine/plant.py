@@ -1,0 +1,224 @@
+"""The plant of a configured machine: what stands around its virtual nodes so that homing and heating do work.
+
+Every stepper is counted where it is driven; every rail's endstop stands where the configuration says, and
+switches by the steppers of all nodes that move its axis. The heat is in ``plant_heat.py``.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import field, replace
+from typing import Final
+
+import numpy as np
+
+from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat
+from coordinator.virtual_machine.plant_tmc import machine_drivers
+from coordinator.kinematics.base import Point
+from coordinator.assembly.load import MachineDescription, RailDescription, StepperDescription
+from coordinator.config.model import SECOND_CARRIAGE
+from coordinator.motion.specs import StepKinematics
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
+from nodes.virtual.plant import Axis, NodePlant, Stepper, Switch, Term
+
+AXES: Final = "xyz"
+START_MM: Final = 30.0
+"""How far from where it is after homing the head begins, along each axis, unless told otherwise."""
+BEYOND_MM: Final = 5.0
+"""How far behind the end of an axis its stop stands."""
+RAD_PER_MM: Final = 0.01
+"""Of a rail that turns, these lengths are as small angles as of an arm of 100 mm."""
+DIGITS: Final = 12
+_SMALL: Final = 1e-9
+
+
+@record(kw_only=True)
+class PlantSettings:
+    """How the machine is to be."""
+
+    seed: int = 1
+    start: Point | None = None
+    """Where the head stands at the begin, mm; None: some way from where it homes to."""
+    stops: bool = True
+    """Whether steps beyond the ends of an axis are lost."""
+    enable_pins: bool = True
+    """Whether a motor whose enable pin is off stands still."""
+    hysteresis_mm: float = 0.1
+    """Travel of an endstop from where it closes to where it opens."""
+    skew_mm: Mapping[str, float] = field(default_factory=dict)
+    """How far beside the head a side of an axis begins that has an endstop of its own, by its first motor."""
+    switch_noise_mm: float = 0.0
+    """How far beside its place each approach finds an endstop, at most."""
+    heat: HeatSettings = HeatSettings()
+
+
+def machine_plants(
+    description: MachineDescription, settings: PlantSettings | None = None
+) -> dict[str, NodePlant]:
+    """Return the plants of the machine's nodes, by node; raises CanductorError when it cannot have one."""
+    settings = settings or PlantSettings()
+    start = settings.start or start_point(description)
+    try:
+        rails = description.kinematics.inverse(start)
+    except ValueError:
+        raise CanductorError(f"the head of the plant cannot begin at {start}: no rail reaches it") from None
+    endstops = [
+        _endstop(description, rail, start, rails, settings)
+        for rail in _rails(description)
+        if rail.homing.endstop_pin is not None
+    ]
+    plants = [_mechanics(description, node.name, endstops, settings) for node in description.nodes]
+    heat = machine_heat(description, settings.heat)
+    drivers = machine_drivers(description)
+    return {
+        plant.node: replace(
+            plant,
+            seed=settings.seed + number,
+            ambient=settings.heat.ambient_c,
+            tmcs=tuple(drivers[plant.node].tmcs),
+            diags=tuple(drivers[plant.node].diags),
+            **heat[plant.node].parts(),
+        )
+        for number, plant in enumerate(plants)
+    }
+
+
+def start_point(description: MachineDescription, away_mm: float = START_MM) -> Point:
+    """Return a place AWAY_MM from where the head is after homing, along each axis, towards the middle."""
+    home = np.array(description.home)
+    space = description.kinematics.work_space
+    middle = (np.array(space.low) + np.array(space.high)) / 2
+    x, y, z = home + np.clip(middle - home, -away_mm, away_mm)
+    return (float(x), float(y), float(z))
+
+
+def _rails(description: MachineDescription) -> Iterator[RailDescription]:
+    for rail in description.rails:
+        yield from rail.pieces
+    if description.second_carriage is not None:
+        yield description.second_carriage
+
+
+def _mechanics(
+    description: MachineDescription,
+    node: str,
+    endstops: Sequence[tuple[str, Switch | None, Axis]],
+    settings: PlantSettings,
+) -> NodePlant:
+    own = [(switch, axis) for at, switch, axis in endstops if at == node and switch is not None]
+    # An axis with stops is also known where its steppers are.
+    moved = [
+        axis
+        for _, switch, axis in endstops
+        if any(term.node == node for term in axis.terms) and (settings.stops or switch is None)
+    ]
+    axes = {axis.name: axis for axis in moved}
+    axes |= {axis.name: axis for _, axis in own}
+    return NodePlant(
+        node=node,
+        steppers=tuple(_stepper(s, settings) for s in description.steppers if s.node == node),
+        axes=tuple(axes.values()),
+        switches=tuple(switch for switch, _ in own),
+    )
+
+
+def _stepper(stepper: StepperDescription, settings: PlantSettings) -> Stepper:
+    enable = stepper.enable_pin if settings.enable_pins else None
+    if enable is not None and enable.node != stepper.node:
+        enable = None  # its driver hangs on another node's pin, which this plant does not see
+    return Stepper(
+        name=stepper.name,
+        step_pin=stepper.step_pin.name,
+        dir_pin=stepper.dir_pin.name,
+        enable_pin=None if enable is None else enable.name,
+        step_inverted=stepper.step_pin.invert,
+        dir_inverted=stepper.dir_pin.invert,
+        enable_inverted=enable is not None and enable.invert,
+        both_edges=stepper.step_pulse_s == 0,
+    )
+
+
+# ------------------------------------------------------------------------------------------------ endstops
+
+
+def _endstop(
+    description: MachineDescription,
+    rail: RailDescription,
+    start: Point,
+    rails: Sequence[float],
+    settings: PlantSettings,
+) -> tuple[str, Switch | None, Axis]:
+    """Return the node, the switch and the axis of RAIL's endstop; one that is felt is the stop itself."""
+    pin, name = rail.homing.endstop_pin, rail.steppers[0].name
+    assert pin is not None
+    if rail in description.rails and rail.axis in AXES and (terms := _axis_terms(description, rail)):
+        origin, at = start[AXES.index(rail.axis)], rail.homing.position_endstop
+        name = rail.axis
+    else:
+        terms = tuple(Term(s.node, s.name, s.step_distance / len(rail.steppers)) for s in rail.steppers)
+        origin, at = _own_places(description, rail, start, rails)
+        origin += settings.skew_mm.get(name, 0.0)
+    assert at is not None
+    direction = 1 if rail.homing.positive_dir else -1
+    unit = RAD_PER_MM if rail.steppers[0].function.turns else 1.0
+    if rail.homing.virtual_endstop:
+        low, high = _stops(rail, at, 0.0)
+        return pin.node, None, Axis(name=name, terms=terms, origin=origin, min=low, max=high)
+    low, high = _stops(rail, at, BEYOND_MM * unit) if settings.stops else (-np.inf, np.inf)
+    switch = Switch(
+        name=name,
+        pin=pin.name,
+        axis=name,
+        at=at,
+        direction=direction,
+        hysteresis=settings.hysteresis_mm * unit,
+        noise=settings.switch_noise_mm * unit,
+        inverted=pin.invert,
+    )
+    return pin.node, switch, Axis(name=name, terms=terms, origin=origin, min=low, max=high)
+
+
+def _own_places(
+    description: MachineDescription, rail: RailDescription, start: Point, rails: Sequence[float]
+) -> tuple[float, float | None]:
+    """Return where a rail that is no axis, or a part of one, is at the begin and at its endstop."""
+    at = rail.homing.position_endstop
+    if rail.axis == SECOND_CARRIAGE:  # parked at its endstop, nearly
+        assert at is not None
+        return (at - START_MM if rail.homing.positive_dir else at + START_MM), at
+    if rail not in description.rails:  # one side of an axis
+        axis = next(whole.axis for whole in description.rails if rail in whole.pieces)
+        return start[AXES.index(axis)], at
+    index = description.kinematics.rails.index(rail.axis)
+    return rails[index], description.kinematics.inverse(description.home)[index]
+
+
+def _stops(rail: RailDescription, at: float, beyond: float) -> tuple[float, float]:
+    """Return where an axis ends: behind its range; where there is none, only behind its endstop."""
+    upper = rail.homing.positive_dir
+    low = rail.position_min if rail.position_min is not None else -np.inf if upper else at
+    high = rail.position_max if rail.position_max is not None else at if upper else np.inf
+    return min(low, at) - beyond, max(high, at) + beyond
+
+
+def _axis_terms(description: MachineDescription, rail: RailDescription) -> tuple[Term, ...]:
+    """Return how the place of RAIL's axis follows from steppers that are sums of axes; empty: it does not."""
+    motors = _motors(description)
+    weights = np.array([motor.weights[:3] for motor in motors]).reshape(-1, 3)
+    axis = np.zeros(3)
+    axis[AXES.index(rail.axis)] = 1.0
+    solution = np.linalg.pinv(weights).T @ axis if len(motors) else axis[:0]
+    if not np.allclose(weights.T @ solution, axis, atol=_SMALL):
+        return ()
+    return tuple(
+        Term(motor.node, motor.name, round(float(share), DIGITS) * motor.step_distance)
+        for motor, share in zip(motors, solution, strict=True)
+        if abs(share) > _SMALL
+    )
+
+
+def _motors(description: MachineDescription) -> list[StepperDescription]:
+    """Return the motors that are sums of axes, but for those of a second carriage."""
+    dual = description.dual_carriage
+    others = [stepper.name for stepper in dual.rails[1].steppers] if dual is not None else []
+    linear = [m for m in description.motors if m.function.kinematics is StepKinematics.LINEAR]
+    return [motor for motor in linear if motor.name not in others]

@@ -1,0 +1,1 @@
+"""A bus or UART with its nodes: node id assignment, start, stop."""

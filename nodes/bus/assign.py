@@ -1,0 +1,308 @@
+"""Node ids on a CAN bus: finding the nodes that wait for one, and giving each its own. Sans-IO.
+
+A round asks who waits (QUERY_UNASSIGNED) and, of firmware that knows the question, who is there already
+(WHO_IS_HERE); the answers of a round are merged with those before, since frames get lost and answers
+collide: older firmware answers at once, all nodes with the same CAN id, and two that begin in the same bit
+destroy each other's frame. A host's own frame right behind the question would make them wait for its end
+and so begin together: nothing follows QUERY_UNASSIGNED, and some rounds ask it alone. Nodes that still
+collide are told their ids unheard, and then collide no more.
+
+Setting an id is not acknowledged. It counts as done when the node says so (WHO_IS_HERE), or when it no
+longer answers SILENT_ROUNDS queries in a row; until then it is told again in every round, as its silence may
+be lost frames. A node that has an id from before answers no query, so one that never answers is told its id
+all the same, and remains *unheard*: only talking to it (identify) shows whether it is there.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from nodes.support.errors import CanductorError
+
+ADMIN_ID: Final = 0x3F0
+ADMIN_RESPONSE_ID: Final = 0x3F1
+QUERY_UNASSIGNED: Final = 0x00
+SET_NODEID: Final = 0x01
+SET_NODEID_BOOTLOADER: Final = 0x11
+NEED_NODEID: Final = 0x20
+NODE_IS_HERE: Final = 0x21
+WHO_IS_HERE: Final = 0x41
+UUID_SIZE: Final = 6
+FIRST_NODEID: Final = 4
+LAST_NODEID: Final = 255
+
+ROUND_NS: Final = 20_000_000
+"""Time for the answers of one round; nodes answer within a few milliseconds."""
+ALL_ASKED_ROUNDS: Final = 3
+"""Rounds after which only every other one asks WHO_IS_HERE."""
+SLOW_ROUND_NS: Final = 100_000_000
+QUICK_ROUNDS: Final = 10
+ANSWER_NS: Final = 540_000
+"""One answer on the wire at 250 kbit/s: a round lasts longer, the more nodes may answer."""
+PATIENCE_NS: Final = 1_200_000_000
+"""How long a node that does not answer is asked, since a new one appeared last: it may still be booting."""
+MAX_NS: Final = 5_000_000_000
+"""After which it ends even if new ones appear for ever."""
+SILENT_ROUNDS: Final = 3
+"""With 1 % of frames lost, an unassigned node stays silent that long once in 10^5 rounds."""
+UNHEARD_ROUNDS: Final = 4
+"""After which one that never answered is told its id."""
+MAX_STRANGERS: Final = 512
+"""Uuids remembered that nobody asked for."""
+_UUID: Final = re.compile(r"[0-9a-fA-F]{12}\Z")
+
+
+class AssignError(CanductorError):
+    """A node cannot get its id: not found, in its bootloader, or not alone with its uuid."""
+
+
+@dataclass(frozen=True, slots=True)
+class Uuid:
+    """A board's six bytes as they stand on the wire; printed as 12 hex digits."""
+
+    raw: bytes
+
+    def __post_init__(self) -> None:
+        if len(self.raw) != UUID_SIZE:
+            raise AssignError(f"a uuid has {UUID_SIZE} bytes, not {len(self.raw)}")
+
+    @classmethod
+    def parse(cls, text: str) -> "Uuid":
+        """Read 12 hex digits; raises AssignError."""
+        if _UUID.match(text.strip()):
+            return cls(bytes.fromhex(text.strip()))
+        raise AssignError(f"{text!r} is no uuid: give the 12 hex digits that 'canductor can query' prints")
+
+    def __str__(self) -> str:
+        return self.raw.hex()
+
+
+@dataclass(frozen=True, slots=True)
+class AdminFrame:
+    """A frame to send."""
+
+    can_id: int
+    data: bytes
+
+
+def waiting_uuid(data: bytes) -> Uuid | None:
+    """Return who waits for an id, from an admin response; None when it says something else."""
+    if len(data) == UUID_SIZE + 2 and data[0] == NEED_NODEID:
+        return Uuid(data[1 : 1 + UUID_SIZE])
+    return None
+
+
+def number_nodes(uuids: Iterable[Uuid]) -> dict[Uuid, int]:
+    """Give out node ids 4, 5, 6, … in the order of UUIDS; raises AssignError."""
+    found: dict[Uuid, int] = {}
+    for nodeid, uuid in enumerate(uuids, FIRST_NODEID):
+        if uuid in found:
+            raise AssignError(f"uuid {uuid} is configured twice; every node needs its own")
+        if nodeid > LAST_NODEID:
+            raise AssignError(f"more than {LAST_NODEID - FIRST_NODEID + 1} nodes on one bus cannot get ids")
+        found[uuid] = nodeid
+    return found
+
+
+@dataclass(slots=True)
+class _Seen:
+    """What is known of one uuid."""
+
+    nodeid: int | None = None
+    answers: int = 0
+    here: int = 0
+    """Answers to WHO_IS_HERE."""
+    answered_round: bool = False
+    needs_id: bool = False
+    """It said in this round that it has none or another, or somebody else said to have the same."""
+    silent_rounds: int = 0
+    bootloader: bool = False
+    settled: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """How it ended: ids are set for all wanted uuids; those UNHEARD have yet to prove that they are there."""
+
+    nodeids: Mapping[Uuid, int]
+    unheard: tuple[Uuid, ...]
+    in_bootloader: tuple[Uuid, ...]
+    duplicates: tuple[Uuid, ...]
+    """Uuids that more than one board answered with."""
+    strangers: Mapping[Uuid, str] = field(default_factory=dict)
+    """Uuids that wait for an id and are not wanted, and what they are."""
+    displaced: Mapping[Uuid, int] = field(default_factory=dict)
+    """Uuids that are not wanted and had an id that a wanted one gets."""
+
+    def check(self, bus: str) -> None:
+        """Raise AssignError when a wanted node cannot be used for certain."""
+        for uuid in self.nodeids:
+            self.check_node(uuid, bus)
+
+    def check_node(self, uuid: Uuid, bus: str) -> None:
+        """Raise AssignError when this node cannot be used for certain."""
+        if uuid in self.duplicates:
+            raise AssignError(
+                f"two boards on bus {bus} have the uuid {uuid} (cloned chips?); take one of them off"
+            )
+        if uuid in self.in_bootloader:
+            raise AssignError(
+                f"node {uuid} on bus {bus} is in its bootloader (Katapult) and has no firmware running; "
+                "flash it or reset it"
+            )
+
+    def not_found(self, uuid: Uuid, bus: str) -> AssignError:
+        """Return the error for a node that neither answered a query nor identifies."""
+        waiting = ", ".join(f"{stranger} ({kind})" for stranger, kind in self.strangers.items()) or "none"
+        return AssignError(
+            f"node {uuid} not found on bus {bus}; nodes waiting there: {waiting}; "
+            "check its wiring and power, the bus's bit rate, and the uuid"
+        )
+
+
+class IdAssignment:
+    """Gives the uuids of WANTED their node ids. Times are nanoseconds of any one clock.
+
+    Call ``start``, then ``frame`` for what arrives and ``timer`` when ``deadline_ns`` has come; send what
+    ``frames_to_send`` returns after each; it is over when ``result`` is not None. With nothing
+    WANTED it finds out who waits for an id (``strangers``), until SILENT_ROUNDS rounds brought nobody new.
+    """
+
+    def __init__(self, wanted: Mapping[Uuid, int]) -> None:
+        self._wanted = dict(wanted)
+        self._seen: dict[Uuid, _Seen] = {uuid: _Seen(nodeid) for uuid, nodeid in wanted.items()}
+        self._outbox: list[AdminFrame] = []
+        self._started_ns = 0
+        self._news_ns = 0
+        self._rounds = 0
+        self._rounds_asking_here = 0
+        self._rounds_without_news = 0
+        self._displaced: dict[Uuid, int] = {}
+        self.deadline_ns: int | None = None
+        self.result: Assignment | None = None
+        self.ignored_frames = 0
+
+    def start(self, now_ns: int) -> None:
+        """Begin the first round."""
+        self._started_ns = self._news_ns = now_ns
+        self._next_round(now_ns)
+
+    def frames_to_send(self) -> list[AdminFrame]:
+        """Return what is to be sent now, once."""
+        frames, self._outbox = self._outbox, []
+        return frames
+
+    def frame(self, can_id: int, data: bytes, now_ns: int) -> None:
+        """Take a received frame; anything but an answer of a node is ignored."""
+        if can_id != ADMIN_RESPONSE_ID or len(data) != UUID_SIZE + 2 or self.result is not None:
+            self.ignored_frames += can_id == ADMIN_RESPONSE_ID
+            return
+        uuid = Uuid(data[1 : 1 + UUID_SIZE])
+        seen = self._remember(uuid, now_ns) if data[0] in (NEED_NODEID, NODE_IS_HERE) else None
+        if seen is None:
+            self.ignored_frames += 1
+        elif data[0] == NEED_NODEID:
+            self._node_waits(seen, data[-1])
+        else:
+            self._node_is_here(uuid, seen, data[-1])
+
+    def timer(self, now_ns: int) -> None:
+        """Take the time; closes a round whose deadline has come."""
+        if self.deadline_ns is None or now_ns < self.deadline_ns:
+            return
+        for uuid, seen in self._seen.items():
+            if seen.nodeid is not None:
+                self._close_round(uuid, seen)
+        impatient = now_ns - self._news_ns >= PATIENCE_NS or now_ns - self._started_ns >= MAX_NS
+        if impatient or self._all_settled():
+            self._finish()
+        else:
+            self._next_round(now_ns)
+
+    # ------------------------------------------------------------------------------------------------ rounds
+
+    def _all_settled(self) -> bool:
+        if not self._wanted:
+            return self._rounds_without_news >= SILENT_ROUNDS
+        return all(seen.settled for seen in self._seen.values() if seen.nodeid is not None)
+
+    def _remember(self, uuid: Uuid, now_ns: int) -> _Seen | None:
+        if uuid not in self._seen:
+            if len(self._seen) >= len(self._wanted) + MAX_STRANGERS:
+                return None
+            self._seen[uuid] = _Seen()
+        seen = self._seen[uuid]
+        if not seen.answers and not seen.here:
+            self._news_ns = now_ns
+            self._rounds_without_news = -1  # this round does not count
+        return seen
+
+    @staticmethod
+    def _node_waits(seen: _Seen, set_command: int) -> None:
+        seen.answers += 1
+        seen.answered_round = seen.needs_id = True
+        seen.settled = False
+        seen.bootloader = set_command == SET_NODEID_BOOTLOADER
+
+    def _node_is_here(self, uuid: Uuid, seen: _Seen, nodeid: int) -> None:
+        seen.here += 1
+        if seen.nodeid is not None:
+            seen.settled = seen.nodeid == nodeid
+            seen.needs_id |= not seen.settled
+            return
+        for other in self._seen.values():
+            if other.nodeid == nodeid:
+                # Told its id once more, the wanted node keeps it, and this one drops it and shuts down.
+                self._displaced[uuid] = nodeid
+                other.needs_id = True
+
+    def _close_round(self, uuid: Uuid, seen: _Seen) -> None:
+        """Judge a wanted node by the round that ends, and tell it its id when it does not seem to know it."""
+        if seen.answered_round:
+            seen.silent_rounds = 0
+        else:
+            seen.silent_rounds += 1
+            if seen.answers and not seen.bootloader and seen.silent_rounds >= SILENT_ROUNDS:
+                seen.settled = True
+        unheard = not seen.answers and not seen.settled and seen.silent_rounds >= UNHEARD_ROUNDS
+        silent = seen.answers and not seen.settled  # it knows its id, or the queries got lost
+        if seen.nodeid is not None and not seen.bootloader and (seen.needs_id or silent or unheard):
+            data = bytes((SET_NODEID, *uuid.raw, seen.nodeid))
+            self._outbox.append(AdminFrame(ADMIN_ID, data))
+
+    def _next_round(self, now_ns: int) -> None:
+        for seen in self._seen.values():
+            seen.answered_round = seen.needs_id = False
+        self._rounds += 1
+        self._rounds_without_news += 1
+        if self._rounds <= ALL_ASKED_ROUNDS or self._rounds % 2:
+            self._rounds_asking_here += 1
+            self._outbox.append(AdminFrame(ADMIN_ID, bytes((WHO_IS_HERE,))))
+        self._outbox.append(AdminFrame(ADMIN_ID, bytes((QUERY_UNASSIGNED,))))
+        quiet_ns = ROUND_NS if self._rounds <= QUICK_ROUNDS else SLOW_ROUND_NS
+        self.deadline_ns = now_ns + quiet_ns + len(self._seen) * ANSWER_NS
+
+    def _finish(self) -> None:
+        wanted = [(uuid, self._seen[uuid]) for uuid in self._wanted]
+        self.deadline_ns = None
+        self.result = Assignment(
+            nodeids=self._wanted,
+            unheard=tuple(uuid for uuid, seen in wanted if not seen.settled and not seen.bootloader),
+            in_bootloader=tuple(uuid for uuid, seen in wanted if seen.bootloader),
+            # A node answers a query at most once, so more answers than queries come from more than one.
+            duplicates=tuple(
+                uuid
+                for uuid, seen in self._seen.items()
+                if seen.answers > self._queries_for(seen) or seen.here > self._rounds_asking_here
+            ),
+            strangers={
+                uuid: "in its bootloader" if seen.bootloader else "ready for an id"
+                for uuid, seen in self._seen.items()
+                if seen.nodeid is None and seen.answers
+            },
+            displaced=self._displaced,
+        )
+
+    def _queries_for(self, seen: _Seen) -> int:
+        return self._rounds - seen.silent_rounds if seen.nodeid is not None else self._rounds

@@ -1,0 +1,274 @@
+"""A CAN bus with its nodes: ids, links, sync pulses, the bus-wide stop, and who else is there."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from nodes.bus.assign import (
+    ADMIN_ID,
+    ADMIN_RESPONSE_ID,
+    QUERY_UNASSIGNED,
+    Assignment,
+    IdAssignment,
+    Uuid,
+    number_nodes,
+    waiting_uuid,
+)
+from nodes.bus.bus import LOST_AFTER_S, BusBase, ignore
+from nodes.clock.clock import HostTime
+from nodes.dictionary.cache import DictionaryCache
+from nodes.support.errors import CanductorError
+from nodes.link import LinkSettings
+from nodes.node.node import Node, OnClock, OnState
+from nodes.node.errors import NodeError, NodeLost
+from nodes.node.states import NodeState
+from nodes.link.interfaces import BuildConfig, FrameLike, IoFactory, LinkLike, OnLost, OnResponses
+from nodes.clock.sync_pulse import CONSTANT, PulseKeeper
+from nodes.transport.frame import BUS_OFF
+from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
+from nodes.clock.wire_time import can_wire_ns
+
+SUSPECT_INTERVAL_S: Final = 0.1
+"""The bus is asked at most that often who waits for an id."""
+BUS_STOP_ID: Final = 0x010
+"""Frame ``<reason> <node id of the origin>``: every node of this project's firmware shuts down at once."""
+BUS_STOP_FRAMES: Final = 3
+"""Nobody acknowledges it, and a bus that has to be stopped may be one that loses frames."""
+
+
+class CanBus(BusBase):
+    """A CAN bus; its nodes get their ids 4, 5, 6, … in the order in which they are added."""
+
+    def __init__(
+        self,
+        name: str,
+        start_io: IoFactory,
+        *,
+        cache: DictionaryCache | None = None,
+        on_notice: Callable[[str], None] = ignore,
+    ) -> None:
+        super().__init__(name, start_io, cache=cache, on_notice=on_notice)
+        self._nodeids: dict[Uuid, int] = {}
+        self._by_uuid: dict[Uuid, Node] = {}
+        self._connectors: list[_CanConnector] = []
+        self._assigning = asyncio.Lock()
+        self._assignment: IdAssignment | None = None
+        self._asked_s = float("-inf")
+        self._doubts: dict[Uuid, asyncio.Task[None]] = {}
+        self._pulses: asyncio.Task[None] | None = None
+        self._said: set[Uuid] = set()
+
+    def add_node(
+        self,
+        name: str,
+        uuid: Uuid,
+        build_config: BuildConfig,
+        *,
+        may_be_absent: bool = False,
+        on_state: OnState = ignore,
+        on_clock: OnClock = ignore,
+    ) -> Node:
+        """Add a node, before ``start``; raises AssignError when its uuid is there already."""
+        self._nodeids = number_nodes([*self._nodeids, uuid])
+        connector = _CanConnector(self, uuid)
+        self._connectors.append(connector)
+        node = Node(name, connector, build_config, on_state=on_state, on_clock=on_clock, cache=self._cache)
+        self._by_uuid[uuid] = node
+        return self._add(node, may_be_absent=may_be_absent)
+
+    async def close(self) -> None:
+        """Close all nodes and the bus; nothing is left running."""
+        tasks = [*self._doubts.values(), *([self._pulses] if self._pulses is not None else [])]
+        self._pulses = None
+        for task in tasks:
+            task.cancel()
+        for result in await asyncio.gather(*tasks, return_exceptions=True):
+            if isinstance(result, Exception):
+                raise result  # a bug of those tasks, which expect all that may happen
+        await super().close()
+
+    def emergency_stop(self) -> None:
+        """Stop every node that can be reached: by frames that our firmware obeys at once, and one by one."""
+        if any(node.dictionary.int_constant(KNOWS_BUS_STOP, 0) for node in self.nodes):
+            with contextlib.suppress(CanductorError):  # the bus may be what failed
+                for _ in range(BUS_STOP_FRAMES):
+                    self.io.send_frame(BUS_STOP_ID, bytes((0, 0)))
+        super().emergency_stop()
+
+    async def assign(self, uuids: Iterable[Uuid]) -> Assignment:
+        """Give UUIDS their ids; whether one can be had for certain is for ``Assignment.check_node``."""
+        async with self._assigning:
+            self._assignment = IdAssignment({uuid: self._nodeids[uuid] for uuid in uuids})
+            try:
+                result = await self._run(self._assignment)
+            finally:
+                self._assignment = None
+        for stranger, nodeid in result.displaced.items():
+            self._say(
+                stranger,
+                f"board {stranger} on bus {self.name} is not configured here and had node id {nodeid}, which "
+                "was taken from it; it has shut down: let only one host assign ids on a bus",
+            )
+        return result
+
+    def suspect(self) -> None:
+        """Ask who waits for an id: a node that restarted does. The answers come as frames."""
+        now_s = asyncio.get_running_loop().time()
+        if now_s - self._asked_s >= SUSPECT_INTERVAL_S:
+            self._asked_s = now_s
+            with contextlib.suppress(CanductorError):  # the bus may be gone: that is told elsewhere
+                self.io.send_frame(ADMIN_ID, bytes((QUERY_UNASSIGNED,)))
+
+    def _node_started(self, node: Node) -> None:
+        # Boards are built for one bit rate, and this one has just been heard at it.
+        self.io.learn_bitrate(node.dictionary.int_constant("CANBUS_FREQUENCY", 0))
+
+    def send_frame(self, can_id: int, data: bytes) -> None:
+        """Send a frame that is no node's, before all data; raises CanductorError when it cannot be queued."""
+        self.io.send_frame(can_id, data)
+
+    @property
+    def bitrate(self) -> int:
+        """Bit/s; 0 while it is not known."""
+        return self.io.stats().bitrate
+
+    @property
+    def load(self) -> float:
+        """Share of the bit rate within the last second, by whomever; 0 while the bit rate is not known."""
+        return self.io.stats().load.total
+
+    def nodeid(self, uuid: Uuid) -> int:
+        """Return the id UUID has, or gets."""
+        return self._nodeids[uuid]
+
+    async def _run(self, assignment: IdAssignment) -> Assignment:
+        loop = asyncio.get_running_loop()
+        assignment.start(_ns(loop.time()))
+        while assignment.result is None:
+            for frame in assignment.frames_to_send():
+                self.io.send_frame(frame.can_id, frame.data)
+            if assignment.deadline_ns is not None:
+                await asyncio.sleep(max(0.0, assignment.deadline_ns * 1e-9 - loop.time()))
+            assignment.timer(max(_ns(loop.time()), assignment.deadline_ns or 0))
+        for frame in assignment.frames_to_send():
+            self.io.send_frame(frame.can_id, frame.data)
+        return assignment.result
+
+    async def _prepare(self) -> None:
+        assignment = await self.assign(self._nodeids)
+        for connector in self._connectors:
+            connector.assignment = assignment
+        loop = asyncio.get_running_loop()
+        keeper = PulseKeeper(
+            lambda: [node for node in self.nodes if _knows_pulses(node)],
+            self.send_frame,
+            lambda: HostTime(_ns(loop.time())),
+        )
+        # From the start, so that the clocks agree when the nodes are ready.
+        self._pulses = loop.create_task(keeper.run())
+
+    def _frame_handler(self) -> Callable[[FrameLike], None]:
+        return self._frame_came
+
+    def _frame_came(self, frame: FrameLike) -> None:
+        if self._assignment is not None:
+            self._assignment.frame(frame.can_id, frame.data, _ns(asyncio.get_running_loop().time()))
+        if frame.can_id == BUS_STOP_ID and len(frame.data) == 2:
+            self._bus_stopped(reason=frame.data[0], nodeid=frame.data[1])
+        elif frame.can_id == ADMIN_RESPONSE_ID:
+            self._doubt(waiting_uuid(frame.data))
+        elif frame.can_id == BUS_OFF:
+            self._went_bus_off()
+
+    def _bus_stopped(self, reason: int, nodeid: int) -> None:
+        """Take note that a node stopped the bus: what the others report from now on follows from that."""
+        for uuid, node in self._by_uuid.items():
+            if self._nodeids[uuid] == nodeid:
+                node.shut_down_for(reason)
+
+    def _went_bus_off(self) -> None:
+        cause = (
+            f"the controller of {self.name} met too many errors and went off the bus (bus-off); check "
+            "cables, termination and bit rates, and have it return by itself: while the interface is down, "
+            f"'ip link set {self.name} type can restart-ms 100'"
+        )
+        for node in self.nodes:
+            node.lose(cause)
+
+    def _doubt(self, uuid: Uuid | None) -> None:
+        """Find out why a board asks for an id whose node has one: it restarted, or there are two."""
+        node = self._by_uuid.get(uuid) if uuid is not None else None
+        if uuid is None or node is None or uuid in self._doubts:
+            return
+        if node.state in (NodeState.READY, NodeState.SHUTDOWN):
+            task = asyncio.get_running_loop().create_task(self._resolve(uuid, node))
+            self._doubts[uuid] = task
+            task.add_done_callback(lambda _: self._doubts.pop(uuid, None))
+
+    async def _resolve(self, uuid: Uuid, node: Node) -> None:
+        if await node.lives():
+            self._say(uuid, f"{_twins(uuid, self.name)}; the second one waits for an id and is not used")
+        else:
+            node.restarted("its uuid asks for an id again")
+
+    def _say(self, uuid: Uuid, sentence: str) -> None:
+        """Tell the user, once for each board."""
+        if uuid not in self._said:
+            self._said.add(uuid)
+            self._on_notice(sentence)
+
+
+class _CanConnector:
+    """Connects one node of a CAN bus; after a reset it has to get its id again."""
+
+    def __init__(self, bus: CanBus, uuid: Uuid) -> None:
+        self._bus = bus
+        self._uuid = uuid
+        self.assignment: Assignment | None = None
+
+    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
+        if self.assignment is None:
+            self.assignment = await self._bus.assign([self._uuid])
+        self.assignment.check_node(self._uuid, self._bus.name)
+        settings = LinkSettings(self._bus.nodeid(self._uuid), lost_after_s=LOST_AFTER_S)
+        return self._bus.io.open_link(settings, on_responses=on_responses, on_lost=on_lost)
+
+    def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
+        return can_wire_ns(content_bytes, bitrate, answer=answer) if bitrate > 0 else 0
+
+    def forget(self) -> None:
+        self.assignment = None
+
+    def why_silent(self) -> CanductorError | None:
+        if self.assignment is None:
+            return None
+        if self._uuid in self.assignment.unheard:
+            return self.assignment.not_found(self._uuid, self._bus.name)
+        return NodeLost(
+            f"node {self._uuid} on bus {self._bus.name} took id {self._bus.nodeid(self._uuid)} but does not "
+            "answer on it; check the bus for errors and for another host"
+        )
+
+    def check_identity(self, found: bytes) -> None:
+        if found != self._uuid.raw:
+            raise NodeError(
+                f"two boards answer on node id {self._bus.nodeid(self._uuid)} of bus {self._bus.name}: "
+                f"{self._uuid}, and one that says it is {found.hex()}; switch both off and on again, and let "
+                "only one host assign ids on this bus"
+            )
+
+    def suspect(self) -> None:
+        self._bus.suspect()
+
+
+def _knows_pulses(node: Node) -> bool:
+    return node.talks and bool(node.dictionary.int_constant(CONSTANT, 0))
+
+
+def _twins(uuid: Uuid, bus: str) -> str:
+    return f"two boards on bus {bus} have the uuid {uuid} (cloned chips?); take one of them off"
+
+
+def _ns(loop_time_s: float) -> int:
+    return round(loop_time_s * 1e9)

@@ -1,0 +1,1 @@
+"""Time between host and nodes: clock estimates, sync pulses, time on the wire."""

@@ -1,0 +1,53 @@
+"""A clock that is mostly steady and sometimes warms: two filters, each weighed by what it foretells.
+
+The one lets the rate change for long in one direction, so it follows temperature but remembers only some
+minutes. The other believes the rate stays what it is and so remembers much longer; it is wrong as soon as
+the temperature moves, foretells worse, loses its weight, and begins anew from what the first one knows.
+"""
+
+import math
+from typing import Final
+
+from nodes.clock.fit import Filter
+
+FIRST_ODDS: Final = -2.0
+"""Logarithm of the odds of a steady filter that begins anew."""
+MOST_ODDS: Final = 1.0
+"""Not believed more than so, so that a change is noticed soon."""
+LEAST_ODDS: Final = -3.0
+"""Believed less than so, it begins anew."""
+
+
+class Blend:
+    """Goes on from FIRST, as ``Filter``; state and covariance are lead (s) and rate only."""
+
+    def __init__(self, first: Filter) -> None:
+        self._warming = first
+        self._steady = first.steady()
+        self._odds = 0.0
+        self.state = [0.0, 0.0]
+        self.covariance = [[0.0, 0.0], [0.0, 0.0]]
+
+    def add(self, at_s: float, lead_s: float, round_trip_s: float) -> None:
+        """Take an exchange in whose middle, AT_S, the clock would have been ahead by LEAD_S."""
+        warming = self._warming.add(at_s, lead_s, round_trip_s)
+        steady = self._steady.add(at_s, lead_s, round_trip_s)
+        self._odds = min(self._odds + steady - warming, MOST_ODDS)
+        if self._odds < LEAST_ODDS:
+            self._steady, self._odds = self._warming.steady(), FIRST_ODDS
+        self._mix(1 / (1 + math.exp(-self._odds)))
+
+    @property
+    def faded_s(self) -> float:
+        """Most that forgetting a difference of the ways may have moved the lead."""
+        return max(abs(self._warming.faded_s), abs(self._steady.faded_s))
+
+    def _mix(self, share: float) -> None:
+        """Set state and covariance to those of both filters together, the steady one having SHARE."""
+        one, two = self._warming, self._steady
+        apart = [b - a for a, b in zip(one.state[:2], two.state[:2], strict=True)]
+        for i in (0, 1):
+            self.state[i] = one.state[i] + share * apart[i]
+            for j in (0, 1):
+                within = (1 - share) * one.covariance[i][j] + share * two.covariance[i][j]
+                self.covariance[i][j] = within + share * (1 - share) * apart[i] * apart[j]

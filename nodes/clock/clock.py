@@ -1,0 +1,204 @@
+"""Time between the host and a node: the types, and the estimate of a node's clock from its answers.
+
+Sans-IO: samples come in with their times, an estimate and the time of the next sample go out. Host time
+is CLOCK_MONOTONIC in integer nanoseconds; a node's ticks have 64 bits in the host and 32 on the wire.
+
+How it estimates. An answer sent for at S and received at R was read after S plus the fastest way out and
+before R minus the fastest way back: two bounds on the clock, most of them loose, some tight. The first
+START_SAMPLES are fitted together (clock_start.py), the later ones update a filter that follows temperature
+(clock_fit.py). A slow exchange only makes loose bounds, so no series of them can spoil the estimate.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Final, NewType
+
+from nodes.clock.blend import Blend
+from nodes.clock.fit import Filter
+from nodes.clock.start import Start
+
+HostTime = NewType("HostTime", int)
+"""Nanoseconds of the host's CLOCK_MONOTONIC."""
+Ticks = NewType("Ticks", int)
+"""A node's clock in 64 bits."""
+
+BURST_SAMPLES: Final = 16
+BURST_INTERVAL_NS: Final = 25_000_000
+SETTLE_SAMPLES: Final = 48
+SETTLE_INTERVAL_NS: Final = 50_000_000
+"""After the burst, up to SETTLE_SAMPLES: two seconds after the start the rate is known to some 10 ppm."""
+SAMPLE_INTERVAL_NS: Final = 984_300_000
+"""Not a divisor or multiple of a second: periodic work on a node must not meet every sample."""
+START_SAMPLES: Final = 64
+"""So many are fitted together before the filter goes on alone."""
+REMEMBERED: Final = 160
+"""Exchanges among which the fastest is looked for."""
+CONTRADICTIONS: Final = 3
+"""So many answers in a row that the estimate says are impossible begin it anew."""
+GAP_NS: Final = 600_000_000_000
+"""A silence after which the filter begins anew: temperature may have done anything."""
+AHEAD_S: Final = 1.0
+"""The error bound holds for so long after the sample."""
+CONFIDENCE: Final = 4.0
+"""Standard deviations in the published error bound."""
+_HALF: Final = 1 << 31
+_WHOLE: Final = 1 << 32
+
+
+def ticks_since(later: int, earlier: int) -> int:
+    """Return LATER - EARLIER for two 32-bit clocks less than 2^31 ticks apart: -2^31..2^31-1."""
+    return (later - earlier + _HALF) % _WHOLE - _HALF
+
+
+def extend32(clock32: int, near: Ticks) -> Ticks:
+    """Return the 64-bit clock whose low bits are CLOCK32 and that is nearest to NEAR."""
+    return Ticks(near + ticks_since(clock32, near % _WHOLE))
+
+
+@dataclass(frozen=True, slots=True)
+class ClockEstimate:
+    """A node's clock as a line through one point; good for extrapolation over a few seconds."""
+
+    freq_hz: float
+    at_ns: HostTime
+    at_ticks: Ticks
+    error_s: float
+    """Bound of the error, from AT_NS to a second later, if the fastest ways out and back take as long."""
+    asymmetry_s: float = 0.0
+    """What they may add when not: half the fastest exchange, were all of it spent in one direction."""
+
+    @property
+    def bound_s(self) -> float:
+        """What the error may be in all: ``error_s``, and what unequal ways may add unseen."""
+        return self.error_s + self.asymmetry_s
+
+    def ticks_at(self, at_ns: HostTime) -> Ticks:
+        """Return the node's clock at host time AT_NS."""
+        return Ticks(self.at_ticks + round((at_ns - self.at_ns) * (self.freq_hz * 1e-9)))
+
+    def ns_at(self, ticks: Ticks) -> HostTime:
+        """Return the host time at which the node's clock shows TICKS."""
+        return HostTime(self.at_ns + round((ticks - self.at_ticks) * 1e9 / self.freq_hz))
+
+
+class ClockEstimator:
+    """Estimates one node's clock. NOMINAL_FREQ_HZ > 0 comes from its dictionary.
+
+    ``begin`` with the answer to get_uptime, then ``add`` for every answer to get_clock.
+    """
+
+    def __init__(self, nominal_freq_hz: int) -> None:
+        self._freq_hz = nominal_freq_hz
+        self._round_trips_s: deque[float] = deque(maxlen=REMEMBERED)
+        self._zero_ns = 0
+        self._zero_ticks = 0
+        self._last_ns = -1
+        self._contradictions = 0
+        self._start = Start()
+        self._filter: Blend | None = None
+        self._estimate: ClockEstimate | None = None
+        self.accepted = 0
+        self.unusable = 0
+        """Answers whose times are not known (a repeated block) or make no sense."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether there are samples enough to plan with: what is planned looks two seconds ahead."""
+        return self.accepted >= SETTLE_SAMPLES
+
+    @property
+    def round_trip_s(self) -> float:
+        """The fastest exchange remembered; 0 before the first."""
+        return min(self._round_trips_s, default=0.0)
+
+    def begin(self, sent_ns: int, received_ns: int, high: int, clock32: int) -> bool:
+        """Start, or start anew, with an answer to get_uptime. Returns whether it was usable."""
+        self._round_trips_s.clear()
+        self._last_ns = -1
+        self._contradictions = 0
+        self._estimate = None
+        self.accepted = 0
+        return self._take(sent_ns, received_ns, Ticks(high * _WHOLE + clock32 % _WHOLE))
+
+    def add(self, sent_ns: int, received_ns: int, clock32: int) -> bool:
+        """Take an answer to get_clock: SENT_NS 0 means unknown. Returns whether it was usable."""
+        middle_ns = HostTime((sent_ns + received_ns) // 2)
+        return self._take(sent_ns, received_ns, extend32(clock32, self.estimate().ticks_at(middle_ns)))
+
+    def estimate(self) -> ClockEstimate:
+        """Return the estimate as of the last sample; RuntimeError before ``begin``."""
+        if self._estimate is None:
+            raise RuntimeError("the clock was asked before its first sample")
+        return self._estimate
+
+    def ticks_at(self, at_ns: HostTime) -> Ticks:
+        """Return the node's clock at host time AT_NS."""
+        return self.estimate().ticks_at(at_ns)
+
+    def ns_at(self, ticks: Ticks) -> HostTime:
+        """Return the host time at which the node's clock shows TICKS."""
+        return self.estimate().ns_at(ticks)
+
+    def next_sample_ns(self, now_ns: int) -> int:
+        """Return when to ask the node again, given that it was asked at NOW_NS."""
+        if self.accepted < BURST_SAMPLES:
+            return now_ns + BURST_INTERVAL_NS
+        return now_ns + (SETTLE_INTERVAL_NS if self.accepted < SETTLE_SAMPLES else SAMPLE_INTERVAL_NS)
+
+    # ------------------------------------------------------------------------------------------------- fit
+
+    def _take(self, sent_ns: int, received_ns: int, ticks: Ticks) -> bool:
+        middle_ns = (sent_ns + received_ns) // 2
+        if sent_ns <= 0 or received_ns <= sent_ns or middle_ns <= self._last_ns:
+            self.unusable += 1
+            return False
+        round_trip_s = (received_ns - sent_ns) * 1e-9
+        if (
+            self._last_ns < 0
+            or middle_ns - self._last_ns > GAP_NS
+            or self._impossible(middle_ns, ticks, round_trip_s)
+        ):
+            self._restart(middle_ns, ticks)
+        self._last_ns = middle_ns
+        self._round_trips_s.append(round_trip_s)
+        self.accepted += 1
+        self._fit(middle_ns, ticks, round_trip_s)
+        return True
+
+    def _restart(self, middle_ns: int, ticks: Ticks) -> None:
+        """Measure from here on, as if nothing were known."""
+        self._zero_ns, self._zero_ticks = middle_ns, ticks
+        self._start, self._filter = Start(), None
+        self._round_trips_s.clear()
+        self._contradictions = 0
+
+    def _impossible(self, middle_ns: int, ticks: Ticks, round_trip_s: float) -> bool:
+        """Whether this reading, like the ones before it, was not taken between question and answer."""
+        estimate = self.estimate()
+        off_s = abs(ticks - estimate.ticks_at(HostTime(middle_ns))) / self._freq_hz
+        age_s = (middle_ns - estimate.at_ns) * 1e-9
+        allowed_s = round_trip_s / 2 + estimate.error_s * (1 + age_s / AHEAD_S)
+        self._contradictions = self._contradictions + 1 if off_s > allowed_s else 0
+        return self._contradictions >= CONTRADICTIONS
+
+    def _fit(self, middle_ns: int, ticks: Ticks, round_trip_s: float) -> None:
+        faded_s = 0.0
+        at_s = (middle_ns - self._zero_ns) * 1e-9
+        lead_s = (ticks - self._zero_ticks) / self._freq_hz - at_s
+        if self._filter is None:
+            state, covariance = self._start.add(at_s, lead_s, round_trip_s)
+            if self._start.samples >= START_SAMPLES:
+                self._filter = Blend(Filter(state, covariance, at_s, self._start.spread_s))
+        else:
+            self._filter.add(at_s, lead_s, round_trip_s)
+            state, covariance = self._filter.state, self._filter.covariance
+            faded_s = self._filter.faded_s
+        variance = covariance[0][0] + 2 * AHEAD_S * covariance[0][1] + AHEAD_S**2 * covariance[1][1]
+        self._estimate = ClockEstimate(
+            self._freq_hz * (1 + state[1]),
+            HostTime(middle_ns),
+            Ticks(self._zero_ticks + round((at_s + state[0]) * self._freq_hz)),
+            CONFIDENCE * math.sqrt(max(covariance[0][0], variance, 0.0)) + faded_s + 1e-6,
+            self.round_trip_s / 2,
+        )

@@ -1,0 +1,106 @@
+"""Asks one node for its clock, for as long as it can be talked to, and suspects it when it goes silent."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Final
+
+from nodes.clock.clock import ClockEstimate, ClockEstimator
+from nodes.node.request_reply import Answer, Conversation, QueryTimeout
+from nodes.support.errors import CanductorError
+from nodes.link.interfaces import Connector
+from nodes.clock.wire_time import narrow
+
+SILENCE_S: Final = 0.25
+"""A node that owes an acknowledgement and says nothing for so long may have restarted: the bus is asked."""
+
+
+class ClockKeeper:
+    """Keeps the clock of the node that TALK talks with, reached through CONNECTOR, until ``close``.
+
+    ON_ESTIMATE gets every new estimate; ON_SAMPLE is awaited after every sample and may raise as the
+    conversation does; ON_LOST gets a sentence when the clock is no longer kept.
+    """
+
+    def __init__(
+        self,
+        talk: Conversation,
+        connector: Connector,
+        *,
+        on_estimate: Callable[[ClockEstimate], None],
+        on_sample: Callable[[], Awaitable[None]],
+        on_lost: Callable[[str], None],
+    ) -> None:
+        self.estimator = ClockEstimator(talk.dictionary.clock_freq_hz)
+        self.ready = asyncio.Event()
+        """Set when the clock is learnt, or nobody needs to wait for it any more."""
+        self._talk = talk
+        self._connector = connector
+        self._on_estimate = on_estimate
+        self._on_sample = on_sample
+        self._on_lost = on_lost
+        self._task = asyncio.get_running_loop().create_task(self._keep())
+        self._task.add_done_callback(self._ended)
+
+    async def close(self) -> None:
+        """Stop asking; what was learnt remains. Doing it again is harmless."""
+        if not self._task.done():
+            self._task.cancel()
+            await asyncio.wait([self._task])
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        """Bring a bug in keeping the clock to light, and stop using the node: its time is not known."""
+        bug = None if task.cancelled() else task.exception()
+        if bug is not None:
+            self._on_lost("its clock is no longer kept; this is a bug, please report it")
+            task.get_loop().call_exception_handler({"message": "keeping a clock failed", "exception": bug})
+
+    async def _keep(self) -> None:
+        while True:
+            try:
+                self._sampled(await self._ask())
+                await self._on_sample()
+            except QueryTimeout:
+                self._connector.suspect()  # the link decides when a silent node is lost
+            except CanductorError as error:
+                self._on_lost(str(error))
+                return
+            await self._wait_watching(self.estimator.next_sample_ns(0) * 1e-9)
+
+    async def _wait_watching(self, wait_s: float) -> None:
+        """Wait, and suspect the node when it owes answers and gives none."""
+        while wait_s > 0:
+            heard = self._talk.heard
+            await asyncio.sleep(min(wait_s, SILENCE_S))
+            wait_s -= SILENCE_S
+            if wait_s > 0 and heard == self._talk.heard and self._owes():
+                self._connector.suspect()
+
+    def _owes(self) -> bool:
+        return self._talk.connected and self._talk.link.pending() > 0
+
+    def _sampled(self, answer: Answer) -> None:
+        if not self._take(answer):
+            return
+        estimate = self.estimator.estimate()
+        self._talk.link.set_clock(estimate.freq_hz, estimate.at_ns, estimate.at_ticks)
+        self._on_estimate(estimate)
+        if self.estimator.ready:
+            self.ready.set()
+
+    async def _ask(self) -> Answer:
+        if self.estimator.accepted:
+            return await self._talk.ask("get_clock", "clock", tries=1, survives_shutdown=True)
+        return await self._talk.ask("get_uptime", "uptime", tries=1, survives_shutdown=True)
+
+    def _take(self, answer: Answer) -> bool:
+        message = answer.message
+        bitrate = self._talk.dictionary.int_constant("CANBUS_FREQUENCY", 0)
+        sent_ns, received_ns = narrow(
+            answer.sent_ns,
+            answer.received_ns,
+            self._connector.wire_ns(answer.asked_bytes, bitrate, answer=False),
+            self._connector.wire_ns(answer.answered_bytes, bitrate, answer=True),
+        )
+        if message.name == "clock":
+            return self.estimator.add(sent_ns, received_ns, message.integer("clock"))
+        return self.estimator.begin(sent_ns, received_ns, message.integer("high"), message.integer("clock"))

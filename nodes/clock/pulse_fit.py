@@ -1,0 +1,173 @@
+"""One node's clock against another's, from moments at which both were read at the same time. Sans-IO.
+
+A sync pulse is one CAN frame: every node latches its clock when the frame has ended, which on a bus happens
+within a bit time everywhere. What differs is how long each takes to its receive interrupt: usually a fraction
+of a microsecond, sometimes much more, on either side. So the difference of the two clocks is fitted by a
+parabola (crystals warm up at different rates) whose readings count the less the further they lie off and the
+older they are.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.clock.clock import Ticks
+
+FADE_S: Final = 8.0
+"""Chosen over simulated ramps of 20 ppm in 600 s: shorter follows their begin faster, longer is quieter."""
+PAIRS_MAX: Final = 64
+SETTLE_PAIRS: Final = 24
+SETTLE_S: Final = 1.0
+"""The rate is known to some 0.2 ppm after so many pairs over so long."""
+BEND_S: Final = 6.0
+"""A curvature is good for no more than so many seconds ahead."""
+JITTER_FLOOR_S: Final = 0.3e-6
+"""No reading is trusted better than this: about what receive interrupts differ by on a quiet chip."""
+RATE_PRIOR: Final = 1e-3
+CURVATURE_PRIOR_PER_S: Final = 1e-7
+"""Standard deviations of what is known of two crystals before anything is measured."""
+ROBUST: Final = 3.0
+"""Readings further off than so many standard deviations lose weight with the square of that."""
+ROUNDS: Final = 4
+JUMP_S: Final = 1e-3
+"""No two crystals part by so much between two pulses: one of the nodes restarted."""
+REACH_S: Final = 1.5
+"""How far ahead of the last pair the error bound is meant: as far as steps are made ahead."""
+CONFIDENCE: Final = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class PulseLine:
+    """A node's clock as a function of the reference node's; never changes, so that any thread may use it."""
+
+    reference: Ticks
+    ticks: Ticks
+    """The two clocks at the last pulse, as they were latched."""
+    reference_hz: int
+    freq_hz: int
+    offset_s: float
+    """What the latched pair is off by."""
+    rate: float
+    """By how much the node's clock is faster, against nominal: 1e-6 is 1 ppm."""
+    curvature_per_s: float
+    error_s: float
+    """Bound of the error up to REACH_S ahead of the last pulse, interrupt latency included."""
+
+    def ticks_at(self, reference: Ticks) -> Ticks:
+        """Return the node's clock when the reference's shows REFERENCE."""
+        t = (reference - self.reference) / self.reference_hz
+        return Ticks(self.ticks + round((t + self._parting_s(t)) * self.freq_hz))
+
+    def reference_at(self, ticks: Ticks) -> Ticks:
+        """Return the reference's clock when the node's shows TICKS."""
+        passed = (ticks - self.ticks) / self.freq_hz
+        t = passed
+        for _ in range(3):  # each gains three digits and more: rates differ by less than RATE_PRIOR
+            t = passed - self._parting_s(t)
+        return Ticks(self.reference + round(t * self.reference_hz))
+
+    def _parting_s(self, t: float) -> float:
+        """Return by how much more than T the node's clock has moved T s after the last pulse."""
+        bend_s = min(t, BEND_S)
+        return self.offset_s + self.rate * t + self.curvature_per_s * bend_s * bend_s / 2
+
+
+def _noise(off_s: NDArray[np.float64]) -> float:
+    """Return the middle of what readings are off by, as the standard deviation of a normal distribution."""
+    ranked, half = np.sort(off_s), len(off_s) // 2  # np.median takes ten times as long over so few
+    return max(JITTER_FLOOR_S, 1.4826 * float(ranked[half] + ranked[~half]) / 2)
+
+
+class PulseFit:
+    """Fits the clock of a node (FREQ_HZ nominal) to the reference node's (REFERENCE_HZ nominal)."""
+
+    def __init__(self, reference_hz: int, freq_hz: int) -> None:
+        self._reference_hz = reference_hz
+        self._freq_hz = freq_hz
+        self._pairs: deque[tuple[Ticks, Ticks]] = deque(maxlen=PAIRS_MAX)
+        self._off_s = np.zeros(0)
+        """How far the pairs lie off the newest fit."""
+        self.line: PulseLine | None = None
+        """The newest fit; None before the first pair."""
+        self.restarts = 0
+        """How often a jump of either clock made it begin anew."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether there are pairs enough, over a time long enough."""
+        if len(self._pairs) < SETTLE_PAIRS:
+            return False
+        return (self._pairs[-1][0] - self._pairs[0][0]) / self._reference_hz >= SETTLE_S
+
+    def add(self, reference: Ticks, ticks: Ticks) -> None:
+        """Take a pair of clocks latched together; pairs come in order."""
+        if self.line is not None and self._jumped(self.line, reference, ticks):
+            self._pairs.clear()
+            self.restarts += 1
+        self._pairs.append((reference, ticks))
+        self.line = self._fit(self._off_the_last_line())
+
+    def fill(self, pairs: Iterable[tuple[Ticks, Ticks]]) -> None:
+        """Begin anew with PAIRS, in order; what lies before a jump of either clock does not count."""
+        self._pairs.clear()
+        for pair in pairs:
+            if self._pairs and self._parted(self._pairs[-1], pair):
+                self._pairs.clear()
+            self._pairs.append(pair)
+        self.line = self._fit(np.zeros(len(self._pairs))) if self._pairs else None
+
+    def _parted(self, earlier: tuple[Ticks, Ticks], later: tuple[Ticks, Ticks]) -> bool:
+        passed_s = (later[0] - earlier[0]) / self._reference_hz
+        off_s = abs((later[1] - earlier[1]) / self._freq_hz - passed_s)
+        return passed_s <= 0 or off_s > JUMP_S + RATE_PRIOR * passed_s
+
+    def _jumped(self, line: PulseLine, reference: Ticks, ticks: Ticks) -> bool:
+        passed_s = (reference - line.reference) / self._reference_hz
+        off_s = abs(ticks - line.ticks_at(reference)) / self._freq_hz
+        return passed_s <= 0 or off_s > JUMP_S + RATE_PRIOR * passed_s
+
+    def _fit(self, off_s: NDArray[np.float64]) -> PulseLine:
+        """Fit the pairs, which are known to lie OFF_S off."""
+        last_reference, last_ticks = self._pairs[-1]
+        pairs = np.array(self._pairs, dtype=np.int64)
+        t = (pairs[:, 0] - last_reference) / self._reference_hz
+        y = (pairs[:, 1] - last_ticks) / self._freq_hz - t
+        rows = np.stack([np.ones_like(t), t, t * t / 2], axis=1)
+        fade = np.exp(t / FADE_S)
+        hold = np.diag([0.0, RATE_PRIOR**-2, CURVATURE_PRIOR_PER_S**-2])
+        noise_s = _noise(off_s)
+        for _ in range(ROUNDS):
+            trust = np.minimum(1.0, (ROBUST * noise_s / np.maximum(off_s, JITTER_FLOOR_S)) ** 2)
+            weight = fade * trust / noise_s**2
+            normal = rows.T @ (rows * weight[:, None]) + hold
+            fitted = np.linalg.solve(normal, rows.T @ (weight * y))
+            off_s = np.abs(y - rows @ fitted)
+            noise_s = _noise(off_s)
+        self._off_s = off_s
+        offset_s, rate, curvature_per_s = (float(value) for value in fitted)
+        ahead = np.array([1.0, REACH_S, REACH_S**2 / 2])
+        variance = float(ahead @ np.linalg.solve(normal, ahead))
+        return PulseLine(
+            last_reference,
+            last_ticks,
+            self._reference_hz,
+            self._freq_hz,
+            offset_s,
+            rate,
+            curvature_per_s,
+            CONFIDENCE * math.sqrt(variance) + noise_s,
+        )
+
+    def _off_the_last_line(self) -> NDArray[np.float64]:
+        """Return how far pairs lie off the last fit: a late latch is doubted before it bends the new one."""
+        line, count = self.line, len(self._pairs)
+        if line is None or count < SETTLE_PAIRS:
+            return np.zeros(count)
+        reference, ticks = self._pairs[-1]
+        newest_s = abs(ticks - line.ticks_at(reference)) / self._freq_hz
+        return np.append(self._off_s, newest_s)[-count:]

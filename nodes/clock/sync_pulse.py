@@ -1,0 +1,245 @@
+"""Sync pulses: the clocks of a bus's nodes tied together by one frame that all hear at once.
+
+Firmware of this project latches its clock in the receive interrupt of an admin frame SYNC_PULSE and tells
+the pair when asked (`get_sync_pulse`). The first capable node of a bus is the reference; every other is
+fitted to it (`nodes.clock.pulse_fit`), far better than answers that pass a host could tell. Nodes without the
+extension keep their own estimate. `PulseRounds` is sans-IO; `PulseKeeper` sends and asks.
+"""
+
+import asyncio
+import contextlib
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from nodes.bus.assign import ADMIN_ID
+from nodes.clock.clock import HostTime, Ticks, extend32
+from nodes.support.errors import CanductorError
+from nodes.clock.estimated_clock import EstimatedClock
+from nodes.dictionary.message_format import Message
+from nodes.clock.pulse_fit import PAIRS_MAX, PulseFit, PulseLine
+
+SYNC_PULSE: Final = 0x40
+CONSTANT: Final = "CAN_SYNC_PULSE"
+"""Of the dictionary: the firmware knows sync pulses."""
+SETTLE_ROUNDS: Final = 40
+SETTLE_INTERVAL_S: Final = 0.05
+INTERVAL_S: Final = 0.933
+"""Not a divisor of a second: periodic work on a node must not meet every pulse."""
+IDLE_S: Final = 0.25
+"""How often to look whether there are two capable nodes."""
+ANSWER_TIMEOUT_S: Final = 0.2
+MISSED_MAX: Final = 5
+"""Rounds in a row without a node's answer after which its fit is no longer used."""
+
+
+@dataclass(frozen=True, slots=True)
+class PulseClock:
+    """A follower's clock: the host knows the reference's, pulses tell the rest.
+
+    When print time is the reference's own clock the host's error cancels: the same estimate turns print time
+    into host time and host time into the reference's ticks.
+    """
+
+    reference: EstimatedClock
+    line: PulseLine
+
+    @property
+    def error_s(self) -> float:
+        """Bound of the error against the reference node's clock."""
+        return self.line.error_s
+
+    def ticks_at(self, at_ns: HostTime, /) -> Ticks:
+        """Return the node's 64-bit ticks at a moment of host time."""
+        return self.line.ticks_at(self.reference.ticks_at(at_ns))
+
+    def ns_at(self, ticks: Ticks, /) -> HostTime:
+        """Return the host time at which the node's clock stands at TICKS."""
+        return self.reference.ns_at(self.line.reference_at(ticks))
+
+
+@dataclass(slots=True)
+class _Follower:
+    fit: PulseFit
+    missed: int = 0
+    """Rounds in a row without a pair."""
+    settling: int = 0
+    """Rounds for which it may still hasten the pulses."""
+
+
+class PulseRounds:
+    """Pairs what the nodes latched. A round is one pulse; answers of an older one do not count."""
+
+    def __init__(self) -> None:
+        self.seq = 0
+        """Of the last pulse, 1..255; 0 before the first."""
+        self.late = 0
+        """Answers that told of another pulse than the last, or of none."""
+        self.reference: str | None = None
+        self._followers: dict[str, _Follower] = {}
+        self._history: deque[dict[str, Ticks]] = deque(maxlen=PAIRS_MAX)
+        """What was latched, by round; the last entry is that of the present one."""
+
+    @property
+    def settling(self) -> bool:
+        """Whether a node has come up so recently that pulses should follow each other fast."""
+        return any(follower.settling > 0 for follower in self._followers.values())
+
+    def forget(self) -> None:
+        """Forget all: there will be no pulses for a time of unknown length."""
+        self.reference = None
+        self._followers.clear()
+        self._history.clear()
+
+    def next_pulse(self, members: Mapping[str, int]) -> int:
+        """Begin a round with these nodes (nominal Hz by name, not none, the preferred one first): its seq.
+
+        The preferred node is the reference, once it was seen often enough for all others to follow at once.
+        """
+        self._followers = {name: f for name, f in self._followers.items() if name in members}
+        preferred = next(iter(members))
+        if self.reference not in members or self.line(preferred) is not None:
+            self._refer_to(preferred, members)
+        for name, freq_hz in members.items():
+            if name not in (self.reference, *self._followers):
+                self._followers[name] = self._follower(name, freq_hz, members[self.reference or preferred])
+        for follower in self._followers.values():
+            follower.missed += 1
+            follower.settling -= follower.settling > 0
+        self._history.append({})
+        self.seq = self.seq % 255 + 1
+        return self.seq
+
+    def answer(self, name: str, seq: int, clock32: int, near: Ticks) -> None:
+        """Take a node's answer; NEAR is its clock as far as it is known, within 2^31 ticks."""
+        if seq != self.seq or not self._history:
+            self.late += 1
+            return
+        latched = self._history[-1]
+        if name not in latched:
+            latched[name] = extend32(clock32, near)
+            for other in tuple(latched) if name == self.reference else (name,):
+                self._pair(other)
+
+    def line(self, name: str) -> PulseLine | None:
+        """Return the fit of a follower that can be relied on now, else None."""
+        follower = self._followers.get(name)
+        if follower is None or follower.missed > MISSED_MAX or not follower.fit.settled:
+            return None
+        return follower.fit.line
+
+    def _refer_to(self, reference: str, members: Mapping[str, int]) -> None:
+        """Let REFERENCE be it; nodes known against another node are known against this one at once."""
+        self.reference = reference
+        self._followers = {
+            name: self._follower(name, freq_hz, members[reference])
+            for name, freq_hz in members.items()
+            if name != reference
+        }
+
+    def _follower(self, name: str, freq_hz: int, reference_hz: int) -> _Follower:
+        fit = PulseFit(reference_hz, freq_hz)
+        reference = self.reference or ""
+        both = [reference in latched and name in latched for latched in self._history]
+        fit.fill((r[reference], r[name]) for r, paired in zip(self._history, both, strict=True) if paired)
+        missed = next((n for n, paired in enumerate(reversed(both)) if paired), len(both))
+        return _Follower(fit, missed, settling=0 if fit.settled else SETTLE_ROUNDS)
+
+    def _pair(self, name: str) -> None:
+        latched = self._history[-1]
+        follower = self._followers.get(name)
+        if self.reference not in latched or follower is None:
+            return
+        was_settled = follower.fit.settled
+        follower.fit.add(latched[self.reference], latched[name])
+        follower.missed = 0
+        if was_settled and not follower.fit.settled:  # it restarted
+            follower.settling = SETTLE_ROUNDS
+
+
+class PulseNode(Protocol):
+    """What the keeper needs of a node."""
+
+    name: str
+    pulse_clock: PulseClock | None
+
+    @property
+    def clock(self) -> EstimatedClock:
+        """The host's own estimate of its clock."""
+        ...
+
+    @property
+    def clock_freq_hz(self) -> int:
+        """Nominal."""
+        ...
+
+    async def query(
+        self, name: str, response: str, /, *, timeout_s: float = ..., tries: int = ...
+    ) -> Message:
+        """Ask the node."""
+        ...
+
+
+class PulseKeeper:
+    """Keeps the clocks of one CAN bus together for as long as `run` runs.
+
+    CAPABLE returns the nodes that know pulses and can be asked now, in the order of preference as reference.
+    SEND_FRAME sends a frame ahead of all data; NOW is host time.
+    """
+
+    def __init__(
+        self,
+        capable: Callable[[], Sequence[PulseNode]],
+        send_frame: Callable[[int, bytes], None],
+        now: Callable[[], HostTime],
+    ) -> None:
+        self._capable = capable
+        self._send_frame = send_frame
+        self._now = now
+        self._asked: dict[str, PulseNode] = {}
+        self.rounds = PulseRounds()
+
+    async def run(self) -> None:
+        """Send pulses and ask for them until cancelled; a bus that fails is others' concern."""
+        while True:
+            nodes = self._capable()
+            if len(nodes) < 2:
+                self.rounds.forget()
+                self._publish(())
+                await asyncio.sleep(IDLE_S)
+                continue
+            with contextlib.suppress(CanductorError):  # the bus closes: that is told elsewhere
+                await self._round(nodes)
+            self._publish(nodes)
+            await asyncio.sleep(SETTLE_INTERVAL_S if self.rounds.settling else INTERVAL_S)
+
+    async def _round(self, nodes: Sequence[PulseNode]) -> None:
+        seq = self.rounds.next_pulse({node.name: node.clock_freq_hz for node in nodes})
+        self._send_frame(ADMIN_ID, bytes((SYNC_PULSE, seq)))
+        await asyncio.gather(*(self._ask(node) for node in nodes))
+
+    async def _ask(self, node: PulseNode) -> None:
+        with contextlib.suppress(CanductorError):  # lost on the way, or the node is: it misses this round
+            answer = await node.query("get_sync_pulse", "sync_pulse", timeout_s=ANSWER_TIMEOUT_S, tries=1)
+            near = node.clock.ticks_at(self._now())
+            self.rounds.answer(node.name, answer.integer("seq"), answer.integer("clock"), near)
+
+    def _publish(self, nodes: Sequence[PulseNode]) -> None:
+        """Give every node its clock by pulses, or take it away."""
+        present = {node.name: node for node in nodes}
+        for name, node in self._asked.items():
+            if name not in present:
+                node.pulse_clock = None
+        self._asked = present
+        reference = _clock_of(present.get(self.rounds.reference or ""))
+        for node in nodes:
+            line = self.rounds.line(node.name)
+            node.pulse_clock = PulseClock(reference, line) if line and reference else None
+
+
+def _clock_of(node: PulseNode | None) -> EstimatedClock | None:
+    """Return the host's own estimate, if there is any yet."""
+    with contextlib.suppress(CanductorError):
+        return node.clock if node is not None else None
+    return None

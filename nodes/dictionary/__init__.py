@@ -1,0 +1,1 @@
+"""A node's data dictionary: parsing, cache, identification, messages to and from bytes."""

@@ -1,0 +1,216 @@
+"""Dictionaries that were downloaded before, so that a node's is known without downloading it again.
+
+In memory for all nodes that share the cache, and on disk for the next start. What lies on disk is as hostile
+as what comes off a wire: a file counts only when its content has the SHA-256 of its name, and is parsed with
+all the bounds of a download. A file that fails is left out and replaced by the next download.
+"""
+
+import asyncio
+import contextlib
+import hashlib
+import os
+import re
+import stat
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from nodes.dictionary.dictionary import MAX_COMPRESSED_BYTES, Dictionary
+from nodes.dictionary.parts import DictionaryError
+
+MAX_FILES: Final = 64
+"""On disk; the ones used longest ago are dropped."""
+MAX_KEPT: Final = 64
+"""In memory."""
+_NAME: Final = re.compile(r"[A-Za-z0-9_.+-]{1,40}-([0-9a-f]{64})\.dict\Z")
+_NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9_.+-]+")
+_TEMPORARY: Final = ".new-"
+
+
+@dataclass(frozen=True, slots=True)
+class CachedDictionary:
+    """A dictionary, parsed and as it was downloaded."""
+
+    compressed: bytes
+    dictionary: Dictionary
+
+
+class DictionaryCache:
+    """Dictionaries by their first bytes; kept in FOLDER, or only in memory when there is none.
+
+    For one event loop. The disk never makes anything fail: what cannot be read or written is as if it had
+    not been cached, and ``problem`` says why.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self.problem: str | None = None
+        """Why the last reading or writing failed, in a sentence's words."""
+        self.ignored_files = 0
+        """Files with the name of a dictionary that are none."""
+        self._folder = folder
+        self._kept: dict[str, CachedDictionary] = {}
+        """By SHA-256 of the compressed form; the one used last comes last."""
+        self._looked_for: set[bytes] = set()
+        self._downloads: dict[bytes, _Download] = {}
+
+    @classmethod
+    def of_user(cls) -> "DictionaryCache":
+        """Return the cache in the user's own cache folder (XDG_CACHE_HOME)."""
+        base = os.environ.get("XDG_CACHE_HOME", "")
+        # A relative path there is to be ignored, says the XDG Base Directory Specification.
+        root = Path(base) if os.path.isabs(base) else Path.home() / ".cache"  # noqa: PTH117
+        return cls(root / "canductor" / "dictionaries")
+
+    def candidates(self, beginning: bytes) -> list[CachedDictionary]:
+        """Return all dictionaries whose compressed form begins like this, the one used last first."""
+        assert beginning
+        self._read_folder(beginning)
+        return [kept for kept in reversed(self._kept.values()) if kept.compressed.startswith(beginning)]
+
+    def all(self) -> list[CachedDictionary]:
+        """Return every dictionary there is, the one used last first."""
+        self._read_folder(b"")
+        return list(reversed(self._kept.values()))
+
+    def used(self, cached: CachedDictionary) -> None:
+        """Take note that a node has this dictionary: it is the last to be dropped."""
+        key = _sha256(cached.compressed)
+        self._keep(key, cached)
+        if self._folder is not None:
+            with contextlib.suppress(OSError):
+                os.utime(self._folder / _file_name(cached, key))
+
+    def store(self, compressed: bytes, dictionary: Dictionary) -> None:
+        """Keep a dictionary that was downloaded, and parsed without complaint."""
+        cached = CachedDictionary(compressed, dictionary)
+        key = _sha256(compressed)
+        self._keep(key, cached)
+        if self._folder is None:
+            return
+        try:
+            self._write(self._folder, _file_name(cached, key), compressed)
+        except OSError as error:
+            self.problem = f"cannot write to {self._folder}: {error.strerror or error}"
+
+    @contextlib.asynccontextmanager
+    async def downloading(self, beginning: bytes) -> AsyncIterator[None]:
+        """Hold off all other downloads that begin alike: look into the cache again inside, it may be there.
+
+        So of thirty equal nodes that start together one downloads, and different ones do not wait.
+        """
+        download = self._downloads.setdefault(beginning, _Download(asyncio.Lock()))
+        download.users += 1
+        try:
+            async with download.lock:
+                yield
+        finally:
+            download.users -= 1
+            if not download.users:
+                del self._downloads[beginning]
+
+    # ------------------------------------------------------------------------------------------- in memory
+
+    def _keep(self, key: str, cached: CachedDictionary) -> None:
+        self._kept.pop(key, None)
+        self._kept[key] = cached
+        while len(self._kept) > MAX_KEPT:
+            del self._kept[next(iter(self._kept))]
+
+    # --------------------------------------------------------------------------------------------- on disk
+
+    def _read_folder(self, beginning: bytes) -> None:
+        """Take what the folder has of dictionaries that begin like this; once for each beginning."""
+        if beginning in self._looked_for:
+            return
+        if len(self._looked_for) >= MAX_KEPT:
+            self._looked_for.clear()
+        self._looked_for.add(beginning)
+        for path, key in self._files():
+            compressed = None if key in self._kept else _read(path, beginning)
+            if compressed is None:
+                continue
+            cached = _checked(compressed, key)
+            if cached is None:
+                self.ignored_files += 1
+            else:
+                self._keep(key, cached)
+
+    def _files(self) -> Iterator[tuple[Path, str]]:
+        """Yield the newest MAX_FILES dictionaries with their SHA-256, oldest first."""
+        for path in self._oldest_first()[-MAX_FILES:]:
+            match = _NAME.match(path.name)
+            assert match
+            yield path, match[1]
+
+    def _oldest_first(self) -> list[Path]:
+        if self._folder is None:
+            return []
+        found: list[tuple[int, Path]] = []
+        try:
+            found += (
+                (entry.stat(follow_symlinks=False).st_mtime_ns, Path(entry.path))
+                for entry in os.scandir(self._folder)
+                if _NAME.match(entry.name)
+            )
+        except FileNotFoundError:
+            pass  # nothing was ever cached, or another process just dropped a file
+        except OSError as error:
+            self.problem = f"cannot read {self._folder}: {error.strerror or error}"
+        return [path for _, path in sorted(found)]
+
+    def _write(self, folder: Path, name: str, compressed: bytes) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        # Another process may write the same: each has a file of its own until it is whole.
+        temporary = folder / f"{_TEMPORARY}{os.getpid()}"
+        try:
+            temporary.write_bytes(compressed)
+            temporary.replace(folder / name)
+        finally:
+            temporary.unlink(missing_ok=True)
+        for path in self._oldest_first()[:-MAX_FILES]:
+            path.unlink(missing_ok=True)
+
+
+@dataclass(slots=True)
+class _Download:
+    lock: asyncio.Lock
+    users: int = 0
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _checked(compressed: bytes, key: str) -> CachedDictionary | None:
+    """Parse what a file holds; None when it is not what its name says, or no dictionary."""
+    if _sha256(compressed) != key:
+        return None
+    try:
+        return CachedDictionary(compressed, Dictionary.parse(compressed))
+    except DictionaryError:
+        return None
+
+
+def _file_name(cached: CachedDictionary, key: str) -> str:
+    version = _NOT_IN_NAMES.sub("_", cached.dictionary.version)[:40]
+    return f"{version or 'unknown'}-{key}.dict"
+
+
+def _read(path: Path, beginning: bytes) -> bytes | None:
+    """Return the content of a regular file that begins like this and is not too big, else None."""
+    try:
+        # A link could lead anywhere, and opening a pipe would wait for its other end.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        return None
+    try:
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_COMPRESSED_BYTES:
+            return None
+        compressed = os.read(descriptor, MAX_COMPRESSED_BYTES)
+    except OSError:
+        return None
+    finally:
+        os.close(descriptor)
+    return compressed if compressed.startswith(beginning) else None

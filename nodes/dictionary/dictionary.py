@@ -1,0 +1,301 @@
+"""The data dictionary: what a node says about its own commands, responses, enumerations and constants.
+
+A dictionary comes off a wire and is hostile until parsed: every size is bounded, and whatever is wrong ends
+in one DictionaryError sentence. Once parsed it does not change; decoding is total (a message or None).
+"""
+
+import json
+import re
+import zlib
+from collections.abc import Mapping
+from typing import Final, TypeVar
+
+from nodes.dictionary.parts import (
+    DictionaryError,
+    Enumeration,
+    OutputFormat,
+    parse_enumerations,
+    parse_formats,
+)
+from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value, vlq_read
+
+MAX_INFLATED_BYTES: Final = 1 << 20
+"""Real ones have 10 to 13 kB."""
+MAX_COMPRESSED_BYTES: Final = 1 << 18
+"""Where a download is given up."""
+IDENTIFY: Final = "identify offset=%u count=%c"
+IDENTIFY_RESPONSE: Final = "identify_response offset=%u data=%.*s"
+_WORD: Final = re.compile(r'\s*([A-Za-z_]\w*)=("(?:[^"\\]|\\.)*"|\S*)')
+_HEX: Final = re.compile(r"(?:0x)?((?:[0-9a-fA-F]{2})*)\Z")
+_INTEGER: Final = re.compile(r"[+-]?(?:0x[0-9a-fA-F]{1,16}|[0-9]{1,20})\Z")
+
+
+class Dictionary:
+    """What one firmware build understands and says. Make it with ``parse`` or ``from_json``."""
+
+    def __init__(self, source: Mapping[str, object]) -> None:
+        self.version = _text(source, "version")
+        self.build_versions = _text(source, "build_versions")
+        self.app = _text(source, "app")
+        self.license = _text(source, "license")
+        self.constants: Mapping[str, int | float | str] = _constants(source)
+        self.enumerations: Mapping[str, Enumeration] = parse_enumerations(source.get("enumerations", {}))
+        taken: dict[int, str] = {}
+        self.commands = parse_formats(source, "commands", taken, {"identify": (IDENTIFY, 1)})
+        self.responses = parse_formats(
+            source, "responses", taken, {"identify_response": (IDENTIFY_RESPONSE, 0)}
+        )
+        self.outputs = OutputFormat.parse_all(source.get("output", {}), taken)
+        self._commands_by_id = {f.message_id: f for f in self.commands.values()}
+        self._commands_by_prefix = {f.prefix: f for f in self.commands.values()}
+        self._responses_by_id: dict[int, MessageFormat | OutputFormat] = {
+            f.message_id: f for f in self.responses.values()
+        }
+        self._responses_by_id.update({output.message_id: output for output in self.outputs})
+        self._by_prefix = {f.prefix: f for f in self._responses_by_id.values()}
+
+    # ----------------------------------------------------------------------------------------------- parse
+
+    @classmethod
+    def parse(cls, compressed: bytes) -> "Dictionary":
+        """Parse a downloaded (zlib-compressed) dictionary; raises DictionaryError."""
+        if len(compressed) > MAX_COMPRESSED_BYTES:
+            raise DictionaryError(f"dictionary: more than {MAX_COMPRESSED_BYTES} bytes compressed; refused")
+        inflater = zlib.decompressobj()
+        try:
+            inflated = inflater.decompress(compressed, MAX_INFLATED_BYTES + 1)
+        except zlib.error as error:
+            raise DictionaryError(
+                f"dictionary: not zlib data ({error}); other firmware, or the download was damaged"
+            ) from None
+        if len(inflated) > MAX_INFLATED_BYTES:
+            raise DictionaryError(f"dictionary: inflates to more than {MAX_INFLATED_BYTES} bytes; refused")
+        if not inflater.eof:
+            raise DictionaryError("dictionary: the compressed data ends early; the download was cut short")
+        return cls.from_json(inflated)
+
+    @classmethod
+    def from_json(cls, text: bytes) -> "Dictionary":
+        """Parse an inflated dictionary; raises DictionaryError."""
+        if len(text) > MAX_INFLATED_BYTES:
+            raise DictionaryError(f"dictionary: has more than {MAX_INFLATED_BYTES} bytes; refused")
+        try:
+            source = json.loads(text, object_pairs_hook=_unique, parse_constant=_refuse_constant)
+        except (ValueError, RecursionError) as error:
+            raise DictionaryError(f"dictionary: not usable JSON ({error})") from None
+        if not isinstance(source, dict):
+            raise DictionaryError("dictionary: not a JSON object")
+        return cls(source)
+
+    # -------------------------------------------------------------------------------------------- look up
+
+    def command(self, name: str) -> MessageFormat:
+        """Return the command NAME; MessageError when the firmware has none of that name."""
+        if name in self.commands:
+            return self.commands[name]
+        raise MessageError(f"the node's firmware ({self.version}) has no command {name!r}")
+
+    def int_constant(self, name: str, default: int | None = None) -> int:
+        """Return a whole-number constant, or DEFAULT; DictionaryError when neither serves."""
+        value = self.constants.get(name, default)
+        if isinstance(value, int):
+            return value
+        found = "missing" if value is None else f"{value!r}"
+        raise DictionaryError(f"dictionary: constant {name} must be a whole number and is {found}")
+
+    def str_constant(self, name: str, default: str | None = None) -> str:
+        """Return a text constant, or DEFAULT; DictionaryError when neither serves."""
+        value = self.constants.get(name, default)
+        if isinstance(value, str):
+            return value
+        found = "missing" if value is None else f"{value!r}"
+        raise DictionaryError(f"dictionary: constant {name} must be a text and is {found}")
+
+    @property
+    def clock_freq_hz(self) -> int:
+        """Nominal ticks per second, > 0."""
+        freq_hz = self.int_constant("CLOCK_FREQ")
+        if 0 < freq_hz < 1 << 32:
+            return freq_hz
+        raise DictionaryError(f"dictionary: CLOCK_FREQ={freq_hz} is no frequency")
+
+    @property
+    def receive_window(self) -> int:
+        """Bytes that may be in flight to the node (192 unless the dictionary says so)."""
+        window = self.int_constant("RECEIVE_WINDOW", 192)
+        if 64 <= window < 1 << 20:
+            return window
+        raise DictionaryError(f"dictionary: RECEIVE_WINDOW={window} cannot hold a block of 64 bytes")
+
+    def enumeration_for(self, param: str) -> Enumeration | None:
+        """Return the enumeration of parameter PARAM: named like it or like what follows an underscore."""
+        while param:
+            if param in self.enumerations:
+                return self.enumerations[param]
+            _, _, param = param.partition("_")
+        return None
+
+    def enum_value(self, enumeration: str, name: str) -> int:
+        """Return the value of NAME; MessageError names the enumeration when it has no such name."""
+        if enumeration not in self.enumerations:
+            raise MessageError(f"the node's firmware ({self.version}) has no enumeration {enumeration!r}")
+        return self.enumerations[enumeration].value_of(name)
+
+    def enum_name(self, enumeration: str, value: int) -> str:
+        """Return the name of VALUE, or ``?VALUE`` when the enumeration does not know it."""
+        known = self.enumerations.get(enumeration)
+        return (known and known.name_of(value)) or f"?{value}"
+
+    # --------------------------------------------------------------------------------------------- encode
+
+    def encode(self, name: str, /, **values: Value | str) -> bytes:
+        """Encode command NAME; a text as VALUE is a name of the parameter's enumeration. MessageError."""
+        return encode_values(self, self.command(name), values)
+
+    def encode_text(self, text: str) -> bytes:
+        """Encode a command written as ``name parameter=value …``; MessageError.
+
+        Values are numbers (decimal or 0x…), names of the parameter's enumeration, and for buffers hex digits
+        or a text in double quotes.
+        """
+        name, _, rest = text.strip().partition(" ")
+        command = self.command(name)
+        values: dict[str, Value | str] = {}
+        at = 0
+        while rest[at:].strip():
+            word = _WORD.match(rest, at)
+            if word is None:
+                raise MessageError(f"{name}: {rest[at:].strip()!r} is not parameter=value")
+            if word[1] in values:
+                raise MessageError(f"{name}: {word[1]} is given twice")
+            values[word[1]] = _text_value(command, word[1], word[2])
+            at = word.end()
+        return encode_values(self, command, values)
+
+    # --------------------------------------------------------------------------------------------- decode
+
+    def decode(self, content: bytes) -> Message | None:
+        """Decode one response or debug output.
+
+        None when its id is unknown, it is cut short, or something follows it.
+        """
+        found = self.response_at(content)
+        decoded = found[0].decode(content, found[1]) if found else None
+        return decoded[0] if decoded and decoded[1] == len(content) else None
+
+    def response_at(self, content: bytes) -> "tuple[MessageFormat | OutputFormat, int] | None":
+        """Return the format of the response in CONTENT and where its parameters begin; None: unknown id."""
+        return _format_at(self._by_prefix, self._responses_by_id, content, 0)
+
+    def command_at(self, content: bytes, at: int) -> tuple[MessageFormat, int] | None:
+        """Return the format of the command at AT of CONTENT and where its parameters begin, or None."""
+        return _format_at(self._commands_by_prefix, self._commands_by_id, content, at)
+
+    def decode_commands(self, content: bytes, *, as_sent: bool = False) -> list[Message] | None:
+        """Decode all commands of a block; None when any of them is unknown or cut short.
+
+        AS_SENT keeps what ``MessageFormat.decode_as_sent`` keeps, so that ``encode_commands`` gives CONTENT.
+        """
+        messages: list[Message] = []
+        at = 0
+        while at < len(content):
+            found = self.command_at(content, at)
+            if found is None:
+                return None
+            command, start = found
+            decoded = (command.decode_as_sent if as_sent else command.decode)(content, start)
+            if decoded is None:
+                return None
+            messages.append(decoded[0])
+            at = decoded[1]
+        return messages
+
+    def encode_commands(self, messages: list[Message]) -> bytes:
+        """Encode commands as ``decode_commands(…, as_sent=True)`` gave them."""
+        return b"".join(self.command(message.name).encode_as_sent(message) for message in messages)
+
+
+def encode_values(dictionary: Dictionary, command: MessageFormat, values: Mapping[str, Value | str]) -> bytes:
+    """Encode COMMAND with enumeration names resolved; MessageError."""
+    resolved: dict[str, Value] = {}
+    for param, value in values.items():
+        if not isinstance(value, str):
+            resolved[param] = value
+            continue
+        enumeration = dictionary.enumeration_for(param)
+        if enumeration is None:
+            raise MessageError(f"{command.name}: {param} takes no names, so {value!r} cannot be its value")
+        try:
+            resolved[param] = enumeration.value_of(value)
+        except MessageError as error:
+            raise MessageError(f"{command.name}: {param}: {error}") from None
+    return command.encode(resolved)
+
+
+def _text_value(command: MessageFormat, param: str, text: str) -> Value | str:
+    """Read one value of a command's text: what it can be depends on the parameter."""
+    codes = dict(zip(command.names, command.code_texts, strict=True))
+    if not codes.get(param, "").endswith("s"):
+        return int(text, 0 if "x" in text else 10) if _INTEGER.match(text) else text
+    if text.startswith('"'):
+        return text[1:-1].replace('\\"', '"').replace("\\\\", "\\").encode()
+    digits = _HEX.match(text)
+    if digits is None:
+        raise MessageError(f'{command.name}: {param} takes hex digits or "text", not {text!r}')
+    return bytes.fromhex(digits[1])
+
+
+F = TypeVar("F")
+
+
+def _format_at(
+    by_prefix: Mapping[bytes, F], by_id: Mapping[int, F], content: bytes, at: int
+) -> tuple[F, int] | None:
+    """Look up the id at AT of CONTENT; return what has it and what stands behind it, or None."""
+    found = by_prefix.get(content[at : at + 1])
+    if found is not None:
+        return found, at + 1
+    found = by_prefix.get(content[at : at + 2])
+    if found is not None:
+        return found, at + 2
+    number = vlq_read(content, at)  # an id in more bytes than it needs is legal
+    found = by_id.get(_signed(number[0])) if number else None
+    return None if found is None or number is None else (found, number[1])
+
+
+def _signed(value: int) -> int:
+    return value - (1 << 32) if value >> 31 else value
+
+
+def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"{twice[:80]!r} stands twice in one object")
+    return found
+
+
+def _refuse_constant(text: str) -> object:
+    raise ValueError(f"{text} is no number")
+
+
+def _text(source: Mapping[str, object], key: str) -> str:
+    value = source.get(key, "")
+    if isinstance(value, str):
+        return value[:1000]
+    raise DictionaryError(f"dictionary: {key} must be a text")
+
+
+def _constants(source: Mapping[str, object]) -> dict[str, int | float | str]:
+    constants = source.get("config", {})
+    if not isinstance(constants, dict):
+        raise DictionaryError("dictionary: config must be an object of constants")
+    for name, value in constants.items():
+        if isinstance(value, bool) or not isinstance(value, int | float | str):
+            raise DictionaryError(f"dictionary: constant {name[:80]!r} must be a number or a text")
+    return constants
+
+
+BOOTSTRAP: Final = Dictionary({})
+"""The two messages every node knows before its dictionary is read."""

@@ -1,0 +1,278 @@
+"""One message of a node's vocabulary: its format, and its way to and from bytes through the C codec.
+
+Every encoding and decoding is one call into ``firmware/wire``. The buffers a format hands to C are its own
+and reused, so a format must be used from one thread only (the control loop's).
+"""
+
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from nodes.support._wire import ffi, lib
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
+
+Value = int | bytes
+"""What a parameter carries: a number, or the raw bytes of a buffer."""
+
+CONTENT_MAX: Final[int] = lib.WIRE_CONTENT_MAX
+"""Bytes of content one block can carry, hence the longest message."""
+MAX_PARAMETERS: Final = 32
+NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+_BITS32: Final = 0xFFFFFFFF
+
+
+class MessageError(CanductorError):
+    """A message cannot be encoded: unknown name, wrong parameters, or a value its parameter cannot hold."""
+
+
+@record
+class Message:
+    """A decoded message: its name and its parameters by name, in the order of the format.
+
+    Numbers have the signedness of the parameter's code. ``str()`` gives the text that
+    ``Dictionary.encode_text`` takes.
+    """
+
+    name: str
+    params: dict[str, Value]
+
+    def integer(self, param: str) -> int:
+        """Return the number PARAM; a buffer or a missing parameter is a caller's error (KeyError)."""
+        value = self.params[param]
+        if isinstance(value, int):
+            return value
+        raise KeyError(f"{self.name} {param} is a buffer")
+
+    def data(self, param: str) -> bytes:
+        """Return the bytes of buffer PARAM; a number or a missing one is a caller's error (KeyError)."""
+        value = self.params[param]
+        if isinstance(value, bytes):
+            return value
+        raise KeyError(f"{self.name} {param} is a number")
+
+    def __str__(self) -> str:
+        words = (f"{name}={v.hex() if isinstance(v, bytes) else v}" for name, v in self.params.items())
+        return " ".join((self.name, *words))
+
+
+@record
+class Code:
+    """What a parameter's code says: the C codec's type and the numbers it takes.
+
+    The code documents size, signedness is the reader's: an unsigned one takes negative numbers of its size
+    too (``invert_step=%c`` is -1 for steps on both edges).
+    """
+
+    wire_type: int
+    low: int
+    high: int
+    field: str
+    """The struct module's letter for the number's signedness in C's 32 bits."""
+
+
+CODES: Final[Mapping[str, Code]] = {
+    "%u": Code(lib.WIRE_U32, -(1 << 31), (1 << 32) - 1, "I"),
+    "%i": Code(lib.WIRE_I32, -(1 << 31), (1 << 31) - 1, "i"),
+    "%hu": Code(lib.WIRE_U16, -(1 << 15), (1 << 16) - 1, "I"),
+    "%hi": Code(lib.WIRE_I16, -(1 << 15), (1 << 15) - 1, "i"),
+    "%c": Code(lib.WIRE_U8, -(1 << 7), (1 << 8) - 1, "I"),
+    "%s": Code(lib.WIRE_BYTES, 0, 0, "I"),
+    "%*s": Code(lib.WIRE_BYTES, 0, 0, "I"),
+    "%.*s": Code(lib.WIRE_BYTES, 0, 0, "I"),
+}
+
+# struct wire_arg as the struct module sees it: the number, and the address behind its padding.
+_ARG_SIZE: Final[int] = ffi.sizeof("struct wire_arg")
+_DATA_AT: Final[int] = ffi.offsetof("struct wire_arg", "data")
+_POINTER_SIZE: Final[int] = ffi.sizeof("uint8_t *")
+_SKIP_POINTER: Final = f"{_ARG_SIZE - 4}x"
+_POINTER: Final = f"{_DATA_AT - 4}x{'Q' if struct.calcsize('=Q') == _POINTER_SIZE else 'I'}"
+
+
+# Looked up once: these run for every message.
+_from_buffer: Final = ffi.from_buffer
+_unpack: Final = lib.wire_unpack
+
+
+class MessageFormat:
+    """A message's name, id and parameters, able to encode and decode it.
+
+    NAMES and CODES_ are its parameters in order; the caller checked them. MESSAGE_ID -2^31..2^31-1.
+    """
+
+    def __init__(self, name: str, message_id: int, names: Sequence[str], codes: Sequence[str]) -> None:
+        self.name = name
+        self.message_id = message_id
+        self.names = tuple(names)
+        self.codes = tuple(CODES[code] for code in codes)
+        self.code_texts = tuple(codes)
+        self._count = len(self.names)
+        self._types = ffi.new("uint8_t[]", bytes(code.wire_type for code in self.codes) or b"\0")
+        self._args = ffi.new("struct wire_arg[]", max(1, len(names)))
+        self._view = memoryview(ffi.buffer(self._args))
+        self._numbers = struct.Struct("=" + "".join(code.field + _SKIP_POINTER for code in self.codes))
+        self._pairs = struct.Struct("=" + "".join(code.field + _POINTER for code in self.codes))
+        self._buffers = tuple(i for i, code in enumerate(self.codes) if code.wire_type == lib.WIRE_BYTES)
+        self._cursor = ffi.new("const uint8_t *[1]")
+        self._out = ffi.new("uint8_t[]", CONTENT_MAX)
+        self._room = memoryview(ffi.buffer(self._out))
+        self.prefix = vlq(message_id)
+
+    def __repr__(self) -> str:
+        return f"MessageFormat({self.text!r}, {self.message_id})"
+
+    @property
+    def text(self) -> str:
+        """The format as dictionaries write it."""
+        pairs = zip(self.names, self.code_texts, strict=True)
+        return " ".join((self.name, *(f"{name}={code}" for name, code in pairs)))
+
+    # ---------------------------------------------------------------------------------------------- encode
+
+    def encode(self, values: Mapping[str, Value]) -> bytes:
+        """Encode the message, id included; MessageError when VALUES do not fit it."""
+        if values.keys() != set(self.names):
+            raise MessageError(self._mismatch(values))
+        numbers: list[int] = []
+        keep: list[object] = []  # what the addresses point into
+        for name, code in zip(self.names, self.codes, strict=True):
+            number, address = self._argument(name, code, values[name], keep)
+            numbers += (number, address)
+        self._pairs_write(numbers)
+        count = len(self.names)
+        room = CONTENT_MAX - len(self.prefix)
+        used: int = lib.wire_pack(self._types, count, self._args, self._out, room) if count else 0
+        if count and not used:
+            raise MessageError(
+                f"{self.name}: longer than the {CONTENT_MAX} bytes one block carries; send less at once"
+            )
+        return self.prefix + bytes(self._room[:used])
+
+    def _pairs_write(self, numbers: Sequence[int]) -> None:
+        pairs = iter(numbers)
+        flat = [
+            x
+            for code, number, address in zip(self.codes, pairs, pairs, strict=True)
+            for x in (number if code.field == "i" else number & _BITS32, address)
+        ]
+        self._pairs.pack_into(self._view, 0, *flat)
+
+    def _argument(self, name: str, code: Code, value: Value, keep: list[object]) -> tuple[int, int]:
+        if code.wire_type == lib.WIRE_BYTES:
+            if not isinstance(value, bytes):
+                raise MessageError(f"{self.name}: {name} takes bytes, not {value!r}")
+            held = ffi.from_buffer("uint8_t[]", value)
+            keep.append(held)
+            return len(value), int(ffi.cast("uintptr_t", held))
+        if not isinstance(value, int):
+            raise MessageError(f"{self.name}: {name} takes a number, not {value!r}")
+        if not code.low <= value <= code.high:
+            raise MessageError(f"{self.name}: {name}={value} is outside {code.low}..{code.high}")
+        return value, 0
+
+    def _mismatch(self, values: Mapping[str, Value]) -> str:
+        missing = [name for name in self.names if name not in values]
+        unknown = [name for name in values if name not in self.names]
+        faults = [
+            f"{what} {' '.join(names)}"
+            for what, names in (("missing", missing), ("unknown", unknown))
+            if names
+        ]
+        return f"{self.name}: {', '.join(faults)}; the node's firmware has '{self.text}'"
+
+    # ---------------------------------------------------------------------------------------------- decode
+
+    def decode(self, content: bytes, start: int) -> tuple[Message, int] | None:
+        """Decode the parameters at START of CONTENT.
+
+        Returns the message and where it ends, or None when it is cut short.
+        """
+        found = self.read_values(content, start)
+        if found is None:
+            return None
+        return Message(self.name, dict(zip(self.names, found[0], strict=True))), found[1]
+
+    def read_values(self, content: bytes, start: int) -> tuple[Sequence[Value], int] | None:
+        """Decode like ``decode``, but give only the parameters' values, in the order of ``names``."""
+        if not self._count:
+            return (), start
+        held = _from_buffer("uint8_t[]", content)
+        cursor = self._cursor
+        cursor[0] = held + start
+        if _unpack(self._types, self._count, cursor, held + len(content), self._args):
+            return None
+        values: Sequence[Value] = self._numbers.unpack_from(self._view)
+        if self._buffers:
+            values = list(values)
+            for i in self._buffers:
+                at = self._args[i].data - held
+                values[i] = content[at : at + values[i]]
+        return values, cursor[0] - held
+
+    # ------------------------------------------------------------------------------------- numbers as sent
+
+    def decode_as_sent(self, data: bytes, start: int) -> tuple[Message, int] | None:
+        """Decode like ``decode``, but tell numbers apart that a node reads as the same 32 bits.
+
+        Hosts send a clock in its 64-bit form, of which 35 bits reach the wire, and -1 as ``7f`` or as 2^32-1
+        in five bytes. For comparing recordings: ``encode_as_sent`` makes the same bytes of it.
+        """
+        values: list[Value] = []
+        at = start
+        for code in self.codes:
+            number = vlq_read(data, at)
+            if number is None:
+                return None
+            value, behind = number
+            if code.wire_type == lib.WIRE_BYTES:
+                if value > len(data) - behind:
+                    return None
+                values.append(data[behind : behind + value])
+                at = behind + value
+                continue
+            values.append(_number_as_sent(value, data[at:behind]))
+            at = behind
+        return Message(self.name, dict(zip(self.names, values, strict=True))), at
+
+    def encode_as_sent(self, message: Message) -> bytes:
+        """Encode what ``decode_as_sent`` gave."""
+        out = self.prefix
+        for value in message.params.values():
+            out += vlq(len(value)) + value if isinstance(value, bytes) else _vlq_as_sent(value)
+        return out
+
+
+_FIVE_BYTES: Final = 5
+_HIGH_GROUP_SHIFT: Final = 4  # bits 28..31 are the low half of a five-byte number's first group
+
+
+def _number_as_sent(value: int, encoded: bytes) -> int:
+    if len(encoded) < _FIVE_BYTES:
+        return value - (1 << 32) if value >> 31 else value
+    return value | (encoded[0] & 0x7F) >> _HIGH_GROUP_SHIFT << 32
+
+
+def _vlq_as_sent(value: int) -> bytes:
+    if value <= _BITS32:
+        return vlq(value)
+    low = vlq(value & _BITS32 | 1 << 31)  # five bytes whatever the low bits are
+    first = low[0] & ~0x0F | value >> 28 & 0x0F | value >> 32 << _HIGH_GROUP_SHIFT
+    return bytes((first,)) + low[1:]
+
+
+def vlq(value: int) -> bytes:
+    """Encode one number (-2^31..2^32-1) in the form of its sign."""
+    out = ffi.new("uint8_t[]", lib.WIRE_VLQ_MAX)
+    return bytes(ffi.buffer(out, lib.wire_vlq_encode(out, value)))
+
+
+def vlq_read(data: bytes, start: int) -> tuple[int, int] | None:
+    """Return the number at START of DATA as unsigned 32 bits and where it ends; None when cut short."""
+    held = ffi.from_buffer("uint8_t[]", data)
+    cursor = ffi.new("const uint8_t *[1]", [held + start])
+    value = ffi.new("uint32_t *")
+    if lib.wire_vlq_decode(cursor, held + len(data), value):
+        return None
+    return value[0], cursor[0] - held

@@ -1,0 +1,66 @@
+"""What the coordinator itself needs a firmware to understand, checked once when its dictionary is read.
+
+Afterwards these messages can be used without looking; a strange dictionary ends in one sentence here.
+"""
+
+from typing import Final
+
+from nodes.dictionary.dictionary import Dictionary
+from nodes.dictionary.parts import DictionaryError
+
+KNOWS_BUS_STOP: Final = "CAN_BUS_STOP"
+"""A constant: firmware that has it stops its whole bus when it is told so, or when it shuts down itself."""
+REQUIRED_COMMANDS: Final = {
+    "get_config": (),
+    "allocate_oids": ("count",),
+    "finalize_config": ("crc",),
+    "get_clock": (),
+    "get_uptime": (),
+}
+REQUIRED_RESPONSES: Final = {
+    "config": ("is_config", "crc", "is_shutdown", "move_count"),
+    "clock": ("clock",),
+    "uptime": ("high", "clock"),
+}
+OPTIONAL_RESPONSES: Final = {
+    "stats": ("count", "sum", "sumsq"),
+    "shutdown": ("static_string_id",),
+    "is_shutdown": ("static_string_id",),
+    "stepper_position": ("oid", "pos"),
+}
+
+
+def check_vocabulary(dictionary: Dictionary) -> None:
+    """Raise DictionaryError when a firmware cannot be used because of what it does not say or understand."""
+    for name, params in REQUIRED_COMMANDS.items():
+        found = dictionary.commands.get(name)
+        if found is None or found.names != params:
+            raise _unusable(dictionary, "command", name, params)
+    for name, params in REQUIRED_RESPONSES.items():
+        if name not in dictionary.responses or not _carries(dictionary, name, params):
+            raise _unusable(dictionary, "response", name, params)
+    for name, params in OPTIONAL_RESPONSES.items():
+        if name in dictionary.responses and not _carries(dictionary, name, params):
+            raise _unusable(dictionary, "response", name, params)
+    _ = dictionary.clock_freq_hz, dictionary.receive_window, dictionary.int_constant("STATS_SUMSQ_BASE", 256)
+
+
+def carries_identity(dictionary: Dictionary) -> bool:
+    """Tell whether the node can be asked which board it is (get_canbus_id), with the answer as bytes."""
+    format_ = dictionary.responses.get("canbus_id")
+    asked = dictionary.commands.get("get_canbus_id")
+    if format_ is None or asked is None or asked.names:
+        return False
+    codes = dict(zip(format_.names, format_.code_texts, strict=True))
+    return codes.get("canbus_uuid", "").endswith("s")
+
+
+def _carries(dictionary: Dictionary, name: str, params: tuple[str, ...]) -> bool:
+    found = dictionary.responses[name]
+    codes = dict(zip(found.names, found.code_texts, strict=True))
+    return all(not codes.get(param, "s").endswith("s") for param in params)
+
+
+def _unusable(dictionary: Dictionary, kind: str, name: str, params: tuple[str, ...]) -> DictionaryError:
+    wanted = " ".join((name, *params))
+    return DictionaryError(f"firmware {dictionary.version!r} has no {kind} {wanted!r} and cannot be driven")

@@ -1,0 +1,98 @@
+"""What nodes need of the link: the seam at which a simulation or a test takes its place.
+
+``nodes.link`` provides all of it; its classes are documented there.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+from nodes.dictionary.dictionary import Dictionary
+from nodes.link import BusLoad, Forecast, IOStats, LinkSettings
+from nodes.node.config import NodeConfig
+
+
+class ResponseLike(Protocol):
+    """One message from a node. Times are HostTime; sent_ns 0: which sending it answers is not known."""
+
+    @property
+    def content(self) -> bytes: ...  # noqa: D102
+    @property
+    def sent_ns(self) -> int: ...  # noqa: D102
+    @property
+    def received_ns(self) -> int: ...  # noqa: D102
+
+
+class FrameLike(Protocol):
+    """A CAN frame that belongs to no link."""
+
+    @property
+    def can_id(self) -> int: ...  # noqa: D102
+    @property
+    def data(self) -> bytes: ...  # noqa: D102
+
+
+OnResponses = Callable[[Sequence[ResponseLike]], None]
+OnLost = Callable[[str], None]
+OnFrame = Callable[[FrameLike], None]
+
+
+class LinkLike(Protocol):
+    """The reliable way to one node. Callbacks run on the control loop."""
+
+    def send(  # noqa: D102
+        self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False
+    ) -> None: ...
+    def send_batch(self, buffer: bytes, /) -> None: ...  # noqa: D102
+    def send_urgent(self, content: bytes) -> None: ...  # noqa: D102
+    def set_receive_window(self, size: int, /) -> None: ...  # noqa: D102
+    def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> None: ...  # noqa: D102
+    def pending(self) -> int: ...  # noqa: D102
+    async def drained(self) -> None: ...  # noqa: D102
+    def stats(self) -> Any: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+
+
+class LinkIOLike(Protocol):
+    """All links over one transport."""
+
+    def open_link(  # noqa: D102
+        self, settings: LinkSettings, *, on_responses: OnResponses, on_lost: OnLost
+    ) -> LinkLike: ...
+    def send_frame(self, can_id: int, data: bytes) -> None: ...  # noqa: D102
+    def learn_bitrate(self, bitrate: int) -> None: ...  # noqa: D102
+    def forecast(self) -> Forecast: ...  # noqa: D102
+    def stats(self) -> IOStats: ...  # noqa: D102
+    def load(self) -> BusLoad: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+
+
+class IoFactory(Protocol):
+    """Starts the I/O of a bus; on_frame is None on a UART."""
+
+    def __call__(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike: ...  # noqa: D102
+
+
+class Connector(Protocol):
+    """How a node gets its link; the bus provides it."""
+
+    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
+        """Open a link, giving the node its id first where it needs one."""
+
+    def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
+        """Return how long a block is on the wire for certain; 0 where that is not known."""
+
+    def forget(self) -> None:
+        """Take note that the node was reset: what it knew of the bus is gone."""
+
+    def why_silent(self) -> Exception | None:
+        """Return a better explanation than "no answer" when a node never answered at all."""
+
+    def check_identity(self, found: bytes) -> None:
+        """Raise when a board that answers get_canbus_id with FOUND is not the node."""
+
+    def suspect(self) -> None:
+        """Find out whether a node that is silent restarted; the bus tells the node when it did."""
+
+
+BuildConfig = Callable[[Dictionary], NodeConfig]
+"""Makes a node's configuration when its dictionary is known; called again at every restart."""

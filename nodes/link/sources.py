@@ -1,0 +1,14 @@
+"""What a cffi module needs that contains the core of a bus, whatever its driver."""
+
+CORE_HEADERS = (
+    "firmware/wire/wire.h",
+    *(f"nodes/link/{name}.h" for name in ("queue", "link", "schedule", "io_core", "io_api")),
+)
+"""In this order."""
+CORE_SOURCES = (
+    *(f"firmware/wire/{name}.c" for name in ("vlq", "message", "block")),
+    *(f"nodes/link/{name}.c" for name in ("queue", "link", "link_states", "link_pack", "link_receive")),
+    *(f"nodes/link/{name}.c" for name in ("schedule", "io_core", "io_receive", "io_send", "io_schedule")),
+    *(f"nodes/link/{name}.c" for name in ("io_forecast", "io_stats", "io_links")),
+    "nodes/support/can_bits.c",
+)

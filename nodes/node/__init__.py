@@ -1,0 +1,1 @@
+"""One node through its life: configuration, states, requests and replies, watchdog."""

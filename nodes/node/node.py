@@ -1,0 +1,450 @@
+"""One node through its life: identified, configured, kept in time, and left in a known state."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from typing import Final, Literal
+
+from nodes.clock.clock import ClockEstimate, ClockEstimator
+from nodes.clock.keeper import ClockKeeper
+from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, Conversation
+from nodes.dictionary.dictionary import Dictionary
+from nodes.dictionary.cache import DictionaryCache
+from nodes.dictionary.parts import DictionaryError
+from nodes.support.errors import CanductorError
+from nodes.clock.estimated_clock import EstimatedClock
+from nodes.dictionary.identify import identify
+from nodes.node.load import NodeLoad, load_of
+from nodes.dictionary.message_format import Message, Value
+from nodes.node.config import NodeConfig
+from nodes.node.errors import NodeError, NodeLost, NodeShutdown, shutdown_sentence
+from nodes.node.states import NodeEvent, NodeState, following
+from nodes.node.queue_slots import share_slots
+from nodes.link.interfaces import BuildConfig, Connector, LinkLike
+from nodes.clock.sync_pulse import PulseClock
+from nodes.node.watchdog import Vigil, get_config, restarted
+from nodes.dictionary.vocabulary import carries_identity, check_vocabulary
+
+MAX_STARTS: Final = 3
+"""How often a node is connected anew in one start because only a reset rids it of an old configuration."""
+CONFIG_RESET_TRIES: Final = 4
+RESET_SETTLE_S: Final = 0.3
+"""For the reset command to arrive, repeated if need be, and the node to come up again."""
+ALIVE_TIMEOUT_S: Final = 0.1
+"""For a node of which another board claims to be it to show that it lives."""
+CLOCK_TIMEOUT_S: Final = 15.0
+"""On a bus that loses one frame in twenty every fourth sample is lost or of no use."""
+
+
+ClockSource = Literal["pulse", "exchange"]
+OnState = Callable[["Node"], None]
+OnClock = Callable[["Node", ClockEstimate], None]
+
+
+def _ignore(*_: object) -> None:
+    pass
+
+
+class Node:
+    """Node NAME, reached through CONNECTOR and configured as BUILD_CONFIG says.
+
+    ON_STATE is called after every change of ``state``, ON_CLOCK with every new estimate of its clock, both on
+    the control loop. ``failure`` says why it is lost or shut down. Without a CACHE every start downloads the
+    dictionary.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        connector: Connector,
+        build_config: BuildConfig,
+        *,
+        on_state: OnState = _ignore,
+        on_clock: OnClock = _ignore,
+        cache: DictionaryCache | None = None,
+    ) -> None:
+        self.name = name
+        self.state = NodeState.CONNECTING
+        self.failure: NodeError | None = None
+        self.move_count = 0
+        """Queue slots shared by all steppers and timed outputs; known when READY."""
+        self.step_slots = 0
+        """Those of them that the steppers have."""
+        self.output_slots = 0
+        """Those that each timed output has."""
+        self.load: NodeLoad | None = None
+        self.pulse_clock: PulseClock | None = None
+        """The node's clock by sync pulses, while its bus has such; kept by the bus."""
+        self.reset_first = False
+        """Whether the next start resets the node even when it is configured as it should be."""
+        self._connector = connector
+        self._build_config = build_config
+        self._on_state = on_state
+        self._on_clock = on_clock
+        self._cache = cache
+        self._talk = Conversation(name)
+        self._keeper: ClockKeeper | None = None
+        self._vigil = Vigil(self._talk, 0)
+        self._starting_over = True  # until an old configuration is judged, old news mean nothing
+        self._generation = 0
+        for response, handler in (
+            ("stats", self._stats_came),
+            ("shutdown", self._shutdown_came),
+            ("is_shutdown", self._shutdown_came),
+            ("starting", self._starting_came),
+        ):
+            self._talk.on(response, None, handler)
+
+    # ------------------------------------------------------------------------------------------- looking at
+
+    @property
+    def dictionary(self) -> Dictionary:
+        """The node's dictionary; before it is read, one that knows only how to ask for it."""
+        return self._talk.dictionary
+
+    @property
+    def clock(self) -> ClockEstimator:
+        """The node's clock; NodeError before its first sample."""
+        if self._keeper is None or not self._keeper.estimator.accepted:
+            raise NodeError(f"the clock of node {self.name} is not known yet: the node is {self.state.value}")
+        return self._keeper.estimator
+
+    @property
+    def talks(self) -> bool:
+        """Whether commands can be sent to it now."""
+        return self.failure is None and self.state in (NodeState.CONFIGURING, NodeState.READY)
+
+    @property
+    def best_clock(self) -> EstimatedClock:
+        """The node's clock as well as it is known: by sync pulses, else by exchanges; NodeError before."""
+        pulses = self.pulse_clock
+        # Interrupts of some boards come so unevenly that exchanges tell more.
+        if pulses is not None and pulses.error_s <= self.clock.estimate().bound_s:
+            return pulses
+        return self.clock
+
+    @property
+    def clock_source(self) -> ClockSource:
+        """What ``best_clock`` rests on; NodeError before the first sample."""
+        return "pulse" if isinstance(self.best_clock, PulseClock) else "exchange"
+
+    @property
+    def clock_error_s(self) -> float | None:
+        """Bound of the error of ``best_clock``; None while that is not known.
+
+        By pulses it is against the reference node's clock, by exchanges against host time.
+        """
+        if self._keeper is None or not self._keeper.estimator.accepted:
+            return None
+        best = self.best_clock
+        return best.error_s if isinstance(best, PulseClock) else self.clock.estimate().bound_s
+
+    @property
+    def clock_freq_hz(self) -> int:
+        """Nominal ticks per second."""
+        return self.dictionary.clock_freq_hz
+
+    @property
+    def link(self) -> LinkLike:
+        """The link, for batches of commands; NodeError unless the node can be talked to."""
+        self._check_usable()
+        return self._talk.link
+
+    @property
+    def undecodable(self) -> int:
+        """Responses dropped because nothing in the dictionary fits them."""
+        return self._talk.undecodable
+
+    # ---------------------------------------------------------------------------------------------- talking
+
+    def send(self, name: str, /, *, min_clock: int = 0, req_clock: int = 0, **args: Value | str) -> None:
+        """Send a command (clocks: ``nodes/link/batch.h``); NodeError when the node cannot take it."""
+        self._check_usable()
+        self._talk.send(name, min_clock=min_clock, req_clock=req_clock, **args)
+
+    async def query(
+        self,
+        name: str,
+        response: str,
+        /,
+        *,
+        timeout_s: float = QUERY_TIMEOUT_S,
+        tries: int = QUERY_TRIES,
+        **args: Value | str,
+    ) -> Message:
+        """Send a command and return its RESPONSE (of the same oid), asking again when it gets lost.
+
+        Raises QueryTimeout, or NodeLost or NodeShutdown when that happens meanwhile.
+        """
+        self._check_usable()
+        answer = await self._talk.ask(name, response, args, timeout_s=timeout_s, tries=tries)
+        return answer.message
+
+    def on(self, response: str, oid: int | None, callback: Callback) -> Callable[[], None]:
+        """Call CALLBACK for every RESPONSE (of OID, unless None); returns what ends it."""
+        return self._talk.on(response, oid, callback)
+
+    def emergency_stop(self) -> None:
+        """Stop the node ahead of everything queued for it; without effect on one that cannot be reached."""
+        if self._talk.connected and "emergency_stop" in self.dictionary.commands:
+            # The link may know already what the loop has yet to hear: that the node is gone.
+            with contextlib.suppress(CanductorError):
+                self._talk.link.send_urgent(self.dictionary.encode("emergency_stop"))
+
+    def lose(self, cause: str) -> None:
+        """Take note that the node can no longer be reached."""
+        self._fail(NodeEvent.LOST, NodeLost(f"lost node {self.name}: {cause}"))
+
+    def restarted(self, how: str) -> None:
+        """Take note that the node restarted by itself; HOW that is known."""
+        self._fail(NodeEvent.RESTARTED, restarted(self.name, how))
+
+    async def lives(self) -> bool:
+        """Tell whether the node answers at once, and has its configuration."""
+        try:
+            answer = await self._talk.ask(
+                "get_config", "config", tries=1, timeout_s=ALIVE_TIMEOUT_S, survives_shutdown=True
+            )
+        except CanductorError:
+            return False
+        return bool(answer.message.integer("is_config"))
+
+    def _check_usable(self) -> None:
+        if self.failure is not None:
+            raise self.failure.with_traceback(None)
+        if self.state not in (NodeState.CONFIGURING, NodeState.READY):
+            raise NodeError(f"node {self.name} is {self.state.value} and takes no commands")
+
+    # --------------------------------------------------------------------------------------------- starting
+
+    async def start(self) -> None:
+        """Bring the node to READY from CONNECTING; raises CanductorError, leaving it LOST or SHUTDOWN."""
+        try:
+            await self._start()
+        except CanductorError as error:
+            failure = error if isinstance(error, NodeError) else NodeError(str(error))
+            if self.failure is None:
+                self._fail(NodeEvent.LOST, failure)
+            elif self.state is NodeState.LOST:
+                self.failure = failure  # says more than its link, which only found it silent
+            raise
+
+    async def _start(self) -> None:
+        for _ in range(MAX_STARTS):
+            self._starting_over = True
+            link = await self._connector.connect(self._talk.receive, self._link_lost(self._generation))
+            self._talk.attach(link)
+            self._enter(NodeEvent.CONNECTED)
+            await self._identify()
+            self._enter(NodeEvent.IDENTIFIED)
+            keeper = self._start_clock()
+            if await self._configure(self._build_config(self.dictionary)):
+                await self._wait_for_clock(keeper)
+                self._enter(NodeEvent.CONFIGURED)
+                return
+            await self._disconnect()
+            self._connector.forget()
+            self._enter(NodeEvent.RESET)
+        raise NodeError(f"node {self.name} keeps its configuration after {MAX_STARTS} resets; power-cycle it")
+
+    async def restart(self) -> None:
+        """Start again, from READY, SHUTDOWN or LOST; raises like ``start``."""
+        await self._disconnect()
+        if following(self.state, NodeEvent.RESET) is None:
+            raise NodeError(f"node {self.name} is {self.state.value} and cannot be restarted")
+        if self.state is NodeState.LOST:
+            self._connector.forget()
+        self.failure = None
+        self._enter(NodeEvent.RESET)
+        await self.start()
+
+    async def sleep(self) -> None:
+        """Let go of the node, so that its power can be switched off: it is neither talked to nor missed.
+
+        A start that was under way must have been cancelled. Raises NodeError when it sleeps or is closed.
+        """
+        if following(self.state, NodeEvent.SLEEP) is None:
+            raise NodeError(f"node {self.name} is {self.state.value} and cannot be put to sleep")
+        await self._disconnect()
+        self._connector.forget()
+        self.failure = None
+        self._enter(NodeEvent.SLEEP)
+
+    async def wake(self) -> None:
+        """Start the node again, from SLEEPING; raises like ``start``."""
+        if following(self.state, NodeEvent.WAKE) is None:
+            raise NodeError(f"node {self.name} is {self.state.value} and cannot be woken")
+        self._enter(NodeEvent.WAKE)
+        await self.start()
+
+    async def close(self) -> None:
+        """End the conversation; the node itself is left as it is."""
+        await self._disconnect()
+        self._enter(NodeEvent.CLOSE)
+
+    async def _disconnect(self) -> None:
+        self._generation += 1
+        self._talk.fail(self.failure or NodeLost(f"the connection to node {self.name} was closed"))
+        if self._keeper is not None:
+            await self._keeper.close()
+        link = self._talk.detach()
+        if link is not None:
+            link.close()
+
+    async def _identify(self) -> None:
+        cache = self._cache or DictionaryCache()
+        dictionary = await identify(self._talk, cache, self._connector.why_silent)
+        try:
+            check_vocabulary(dictionary)
+            self._talk.dictionary = dictionary
+            self._talk.link.set_receive_window(dictionary.receive_window)
+        except DictionaryError as error:
+            raise DictionaryError(f"node {self.name}: {error}") from None
+        await self._check_identity()
+
+    async def _check_identity(self) -> None:
+        """Make sure that the board that answers is the one that was given the node's id."""
+        if carries_identity(self.dictionary):
+            answer = await self._talk.ask("get_canbus_id", "canbus_id", survives_shutdown=True)
+            self._connector.check_identity(answer.message.data("canbus_uuid"))
+
+    # ------------------------------------------------------------------------------------------ configuring
+
+    async def _configure(self, wanted: NodeConfig) -> bool:
+        """Make the node what WANTED says; False when it had to be reset and must be connected anew."""
+        found = await get_config(self._talk)
+        other = bool(found.integer("is_config")) and found.integer("crc") != wanted.crc
+        reset_first, self.reset_first = self.reset_first, False
+        if other or reset_first or found.integer("is_shutdown"):
+            # Preferred to a reset of the whole board, with which a USB device or a CAN bridge would vanish.
+            if "config_reset" not in self.dictionary.commands:
+                await self._reset()
+                return False
+            found = await self._config_reset()
+        self._starting_over = False
+        if not found.integer("is_config"):
+            for command in wanted.config_commands:
+                self._talk.send_text(command)
+            self._talk.send("finalize_config", crc=wanted.crc)
+            found = await self._finalized()
+        self._check_configured(found, wanted)
+        self.move_count = found.integer("move_count")
+        self.step_slots, self.output_slots = share_slots(self.move_count, wanted.timed_outputs)
+        self._vigil = Vigil(self._talk, wanted.crc)
+        for command in wanted.init_commands:
+            self._talk.send_text(command)
+        return True
+
+    async def _finalized(self) -> Message:
+        """Ask for the configuration state after its last command.
+
+        Answers have no numbers: where one came late and was asked for again, the others come now.
+        """
+        for _ in range(QUERY_TRIES):
+            found = await get_config(self._talk)
+            if found.integer("is_config") or found.integer("is_shutdown") or self.failure is not None:
+                break
+        return found
+
+    def _check_configured(self, found: Message, wanted: NodeConfig) -> None:
+        if self.failure is not None:
+            raise self.failure.with_traceback(None)
+        if found.integer("is_shutdown"):
+            raise NodeShutdown(f"node {self.name} shut down while being configured; see its pins and limits")
+        if not found.integer("is_config") or found.integer("crc") != wanted.crc:
+            raise NodeError(f"node {self.name} did not take its configuration; restart it and try again")
+
+    async def _reset(self) -> None:
+        if "reset" not in self.dictionary.commands:
+            raise NodeError(f"node {self.name} has another configuration and no way to reset; power-cycle it")
+        self._generation += 1  # that this link breaks is what we want
+        self._talk.send("reset")
+        await asyncio.sleep(RESET_SETTLE_S)
+
+    async def _config_reset(self) -> Message:
+        """Rid the node of its configuration. Firmware takes config_reset only when shut down."""
+        for _ in range(CONFIG_RESET_TRIES):
+            self._talk.send("emergency_stop")
+            self._talk.send("config_reset")
+            found = await get_config(self._talk)
+            if found.integer("is_shutdown") and "clear_shutdown" in self.dictionary.commands:
+                self._talk.send("clear_shutdown")
+                found = await get_config(self._talk)
+            if not found.integer("is_config") and not found.integer("is_shutdown"):
+                return found
+        raise NodeError(f"node {self.name} does not let go of its old configuration; power-cycle it")
+
+    # ------------------------------------------------------------------------------------------------ clock
+
+    def _start_clock(self) -> ClockKeeper:
+        self._keeper = ClockKeeper(
+            self._talk,
+            self._connector,
+            on_estimate=lambda estimate: self._on_clock(self, estimate),
+            on_sample=self._look,
+            on_lost=self.lose,
+        )
+        return self._keeper
+
+    async def _look(self) -> None:
+        """Notice what the node said only once, should that have been lost."""
+        trouble = await self._vigil.look() if self.state is NodeState.READY else None
+        if trouble is not None:
+            shutdown = isinstance(trouble, NodeShutdown)
+            self._fail(NodeEvent.SHUTDOWN if shutdown else NodeEvent.RESTARTED, trouble)
+
+    async def _wait_for_clock(self, keeper: ClockKeeper) -> None:
+        try:
+            async with asyncio.timeout(CLOCK_TIMEOUT_S):
+                await keeper.ready.wait()
+        except TimeoutError:
+            raise self.failure or NodeError(
+                f"node {self.name} answers too seldom to learn its clock; check the bus for errors and load"
+            ) from None
+        if self.failure is not None:
+            raise self.failure.with_traceback(None)
+
+    # ------------------------------------------------------------------------------------------- what comes
+
+    def _enter(self, event: NodeEvent) -> None:
+        after = following(self.state, event)
+        if after is not None:
+            self.state = after
+            self._on_state(self)
+
+    def _fail(self, event: NodeEvent, failure: NodeError) -> None:
+        if following(self.state, event) is None:
+            return
+        self.failure = failure
+        self._enter(event)
+        self._talk.fail(failure, shutdown=event is NodeEvent.SHUTDOWN)
+        if self._keeper is not None:
+            self._keeper.ready.set()  # nobody needs to wait for it any more
+
+    def _link_lost(self, generation: int) -> Callable[[str], None]:
+        def lost(cause: str) -> None:
+            if generation == self._generation:
+                self.lose(cause)
+
+        return lost
+
+    def _stats_came(self, stats: Message) -> None:
+        base = self.dictionary.int_constant("STATS_SUMSQ_BASE", 256)
+        self.load = load_of(stats, self.dictionary.clock_freq_hz, base)
+
+    def _shutdown_came(self, message: Message) -> None:
+        self.shut_down_for(message.integer("static_string_id"))
+
+    def shut_down_for(self, static_string_id: int) -> None:
+        """Take note that the node shut down, and which text it gives as reason."""
+        if self._starting_over or self.failure is not None or self.state not in _SHUTDOWN_MEANS:
+            return
+        text = self.dictionary.enum_name("static_string_id", static_string_id)
+        self._fail(NodeEvent.SHUTDOWN, NodeShutdown(shutdown_sentence(self.name, text)))
+
+    def _starting_came(self, _: Message) -> None:
+        if not self._starting_over:
+            self.restarted("it said so")
+
+
+_SHUTDOWN_MEANS: Final = (NodeState.CONFIGURING, NodeState.READY)

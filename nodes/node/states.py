@@ -1,0 +1,96 @@
+"""The life of a node as a table: the only place that says what may follow what.
+
+docs/node-states.md is generated from it: ``python -m nodes.node.states > docs/node-states.md``.
+"""
+
+import sys
+from enum import Enum
+from typing import Final
+
+
+class NodeState(Enum):
+    """Where a node is in its life; the value says it in a sentence's words."""
+
+    CONNECTING = "being connected"
+    IDENTIFYING = "telling its dictionary"
+    CONFIGURING = "being configured"
+    READY = "ready"
+    SHUTDOWN = "shut down"
+    LOST = "lost"
+    SLEEPING = "asleep"
+    CLOSED = "closed"
+
+
+class NodeEvent(Enum):
+    """What moves a node from one state to another."""
+
+    CONNECTED = "link open"
+    IDENTIFIED = "dictionary read"
+    CONFIGURED = "configuration finalized, clock known"
+    RESET = "reset, to start again"
+    SHUTDOWN = "shutdown reported"
+    LOST = "no answer"
+    RESTARTED = "it restarted by itself"
+    SLEEP = "put to sleep by the host"
+    WAKE = "woken by the host"
+    CLOSE = "closed by the host"
+
+
+_S, _E = NodeState, NodeEvent
+TRANSITIONS: Final = {
+    (_S.CONNECTING, _E.CONNECTED): _S.IDENTIFYING,
+    (_S.CONNECTING, _E.LOST): _S.LOST,
+    (_S.CONNECTING, _E.SLEEP): _S.SLEEPING,
+    (_S.CONNECTING, _E.CLOSE): _S.CLOSED,
+    (_S.IDENTIFYING, _E.IDENTIFIED): _S.CONFIGURING,
+    (_S.IDENTIFYING, _E.LOST): _S.LOST,
+    (_S.IDENTIFYING, _E.RESTARTED): _S.LOST,
+    (_S.IDENTIFYING, _E.SLEEP): _S.SLEEPING,
+    (_S.IDENTIFYING, _E.CLOSE): _S.CLOSED,
+    (_S.CONFIGURING, _E.CONFIGURED): _S.READY,
+    (_S.CONFIGURING, _E.RESET): _S.CONNECTING,
+    (_S.CONFIGURING, _E.SHUTDOWN): _S.SHUTDOWN,
+    (_S.CONFIGURING, _E.LOST): _S.LOST,
+    (_S.CONFIGURING, _E.RESTARTED): _S.LOST,
+    (_S.CONFIGURING, _E.SLEEP): _S.SLEEPING,
+    (_S.CONFIGURING, _E.CLOSE): _S.CLOSED,
+    (_S.READY, _E.RESET): _S.CONNECTING,
+    (_S.READY, _E.SHUTDOWN): _S.SHUTDOWN,
+    (_S.READY, _E.LOST): _S.LOST,
+    (_S.READY, _E.RESTARTED): _S.LOST,
+    (_S.READY, _E.SLEEP): _S.SLEEPING,
+    (_S.READY, _E.CLOSE): _S.CLOSED,
+    (_S.SHUTDOWN, _E.RESET): _S.CONNECTING,
+    (_S.SHUTDOWN, _E.LOST): _S.LOST,
+    (_S.SHUTDOWN, _E.RESTARTED): _S.LOST,
+    (_S.SHUTDOWN, _E.SLEEP): _S.SLEEPING,
+    (_S.SHUTDOWN, _E.CLOSE): _S.CLOSED,
+    (_S.LOST, _E.RESET): _S.CONNECTING,
+    (_S.LOST, _E.SLEEP): _S.SLEEPING,
+    (_S.LOST, _E.CLOSE): _S.CLOSED,
+    (_S.SLEEPING, _E.WAKE): _S.CONNECTING,
+    (_S.SLEEPING, _E.CLOSE): _S.CLOSED,
+}
+
+
+def following(state: NodeState, event: NodeEvent) -> NodeState | None:
+    """Return the state after EVENT in STATE, or None when the event means nothing there."""
+    return TRANSITIONS.get((state, event))
+
+
+def page() -> str:
+    """Return docs/node-states.md."""
+    arrows = "\n".join(
+        f"    {before.name} --> {after.name}: {event.value}" for (before, event), after in TRANSITIONS.items()
+    )
+    states = "\n".join(f"* **{state.name}**: {state.value}" for state in NodeState)
+    return (
+        "# The life of a node\n\n"
+        "Generated from `nodes/node/states.py` by `python -m nodes.node.states`; a test fails when stale.\n\n"
+        f"{states}\n\n```mermaid\nstateDiagram-v2\n    [*] --> CONNECTING\n"
+        f"{arrows}\n    CLOSED --> [*]\n```\n"
+    )
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())

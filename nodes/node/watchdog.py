@@ -1,0 +1,52 @@
+"""Looks whether a node is still the one that was configured, should the one message that said so be lost."""
+
+import asyncio
+from typing import Final
+
+from nodes.node.request_reply import QUERY_TRIES, Conversation
+from nodes.dictionary.message_format import Message
+from nodes.node.errors import NodeError, NodeRestarted, NodeShutdown, shutdown_sentence
+
+SHUTDOWN_GRACE_S: Final = 0.05
+"""For a node that is seen to be shut down to say why."""
+
+
+def restarted(node: str, how: str) -> NodeRestarted:
+    """Return the failure of NODE, which restarted by itself; HOW that is known."""
+    return NodeRestarted(f"node {node} restarted by itself ({how}); check its power supply")
+
+
+async def get_config(talk: Conversation, tries: int = QUERY_TRIES) -> Message:
+    """Ask for the node's configuration state."""
+    return (await talk.ask("get_config", "config", tries=tries, survives_shutdown=True)).message
+
+
+class Vigil:
+    """Watches the node that TALK talks with, since it took the configuration with CRC."""
+
+    def __init__(self, talk: Conversation, crc: int) -> None:
+        self._talk = talk
+        self._crc = crc
+        self._uptime_ticks = 0
+
+    async def look(self) -> NodeError | None:
+        """Return what happened to the node, or None. Raises QueryTimeout and what ends the conversation.
+
+        Its configuration is gone after a restart, and its uptime ran backwards; the latter even shows when
+        another host has configured it meanwhile, in the same words.
+        """
+        name = self._talk.name
+        found = await get_config(self._talk, tries=1)
+        if not found.integer("is_config"):
+            return restarted(name, "its configuration is gone")
+        if found.integer("crc") != self._crc:
+            return NodeRestarted(f"node {name} was given another configuration; let only one host drive it")
+        if found.integer("is_shutdown"):
+            await asyncio.sleep(SHUTDOWN_GRACE_S)
+            return NodeShutdown(shutdown_sentence(name, "the message with the reason got lost"))
+        answer = await self._talk.ask("get_uptime", "uptime", tries=1, survives_shutdown=True)
+        ticks = answer.message.integer("high") << 32 | answer.message.integer("clock")
+        if ticks < self._uptime_ticks:
+            return restarted(name, "its uptime ran backwards")
+        self._uptime_ticks = ticks
+        return None

@@ -1,0 +1,51 @@
+"""Shared by the ``build_*.py`` scripts: makes a cffi builder whose declarations come from the C headers.
+
+What a header shows to Python stands between the lines ``// cffi: begin`` and ``// cffi: end``; there is no
+second copy of a declaration that could go stale.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from cffi import FFI
+
+ROOT = Path(__file__).resolve().parents[2]
+_SECTION = re.compile(r"^// cffi: begin\n(.*?)^// cffi: end$", re.MULTILINE | re.DOTALL)
+
+
+def declarations(header: Path) -> str:
+    """Return the parts of HEADER that cffi may see; raises ValueError when it marks none."""
+    sections = _SECTION.findall(header.read_text())
+    if not sections:
+        raise ValueError(f"{header} has no '// cffi: begin' section")
+    return "\n".join(sections)
+
+
+def builder(module: str, headers: Sequence[str], sources: Iterable[str], *, cdef: str = "") -> FFI:
+    """Describe the extension MODULE made of SOURCES (paths from the project's root).
+
+    HEADERS are included in this order, and their marked sections declared, after the extra CDEF.
+    """
+    ffi = FFI()
+    ffi.cdef(cdef + "\n".join(declarations(ROOT / header) for header in headers))
+    ffi.set_source(
+        module,
+        "\n".join(f'#include "{header}"' for header in headers),
+        # Relative paths: setuptools refuses absolute ones.
+        sources=list(sources),
+        include_dirs=[".", "firmware"],
+        extra_compile_args=[
+            "-std=gnu11",
+            "-O3",
+            "-Wall",
+            "-Wextra",
+            "-Wno-psabi",
+            "-fno-math-errno",
+            "-ffp-contract=off",  # the same numbers on every processor
+            "-pthread",
+        ],
+        extra_link_args=["-pthread"],
+        libraries=["m"],
+    )
+    return ffi
