@@ -23,7 +23,7 @@ from nodes.mt.cost import FRAME_BITS_MAX, RegisterCost
 from nodes.mt.download import BUS_SHARE, Report, download
 from nodes.mt.mt import transmission
 from nodes.virtual.world import run
-from tests.nodes.table.machines import TableMachine, wavy
+from tests.nodes.mt.machines import TableMachine, wavy
 
 T = TypeVar("T")
 

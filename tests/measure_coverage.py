@@ -68,7 +68,7 @@ exclude_also =
     class .*\\(Protocol.*\\):
     @overload
 """
-DISTURBED: Final = ("tests/coordinator/test_plan.py::test_planning_imports_nothing_slow",)
+DISTURBED: Final = ("tests/coordinator/planning/test_plan.py::test_planning_imports_nothing_slow",)
 """Tests of what a process imports: coverage.py is among that."""
 # gcov's files are many; a command line takes this many of them.
 BATCH: Final = 200

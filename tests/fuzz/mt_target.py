@@ -8,7 +8,7 @@ from typing import Any, Final
 from nodes.mt.mt import AXLES, MtStatus, digest, transmission
 from nodes.mt.receiver import ByteWords, MtReceiver, PolledRegister
 from nodes.virtual._sim import ffi, lib
-from tests.nodes.table.receivers import FirmwareReceiver
+from tests.nodes.mt.receivers import FirmwareReceiver
 
 GAP: Final = 100
 ROOM_MAX: Final = 12

@@ -1,1 +1,0 @@
-"""The configuration file, its options and pins."""
