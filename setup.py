@@ -17,7 +17,7 @@ PACKAGES = ("nodes", "coordinator", "canbus_tools")
 BUILD_MODULES = {("nodes", "native_build"), ("nodes", "link_sources")}
 """Modules that only the build scripts import."""
 EXAMPLE_MACHINES = ("coordinator", "example_machines")
-"""Where an installation has the files of config/; coordinator/support/command_options.py looks there first."""
+"""Where an installation has the files of config/."""
 
 
 class BuildPython(build_py):

@@ -17,14 +17,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import pytest
 
-from canbus_tools.recordings.candump import candump_line
-from canbus_tools.tools.decode import Decoding
 from canbus_tools.protocol.decoded import Kind
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import DictionarySource
 from canbus_tools.protocol.filters import Filter
-from canbus_tools.bus.frame import Frame
+from canbus_tools.protocol.frame import Frame
+from canbus_tools.recordings.candump import candump_line
 from canbus_tools.recordings.recordings import read_frames
+from canbus_tools.tools.decode import Decoding
 from nodes.dictionary.dictionary import Dictionary
 from tests.canbus_tools import recorded
 from tests.canbus_tools.talk_twin import DICTIONARY, Talk

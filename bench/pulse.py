@@ -21,18 +21,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.streaming.worker import SEND_AHEAD_S
+from coordinator.runtime.timebase import ClockMap, TimeBase
 from coordinator.simulate.boards import dictionary_blob
 from coordinator.streaming.streamer import CYCLE_S
-from coordinator.runtime.timebase import ClockMap, TimeBase
+from coordinator.streaming.worker import SEND_AHEAD_S
 from nodes.bus.assign import Uuid
 from nodes.bus.can_bus import CanBus
 from nodes.clock.clock import HostTime, Ticks
 from nodes.dictionary.dictionary import Dictionary
 from nodes.link import LinkIO
-from nodes.node.node import Node
-from nodes.node.config import NodeConfig
 from nodes.link.interfaces import LinkIOLike, OnFrame, OnLost
+from nodes.node.config import NodeConfig
+from nodes.node.node import Node
 from nodes.virtual.world import CanPort, World, WorldNode, run
 
 JITTER_S: Final = 1e-6

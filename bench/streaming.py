@@ -28,12 +28,12 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from coordinator.runtime.machine import Machine
-from coordinator.gcode.program import Program
 from coordinator.assembly.load import CanConnection, MachineDescription, load_machine
-from coordinator.support.progress import Progress
+from coordinator.gcode.program import Program
+from coordinator.runtime.machine import Machine
 from coordinator.streaming.job_runner import run_job
 from coordinator.streaming.streamer import Streamer
+from coordinator.support.progress import Progress
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import MAINBOARD, firmware_dictionary
 from nodes.virtual.hub import VirtualBus

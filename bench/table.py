@@ -18,10 +18,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from nodes.clock.clock import HostTime
-from nodes.devices.table import Activation
 from nodes.mt.cost import FRAME_BITS_MAX, RegisterCost
 from nodes.mt.download import BUS_SHARE, Report, download
 from nodes.mt.mt import transmission
+from nodes.mt.table import Activation
 from nodes.virtual.world import run
 from tests.nodes.mt.machines import TableMachine, wavy
 

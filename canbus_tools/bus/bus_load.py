@@ -1,7 +1,7 @@
 """How busy a CAN bus is: the library behind ``canductor can load``, for any user of python-can.
 
     meter = LoadMeter(bitrate=1_000_000)
-    for message in bus:                 # can.Message, or canbus_tools.bus.frame.Frame
+    for message in bus:                 # can.Message, or canbus_tools.protocol.frame.Frame
         meter.feed(message)
     print(f"{meter.load().mean:.1%}")   # of all the bus could carry
 
@@ -21,10 +21,10 @@ from typing import Final, NamedTuple
 
 import can
 
-from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.protocol.frame import Frame, FrameKind
 from canbus_tools.protocol.protocol import SIGNAL_FRAMES, Direction, owner_of
 from nodes.support._can_bits import ffi, lib
-from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
 

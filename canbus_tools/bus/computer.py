@@ -10,9 +10,9 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from canbus_tools.bus.frame import Frame
 from canbus_tools.bus.frame_queue import FRAMES_MAX, FrameQueue
 from canbus_tools.bus.open_bus import BusOptions, open_bus
+from canbus_tools.protocol.frame import Frame
 from nodes.link import LinkIO
 from nodes.link.types import FrameHandler
 from nodes.support.records import record

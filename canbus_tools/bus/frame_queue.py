@@ -10,8 +10,8 @@ from typing import Final, Self
 
 import can
 
-from canbus_tools.bus.frame import Frame
 from canbus_tools.bus.open_bus import BusOptions
+from canbus_tools.protocol.frame import Frame
 from nodes.support.errors import CanductorError
 
 FRAMES_MAX: Final = 100_000

@@ -14,16 +14,16 @@ from typing import Any, Final, Protocol
 
 from canbus_tools.bus.computer import Computer, Port
 from canbus_tools.bus.open_bus import BusOptions
-from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, Conversation
-from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.cache import DictionaryCache
-from nodes.dictionary.parts import DictionaryError
-from nodes.support.errors import CanductorError
-from nodes.dictionary.identify import identify
-from nodes.link import Frame, LinkIO, LinkSettings, LinkStats, Response
+from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
-from nodes.node.errors import NodeLost
+from nodes.dictionary.parts import DictionaryError
+from nodes.link import Frame, LinkIO, LinkSettings, LinkStats, Response
 from nodes.link.interfaces import LinkLike
+from nodes.node.errors import NodeLost
+from nodes.node.identify import identify
+from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, Conversation
+from nodes.support.errors import CanductorError
 
 LISTEN_S: Final = 1.2
 """How long a node's id must be silent before it is talked to; hosts ask for clocks every 0.98 s."""

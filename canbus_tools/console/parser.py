@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 
 from canbus_tools.console.expressions import ExpressionError, Quantity, evaluate, names_in
 from nodes.dictionary.dictionary import Dictionary
-from nodes.support.errors import CanductorError
 from nodes.dictionary.message_format import MessageError, MessageFormat, Value
+from nodes.support.errors import CanductorError
 
 LINE_MAX: Final = 2000
 """Characters of a line."""

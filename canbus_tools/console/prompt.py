@@ -14,8 +14,8 @@ from prompt_toolkit.history import FileHistory, History, InMemoryHistory
 from prompt_toolkit.patch_stdout import patch_stdout
 from prompt_toolkit.shortcuts import print_formatted_text
 
-from canbus_tools.console.session import Quit, Session
 from canbus_tools.console.parser import complete
+from canbus_tools.console.session import Quit, Session
 from nodes.support.errors import CanductorError
 
 HISTORY_BYTES_MAX: Final = 1 << 20

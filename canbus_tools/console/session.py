@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Final
 
+from canbus_tools.bus.talk import NodeTalk
+from canbus_tools.console.expressions import Quantity, evaluate, is_name, names_in
 from canbus_tools.console.parser import (
     OWN,
     Command,
@@ -22,8 +24,6 @@ from canbus_tools.console.parser import (
     values_of,
 )
 from canbus_tools.protocol.decoded import MessageShape
-from canbus_tools.console.expressions import Quantity, evaluate, is_name, names_in
-from canbus_tools.bus.talk import NodeTalk
 from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message
 

@@ -3,11 +3,11 @@
 import argparse
 from typing import Final
 
-from canbus_tools.discovery.node_discovery import ROUNDS, Census, CensusResult
 from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.bus.talk import LISTEN_S, BusTalk
-from nodes.support.errors import CanductorError
+from canbus_tools.discovery.node_discovery import ROUNDS, Census, CensusResult
 from nodes.link import Frame
+from nodes.support.errors import CanductorError
 from nodes.support.option_values import number
 from nodes.transport.frame import BUS_OFF
 

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from canbus_tools.discovery.node_info import Facts, Firmware
 from canbus_tools.bus.open_bus import BusOptions
+from canbus_tools.discovery.node_info import Facts, Firmware
 from nodes.bus.assign import AssignError, Uuid
 from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import host_sockets

@@ -12,16 +12,17 @@ from dataclasses import replace
 from enum import Enum
 from typing import Final
 
+from canbus_tools.bus.open_bus import BusOptions
+from canbus_tools.bus.talk import DATA_IDS, LISTEN_S, BusTalk, data_ids
+from canbus_tools.discovery.ask_bus import take_census
 from canbus_tools.discovery.ask_host import ask_hosts
 from canbus_tools.discovery.node_discovery import ROUNDS, Application, CensusResult, NodeHere, WaitingNode
-from canbus_tools.discovery.ask_bus import take_census
 from canbus_tools.discovery.node_info import Facts, interview
-from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.discovery.passive_discovery import Overhearing
-from canbus_tools.bus.talk import DATA_IDS, LISTEN_S, BusTalk, data_ids
-from nodes.bus.assign import FIRST_NODEID, Uuid
-from nodes.support.errors import CanductorError
+from nodes.bus.assign import Uuid
 from nodes.link import Frame
+from nodes.support.can_protocol import FIRST_NODEID
+from nodes.support.errors import CanductorError
 from nodes.support.records import record
 
 PROBED: Final = range(FIRST_NODEID, 68)

@@ -14,10 +14,10 @@ from enum import Enum
 from typing import Final
 
 from canbus_tools.bus.talk import DATA_IDS
-from nodes.bus.assign import (
+from nodes.bus.assign import ANSWER_NS, AdminFrame, Uuid
+from nodes.support.can_protocol import (
     ADMIN_ID,
     ADMIN_RESPONSE_ID,
-    ANSWER_NS,
     NEED_NODEID,
     NODE_IS_HERE,
     QUERY_UNASSIGNED,
@@ -25,8 +25,6 @@ from nodes.bus.assign import (
     SET_NODEID_BOOTLOADER,
     UUID_SIZE,
     WHO_IS_HERE,
-    AdminFrame,
-    Uuid,
 )
 from nodes.support.records import record
 

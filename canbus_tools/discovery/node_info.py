@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Final, TypeVar
 
 from canbus_tools.bus.talk import BusTalk, NodeTalk
-from nodes.bus.assign import UUID_SIZE, Uuid
+from nodes.bus.assign import Uuid
 from nodes.dictionary.dictionary import Dictionary
-from nodes.dictionary.parts import DictionaryError
-from nodes.support.errors import CanductorError
 from nodes.dictionary.message_format import Message
+from nodes.dictionary.parts import DictionaryError
+from nodes.support.can_protocol import UUID_SIZE
+from nodes.support.errors import CanductorError
 from nodes.support.records import record
 
 T = TypeVar("T")

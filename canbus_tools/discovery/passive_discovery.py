@@ -5,14 +5,14 @@ Hosts ask their nodes for clocks, and those on CAN for their error counters, abo
 
 from typing import Final
 
+from canbus_tools.discovery.node_info import Facts, facts_of
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import DictionarySource
-from canbus_tools.bus.frame import Frame as BusFrame
-from canbus_tools.discovery.node_info import Facts, facts_of
+from canbus_tools.protocol.frame import Frame as BusFrame
 from canbus_tools.protocol.protocol import Direction
 from nodes.dictionary.cache import DictionaryCache
-from nodes.link import Frame
 from nodes.dictionary.message_format import Message
+from nodes.link import Frame
 
 _ANSWERS: Final = {"canbus_id", "config", "uptime", "canbus_status"}
 ID_MAX: Final = 0x7FF

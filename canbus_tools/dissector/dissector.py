@@ -16,20 +16,12 @@ from canbus_tools.protocol.blocks import GAP_S, NOISE_SHOWN
 from canbus_tools.protocol.decoded import quoted
 from canbus_tools.protocol.dictionaries import read_dictionary
 from canbus_tools.protocol.flow import REPEAT_S
-from canbus_tools.protocol.protocol import (
-    ADMIN_FRAMES,
-    BLOCK,
-    DATA_NODEID_MAX,
-    FIRST_DATA_ID,
-    SIGNAL_FRAMES,
-    Field,
-    FieldKind,
-    FrameFormat,
-)
+from canbus_tools.protocol.protocol import ADMIN_FRAMES, BLOCK, SIGNAL_FRAMES, Field, FieldKind, FrameFormat
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
-from nodes.dictionary.parts import OutputFormat
-from nodes.support.errors import CanductorError
 from nodes.dictionary.message_format import CODES, MessageFormat
+from nodes.dictionary.parts import OutputFormat
+from nodes.support.can_protocol import DATA_NODEID_MAX, FIRST_DATA_ID
+from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, whole
 from nodes.support.records import record
 

@@ -13,7 +13,10 @@ import can
 
 from canbus_tools.bus.bus_load import BusLoad, LoadMeter
 from canbus_tools.bus.computer import Computer, now_s
-from canbus_tools.protocol.decoder import BusDecoder
+from canbus_tools.bus.link_facts import LinkFacts, NoInterface, read_link
+from canbus_tools.bus.open_bus import BusOptions, open_bus
+from canbus_tools.bus.talk import BusTalk
+from canbus_tools.discovery.inventory import PROBED, State, SurveyResult, survey
 from canbus_tools.doctor.facts import (
     AdapterFacts,
     InterfaceFacts,
@@ -22,15 +25,12 @@ from canbus_tools.doctor.facts import (
     TrafficFacts,
     WayFacts,
 )
+from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.flow import RoundTrips
-from canbus_tools.bus.frame import Frame, FrameKind
-from canbus_tools.bus.link_facts import LinkFacts, NoInterface, read_link
-from canbus_tools.bus.open_bus import BusOptions, open_bus
-from canbus_tools.discovery.inventory import PROBED, State, SurveyResult, survey
-from canbus_tools.bus.talk import BusTalk
-from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID
-from nodes.support.errors import CanductorError
+from canbus_tools.protocol.frame import Frame, FrameKind
 from nodes.link import LinkStats
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
+from nodes.support.errors import CanductorError
 
 ASKED: Final = 100
 """Questions to each node."""

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 from typing import Final
 
+from canbus_tools.bus.link_facts import DRIVER_CAN, DRIVER_VCAN, LinkFacts
 from canbus_tools.doctor.facts import InterfaceFacts
 from canbus_tools.doctor.finding import Finding, note, problem, warning
 from canbus_tools.doctor.known_faults import faults_of
-from canbus_tools.bus.link_facts import DRIVER_CAN, DRIVER_VCAN, LinkFacts
 
 QUEUE_MIN: Final = 32
 """Frames. A host's burst to some nodes is as long; the kernel's default of 10 is too short for that."""

@@ -4,11 +4,11 @@ from collections import defaultdict
 from collections.abc import Iterator
 from typing import Final
 
+from canbus_tools.discovery.inventory import Entry, State
 from canbus_tools.doctor.facts import NodeFacts, PingFacts, Place
 from canbus_tools.doctor.finding import Finding, note, problem, warning
 from canbus_tools.doctor.traffic import RTT_SPREAD_S, slow
-from canbus_tools.discovery.inventory import Entry, State
-from nodes.bus.assign import FIRST_NODEID, LAST_NODEID
+from nodes.support.can_protocol import FIRST_NODEID, LAST_NODEID
 
 SAID_ACTIVE: Final = "active"
 LOSS_MANY: Final = 0.02

@@ -7,7 +7,7 @@ from typing import Final
 from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
-from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.protocol.frame import Frame, FrameKind
 from canbus_tools.protocol.protocol import owner_of
 from canbus_tools.protocol.traffic import NodeTraffic
 from nodes.support.records import record

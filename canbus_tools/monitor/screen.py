@@ -13,16 +13,16 @@ from textual.binding import Binding, BindingType
 from textual.containers import Vertical
 from textual.widgets import DataTable, Footer, Input, RichLog, Static
 
-from canbus_tools.monitor.bus_watch import BusRates, BusWatch
 from canbus_tools.bus.computer import Computer, Listener, now_s
+from canbus_tools.monitor.bus_watch import BusRates, BusWatch
+from canbus_tools.monitor.text import COLUMNS, bar_line, cells, log_line, read_filter
 from canbus_tools.protocol.decoded import Decoded, Kind
 from canbus_tools.protocol.filters import Filter
-from canbus_tools.monitor.text import COLUMNS, bar_line, cells, log_line, read_filter
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError
 
 if TYPE_CHECKING:
-    from canbus_tools.tools.monitor import MonitorOptions
+    from canbus_tools.monitor.options import MonitorOptions
 
 REFRESH_S: Final = 0.25
 KEPT: Final = 20_000

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from canbus_tools.protocol.decoded import Decoded
-from canbus_tools.bus.frame import Frame
+from canbus_tools.protocol.frame import Frame
 from canbus_tools.protocol.traffic import Way
 from nodes.support._wire import ffi, lib
 

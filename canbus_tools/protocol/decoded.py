@@ -8,8 +8,8 @@ from typing import Final, NamedTuple, Protocol
 
 from canbus_tools.protocol.protocol import Direction, FrameFormat
 from nodes.dictionary.dictionary import Dictionary
-from nodes.dictionary.parts import Enumeration, OutputFormat
 from nodes.dictionary.message_format import MessageFormat, Value
+from nodes.dictionary.parts import Enumeration, OutputFormat
 
 _WORD: Final = re.compile(r"[\w.+/:-]+\Z")
 

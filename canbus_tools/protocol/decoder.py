@@ -12,22 +12,15 @@ from canbus_tools.protocol import decoded as shapes
 from canbus_tools.protocol.blocks import BlockStream, Noise
 from canbus_tools.protocol.decoded import Decoded, FrameShape, Kind, MessageShape, OutputShape, Shape
 from canbus_tools.protocol.dictionaries import DictionarySource
-from canbus_tools.bus.error_frames import error_frame
+from canbus_tools.protocol.error_frames import error_frame
 from canbus_tools.protocol.flow import EMPTY_SIZE, SEQUENCE_MASK
-from canbus_tools.bus.frame import Frame, FrameKind
-from canbus_tools.protocol.protocol import (
-    ADMIN_FRAMES,
-    DATA_NODEID_MAX,
-    SIGNAL_FRAMES,
-    Direction,
-    frame_format,
-    owner_of,
-)
+from canbus_tools.protocol.frame import Frame, FrameKind
+from canbus_tools.protocol.protocol import ADMIN_FRAMES, SIGNAL_FRAMES, Direction, frame_format, owner_of
 from canbus_tools.protocol.traffic import NodeTraffic
-from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID, UUID_SIZE
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
-from nodes.dictionary.parts import OutputFormat
 from nodes.dictionary.message_format import MessageFormat, Value
+from nodes.dictionary.parts import OutputFormat
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, DATA_NODEID_MAX, UUID_SIZE
 
 AnyShape = MessageShape | OutputShape
 _FRAME_SHAPES: Final = {format_.name: FrameShape(format_) for format_ in (*ADMIN_FRAMES, *SIGNAL_FRAMES)}

@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Final
 
 from canbus_tools.protocol.guess import Guess
-from canbus_tools.protocol.protocol import DATA_NODEID_MAX, Direction
-from nodes.dictionary.dictionary import MAX_COMPRESSED_BYTES, MAX_INFLATED_BYTES, Dictionary
+from canbus_tools.protocol.protocol import Direction
 from nodes.dictionary.cache import CachedDictionary, DictionaryCache
+from nodes.dictionary.dictionary import MAX_COMPRESSED_BYTES, MAX_INFLATED_BYTES, Dictionary
 from nodes.dictionary.parts import DictionaryError
+from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import assignments, existing_file, whole
 

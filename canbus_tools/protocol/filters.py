@@ -7,7 +7,8 @@ from fnmatch import translate
 from typing import Final
 
 from canbus_tools.protocol.decoded import Decoded, Kind
-from canbus_tools.protocol.protocol import DATA_NODEID_MAX, Direction
+from canbus_tools.protocol.protocol import Direction
+from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.option_values import UsageError, whole
 
 ALL: Final = "all"

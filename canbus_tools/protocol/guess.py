@@ -12,8 +12,8 @@ from typing import Final
 
 from canbus_tools.protocol.protocol import Direction
 from nodes.dictionary.dictionary import Dictionary
-from nodes.dictionary.parts import DictionaryError
 from nodes.dictionary.message_format import Message
+from nodes.dictionary.parts import DictionaryError
 
 CLOCK_RESPONSES: Final = ("clock", "uptime")
 SPAN_MIN_S: Final = 0.2

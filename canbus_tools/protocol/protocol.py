@@ -9,18 +9,25 @@ from dataclasses import field
 from enum import Enum
 from typing import Final
 
-from nodes.bus.assign import (
+from nodes.dictionary.message_format import CONTENT_MAX
+from nodes.support.can_protocol import (
     ADMIN_ID,
     ADMIN_RESPONSE_ID,
+    BUS_STOP_ID,
+    DATA_NODEID_MAX,
+    FIRST_DATA_ID,
     NEED_NODEID,
     NODE_IS_HERE,
     QUERY_UNASSIGNED,
+    REQUEST_BOOTLOADER,
     SET_NODEID,
     SET_NODEID_BOOTLOADER,
+    SYNC_PULSE,
+    TRIGGER_GROUPS,
+    TRIGGER_ID,
     UUID_SIZE,
     WHO_IS_HERE,
 )
-from nodes.dictionary.message_format import CONTENT_MAX
 from nodes.support.records import record
 
 
@@ -36,16 +43,6 @@ class Direction(Enum):
 
 
 # -------------------------------------------------------------------------------------------------------- ids
-
-FIRST_DATA_ID: Final = 0x100
-DATA_NODEID_MAX: Final = 255
-TRIGGER_ID: Final = 0x020
-TRIGGER_GROUPS: Final = 16
-REQUEST_BOOTLOADER: Final = 0x02
-BUS_STOP_ID: Final = 0x010
-"""As in nodes.bus.can_bus; imported from there it would cost every tool that module's numpy at its start."""
-SYNC_PULSE: Final = 0x40
-"""As in nodes.clock.sync_pulse."""
 
 
 def data_id(nodeid: int, direction: Direction) -> int:

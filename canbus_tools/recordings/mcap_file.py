@@ -13,7 +13,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from canbus_tools.protocol.decoded import Decoded
-from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.protocol.frame import Frame, FrameKind
 from nodes.support.errors import CanductorError
 
 FRAMES: Final = "/can/frames"

@@ -11,9 +11,9 @@ from typing import BinaryIO, Final
 
 import can
 
+from canbus_tools.protocol.frame import Frame
 from canbus_tools.recordings import mcap_file, pcap
 from canbus_tools.recordings.candump import read_candump
-from canbus_tools.bus.frame import Frame
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import existing_file
 

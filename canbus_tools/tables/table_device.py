@@ -13,6 +13,8 @@ from typing import Final
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.link_facts import read_link
 from canbus_tools.bus.open_bus import BusOptions
+from canbus_tools.bus.talk import BusTalk, TalkError, refuse_if_in_use
+from canbus_tools.bus.uart_talk import open_uart_talk
 from canbus_tools.tables.table_nodes import (
     Said,
     TableTalk,
@@ -25,15 +27,13 @@ from canbus_tools.tables.table_nodes import (
     write_register,
 )
 from canbus_tools.tables.table_ways import Sent, send_blind
-from canbus_tools.bus.talk import BusTalk, TalkError, refuse_if_in_use
-from canbus_tools.bus.uart_talk import open_uart_talk
-from nodes.devices.table import AxleTable
-from nodes.support.errors import CanductorError
-from nodes.support.records import record
 from nodes.mt.cost import SerialCost
 from nodes.mt.device_job import DeviceJob, DeviceKind, Load
 from nodes.mt.download import Outcome, Place, Report, download
 from nodes.mt.mt import WORD_BYTES
+from nodes.mt.table import AxleTable
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 
 _VIRTUAL: Final = "virtual"
 SLOW_TRIES: Final = 3

@@ -9,19 +9,19 @@ import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Final
 
-from canbus_tools.tables.table_ways import Sent, register_cost
 from canbus_tools.bus.talk import BusTalk, NodeTalk, TalkError
-from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES
-from nodes.devices.table import CONSTANT, AxleTable, TableState
+from canbus_tools.tables.table_ways import Sent, register_cost
 from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
-from nodes.node.config import NodeConfig
-from nodes.support.records import record
 from nodes.link.interfaces import LinkLike
 from nodes.mt.device_job import Load
 from nodes.mt.download import SLOW_BITRATE
 from nodes.mt.mt import MtStatus, transmission
 from nodes.mt.pace import NS_PER_S, PacedWords
+from nodes.mt.table import CONSTANT, AxleTable, TableState
+from nodes.node.config import NodeConfig
+from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES
+from nodes.support.records import record
 
 NO_TABLE: Final = 255
 POLLS_PER_WORD: Final = 4
@@ -37,7 +37,7 @@ def loop_ns() -> int:
 
 
 class TableTalk:
-    """A node that a tool talks to, as ``nodes.devices.table.TableNode``."""
+    """A node that a tool talks to, as ``nodes.mt.table.TableNode``."""
 
     def __init__(self, talk: NodeTalk) -> None:
         self._talk = talk

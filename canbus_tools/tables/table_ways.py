@@ -13,13 +13,13 @@ import serial
 
 from canbus_tools.bus.computer import Computer, FrameLine
 from canbus_tools.bus.open_bus import BusOptions
-from nodes.support.errors import CanductorError
-from nodes.support.records import record
 from nodes.mt.cost import CanCost, RegisterCost, SerialCost, frame_bits, literals
 from nodes.mt.device_job import DeviceJob, DeviceKind, Load
 from nodes.mt.download import BURST_FRAMES, SLOW_BITRATE
 from nodes.mt.mt import WORD_BYTES, MtError, to_bytes, to_frames, transmission
 from nodes.mt.pace import NS_PER_S, PacedFrames, PacedWords
+from nodes.support.errors import CanductorError
+from nodes.support.records import record
 from nodes.transport import CanFrame
 
 SILENCE_S: Final = 0.15

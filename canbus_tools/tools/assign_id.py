@@ -6,12 +6,13 @@ from dataclasses import asdict
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
-from canbus_tools.discovery.ask_bus import declare_listen, listen_option, take_census, where
-from canbus_tools.discovery.node_info import Facts, interview
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.discovery.inventory import PROBED, State, SurveyResult, survey
 from canbus_tools.bus.talk import LISTEN_S, BusTalk
-from nodes.bus.assign import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID, AssignError, Uuid
+from canbus_tools.discovery.ask_bus import declare_listen, listen_option, take_census, where
+from canbus_tools.discovery.inventory import PROBED, State, SurveyResult, survey
+from canbus_tools.discovery.node_info import Facts, interview
+from nodes.bus.assign import AssignError, Uuid
+from nodes.support.can_protocol import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID
 from nodes.support.option_values import UsageError, whole
 from nodes.support.records import record
 

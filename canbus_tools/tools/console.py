@@ -9,11 +9,11 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
 
 from canbus_tools.bus.computer import Computer
-from canbus_tools.console.session import Quit, Session
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.discovery.inventory import survey
 from canbus_tools.bus.talk import BusTalk, NodeTalk, TalkError, refuse_if_in_use
 from canbus_tools.bus.uart_talk import open_uart_talk
+from canbus_tools.console.session import Quit, Session
+from canbus_tools.discovery.inventory import survey
 from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file, whole

@@ -9,17 +9,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, Final
 
+from canbus_tools.bus.until_stopped import StopFlag, stop_flag
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
 from canbus_tools.protocol.filters import Filter, declare_filter, given_filter
-from canbus_tools.bus.frame import Frame
+from canbus_tools.protocol.frame import Frame
 from canbus_tools.protocol.lines import line_of, printable, table_of
 from canbus_tools.recordings.mcap_file import json_of
 from canbus_tools.recordings.recordings import STANDARD_INPUT, read_batches
-from canbus_tools.bus.until_stopped import StopFlag, stop_flag
-from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.cache import DictionaryCache
+from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file
 from nodes.support.records import record

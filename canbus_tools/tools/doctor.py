@@ -5,15 +5,15 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
+from canbus_tools.bus.link_facts import LinkFacts, read_link
+from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.discovery.ask_bus import where
 from canbus_tools.doctor.facts import InterfaceFacts, NodeFacts, Place, TrafficFacts
 from canbus_tools.doctor.finding import Finding, Severity, note, problem
+from canbus_tools.doctor.gather import BusListener, ask_nodes, fill_queue, read_interface, try_bitrates
 from canbus_tools.doctor.interface import check_link, check_presence
 from canbus_tools.doctor.population import check_nodes
 from canbus_tools.doctor.traffic import check_traffic
-from canbus_tools.doctor.gather import BusListener, ask_nodes, fill_queue, read_interface, try_bitrates
-from canbus_tools.bus.link_facts import LinkFacts, read_link
-from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.support.text_table import count, paragraph
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, number

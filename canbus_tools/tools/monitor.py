@@ -8,22 +8,23 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 from canbus_tools.bus.bus_load import BITRATE_MAX, LoadMeter
-from canbus_tools.monitor.bus_watch import BusWatch
 from canbus_tools.bus.computer import Computer, Listener, now_s
+from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
+from canbus_tools.bus.talk import BusTalk, refuse_if_in_use
+from canbus_tools.bus.until_stopped import StopFlag, stop_flag
+from canbus_tools.discovery.inventory import survey
+from canbus_tools.monitor.bus_watch import BusWatch
+from canbus_tools.monitor.options import MonitorOptions
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
-from canbus_tools.protocol.filters import Filter, declare_filter, given_filter
+from canbus_tools.protocol.filters import declare_filter, given_filter
 from canbus_tools.protocol.lines import line_of
-from canbus_tools.tools.load import find_bitrate
 from canbus_tools.recordings.mcap_file import json_of
-from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.protocol.protocol import DATA_NODEID_MAX
-from canbus_tools.discovery.inventory import survey
-from canbus_tools.bus.talk import BusTalk, refuse_if_in_use
-from canbus_tools.bus.until_stopped import StopFlag, stop_flag
-from nodes.dictionary.dictionary import Dictionary
+from canbus_tools.tools.load import find_bitrate
 from nodes.dictionary.cache import DictionaryCache
+from nodes.dictionary.dictionary import Dictionary
+from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, number, whole
 from nodes.support.records import record
@@ -32,24 +33,6 @@ FETCHED: Final = "fetched from the node"
 EVERY_NODE: Final = "all"
 DURATION_MAX_S: Final = 86_400.0
 _WAIT_S: Final = 0.1
-
-
-@record(kw_only=True)
-class MonitorOptions:
-    """Which bus, and what to show of it."""
-
-    bus: BusOptions
-    bitrate: int
-    """That the load is reckoned with."""
-    bitrate_is_known: bool
-    filter_: Filter
-    filter_text: str = "none"
-    """For people."""
-    dictionaries: Mapping[int, Dictionary]
-    fetch: tuple[str, ...] = ()
-    lines: bool = True
-    as_json: bool = False
-    duration_s: float | None = None
 
 
 def declare(command: argparse.ArgumentParser) -> None:

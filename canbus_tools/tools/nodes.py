@@ -5,14 +5,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Final
 
-from canbus_tools.discovery.node_discovery import Application
 from canbus_tools.bus.computer import Computer
-from canbus_tools.discovery.ask_bus import declare_listen, listen_option, where
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.discovery.inventory import PROBED, Entry, State, SurveyResult, survey_all
-from canbus_tools.support.text_table import count, paragraph, table
 from canbus_tools.bus.talk import LISTEN_S, BusTalk
-from nodes.bus.assign import LAST_NODEID
+from canbus_tools.discovery.ask_bus import declare_listen, listen_option, where
+from canbus_tools.discovery.inventory import PROBED, Entry, State, SurveyResult, survey_all
+from canbus_tools.discovery.node_discovery import Application
+from canbus_tools.support.text_table import count, paragraph, table
+from nodes.support.can_protocol import LAST_NODEID
 from nodes.support.option_values import UsageError, whole
 from nodes.support.records import record
 

@@ -4,12 +4,12 @@ import argparse
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from canbus_tools.discovery.node_discovery import ROUNDS, Application, CensusResult, WaitingNode
 from canbus_tools.bus.computer import Computer
-from canbus_tools.discovery.ask_bus import take_census, where
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.support.text_table import count, paragraph, table
 from canbus_tools.bus.talk import BusTalk
+from canbus_tools.discovery.ask_bus import take_census, where
+from canbus_tools.discovery.node_discovery import ROUNDS, Application, CensusResult, WaitingNode
+from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.option_values import whole
 from nodes.support.records import record
 

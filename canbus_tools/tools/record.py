@@ -8,16 +8,16 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, Final, Protocol
 
-from canbus_tools.recordings.candump import candump_line
 from canbus_tools.bus.computer import Computer, Listener, now_s
-from canbus_tools.protocol.decoder import BusDecoder
-from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
-from canbus_tools.bus.frame import Frame
-from canbus_tools.recordings.mcap_file import McapWriter
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.until_stopped import StopFlag, stop_flag
-from nodes.dictionary.dictionary import Dictionary
+from canbus_tools.protocol.decoder import BusDecoder
+from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
+from canbus_tools.protocol.frame import Frame
+from canbus_tools.recordings.candump import candump_line
+from canbus_tools.recordings.mcap_file import McapWriter
 from nodes.dictionary.cache import DictionaryCache
+from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, number
 

@@ -6,15 +6,16 @@ import contextlib
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from canbus_tools.tools.assign_id import uuid_option
-from canbus_tools.discovery.node_discovery import Application, CensusResult, WaitingNode
 from canbus_tools.bus.computer import Computer
-from canbus_tools.discovery.ask_bus import declare_listen, listen_option, take_census, where
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
-from canbus_tools.tools.query import application_name
-from canbus_tools.discovery.inventory import State, survey
 from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError, in_use, refuse_if_in_use
-from nodes.bus.assign import LAST_NODEID, UUID_SIZE, AssignError, Uuid
+from canbus_tools.discovery.ask_bus import declare_listen, listen_option, take_census, where
+from canbus_tools.discovery.inventory import State, survey
+from canbus_tools.discovery.node_discovery import Application, CensusResult, WaitingNode
+from canbus_tools.tools.assign_id import uuid_option
+from canbus_tools.tools.query import application_name
+from nodes.bus.assign import AssignError, Uuid
+from nodes.support.can_protocol import LAST_NODEID, UUID_SIZE
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import whole
 from nodes.support.records import record

@@ -1,1 +1,1 @@
-"""Puts a machine together: loads a configuration whole, checks it, and prints the reference of its options."""
+"""Assembles a machine: loads a whole configuration, checks it, and prints the reference of its options."""

@@ -6,9 +6,9 @@ out, and all is read again; so nothing is told twice, and nothing that only foll
 
 from typing import Final
 
-from coordinator.config.file import ConfigFile, RawSection, parse_config
 from coordinator.assembly.load import describe
 from coordinator.config.errors import ConfigError, MissingSection
+from coordinator.config.file import ConfigFile, RawSection, parse_config
 from nodes.support.errors import CanductorError
 
 PROBLEMS_MAX: Final = 100

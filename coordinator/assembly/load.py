@@ -3,8 +3,8 @@
 import re
 from dataclasses import replace
 
+from coordinator.config.errors import ConfigError, MissingSection, Place, nearest
 from coordinator.config.file import ConfigFile, RawSection, parse_config, saved_values
-from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.model import (
     CanConnection,
     DualCarriageDescription,
@@ -21,18 +21,22 @@ from coordinator.config.model import (
     UartConnection,
 )
 from coordinator.config.pins import PinDescription
+from coordinator.config.saved import ConfigSource
+from coordinator.config.sections.extruder import (
+    limits_without_extruder,
+    read_extruder_steppers,
+    read_extruders,
+)
+from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.sections.kinematics.printer_options import PRINTER_SPECS
-from coordinator.config.errors import ConfigError, MissingSection, Place, nearest
-from coordinator.config.sections.extruder import limits_without_extruder, read_extruder_steppers, read_extruders
 from coordinator.config.sections.kinematics.select import read_frame
 from coordinator.config.sections.nodes import check_policies, make_pin_registry, read_nodes
 from coordinator.config.sections.printer import open_printer, read_printer
+from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.second_endstops import with_second_endstops
 from coordinator.config.sections.shaper import read_shapers
 from coordinator.config.sections.steppers import is_extra_stepper
 from coordinator.config.sections.tables import read_axis_tables
-from coordinator.config.sections.reading import Reading
-from coordinator.config.saved import ConfigSource
-from coordinator.config.sections.second_endstops import with_second_endstops
 from coordinator.config.unsupported import LATER_SECTIONS
 from coordinator.modules.module_set import ModuleSource, ModuleSources
 from coordinator.modules.registry import known_kinds, module_for, modules_beside, own_kinds

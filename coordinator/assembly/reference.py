@@ -8,9 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from coordinator.config.sections.kinematics import delta as read_delta, deltesian as read_deltesian, dual_carriage as read_dual, generic_cartesian as read_generic, polar as read_polar, rotary_delta as read_rotary_delta, winch as read_winch
-from coordinator.config.sections import extruder as read_extruder, nodes as read_nodes, printer as read_printer, rails as read_rails, shaper as read_shaper, tables as read_tables
 from coordinator.config.options import Option, SectionSpec
+from coordinator.config.sections import extruder as read_extruder
+from coordinator.config.sections import nodes as read_nodes
+from coordinator.config.sections import printer as read_printer
+from coordinator.config.sections import rails as read_rails
+from coordinator.config.sections import shaper as read_shaper
+from coordinator.config.sections import tables as read_tables
+from coordinator.config.sections.kinematics import delta as read_delta
+from coordinator.config.sections.kinematics import deltesian as read_deltesian
+from coordinator.config.sections.kinematics import dual_carriage as read_dual
+from coordinator.config.sections.kinematics import generic_cartesian as read_generic
+from coordinator.config.sections.kinematics import polar as read_polar
+from coordinator.config.sections.kinematics import rotary_delta as read_rotary_delta
+from coordinator.config.sections.kinematics import winch as read_winch
 from coordinator.config.sections.kinematics.printer_options import PRINTER_SPECS
 from coordinator.config.unsupported import LATER_SECTIONS
 from coordinator.modules.registry import own_beside, own_modules

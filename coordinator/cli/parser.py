@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
+from coordinator.cli.arguments.serving import declare_serving, is_asked_to_serve, read_serving
 from coordinator.support.command_options import (
     DemoOptions,
     PlanOptions,
@@ -21,7 +22,6 @@ from coordinator.support.command_options import (
     SimulateOptions,
     find_machine,
 )
-from coordinator.cli.arguments.serving import declare_serving, is_asked_to_serve, read_serving
 from nodes.support.option_values import UsageError, assignments, existing_file, share, whole
 
 if TYPE_CHECKING:

@@ -4,10 +4,10 @@ from dataclasses import replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
-from coordinator.config.pins import PinDescription
 from coordinator.config.errors import Place
+from coordinator.config.pins import PinDescription
 from coordinator.config.saved import ConfigSource
+from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
 from coordinator.modules.module_set import ModuleSources
 from coordinator.motion.specs import MotionLimits
 from nodes.support.records import record

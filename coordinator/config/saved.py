@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from coordinator.config.errors import ConfigError, shown, shown_path
 from coordinator.config.file import SAVED_HEADER, SAVED_PREFIX, parse_saved, saved_header
 from coordinator.config.text import split_lines
-from coordinator.config.errors import ConfigError, shown, shown_path
 from coordinator.support.atomic_file import write_whole
 from nodes.support.errors import CanductorError
 from nodes.support.records import record

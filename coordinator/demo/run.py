@@ -8,25 +8,25 @@ from typing import Any
 
 import numpy as np
 
+from coordinator.assembly.load import MachineDescription, StepperDescription, load_machine
+from coordinator.demo.hardware import Hardware, NodeLog
+from coordinator.demo.report import DemoReport, NodeReport
+from coordinator.gcode.program import Program
+from coordinator.motion.specs import StepperSpec
+from coordinator.runtime.host import Computer, LinuxHost
 from coordinator.runtime.machine import Machine
+from coordinator.streaming.job_runner import OnProgress, Outcome, run_job
+from coordinator.streaming.pipeline import PlanRecord
 from coordinator.support.command_options import DEMO_GCODE, DemoOptions
+from coordinator.support.interrupts import run_to_end
+from coordinator.support.progress import ProgressDisplay
 from coordinator.verification.exact_program import program_legs
 from coordinator.verification.expected import ExpectedSteps, expected_steps
 from coordinator.verification.expected_curved import expected_curved
-from coordinator.demo.hardware import Hardware, NodeLog
 from coordinator.verification.heat_proof import HeatProof, HeatWatch, not_steady, prove_heat
 from coordinator.verification.proof import ClockProof, PrimaryClock, StepperProof, prove_clock, prove_stepper
-from coordinator.demo.report import DemoReport, NodeReport
-from coordinator.virtual_machine.stage import Stage
 from coordinator.verification.true_position import PlaceProof, prove_places
-from coordinator.gcode.program import Program
-from coordinator.runtime.host import Computer, LinuxHost
-from coordinator.support.interrupts import run_to_end
-from coordinator.assembly.load import MachineDescription, StepperDescription, load_machine
-from coordinator.motion.specs import StepperSpec
-from coordinator.streaming.pipeline import PlanRecord
-from coordinator.support.progress import ProgressDisplay
-from coordinator.streaming.job_runner import OnProgress, Outcome, run_job
+from coordinator.virtual_machine.stage import Stage
 from nodes.virtual.firmware import firmware_dictionary
 
 BEFORE_S = 1e-3

@@ -5,11 +5,11 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from coordinator.support.command_options import DEMO_GCODE, DemoOptions, ServeOptions
-from coordinator.virtual_machine.stage import Stage
 from coordinator.assembly.load import MachineDescription, load_machine
 from coordinator.modules.programs.virtual_sdcard import VirtualSdcard
 from coordinator.service.core.serve import ServeReport, serve
+from coordinator.support.command_options import DEMO_GCODE, DemoOptions, ServeOptions
+from coordinator.virtual_machine.stage import Stage
 
 
 def serve_demo(options: DemoOptions) -> ServeReport:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Final, Protocol
 
-from coordinator.dnc.blocks import INPUT, OUTPUT, Header
 from coordinator.cli.commands.dnc import DncJob
-from coordinator.dnc.endpoint import Desk, FileSource, Library, Outcome, Sink, Source, Take
+from coordinator.dnc.blocks import INPUT, OUTPUT, Header
 from coordinator.dnc.driver import Driver, Line
+from coordinator.dnc.endpoint import Desk, FileSource, Library, Outcome, Sink, Source, Take
 from coordinator.dnc.engine import Engine
 from coordinator.dnc.feeds import SlowSource
 from coordinator.dnc.files import Check, Entry, Folder, check_lines, check_name
@@ -286,8 +286,8 @@ def _open_stream(file: Path, stack: contextlib.ExitStack, around: Surroundings) 
 
 
 def _drip_to_machine(job: DncJob, around: Surroundings) -> DncReport:
-    from coordinator.dnc.machine import MachineSink  # noqa: PLC0415 (others do without)
     from coordinator.cli.commands.front_ends import tls_of  # noqa: PLC0415 (likewise)
+    from coordinator.dnc.machine import MachineSink  # noqa: PLC0415 (others do without)
     from coordinator.ipc.client.blocking import BlockingClient  # noqa: PLC0415 (likewise)
 
     at = job.machine

@@ -5,8 +5,8 @@ from typing import Final
 
 from coordinator.dnc import events
 from coordinator.dnc.blocks import ACK, EOT, ETX, OUTPUT, SOH, Header, write_block
-from coordinator.dnc.options import DncOptions
 from coordinator.dnc.lexer import Scanner
+from coordinator.dnc.options import DncOptions
 
 ERROR_TEXT_MAX: Final = 32
 """Characters of an error's text: more, old controls do not show."""

@@ -17,8 +17,8 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import field, replace
 from typing import TYPE_CHECKING
 
-from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.gcode.parser import Command
+from coordinator.gcode.reply_kinds import ReplyKind
 from nodes.support.records import record
 
 if TYPE_CHECKING:

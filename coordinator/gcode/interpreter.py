@@ -9,8 +9,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 
-from coordinator.gcode.builtins import basic as basic_commands, machine as machine_commands
 from coordinator.gcode.absent_commands import ABSENT
+from coordinator.gcode.builtins import basic as basic_commands
+from coordinator.gcode.builtins import machine as machine_commands
 from coordinator.gcode.commands import (
     NO_WORDS,
     AtOnce,
@@ -37,12 +38,12 @@ from coordinator.gcode.events import (
     Resting,
     Timed,
 )
-from coordinator.gcode.status import gcode_figures
 from coordinator.gcode.machine_state import MachineState
+from coordinator.gcode.parser import Command, WordError, parse, quoted
 from coordinator.gcode.print_control import PrintControl
 from coordinator.gcode.program import Program
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.gcode.parser import Command, WordError, parse, quoted
+from coordinator.gcode.status import gcode_figures
 from coordinator.motion.planner.language import READ_IN_C
 from coordinator.motion.planner.planner import Feed, FeedStatus, Planner
 from nodes.support.records import record

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.cli.parser import version
 from coordinator.gcode.commands import AtOnce, Call
-from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.gcode.parser import WordError, parse
+from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.klippy_api.client import REMOTE_METHODS_MAX, Client
 from coordinator.klippy_api.params import RequestError, template_of, text_of, wishes_of
 from coordinator.klippy_api.status import StatusBuilder, state_of
@@ -19,9 +19,9 @@ from coordinator.klippy_api.subscription import Subscription, pick
 from coordinator.klippy_api.wire import Request
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.programs.pause_resume import PauseResume
-from coordinator.streaming.move_source import Told
 from coordinator.service.api.motion import RESTARTS, run_script
 from coordinator.service.core.work import LINES_MAX
+from coordinator.streaming.move_source import Told
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from coordinator.service.core.machine_service import ServiceState
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.service.state.log_ring import Entry
     from coordinator.service.core.machine_service import MachineService
+    from coordinator.service.state.log_ring import Entry
 
 UPDATE_S: Final = 0.25
 """Between two updates of what clients watch."""

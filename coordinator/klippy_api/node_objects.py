@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from coordinator.runtime.machine import link_of
-from nodes.support.errors import CanductorError
 from nodes.node.load import STATS_INTERVAL_S
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.runtime.machine import Machine

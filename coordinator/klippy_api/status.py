@@ -9,9 +9,9 @@ from coordinator.klippy_api.motion_objects import motion_objects, resting_object
 from coordinator.klippy_api.node_objects import firmware_of, node_objects
 from coordinator.klippy_api.subscription import Status
 from coordinator.modules.base import Module
-from coordinator.modules.status.config_view import ConfigView
-from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.programs.gcode_macro import GCodeMacro
+from coordinator.modules.status.config_view import ConfigView
 from coordinator.modules.status.machine_view import available_kb
 from coordinator.modules.status.print_stats import NOTHING
 from coordinator.service.core.machine_service import ServiceState

@@ -6,31 +6,31 @@ from collections.abc import Set as AbstractSet
 from dataclasses import field
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from coordinator.gcode.absent_commands import ABSENT
-from coordinator.gcode.builtins.basic import BESIDE, HANDLERS
-from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
-from coordinator.gcode.builtins.command_help import HELPS
+from coordinator.config.errors import ConfigError, NotActing, Place
 from coordinator.config.file import RawSection
 from coordinator.config.pins import PinRegistry
-from coordinator.config.errors import ConfigError, NotActing, Place
 from coordinator.config.unsupported import LATER_SECTIONS
+from coordinator.gcode.absent_commands import ABSENT
+from coordinator.gcode.builtins.basic import BESIDE, HANDLERS
+from coordinator.gcode.builtins.command_help import HELPS
+from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
 from coordinator.modules.base import Build, Device, Module, Value
-from coordinator.modules.status.console import Console
-from coordinator.modules.homing.homing import Homing
-from coordinator.modules.programs.idle_timeout import IdleTimeout
-from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.drivers.motor_power import MotorPower
-from coordinator.modules.status.positions import Positions
-from coordinator.modules.programs.save_config import SaveConfig
 from coordinator.modules.drivers.stepper_buzz import StepperBuzz
-from nodes.support.errors import CanductorError
+from coordinator.modules.homing.homing import Homing
+from coordinator.modules.probes.manual_probe import ManualProbe
+from coordinator.modules.programs.idle_timeout import IdleTimeout
+from coordinator.modules.programs.save_config import SaveConfig
+from coordinator.modules.status.console import Console
+from coordinator.modules.status.positions import Positions
 from nodes.node.config import NodeConfig
+from nodes.support.errors import CanductorError
 from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.config.model import MachineDescription
-    from coordinator.runtime.module_context import Live
     from coordinator.motion.planner.planner import Planner
+    from coordinator.runtime.module_context import Live
     from nodes.node.node import Node
 
 M = TypeVar("M", bound=Module)

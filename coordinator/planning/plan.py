@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from coordinator.support.command_options import PlanOptions
+from coordinator.assembly.load import MachineDescription, load_machine
 from coordinator.gcode.events import (
     Emergency,
     End,
@@ -19,15 +19,15 @@ from coordinator.gcode.events import (
 )
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
-from coordinator.assembly.load import MachineDescription, load_machine
-from coordinator.runtime.devices import MachineDevices, stream_specs
 from coordinator.motion.planner.planner import Planner
 from coordinator.motion.steps.steps import StepError, StepGenerator
-from coordinator.streaming.pipeline import Pipeline
 from coordinator.planning.figures import PlanFigures
 from coordinator.planning.report import PlanReport
 from coordinator.planning.summary import Made, watched_nodes, write_files
+from coordinator.runtime.devices import MachineDevices, stream_specs
+from coordinator.streaming.pipeline import Pipeline
 from coordinator.streaming.program_machine import machine_state
+from coordinator.support.command_options import PlanOptions
 from coordinator.support.progress import Progress as Shown
 from coordinator.support.progress import ProgressDisplay
 from nodes.dictionary.dictionary import Dictionary

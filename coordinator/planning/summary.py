@@ -6,10 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coordinator.support.command_options import PlanOptions
 from coordinator.assembly.load import CanConnection, MachineDescription
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
-from coordinator.streaming.pipeline import Pipeline
 from coordinator.planning.figures import Bus, Peak, PlanFigures, WatchedNode
 from coordinator.planning.report import AxisReport, BusReport, NodeReport, PlanReport, StepperReport, Timeline
 from coordinator.planning.warnings import (
@@ -20,6 +18,8 @@ from coordinator.planning.warnings import (
     slowed_warnings,
     step_rate_warnings,
 )
+from coordinator.streaming.pipeline import Pipeline
+from coordinator.support.command_options import PlanOptions
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
 

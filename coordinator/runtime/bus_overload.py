@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from nodes.clock.clock import HostTime
-from nodes.support.errors import CanductorError
 from nodes.link import Forecast
+from nodes.support.errors import CanductorError
 
 PERSISTS_S: Final = 0.15
 """A forecast counts when it has stood so long: one of a moment of other traffic passes."""

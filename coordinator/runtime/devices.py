@@ -16,8 +16,8 @@ from nodes.devices.endstop import Endstop
 from nodes.devices.stepper import Stepper
 from nodes.devices.trsync import Trsync
 from nodes.dictionary.dictionary import Dictionary
-from nodes.node.config import NodeConfig
 from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
+from nodes.node.config import NodeConfig
 
 if TYPE_CHECKING:
     from coordinator.tables.axle_map import StepperTables

@@ -7,9 +7,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from coordinator.streaming.filament_forecast import FilamentForecast
-from coordinator.runtime.host import Host
-from coordinator.runtime.bus_overload import LoadWatch
 from coordinator.assembly.load import (
     CanConnection,
     MachineDescription,
@@ -17,25 +14,28 @@ from coordinator.assembly.load import (
     NodePolicy,
     UartConnection,
 )
-from coordinator.config.sections.nodes import check_distinct
 from coordinator.config.saved import PendingConfig
-from coordinator.runtime.devices import MachineDevices, stream_specs
-from coordinator.runtime.module_context import Live
+from coordinator.config.sections.nodes import check_distinct
 from coordinator.motion.specs import NodeStreamSpec
+from coordinator.runtime.bus_overload import LoadWatch
+from coordinator.runtime.devices import MachineDevices, stream_specs
+from coordinator.runtime.host import Host
+from coordinator.runtime.module_context import Live
 from coordinator.runtime.node_recovery import JobGate, NodeCare
 from coordinator.runtime.stepper_positions import RailPlaces
 from coordinator.runtime.timebase import ClockMap, TimeBase
 from coordinator.runtime.wire import Wire
+from coordinator.streaming.filament_forecast import FilamentForecast
 from nodes.bus.assign import Uuid
 from nodes.bus.bus import UartBus
 from nodes.bus.can_bus import CanBus
-from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.cache import DictionaryCache
-from nodes.support.errors import CanductorError
+from nodes.dictionary.dictionary import Dictionary
 from nodes.link import IOStats, Link
-from nodes.node.node import Node
 from nodes.node.config import NodeConfig
+from nodes.node.node import Node
 from nodes.node.states import NodeState
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_runner import Runner

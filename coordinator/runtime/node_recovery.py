@@ -6,9 +6,9 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Final, Protocol
 
 from coordinator.assembly.load import NodePolicy
-from nodes.support.errors import CanductorError
 from nodes.node.node import Node
 from nodes.node.states import NodeState
+from nodes.support.errors import CanductorError
 
 FIRST_TRY_S: Final = 0.5
 """From the loss of a node to the first try to bring it back; doubled after each."""

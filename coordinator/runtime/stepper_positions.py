@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
+from coordinator.assembly.load import MachineDescription, StepperDescription
 from coordinator.kinematics.base import Point, Weights
 from coordinator.kinematics.dual_carriage import CarriageState
-from coordinator.assembly.load import MachineDescription, StepperDescription
 from coordinator.motion.planner.planner import Position
 from coordinator.motion.specs import StepKinematics
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.clock.clock import HostTime, Ticks
-from nodes.support.errors import CanductorError
 from nodes.clock.estimated_clock import EstimatedClock
 from nodes.clock.sync_pulse import PulseClock
+from nodes.support.errors import CanductorError
 
 STEER_HORIZON_S = 1.0
 """A difference to the estimate is worked off over this long: shorter follows faster, longer is smoother.

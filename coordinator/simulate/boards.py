@@ -11,8 +11,8 @@ from coordinator.simulate.scenario import NodeSetting
 from coordinator.simulate.script import ScriptedWorld
 from coordinator.simulate.truth import BoardTruth
 from coordinator.simulate.values import Dice
-from nodes.support._wire import ffi, lib
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
+from nodes.support._wire import ffi, lib
 from nodes.virtual.sim import SimNode
 from nodes.virtual.world import CanWire, Latency, NodeSettings, Uart, WorldNode
 

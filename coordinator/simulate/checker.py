@@ -1,9 +1,9 @@
 """The checker: what the nodes' pins did in truth, against the plan; independent of the code under test.
 
-Expected steps come from numpy over the planner's trapezoids (`coordinator.verification.expected`), executed ones from
-the pins of the simulated boards with the simulation's true time. Neither the step generator, nor links, nor
-clock estimates take part. Steps are paired in order, so one that is doubled, lost or reversed shows as a
-difference in number, direction or time.
+Expected steps come from numpy over the planner's trapezoids (`coordinator.verification.expected`),
+executed ones from the pins of the simulated boards with the simulation's true time. Neither the step
+generator, nor links, nor clock estimates take part. Steps are paired in order, so one that is doubled, lost
+or reversed shows as a difference in number, direction or time.
 """
 
 import re

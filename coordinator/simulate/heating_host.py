@@ -3,11 +3,11 @@
 import asyncio
 import sys
 
-from coordinator.runtime.machine import Machine
+from coordinator.assembly.load import load_machine
 from coordinator.gcode.commands import Call, InTime
 from coordinator.gcode.parser import parse
 from coordinator.runtime.host import LinuxHost
-from coordinator.assembly.load import load_machine
+from coordinator.runtime.machine import Machine
 
 
 async def main(path: str, celsius: float) -> None:

@@ -16,16 +16,16 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.runtime.machine import Machine
-from coordinator.virtual_machine.plant import AXES, PlantSettings, machine_plants
-from coordinator.runtime.moves.homing import CYCLE_S, HomingMove
-from coordinator.runtime.host import Host, LinuxHost
 from coordinator.assembly.load import MachineDescription, RailDescription, load_machine
-from coordinator.virtual_machine.real_nodes import CONFIG, real_nodes
+from coordinator.runtime.host import Host, LinuxHost
+from coordinator.runtime.machine import Machine
+from coordinator.runtime.moves.homing import CYCLE_S, HomingMove
+from coordinator.runtime.moves.single import Ramp, SingleMove, ratio_of
 from coordinator.simulate.scenario import BusSetting, Scenario
 from coordinator.simulate.stage import Stage
 from coordinator.simulate.values import Dice, Range
-from coordinator.runtime.moves.single import Ramp, SingleMove, ratio_of
+from coordinator.virtual_machine.plant import AXES, PlantSettings, machine_plants
+from coordinator.virtual_machine.real_nodes import CONFIG, real_nodes
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
 from nodes.virtual.plant_page import PlantPage

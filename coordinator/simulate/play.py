@@ -7,11 +7,9 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from coordinator.runtime.machine import Machine, link_of
-from coordinator.gcode.program import Program
 from coordinator.assembly.load import StepperDescription
-from coordinator.streaming.pipeline import PlanRecord
-from coordinator.streaming.job_runner import Outcome, run_job
+from coordinator.gcode.program import Program
+from coordinator.runtime.machine import Machine, link_of
 from coordinator.simulate import checker, truth
 from coordinator.simulate.checker import Ending, OutputTruth, QueueDepth, StepperTruth, Violation
 from coordinator.simulate.program import make_program
@@ -19,8 +17,10 @@ from coordinator.simulate.result import Result
 from coordinator.simulate.scenario import OutputSetting, Scenario
 from coordinator.simulate.stage import Stage
 from coordinator.simulate.values import ScenarioError
-from nodes.support.errors import CanductorError
+from coordinator.streaming.job_runner import Outcome, run_job
+from coordinator.streaming.pipeline import PlanRecord
 from nodes.link import Link
+from nodes.support.errors import CanductorError
 
 LIMIT_S: Final = 90.0
 """Simulated time after which a run hangs."""

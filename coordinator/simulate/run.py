@@ -12,13 +12,13 @@ from contextlib import contextmanager
 from itertools import islice
 from typing import Any, Final
 
-from coordinator.support.command_options import Report, SimulateOptions
-from coordinator.support.progress import Progress, ProgressDisplay
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.checker import Violation
 from coordinator.simulate.result import Result, ScenarioList, SimulationReport
 from coordinator.simulate.scenario import Scenario
 from coordinator.simulate.values import ScenarioError
+from coordinator.support.command_options import Report, SimulateOptions
+from coordinator.support.progress import Progress, ProgressDisplay
 from nodes.support.errors import CanductorError
 
 SEED_LIMIT_S: Final = 120.0

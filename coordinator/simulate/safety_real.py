@@ -15,9 +15,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
-from coordinator.virtual_machine.real_nodes import CONFIG, real_nodes
 from coordinator.simulate.safety_rig import HEATERS, MACHINE
 from coordinator.simulate.safety_row import MAX_DURATION_S, Row
+from coordinator.virtual_machine.real_nodes import CONFIG, real_nodes
 from nodes.support.errors import CanductorError
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import firmware_dictionary

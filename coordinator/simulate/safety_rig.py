@@ -12,13 +12,13 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.runtime.machine import Machine, MachineStopped
-from coordinator.virtual_machine.plant import PlantSettings, machine_plants
-from coordinator.virtual_machine.plant_heat import HeatSettings
 from coordinator.gcode.program import Program
-from coordinator.streaming.job_runner import run_job
+from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.simulate.scenario import Scenario
 from coordinator.simulate.stage import Stage
+from coordinator.streaming.job_runner import run_job
+from coordinator.virtual_machine.plant import PlantSettings, machine_plants
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
 from nodes.virtual.plant_page import Fault, Kind

@@ -7,9 +7,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from coordinator.verification.expected import Floats, Ints
-from coordinator.virtual_machine.plant import PlantSettings, machine_plants
-from coordinator.runtime.host import Port as HostPort
 from coordinator.assembly.load import (
     CanConnection,
     MachineDescription,
@@ -17,6 +14,7 @@ from coordinator.assembly.load import (
     UartConnection,
     load_machine,
 )
+from coordinator.runtime.host import Port as HostPort
 from coordinator.simulate.actor import SimActor, bit_errors
 from coordinator.simulate.boards import PS_PER_NS, Board
 from coordinator.simulate.checker import QueueDepth
@@ -25,6 +23,8 @@ from coordinator.simulate.scenario import BusSetting, NodeSetting, Scenario
 from coordinator.simulate.script import ScriptedWorld
 from coordinator.simulate.truth import BoardTruth
 from coordinator.simulate.values import Dice, ScenarioError
+from coordinator.verification.expected import Floats, Ints
+from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from nodes.clock.clock import HostTime
 from nodes.link import LinkIO
 from nodes.link.interfaces import LinkIOLike, OnFrame, OnLost

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.verification.expected import ExpectedSteps, Ints, expected_steps
 from coordinator.assembly.load import StepperDescription
-from coordinator.streaming.pipeline import PlanRecord
 from coordinator.simulate.checker import ExecutedSteps, concatenate
+from coordinator.streaming.pipeline import PlanRecord
+from coordinator.verification.expected import ExpectedSteps, Ints, expected_steps
 from nodes.virtual.edge_log import steps_of
 
 

@@ -1,1 +1,1 @@
-"""From a program to the nodes in real time: pipeline, worker thread, streamer, timed events, standstill tasks."""
+"""From a program to the nodes in real time: pipeline, worker thread, streamer, events, standstill tasks."""

@@ -4,24 +4,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from coordinator.runtime.machine import Machine, MachineStopped, link_of
+from coordinator.assembly.load import MachineDescription
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import Notice
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
-from coordinator.runtime.host import Host, LinuxHost
-from coordinator.assembly.load import MachineDescription
 from coordinator.motion.planner.planner import Planner
+from coordinator.runtime.host import Host, LinuxHost
+from coordinator.runtime.machine import Machine, MachineStopped, link_of
+from coordinator.runtime.timebase import ClockMap
 from coordinator.streaming.move_source import JobState, Told
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.program_machine import machine_state
-from coordinator.support.progress import NodeFigures, Progress
 from coordinator.streaming.streamer import Streamer
-from coordinator.runtime.timebase import ClockMap
+from coordinator.support.progress import NodeFigures, Progress
 from nodes.dictionary.cache import DictionaryCache
-from nodes.support.errors import CanductorError
 from nodes.link import LinkStats
 from nodes.node.states import NodeState
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.streaming.compensation import Compensation

@@ -1,8 +1,8 @@
 """From the configured machine to what a program may change of it."""
 
+from coordinator.assembly.load import MachineDescription
 from coordinator.gcode.machine_state import Extruder, MachineState, Shaper
 from coordinator.kinematics.extruder import ExtruderMotion
-from coordinator.assembly.load import MachineDescription
 
 
 def machine_state(description: MachineDescription) -> MachineState:

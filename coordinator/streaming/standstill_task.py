@@ -3,9 +3,9 @@
 import asyncio
 import contextlib
 
-from coordinator.runtime.machine import MachineStopped
 from coordinator.gcode.commands import Done
 from coordinator.gcode.events import Resting
+from coordinator.runtime.machine import MachineStopped
 from nodes.support.errors import CanductorError
 
 

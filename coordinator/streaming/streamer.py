@@ -9,14 +9,14 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final
 
-from coordinator.runtime.machine import Machine, MachineStopped, link_of
-from coordinator.streaming.timed_events import Due, DueEvents
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import Emergency, End, Event, Notice, Resting
-from coordinator.streaming.worker import START_LEAD_S, Cycle, MotionWorker
+from coordinator.runtime.machine import Machine, MachineStopped, link_of
 from coordinator.streaming.move_source import JobState, MoveSource, Planned, Told, Witness
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.standstill_task import RestTask
+from coordinator.streaming.timed_events import Due, DueEvents
+from coordinator.streaming.worker import START_LEAD_S, Cycle, MotionWorker
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:

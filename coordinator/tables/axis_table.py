@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from enum import StrEnum
 from typing import Final
 
+from nodes.mt.mt import VALUES, Pair
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
-from nodes.mt.mt import VALUES, Pair
 
 X_PER_UNIT: Final = 10_000
 """MT's X: 100 nm, or 0.0001 degrees."""

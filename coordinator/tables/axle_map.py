@@ -8,10 +8,10 @@ from typing import Final
 from coordinator.config.model import MachineDescription
 from coordinator.tables.axis_table import Direction
 from nodes.devices.stepper import Stepper
-from nodes.devices.table import CONSTANT, AxleTable
+from nodes.mt.mt import AXLES
+from nodes.mt.table import CONSTANT, AxleTable
 from nodes.node.config import NodeConfig
 from nodes.support.records import record
-from nodes.mt.mt import AXLES
 
 STEPPERS_MAX: Final = len(AXLES) // 2
 

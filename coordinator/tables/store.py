@@ -5,8 +5,8 @@ import re
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.tables.axis_table import AxisTable, TableError, Unit
 from coordinator.support.atomic_file import write_whole
+from coordinator.tables.axis_table import AxisTable, TableError, Unit
 from nodes.support.state_folder import state_folder
 
 _AXIS: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", re.ASCII)

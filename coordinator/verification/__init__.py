@@ -1,1 +1,1 @@
-"""The oracles: independent evaluation of a plan, shared by demo, simulation and tests. Nothing of the engine."""
+"""The oracles: independent evaluation of a plan for demo, simulation and tests; no code of the engine."""

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.verification.exact_signal import REST_S, Floats, Phases, Shaped, Signal, Smoothed
 from coordinator.motion.specs import StepKinematics, StepperSpec
+from coordinator.verification.exact_signal import REST_S, Floats, Phases, Shaped, Signal, Smoothed
 
 Ints = NDArray[np.int64]
 Impulses = tuple[tuple[float, float], ...]

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from coordinator.verification.exact_path import Leg, Setting
-from coordinator.verification.exact_shapers import impulses
 from coordinator.motion.specs import StepperSpec
 from coordinator.streaming.pipeline import Acting, Stretch
+from coordinator.verification.exact_path import Leg, Setting
+from coordinator.verification.exact_shapers import impulses
 
 
 def program_legs(spec: StepperSpec, stretches: Sequence[Stretch]) -> list[Leg]:

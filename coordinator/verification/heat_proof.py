@@ -10,16 +10,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from coordinator.virtual_machine.plant_heat import plant_word
 from coordinator.heat.controller import NEAR_K
 from coordinator.heat.holding import SETTLING_S, Held
 from coordinator.modules.heaters.heaters import Heaters
+from coordinator.virtual_machine.plant_heat import plant_word
 from nodes.support.records import record
 from nodes.virtual.plant_log import PlantEvent
 
 if TYPE_CHECKING:
-    from coordinator.runtime.machine import Machine
     from coordinator.modules.heaters.heater import HeaterUnit
+    from coordinator.runtime.machine import Machine
 
 AROUND_NS: Final = 100_000_000
 """How far beside its steady state the truth is looked at: the log tells it every 50 ms."""

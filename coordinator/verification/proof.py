@@ -1,8 +1,8 @@
 """The proof: what every stepper's pins did, against an independent evaluation of the plan.
 
 Executed steps come from the log of pin levels that each virtual node kept, with the node's true clock;
-expected ones from numpy (`coordinator.verification.expected`). Steps are paired in order, so a lost, doubled or
-reversed step shows as a difference in number, direction or time.
+expected ones from numpy (`coordinator.verification.expected`). Steps are paired in order, so a lost, doubled
+or reversed step shows as a difference in number, direction or time.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.verification.expected import ExpectedSteps, Floats
 from coordinator.runtime.timebase import ClockMap
+from coordinator.verification.expected import ExpectedSteps, Floats
 
 EDGE_TOLERANCE_S = 25e-6
 """No step may be further than this from its planned time, clock error apart."""

@@ -10,12 +10,12 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat
-from coordinator.virtual_machine.plant_tmc import machine_drivers
-from coordinator.kinematics.base import Point
 from coordinator.assembly.load import MachineDescription, RailDescription, StepperDescription
 from coordinator.config.model import SECOND_CARRIAGE
+from coordinator.kinematics.base import Point
 from coordinator.motion.specs import StepKinematics
+from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat
+from coordinator.virtual_machine.plant_tmc import machine_drivers
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
 from nodes.virtual.plant import Axis, NodePlant, Stepper, Switch, Term

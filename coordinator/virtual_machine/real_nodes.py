@@ -5,9 +5,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
-from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from coordinator.assembly.load import CanConnection, load_machine
 from coordinator.simulate.values import Dice
+from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from nodes.virtual.hub import VirtualBus
 from nodes.virtual.plant_page import PlantPage
 from nodes.virtual.processes import NodeProcess

@@ -10,15 +10,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from coordinator.support.command_options import DemoOptions
-from coordinator.virtual_machine.plant import PlantSettings, machine_plants, start_point
-from coordinator.virtual_machine.plant_heat import HeatSettings
 from coordinator.assembly.load import (
     CanConnection,
     MachineDescription,
     NodeDescription,
     UartConnection,
 )
+from coordinator.support.command_options import DemoOptions
+from coordinator.virtual_machine.plant import PlantSettings, machine_plants, start_point
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.support.errors import CanductorError
 from nodes.transport.socketcan import SocketCanTransport
 from nodes.virtual.edge_log import EdgeLog

@@ -14,8 +14,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from coordinator.ipc.server.auth import digest_of
 from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.auth import digest_of
 
 LINK_S: Final = 600.0
 """For so long a link can be used."""

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from aiohttp import WSMsgType, web
 
-from coordinator.ipc.server.auth import Grant, digest_of
-from coordinator.ipc.server.tcp_listener import Door
-from coordinator.ipc.protocol.methods import ApiError, Scope
-from coordinator.ipc.server.server import Adopted, IpcServer, tls_context
 from coordinator.ipc.protocol.messages import Fault
+from coordinator.ipc.protocol.methods import ApiError, Scope
+from coordinator.ipc.server.auth import Grant, digest_of
+from coordinator.ipc.server.server import Adopted, IpcServer, tls_context
+from coordinator.ipc.server.tcp_listener import Door
 from coordinator.web.access import LINK_S, SESSION_S, PageAccess, PageSession, is_key_of
 from coordinator.web.files import PageFile, page_files
 from coordinator.web.names import is_known_host, is_own_origin

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.ipc.protocol.methods import Scope
-from coordinator.web.access import SESSIONS_MAX, PageSession
 from coordinator.support.atomic_file import write_whole
+from coordinator.web.access import SESSIONS_MAX, PageSession
 from nodes.support.errors import CanductorError
 from nodes.support.secret_file import read_secret
 

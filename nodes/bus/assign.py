@@ -18,19 +18,20 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
+from nodes.support.can_protocol import (
+    ADMIN_ID,
+    ADMIN_RESPONSE_ID,
+    FIRST_NODEID,
+    LAST_NODEID,
+    NEED_NODEID,
+    NODE_IS_HERE,
+    QUERY_UNASSIGNED,
+    SET_NODEID,
+    SET_NODEID_BOOTLOADER,
+    UUID_SIZE,
+    WHO_IS_HERE,
+)
 from nodes.support.errors import CanductorError
-
-ADMIN_ID: Final = 0x3F0
-ADMIN_RESPONSE_ID: Final = 0x3F1
-QUERY_UNASSIGNED: Final = 0x00
-SET_NODEID: Final = 0x01
-SET_NODEID_BOOTLOADER: Final = 0x11
-NEED_NODEID: Final = 0x20
-NODE_IS_HERE: Final = 0x21
-WHO_IS_HERE: Final = 0x41
-UUID_SIZE: Final = 6
-FIRST_NODEID: Final = 4
-LAST_NODEID: Final = 255
 
 ROUND_NS: Final = 20_000_000
 """Time for the answers of one round; nodes answer within a few milliseconds."""

@@ -5,19 +5,12 @@ from collections.abc import Callable
 from typing import Final
 
 from nodes.dictionary.cache import DictionaryCache
-from nodes.support.errors import CanductorError
 from nodes.link import LinkSettings
-from nodes.node.node import Node, OnClock, OnState
+from nodes.link.interfaces import FrameLike, IoFactory, LinkIOLike, LinkLike, OnLost, OnResponses
+from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeLost
-from nodes.link.interfaces import (
-    BuildConfig,
-    FrameLike,
-    IoFactory,
-    LinkIOLike,
-    LinkLike,
-    OnLost,
-    OnResponses,
-)
+from nodes.node.node import Node, OnClock, OnState
+from nodes.support.errors import CanductorError
 
 LOST_AFTER_S: Final = 1.0
 

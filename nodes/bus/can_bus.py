@@ -5,34 +5,25 @@ import contextlib
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from nodes.bus.assign import (
-    ADMIN_ID,
-    ADMIN_RESPONSE_ID,
-    QUERY_UNASSIGNED,
-    Assignment,
-    IdAssignment,
-    Uuid,
-    number_nodes,
-    waiting_uuid,
-)
+from nodes.bus.assign import Assignment, IdAssignment, Uuid, number_nodes, waiting_uuid
 from nodes.bus.bus import LOST_AFTER_S, BusBase, ignore
 from nodes.clock.clock import HostTime
-from nodes.dictionary.cache import DictionaryCache
-from nodes.support.errors import CanductorError
-from nodes.link import LinkSettings
-from nodes.node.node import Node, OnClock, OnState
-from nodes.node.errors import NodeError, NodeLost
-from nodes.node.states import NodeState
-from nodes.link.interfaces import BuildConfig, FrameLike, IoFactory, LinkLike, OnLost, OnResponses
 from nodes.clock.sync_pulse import CONSTANT, PulseKeeper
-from nodes.transport.frame import BUS_OFF
-from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
 from nodes.clock.wire_time import can_wire_ns
+from nodes.dictionary.cache import DictionaryCache
+from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
+from nodes.link import LinkSettings
+from nodes.link.interfaces import FrameLike, IoFactory, LinkLike, OnLost, OnResponses
+from nodes.node.connector import BuildConfig
+from nodes.node.errors import NodeError, NodeLost
+from nodes.node.node import Node, OnClock, OnState
+from nodes.node.states import NodeState
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, BUS_STOP_ID, QUERY_UNASSIGNED
+from nodes.support.errors import CanductorError
+from nodes.transport.frame import BUS_OFF
 
 SUSPECT_INTERVAL_S: Final = 0.1
 """The bus is asked at most that often who waits for an id."""
-BUS_STOP_ID: Final = 0x010
-"""Frame ``<reason> <node id of the origin>``: every node of this project's firmware shuts down at once."""
 BUS_STOP_FRAMES: Final = 3
 """Nobody acknowledges it, and a bus that has to be stopped may be one that loses frames."""
 

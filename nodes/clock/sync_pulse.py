@@ -13,14 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from nodes.bus.assign import ADMIN_ID
 from nodes.clock.clock import HostTime, Ticks, extend32
-from nodes.support.errors import CanductorError
 from nodes.clock.estimated_clock import EstimatedClock
-from nodes.dictionary.message_format import Message
 from nodes.clock.pulse_fit import PAIRS_MAX, PulseFit, PulseLine
+from nodes.dictionary.message_format import Message
+from nodes.support.can_protocol import ADMIN_ID, SYNC_PULSE
+from nodes.support.errors import CanductorError
 
-SYNC_PULSE: Final = 0x40
 CONSTANT: Final = "CAN_SYNC_PULSE"
 """Of the dictionary: the firmware knows sync pulses."""
 SETTLE_ROUNDS: Final = 40

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from nodes.devices import tmc_datagram
-from nodes.support.errors import CanductorError
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     import asyncio

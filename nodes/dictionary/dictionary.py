@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Mapping
 from typing import Final, TypeVar
 
+from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value, vlq_read
 from nodes.dictionary.parts import (
     DictionaryError,
     Enumeration,
@@ -17,7 +18,6 @@ from nodes.dictionary.parts import (
     parse_enumerations,
     parse_formats,
 )
-from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value, vlq_read
 
 MAX_INFLATED_BYTES: Final = 1 << 20
 """Real ones have 10 to 13 kB."""

@@ -4,8 +4,8 @@ import re
 from collections.abc import Mapping
 from typing import Final
 
-from nodes.support.errors import CanductorError
 from nodes.dictionary.message_format import CODES, MAX_PARAMETERS, NAME, Message, MessageError, MessageFormat
+from nodes.support.errors import CanductorError
 
 OUTPUT: Final = "#output"
 """Name of the message a debug output decodes to; its one parameter ``text`` is UTF-8."""

@@ -6,9 +6,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from nodes.dictionary.dictionary import Dictionary
 from nodes.link import BusLoad, Forecast, IOStats, LinkSettings
-from nodes.node.config import NodeConfig
 
 
 class ResponseLike(Protocol):
@@ -70,29 +68,3 @@ class IoFactory(Protocol):
     """Starts the I/O of a bus; on_frame is None on a UART."""
 
     def __call__(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike: ...  # noqa: D102
-
-
-class Connector(Protocol):
-    """How a node gets its link; the bus provides it."""
-
-    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
-        """Open a link, giving the node its id first where it needs one."""
-
-    def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
-        """Return how long a block is on the wire for certain; 0 where that is not known."""
-
-    def forget(self) -> None:
-        """Take note that the node was reset: what it knew of the bus is gone."""
-
-    def why_silent(self) -> Exception | None:
-        """Return a better explanation than "no answer" when a node never answered at all."""
-
-    def check_identity(self, found: bytes) -> None:
-        """Raise when a board that answers get_canbus_id with FOUND is not the node."""
-
-    def suspect(self) -> None:
-        """Find out whether a node that is silent restarted; the bus tells the node when it did."""
-
-
-BuildConfig = Callable[[Dictionary], NodeConfig]
-"""Makes a node's configuration when its dictionary is known; called again at every restart."""

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Whose turn it is on a bus, and what a frame costs.
-#include "nodes/support/can_bits.h"
 #include "nodes/link/io_bus.h"
+#include "nodes/support/can_bits.h"
 
 enum { BITS_PER_BYTE = 10 }; // of a serial line: start, eight, stop
 

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from typing import Final
 
+from nodes.mt.mt import CLOSING, LIT
 from nodes.support._can_bits import lib
+from nodes.support.can_protocol import MT_CAN_ID
 from nodes.support.records import record
-from nodes.mt.mt import CLOSING, LIT, MT_CAN_ID
 
 AROUND: Final = 10
 """Words of a transmission that are neither values nor LIT: what begins and ends it."""

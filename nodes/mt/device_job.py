@@ -3,9 +3,10 @@
 from enum import StrEnum
 from typing import Final
 
+from nodes.mt.mt import AXLES, Pair
+from nodes.support.can_protocol import MT_CAN_ID
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
-from nodes.mt.mt import AXLES, MT_CAN_ID, Pair
 
 BAUD: Final = 250_000
 

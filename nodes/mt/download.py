@@ -9,13 +9,14 @@ import asyncio
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final, Protocol
 
+from nodes.mt.cost import CanCost, frame_bits
+from nodes.mt.mt import MtError, MtStatus, Pair, to_bytes, to_frames, transmission
+from nodes.mt.pace import NS_PER_S, PacedFrames
+from nodes.mt.table import AxleTable, TableNode, TableState
 from nodes.node.request_reply import QueryTimeout
-from nodes.devices.table import AxleTable, TableNode, TableState
+from nodes.support.can_protocol import MT_CAN_ID
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
-from nodes.mt.cost import CanCost, frame_bits
-from nodes.mt.mt import MT_CAN_ID, MtError, MtStatus, Pair, to_bytes, to_frames, transmission
-from nodes.mt.pace import NS_PER_S, PacedFrames
 
 BROADCASTS_MAX: Final = 6
 LINK_TRIES: Final = 2

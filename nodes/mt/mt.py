@@ -24,7 +24,6 @@ VALUES: Final = range(-(1 << 28), 1 << 28)
 """What a sender sends. None of it looks like a command, ESC or LIT to a receiver that lost its place, and
 none gets lost in a register that shows changes only."""
 PAIRS_MAX: Final = DATA_MASK
-MT_CAN_ID: Final = 0x3F2
 WORD_BYTES: Final = 4
 DIGEST_FACTOR: Final = 0x01000193
 CLOSING: Final = (ESC, ESC, C_MASK)

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 from typing import Final
 
 from nodes.dictionary.dictionary import Dictionary
-from nodes.support.errors import CanductorError
 from nodes.dictionary.message_format import MessageError
+from nodes.support.errors import CanductorError
 
 MAX_OIDS: Final = 255
 """Object ids are one byte, and so is their count."""

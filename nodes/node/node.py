@@ -6,24 +6,25 @@ from collections.abc import Callable
 from typing import Final, Literal
 
 from nodes.clock.clock import ClockEstimate, ClockEstimator
-from nodes.clock.keeper import ClockKeeper
-from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, Conversation
-from nodes.dictionary.dictionary import Dictionary
-from nodes.dictionary.cache import DictionaryCache
-from nodes.dictionary.parts import DictionaryError
-from nodes.support.errors import CanductorError
 from nodes.clock.estimated_clock import EstimatedClock
-from nodes.dictionary.identify import identify
-from nodes.node.load import NodeLoad, load_of
-from nodes.dictionary.message_format import Message, Value
-from nodes.node.config import NodeConfig
-from nodes.node.errors import NodeError, NodeLost, NodeShutdown, shutdown_sentence
-from nodes.node.states import NodeEvent, NodeState, following
-from nodes.node.queue_slots import share_slots
-from nodes.link.interfaces import BuildConfig, Connector, LinkLike
 from nodes.clock.sync_pulse import PulseClock
-from nodes.node.watchdog import Vigil, get_config, restarted
+from nodes.dictionary.cache import DictionaryCache
+from nodes.dictionary.dictionary import Dictionary
+from nodes.dictionary.message_format import Message, Value
+from nodes.dictionary.parts import DictionaryError
 from nodes.dictionary.vocabulary import carries_identity, check_vocabulary
+from nodes.link.interfaces import LinkLike
+from nodes.node.clock_keeper import ClockKeeper
+from nodes.node.config import NodeConfig
+from nodes.node.connector import BuildConfig, Connector
+from nodes.node.errors import NodeError, NodeLost, NodeShutdown, shutdown_sentence
+from nodes.node.identify import identify
+from nodes.node.load import NodeLoad, load_of
+from nodes.node.queue_slots import share_slots
+from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, Conversation
+from nodes.node.states import NodeEvent, NodeState, following
+from nodes.node.watchdog import Vigil, get_config, restarted
+from nodes.support.errors import CanductorError
 
 MAX_STARTS: Final = 3
 """How often a node is connected anew in one start because only a reset rids it of an old configuration."""

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
-from nodes.support.errors import CanductorError
 from nodes.dictionary.message_format import Message, MessageError, Value
 from nodes.link.interfaces import LinkLike, ResponseLike
+from nodes.support.errors import CanductorError
 
 QUERY_TIMEOUT_S: Final = 0.25
 QUERY_TRIES: Final = 6

@@ -3,9 +3,9 @@
 import asyncio
 from typing import Final
 
-from nodes.node.request_reply import QUERY_TRIES, Conversation
 from nodes.dictionary.message_format import Message
 from nodes.node.errors import NodeError, NodeRestarted, NodeShutdown, shutdown_sentence
+from nodes.node.request_reply import QUERY_TRIES, Conversation
 
 SHUTDOWN_GRACE_S: Final = 0.05
 """For a node that is seen to be shut down to say why."""

@@ -7,4 +7,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from nodes.support.native_build import builder
 
-ffibuilder = builder("nodes.support._can_bits", headers=["nodes/support/can_bits.h"], sources=["nodes/support/can_bits.c"])
+ffibuilder = builder(
+    "nodes.support._can_bits", headers=["nodes/support/can_bits.h"], sources=["nodes/support/can_bits.c"]
+)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from canbus_tools.bus.computer import Computer
-from coordinator.cli import main
+from coordinator.cli.main import main
 from coordinator.cli.parser import read_words
 
 

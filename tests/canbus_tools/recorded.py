@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from canbus_tools.bus.frame import Frame
+from canbus_tools.protocol.frame import Frame
 from canbus_tools.protocol.protocol import Direction, data_id
 
 SHARED = Path(__file__).parents[2] / ".." / "shared" / "data"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
-from canbus_tools.bus.frame import Frame
+from canbus_tools.protocol.frame import Frame
 from canbus_tools.protocol.protocol import Direction, data_id
 from nodes.dictionary.dictionary import Dictionary
 from tests import wire_twin as twin

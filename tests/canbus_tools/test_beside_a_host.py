@@ -2,11 +2,11 @@
 
 import pytest
 
+from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError
 from canbus_tools.discovery.ask_bus import take_census
+from canbus_tools.discovery.inventory import DAMAGED_BLOCK, PROBED, State, survey_all
 from canbus_tools.tools.nodes import NodesReport, list_nodes
 from canbus_tools.tools.release_id import release_on
-from canbus_tools.discovery.inventory import DAMAGED_BLOCK, PROBED, State, survey_all
-from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError
 from nodes.bus.assign import AssignError
 from nodes.bus.can_bus import CanBus
 from nodes.node.states import NodeState

@@ -5,11 +5,11 @@ import signal
 
 import pytest
 
-from canbus_tools.discovery.ask_bus import take_census
 from canbus_tools.bus.talk import BusTalk
-from nodes.bus.assign import ADMIN_ID
-from nodes.support.errors import CanductorError
+from canbus_tools.discovery.ask_bus import take_census
 from nodes.link import Frame
+from nodes.support.can_protocol import ADMIN_ID
+from nodes.support.errors import CanductorError
 from nodes.transport import CanFrame
 from nodes.transport.frame import BUS_OFF
 from tests.canbus_tools.command import Command

@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.transport import CanFrame
 from tests.stages.can_stage import BED, BOOT, MAIN, MAIN_ID, TOOL_ID, TWIN, SixNodes, set_nodeid
 

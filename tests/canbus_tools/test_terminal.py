@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from nodes.bus.assign import ADMIN_ID, SET_NODEID
+from nodes.support.can_protocol import ADMIN_ID, SET_NODEID
 from nodes.transport import CanFrame, open_can
 from nodes.virtual.hub import VirtualBus
 

@@ -9,8 +9,8 @@ import pytest
 
 from canbus_tools.bus.computer import FrameLine, ThisComputer
 from canbus_tools.bus.open_bus import BusOptions
-from nodes.support.errors import CanductorError
 from nodes.link import Frame
+from nodes.support.errors import CanductorError
 from nodes.transport import CanFrame
 from nodes.virtual.hub import VirtualBus
 from nodes.virtual.processes import NodeProcess

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from canbus_tools.dissector import dissector
-from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.protocol.frame import Frame, FrameKind
 from nodes.dictionary.dictionary import Dictionary
 
 NANOSECOND_PCAP = 0xA1B23C4D

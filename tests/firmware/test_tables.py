@@ -4,8 +4,9 @@ from collections.abc import Iterable, Sequence
 
 import pytest
 
-from nodes.mt.mt import MT_CAN_ID, Pair, checksum, to_bytes, to_frames, transmission
+from nodes.mt.mt import Pair, checksum, to_bytes, to_frames, transmission
 from nodes.mt.pace import PacedWords
+from nodes.support.can_protocol import MT_CAN_ID
 from tests.firmware.host import Host
 
 TABLE: tuple[Pair, ...] = ((-50_000, 12), (0, -7), (0, -7), (50_001, 0))

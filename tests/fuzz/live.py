@@ -24,8 +24,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.support.command_options import DEMO_GCODE
 from coordinator.ipc.client.client import Client
+from coordinator.support.command_options import DEMO_GCODE
 from nodes.support.errors import CanductorError
 from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
 

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.ipc.client.client import Client
-from coordinator.ipc.server.settings import Limits
 from coordinator.ipc.protocol.messages import Encoding, Fault, WireReader
+from coordinator.ipc.server.settings import Limits
 from tests.fuzz.ipc_target import line, packed
 
 ENDS: Final = frozenset(

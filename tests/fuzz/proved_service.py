@@ -18,23 +18,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
+from coordinator.assembly.load import load_machine
 from coordinator.demo.run import Prover, report_of
-from coordinator.virtual_machine.stage import Stage
-from coordinator.runtime.host import LinuxHost
 from coordinator.ipc.protocol.methods import Registry, Scope
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import IpcSettings, Limits, TcpSettings
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.uploads import upload_method
-from coordinator.assembly.load import load_machine
 from coordinator.motion.trapezoid_array import TRAPEZOID
-from coordinator.streaming.pipeline import PlanRecord
-from coordinator.service.state.log_ring import Entry
-from coordinator.service.core.machine_service import MachineService, ServiceSettings
+from coordinator.runtime.host import LinuxHost
 from coordinator.service.api.methods import add_methods
+from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.core.motion_lead import MotionLead
+from coordinator.service.state.log_ring import Entry
 from coordinator.streaming.job_runner import Outcome, outcome_of
+from coordinator.streaming.pipeline import PlanRecord
+from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
+from coordinator.virtual_machine.stage import Stage
 
 WATCH_TOKEN, ADMIN_TOKEN = "watch" * 8, "admin" * 8
 LOOK_S = 0.02

@@ -11,7 +11,7 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
     "objects": ("firmware/objects/*.[ch]",),
     "net": ("firmware/net/*.[ch]",),
     "link": ("nodes/link/*.c", "nodes/link/*.h", "nodes/link/*.py"),
-    "clock": ("nodes/clock*.py", "nodes/clock/sync_pulse.py", "nodes/clock/pulse_fit.py", "nodes/clock/estimated_clock.py"),
+    "clock": ("nodes/clock/*.py",),
     "homing": (
         "coordinator/runtime/moves/homing.py",
         "coordinator/modules/homing/homing.py",
@@ -50,8 +50,10 @@ SAFETY: Final = (
 
 TESTS: Final = (
     *(f"tests/{name}" for name in ("firmware", "nodes", "sim")),
-    *(f"tests/coordinator/{name}" for name in ("heat", "modules", "motion", "kinematics", "demo")),
-    *(f"tests/coordinator/test_{name}.py" for name in ("node_care", "timebase", "rail_places", "resting")),
+    *(
+        f"tests/coordinator/{name}"
+        for name in ("heat", "modules", "motion", "kinematics", "demo", "runtime", "streaming")
+    ),
 )
 """Where tests are looked for."""
 

@@ -9,8 +9,8 @@ from nodes.bus.can_bus import CanBus
 from nodes.devices.stepper import Stepper
 from nodes.dictionary.dictionary import Dictionary
 from nodes.node.config import NodeConfig
+from nodes.node.connector import BuildConfig
 from nodes.node.states import NodeState
-from nodes.link.interfaces import BuildConfig
 from tests.nodes import virtual_time
 from tests.nodes.twin_bus import TwinIO, TwinNode
 

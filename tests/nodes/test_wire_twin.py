@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.support._wire import ffi, lib
 from nodes.dictionary.message_format import CODES, vlq, vlq_read
+from nodes.support._wire import ffi, lib
 from tests import wire_twin as twin
 
 NUMBERS = st.integers(-(1 << 31), (1 << 32) - 1)

@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID, Uuid
+from nodes.bus.assign import Uuid
 from nodes.dictionary.dictionary import Dictionary
-from nodes.link import BusLoad, Forecast, IOStats, LinkSettings
 from nodes.dictionary.message_format import Message, Value
+from nodes.link import BusLoad, Forecast, IOStats, LinkSettings
 from nodes.link.interfaces import OnFrame, OnLost, OnResponses
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
 
 DATA = Path(__file__).parents[1] / "data" / "dictionary.json"
 DELAY_S = 0.0003

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.program import Program
-from coordinator.support.progress import Progress
-from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.simulate.scenario import Scenario
 from coordinator.simulate.stage import Stage
+from coordinator.streaming.job_runner import Outcome, run_job
+from coordinator.support.progress import Progress
 from nodes.support.errors import CanductorError
 
 GCODE = "G28\nM83\nG1 X10 Y5 F1800\nG1 X30 Y25 E1.5 F1800\nG1 X12 Y40 E1 F1800\n"

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.runtime.machine import Machine, link_of
 from coordinator.gcode.program import Program
-from coordinator.streaming.job_runner import Outcome, run_job
+from coordinator.runtime.machine import Machine, link_of
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.play import Text
 from coordinator.simulate.stage import Stage
-from nodes.support.errors import CanductorError
+from coordinator.streaming.job_runner import Outcome, run_job
 from nodes.link import IOStats, LinkError
+from nodes.support.errors import CanductorError
 
 SENSORS = 0x104
 """An id that wins against the data of all nodes."""

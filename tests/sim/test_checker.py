@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coordinator.verification.expected import ExpectedSteps
 from coordinator.simulate import checker
 from coordinator.simulate.checker import Ending, ExecutedSteps, QueueDepth, StepperTruth, Violation
+from coordinator.verification.expected import ExpectedSteps
 
 PRIMARY_PPM = 37.0
 BEGIN_NS = 5_000_000_000

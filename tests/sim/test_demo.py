@@ -2,10 +2,10 @@
 
 import pytest
 
-from coordinator.support.command_options import EXAMPLES
-from coordinator.verification.proof import EDGE_TOLERANCE_S
 from coordinator.simulate.scenario import BusSetting, NodeSetting
 from coordinator.simulate.values import Range
+from coordinator.support.command_options import EXAMPLES
+from coordinator.verification.proof import EDGE_TOLERANCE_S
 from tests.stages.demo_machine import SQUARE
 from tests.stages.simulated_demo import SimulatedDemo
 

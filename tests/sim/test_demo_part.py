@@ -3,9 +3,9 @@
 import asyncio
 from pathlib import Path
 
+from coordinator.heat.controller import NEAR_K
 from coordinator.verification.heat_proof import HeatWatch
 from coordinator.virtual_machine.plant_heat import HeatSettings
-from coordinator.heat.controller import NEAR_K
 from tests.stages.plant_stage import PlantStage
 from tests.stages.served import running
 

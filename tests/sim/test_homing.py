@@ -12,8 +12,8 @@ from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.homing import TIMEOUT_S, HomingError, HomingMove, HomingResult
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
-from nodes.support.errors import CanductorError
 from nodes.link import Link
+from nodes.support.errors import CanductorError
 from tests.profiles import examples
 from tests.stages.printer_text import MCU, TOOLHEAD, printer_section, section, stepper_section
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.errors import GCodeError
 from coordinator.assembly.check import check_config
+from coordinator.gcode.errors import GCodeError
 from tests.stages.printer_text import SWITCHES_CFG
 from tests.stages.program_stage import ProgramStage
 from tests.stages.switch_printer import PINS, STEPS_PER_MM, SwitchPrinter

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.support.command_options import EXAMPLES
 from coordinator.assembly.load import load_machine
 from coordinator.simulate.scenario import NodeSetting
+from coordinator.support.command_options import EXAMPLES
 from tests.stages.plant_stage import STEP_MM, PlantStage
 from tests.stages.printer_text import MCU, TOOLHEAD, printer_section, stepper_section
 from tests.stages.served import running

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.runtime.machine import Machine
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.motion.planner.planner import Planner
+from coordinator.runtime.machine import Machine
 from coordinator.streaming.move_source import JobState
 from coordinator.streaming.streamer import Streamer
 from tests.stages.demo_machine import NODES, DemoMachine

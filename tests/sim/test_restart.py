@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.protocol.methods import ApiError
 from coordinator.assembly.load import load_machine
-from coordinator.runtime.module_context import Live
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.save_config import SaveConfig
+from coordinator.runtime.module_context import Live
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from tests.stages.served import Served, running

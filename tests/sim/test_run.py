@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from coordinator.cli import main as cli
-from coordinator.support.command_options import SimulateOptions
 from coordinator.simulate import run, scenario
 from coordinator.simulate.checker import Violation
 from coordinator.simulate.result import Result, SimulationReport
+from coordinator.support.command_options import SimulateOptions
 
 ALL = [scenario.find(name) for name in scenario.names()]
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.runtime.machine import MachineStopped
-from coordinator.support.command_options import Terminated
-from coordinator.gcode.errors import GCodeError
-from coordinator.streaming.move_source import Told
 from coordinator.cli.commands.run import RunReport
+from coordinator.gcode.errors import GCodeError
+from coordinator.runtime.machine import MachineStopped
 from coordinator.streaming.job_runner import Outcome
+from coordinator.streaming.move_source import Told
+from coordinator.support.command_options import Terminated
 from nodes.support.errors import CanductorError
 from tests.stages.demo_machine import NODES, SQUARE, DemoMachine, TypedRun
 

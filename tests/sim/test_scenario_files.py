@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.assembly.load import load_machine
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program as GCode
-from coordinator.assembly.load import load_machine
 from coordinator.motion.planner.planner import Planner
 from coordinator.simulate import reference, scenario
 from coordinator.simulate.program import make_program

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coordinator.runtime.machine import Machine, MachineStopped
-from coordinator.virtual_machine.plant import PlantSettings
 from coordinator.gcode.errors import GCodeError
 from coordinator.modules.drivers.tmc_driver import TmcDriver
-from coordinator.streaming.move_source import Told
-from coordinator.streaming.job_runner import Outcome
+from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.simulate.scenario import BusSetting
 from coordinator.simulate.values import Range
+from coordinator.streaming.job_runner import Outcome
+from coordinator.streaming.move_source import Told
+from coordinator.virtual_machine.plant import PlantSettings
 from nodes.support.errors import CanductorError
 from nodes.virtual.plant_page import Fault, Kind, PlantPage
 from tests.stages.machine_stage import MachineStage

@@ -7,12 +7,12 @@ from collections.abc import Callable
 import pytest
 
 from coordinator.cli import main as cli
-from coordinator.runtime.devices import MachineDevices
 from coordinator.motion.specs import StepperSpec
+from coordinator.runtime.devices import MachineDevices
+from coordinator.runtime.timebase import ClockMap, ClockPiece, TimeBase
 from coordinator.simulate import scenario
 from coordinator.simulate.play import play
 from coordinator.simulate.result import Result
-from coordinator.runtime.timebase import ClockMap, ClockPiece, TimeBase
 from nodes.bus.bus import BusBase
 from nodes.bus.can_bus import CanBus
 from nodes.link import Link

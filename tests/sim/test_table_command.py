@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.protocol.methods import ApiError
 from coordinator.cli.commands.table import _answer
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.tables.files import read_table
 from tests.stages.demo_machine import DemoMachine
 from tests.stages.served import Served

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.protocol.methods import ApiError
 from coordinator.assembly.load import MachineDescription
 from coordinator.config.model import AxisTablesDescription
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from coordinator.tables.axis_table import AxisTable

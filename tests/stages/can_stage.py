@@ -8,22 +8,22 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Final
 
-from canbus_tools.bus.frame import Frame
 from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.bus.talk import BusTalk, NodeTalk
+from canbus_tools.protocol.frame import Frame
 from coordinator.simulate.script import ScriptedWorld
-from nodes.bus.assign import (
+from nodes.bus.assign import Uuid
+from nodes.dictionary.cache import DictionaryCache
+from nodes.dictionary.message_format import Message
+from nodes.link import LinkSettings
+from nodes.support.can_protocol import (
     ADMIN_ID,
     ADMIN_RESPONSE_ID,
     NEED_NODEID,
     QUERY_UNASSIGNED,
     SET_NODEID,
     SET_NODEID_BOOTLOADER,
-    Uuid,
 )
-from nodes.dictionary.cache import DictionaryCache
-from nodes.link import LinkSettings
-from nodes.dictionary.message_format import Message
 from nodes.transport import CanFrame
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary, firmware_path
 from nodes.virtual.world import NodeSettings, WorldNode

@@ -4,16 +4,16 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
-from coordinator.runtime.machine import Machine, MachineStopped
-from coordinator.virtual_machine.plant import PlantSettings
-from coordinator.virtual_machine.plant_heat import HeatSettings
+from coordinator.assembly.load import load_machine
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, InTime, Reading
 from coordinator.gcode.parser import parse
-from coordinator.assembly.load import load_machine
 from coordinator.modules.base import Value
 from coordinator.modules.module_set import ModuleSet
+from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.simulate.scenario import BusSetting
 from coordinator.simulate.values import Range
+from coordinator.virtual_machine.plant import PlantSettings
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.node.config import NodeConfig
 from nodes.virtual.firmware import firmware_dictionary
 from nodes.virtual.plant_page import Fault, Kind, PlantPage

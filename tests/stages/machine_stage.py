@@ -5,13 +5,13 @@ from collections.abc import Callable, Coroutine, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from coordinator.runtime.machine import Machine
-from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from coordinator.gcode.program import Program
-from coordinator.streaming.move_source import Told
-from coordinator.streaming.job_runner import Outcome, run_job
+from coordinator.runtime.machine import Machine
 from coordinator.simulate.scenario import BusSetting, NodeSetting, Scenario
 from coordinator.simulate.stage import Stage
+from coordinator.streaming.job_runner import Outcome, run_job
+from coordinator.streaming.move_source import Told
+from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from nodes.virtual.plant_page import Kind, PlantPage
 from nodes.virtual.world import WorldNode
 

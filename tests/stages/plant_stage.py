@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.virtual_machine.plant import PlantSettings
-from coordinator.virtual_machine.plant_heat import HeatSettings
 from coordinator.kinematics.base import Point
 from coordinator.simulate.safety_rig import MACHINE, START
 from coordinator.simulate.scenario import NodeSetting
+from coordinator.virtual_machine.plant import PlantSettings
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from tests.stages.machine_stage import MachineStage
 from tests.stages.served import Served, running
 

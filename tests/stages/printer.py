@@ -3,10 +3,10 @@
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
-from coordinator.virtual_machine.plant import PlantSettings
-from coordinator.virtual_machine.plant_heat import HeatSettings
 from coordinator.assembly.load import MachineDescription, load_machine
 from coordinator.modules.base import Value
+from coordinator.virtual_machine.plant import PlantSettings
+from coordinator.virtual_machine.plant_heat import HeatSettings
 from tests.stages.machine_stage import MachineStage
 from tests.stages.served import Served, running
 

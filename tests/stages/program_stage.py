@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from coordinator.assembly.load import load_machine
 from coordinator.gcode.commands import Done
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import End, Event, Full, Notice, Progress, Reply, Resting
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
-from coordinator.assembly.load import load_machine
 from coordinator.motion.planner.planner import Planner
 from coordinator.streaming.program_machine import machine_state
 from tests.stages.printer_text import PRINTER_CFG, write

@@ -8,13 +8,13 @@ from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
 from canbus_tools.bus.computer import Port
-from canbus_tools.bus.frame import Frame, FrameKind
 from canbus_tools.bus.frame_queue import FRAMES_MAX
 from canbus_tools.bus.open_bus import BusOptions
-from nodes.support.errors import CanductorError
+from canbus_tools.protocol.frame import Frame, FrameKind
 from nodes.link import BusSettings, LinkIO
 from nodes.link.types import Frame as LinkFrame
 from nodes.link.types import FrameHandler
+from nodes.support.errors import CanductorError
 from nodes.transport import CanFrame
 from nodes.virtual.world import CanPort, CanWire, ControllerSettings, Uart, UartPort, World, run
 

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from coordinator.virtual_machine.plant import PlantSettings, start_point
-from coordinator.virtual_machine.plant_heat import HeatSettings
+from coordinator.assembly.load import load_machine
 from coordinator.demo.report import DemoReport
 from coordinator.demo.run import print_and_prove
-from coordinator.virtual_machine.stage import START_MM, WARM_C
 from coordinator.gcode.program import Program
-from coordinator.assembly.load import load_machine
 from coordinator.simulate.scenario import BusSetting, NodeSetting
+from coordinator.virtual_machine.plant import PlantSettings, start_point
+from coordinator.virtual_machine.plant_heat import HeatSettings
+from coordinator.virtual_machine.stage import START_MM, WARM_C
 from nodes.virtual.edge_log import Clocks, Directions, steps_of
 from nodes.virtual.plant_log import PlantEvent
 from nodes.virtual.plant_page import Kind, Motor

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from coordinator.gcode.program import Program
-from coordinator.streaming.move_source import Told
-from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
+from coordinator.streaming.job_runner import Outcome, run_job
+from coordinator.streaming.move_source import Told
 from tests.stages.printer_text import SWITCHES_CFG
 
 STEPS_PER_MM = {"x": 80, "y": 80, "z": 400}

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from nodes.bus.assign import ADMIN_ID, SET_NODEID
+from nodes.support.can_protocol import ADMIN_ID, SET_NODEID
 from nodes.transport import CanFrame, open_can
 
 INTERFACE = "vcan0"

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.assembly.load import CanConnection, UartConnection, load_machine
 from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
 from coordinator.virtual_machine.stage import Stage
-from coordinator.assembly.load import CanConnection, UartConnection, load_machine
 from tests.canbus_tools.command import Command
 from tests.vcan.kernel import INTERFACE, SECOND_INTERFACE, why_no_socketcan
 

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from canbus_tools.doctor.gather import ASKED
 from canbus_tools.bus.link_facts import NoInterface, read_link
+from canbus_tools.doctor.gather import ASKED
 from nodes.virtual.processes import NodeProcess
 from tests.canbus_tools.command import Command, Said
 from tests.canbus_tools.findings import examine, expect, findings, problems

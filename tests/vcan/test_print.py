@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.program import Program
 from coordinator.assembly.load import load_machine
+from coordinator.gcode.program import Program
 from coordinator.streaming.job_runner import run_job
 from nodes.virtual.processes import NodeProcess
 from tests.vcan.kernel import INTERFACE, why_no_socketcan

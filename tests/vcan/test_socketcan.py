@@ -10,14 +10,15 @@ from typing import Any
 
 import pytest
 
-from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID, Uuid
+from nodes.bus.assign import Uuid
 from nodes.bus.can_bus import CanBus
-from nodes.support.errors import CanductorError
-from nodes.link import LinkIO
 from nodes.dictionary.message_format import Message
-from nodes.node.node import Node
+from nodes.link import LinkIO
 from nodes.node.config import NodeConfig
+from nodes.node.node import Node
 from nodes.node.states import NodeState
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
+from nodes.support.errors import CanductorError
 from nodes.transport import CanFrame, CanTransport, TransportBusyError, TransportClosedError, open_can
 from nodes.transport.socketcan import SocketCanTransport
 from nodes.virtual.processes import Flavour, NodeProcess

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, cast
 
-from coordinator.support.command_options import Report
 from coordinator.cli.arguments.table import declare_table
+from coordinator.support.command_options import Report
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file, number, whole
 from nodes.support.records import record

@@ -5,8 +5,8 @@ import re
 from pathlib import Path
 from typing import Final
 
-from coordinator.support.command_options import ServeOptions
 from coordinator.cli.arguments.network import declare_network, read_announce, read_metrics
+from coordinator.support.command_options import ServeOptions
 from nodes.support.option_values import UsageError, existing_file
 
 HOST_NAME_MAX: Final = 253

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, cast
 
-from coordinator.support.command_options import Report
 from coordinator.cli.arguments.table_device import declare_device, device_job
+from coordinator.support.command_options import Report
 from nodes.support.option_values import UsageError, existing_file
 
 _UNITS: Final = ("mm", "um", "nm", "inch", "deg", "arcmin", "arcsec")

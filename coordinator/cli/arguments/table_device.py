@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from coordinator.tables.axis_table import AxisTable, Direction, TableError
-from nodes.support.option_values import UsageError, number, share, whole
 from nodes.mt.device_job import BAUD, DeviceJob, DeviceKind, Load
-from nodes.mt.mt import AXLES, MT_CAN_ID
+from nodes.mt.mt import AXLES
+from nodes.support.can_protocol import MT_CAN_ID
+from nodes.support.option_values import UsageError, number, share, whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -7,8 +7,8 @@ from coordinator.assembly import reference as tables
 from coordinator.assembly.check import check_config
 from coordinator.assembly.consequences import meaning
 from coordinator.assembly.load import load_machine
-from coordinator.config.model import NotYetActing
 from coordinator.config.errors import ConfigError
+from coordinator.config.model import NotYetActing
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
 

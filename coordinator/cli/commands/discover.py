@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.ipc.discovery.announcement import Announcement, host_word
 from coordinator.ipc.client.client import Client
+from coordinator.ipc.discovery.announcement import Announcement, host_word
 from coordinator.ipc.discovery.browser import Browser, Listen
-from coordinator.ipc.protocol.methods import Scope, printable
 from coordinator.ipc.discovery.multicast import places
+from coordinator.ipc.protocol.methods import Scope, printable
 from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import host_sockets
 

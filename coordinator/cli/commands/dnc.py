@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final, cast
 
-from coordinator.support.command_options import Report
-from coordinator.dnc.options import BLOCK_MAX, TRANSMISSIONS_MAX, DncOptions, read_frame
 from coordinator.cli.arguments.front_ends import Target, add_target, read_target
+from coordinator.dnc.options import BLOCK_MAX, TRANSMISSIONS_MAX, DncOptions, read_frame
+from coordinator.support.command_options import Report
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file, number, whole
 from nodes.support.records import record

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from coordinator.support.command_options import Report, Terminated
 from coordinator.cli.arguments.front_ends import Target
-from coordinator.support.interrupts import run_to_end
 from coordinator.ipc.client.client import Client, Update
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.ipc.server.uploads import PART_MAX
+from coordinator.support.command_options import Report, Terminated
+from coordinator.support.interrupts import run_to_end
 from nodes.support.errors import CanductorError
 
 T = TypeVar("T")

@@ -5,14 +5,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
-from coordinator.support.command_options import RunOptions, machine_name
-from coordinator.streaming.compensation import kept_compensation
+from coordinator.assembly.load import MachineDescription, load_machine
 from coordinator.gcode.program import Program
 from coordinator.runtime.host import Computer, LinuxHost
-from coordinator.support.interrupts import run_to_end
-from coordinator.assembly.load import MachineDescription, load_machine
-from coordinator.support.progress import Progress, ProgressDisplay
+from coordinator.streaming.compensation import kept_compensation
 from coordinator.streaming.job_runner import NodeOutcome, Outcome, run_job
+from coordinator.support.command_options import RunOptions, machine_name
+from coordinator.support.interrupts import run_to_end
+from coordinator.support.progress import Progress, ProgressDisplay
 from coordinator.tables.store import table_folder
 from nodes.dictionary.cache import DictionaryCache
 

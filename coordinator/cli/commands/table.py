@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coordinator.streaming.compensation import corrected_axes, why_not_corrected
+from coordinator.assembly.load import load_machine
 from coordinator.cli.arguments.front_ends import Target
 from coordinator.cli.commands.front_ends import Answer, call
-from coordinator.assembly.load import load_machine
+from coordinator.streaming.compensation import corrected_axes, why_not_corrected
 from coordinator.tables.axis_table import AxisTable, TableError, figures, notes
 from coordinator.tables.files import read_table
 from coordinator.tables.plot import draw

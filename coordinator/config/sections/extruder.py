@@ -2,16 +2,16 @@
 
 import math
 
-from coordinator.kinematics.base import FILAMENT, StepFunction, WorkSpace
+from coordinator.config.errors import ConfigError, nearest
 from coordinator.config.file import RawSection
 from coordinator.config.model import ExtruderDescription, ExtruderStepperDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec, TextOption
-from coordinator.config.errors import ConfigError, nearest
-from coordinator.config.sections.printer import MAX_ACCEL, MAX_SPEED, PrinterSection
-from coordinator.config.sections.steppers import MOTOR, read_stepper
-from coordinator.config.sections.reading import Reading
-from coordinator.config.unsupported import LATER_EXTRUDER_OPTIONS
 from coordinator.config.sections.heater_options import EXTRUDER_HEATER_OPTIONS, LATER_HEATER_OPTIONS
+from coordinator.config.sections.printer import MAX_ACCEL, MAX_SPEED, PrinterSection
+from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.steppers import MOTOR, read_stepper
+from coordinator.config.unsupported import LATER_EXTRUDER_OPTIONS
+from coordinator.kinematics.base import FILAMENT, StepFunction, WorkSpace
 from coordinator.motion.specs import MotionLimits
 
 NOZZLE_DIAMETER = FloatOption(

@@ -1,9 +1,9 @@
 """How a rail is homed: its endstop, and the speeds towards it."""
 
+from coordinator.config.errors import NotActing
 from coordinator.config.model import HomingDescription
 from coordinator.config.options import BoolOption, FloatOption, SectionReader
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
-from coordinator.config.errors import NotActing
 from coordinator.config.sections.printer import MAX_ACCEL, MAX_SPEED
 from coordinator.config.sections.steppers import MAX_POSITION
 from coordinator.config.sections.virtual_endstops import find_diag_pin

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 
+from coordinator.config.errors import ConfigError
 from coordinator.config.file import RawSection
 from coordinator.config.options import ChoiceOption, FloatOption, SectionReader, SectionSpec, one_of
-from coordinator.config.errors import ConfigError
 from nodes.support.records import record
 
 # Far above any machine, low enough that squares and sums stay exact and a slipped digit group is seen.

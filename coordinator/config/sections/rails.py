@@ -1,9 +1,9 @@
 """Rails along an axis: the range, the endstop, and all steppers that move it."""
 
-from coordinator.kinematics.base import StepFunction
 from coordinator.config.model import RailDescription, StepperDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
 from coordinator.config.sections.homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
+from coordinator.config.sections.reading import Reading, SecondEndstop
 from coordinator.config.sections.steppers import (
     MAX_BELT_POSITION,
     MAX_POSITION,
@@ -12,8 +12,8 @@ from coordinator.config.sections.steppers import (
     extra_sections,
     read_stepper,
 )
-from coordinator.config.sections.reading import Reading, SecondEndstop
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.kinematics.base import StepFunction
 from nodes.support.records import record
 
 

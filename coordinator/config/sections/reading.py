@@ -2,11 +2,11 @@
 
 from dataclasses import field
 
+from coordinator.config.errors import MissingSection, Place
 from coordinator.config.file import ConfigFile, RawSection
 from coordinator.config.model import NotYetActing
 from coordinator.config.options import SectionReader
 from coordinator.config.pins import PinDescription, PinRegistry
-from coordinator.config.errors import MissingSection, Place
 from nodes.support.records import record
 
 

@@ -3,8 +3,8 @@
 from dataclasses import replace
 from typing import Final
 
-from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.model import NotYetActing, RailDescription
+from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.sections.reading import Reading
 from coordinator.motion.specs import StepKinematics
 

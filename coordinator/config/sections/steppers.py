@@ -4,13 +4,13 @@ import math
 import re
 from collections.abc import Iterator
 
-from coordinator.kinematics.base import StepFunction
+from coordinator.config.errors import ConfigError, NotActing
 from coordinator.config.file import RawSection
 from coordinator.config.model import StepperDescription
 from coordinator.config.options import FloatOption, GearRatioOption, IntOption, SectionReader
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
-from coordinator.config.errors import ConfigError, NotActing
 from coordinator.config.sections.reading import Reading
+from coordinator.kinematics.base import StepFunction
 
 MAX_POSITION = 100_000.0
 """mm: a hundred metres; positions stay exact to far below a step."""

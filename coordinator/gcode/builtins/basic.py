@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from coordinator.gcode.builtins import machine as machine_commands, state as state_commands
+from coordinator.gcode.builtins import machine as machine_commands
+from coordinator.gcode.builtins import state as state_commands
 from coordinator.gcode.commands import AtRest, Done
 from coordinator.gcode.events import Emergency, Reply, Wait
-from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.gcode.parser import Command, WordError, number
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.motion.planner.language import ARC_LETTERS, Plane
 from coordinator.motion.planner.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus
 

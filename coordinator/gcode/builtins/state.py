@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from coordinator.gcode.events import Reply
-from coordinator.gcode.status import frames, gcode_figures
 from coordinator.gcode.machine_state import SavedState
 from coordinator.gcode.parser import Command, WordError, number, quoted
+from coordinator.gcode.status import frames, gcode_figures
 from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus
 
 if TYPE_CHECKING:

@@ -9,18 +9,18 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
 
+from coordinator.ipc.protocol.messages import Encoder, Encoding, Fault
+from coordinator.ipc.protocol.methods import ApiError, Registry, Value
 from coordinator.ipc.server.auth import FailureBrake, Grant, Tokens, digest_of, stamp_of
 from coordinator.ipc.server.connection import Connection
-from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, Door
-from coordinator.ipc.protocol.methods import ApiError, Registry, Value
+from coordinator.ipc.server.fair_scheduler import Turns
 from coordinator.ipc.server.publisher import Publisher
 from coordinator.ipc.server.session import Common, Session, SessionCounters
 from coordinator.ipc.server.session_methods import add_session_methods
 from coordinator.ipc.server.settings import IpcSettings, Limits, TcpSettings
 from coordinator.ipc.server.state import StateTree
-from coordinator.ipc.server.fair_scheduler import Turns
+from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, Door
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
-from coordinator.ipc.protocol.messages import Encoder, Encoding, Fault
 from nodes.support.errors import CanductorError
 
 TOKENS_LOOK_S: Final = 1.0

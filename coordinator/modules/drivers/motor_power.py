@@ -5,9 +5,9 @@ SET_STEPPER_ENABLE is for trying out: it switches one, and those that share its 
 
 from typing import TYPE_CHECKING, Final
 
+from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
-from coordinator.config.options import SectionSpec
 from coordinator.modules.base import Build, Module, Value
 from nodes.devices.digital_out import DigitalOut
 

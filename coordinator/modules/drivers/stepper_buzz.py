@@ -3,9 +3,9 @@
 import math
 from typing import TYPE_CHECKING, Final
 
+from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
-from coordinator.config.options import SectionSpec
 from coordinator.modules.base import Build, Module
 
 if TYPE_CHECKING:

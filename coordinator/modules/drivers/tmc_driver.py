@@ -10,6 +10,8 @@ from collections.abc import AsyncIterator, Iterator, Mapping
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from coordinator.config.errors import ConfigError, NotActing, nearest, shown
+from coordinator.drivers.tmc_chips import FAULTS, FORGOTTEN, TMC2208, TMC2209, UNDERVOLTAGE, Chip
+from coordinator.drivers.tmc_chips import shown as register_shown
 from coordinator.modules.base import Build, Value
 from coordinator.modules.drivers.tmc_commands import TmcCommands
 from coordinator.modules.drivers.tmc_options import (
@@ -23,8 +25,6 @@ from coordinator.modules.drivers.tmc_options import (
     driver_spec,
 )
 from coordinator.modules.homing.virtual_endstop import StallEndstop
-from coordinator.drivers.tmc_chips import FAULTS, FORGOTTEN, TMC2208, TMC2209, UNDERVOLTAGE, Chip
-from coordinator.drivers.tmc_chips import shown as register_shown
 from nodes.devices.tmcuart import TmcError
 from nodes.support.errors import CanductorError
 

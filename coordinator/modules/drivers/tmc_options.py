@@ -2,12 +2,12 @@
 
 from typing import TYPE_CHECKING, Any, Final
 
+from coordinator.config.errors import ConfigError
 from coordinator.config.options import BoolOption, FloatOption, IntOption, Option, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.config.errors import ConfigError
-from coordinator.modules.base import Build
 from coordinator.drivers.tmc_chips import Chip, Field
 from coordinator.drivers.tmc_formulas import Currents, currents, largest_current, tstep
+from coordinator.modules.base import Build
 
 if TYPE_CHECKING:
     from coordinator.config.model import StepperDescription

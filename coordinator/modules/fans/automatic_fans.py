@@ -2,13 +2,19 @@
 
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from coordinator.config.options import FloatOption, IntOption, ListOption, SectionSpec
 from coordinator.config.errors import ConfigError, nearest, shown
+from coordinator.config.options import FloatOption, IntOption, ListOption, SectionSpec
 from coordinator.modules.base import Build, Modules
-from coordinator.modules.fans.fan_unit import LATER_FAN_OPTIONS, FanModule, FanUnit, fan_options, shutdown_speed
+from coordinator.modules.drivers.motor_power import MotorPower
+from coordinator.modules.fans.fan_unit import (
+    LATER_FAN_OPTIONS,
+    FanModule,
+    FanUnit,
+    fan_options,
+    shutdown_speed,
+)
 from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.heaters.heaters import Heaters
-from coordinator.modules.drivers.motor_power import MotorPower
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

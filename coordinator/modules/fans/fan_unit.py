@@ -10,8 +10,8 @@ from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
 from nodes.devices.counter import Counter
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
-from nodes.support.errors import CanductorError
 from nodes.node.config import NodeConfig
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

@@ -2,11 +2,17 @@
 
 from typing import ClassVar, Final
 
+from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
 from coordinator.gcode.parser import WordError
-from coordinator.config.options import SectionSpec
 from coordinator.modules.base import Build, Module
-from coordinator.modules.fans.fan_unit import LATER_FAN_OPTIONS, FanModule, FanUnit, fan_options, shutdown_speed
+from coordinator.modules.fans.fan_unit import (
+    LATER_FAN_OPTIONS,
+    FanModule,
+    FanUnit,
+    fan_options,
+    shutdown_speed,
+)
 from coordinator.modules.words import numbers, one, parameters, value
 
 OFF: Final = shutdown_speed(0.0)

@@ -6,20 +6,30 @@ While its sensor says nothing, or what cannot be, it runs at its highest speed: 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Final
 
+from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
+from coordinator.config.sections.heater_options import MAX_DELTA, PID_KD, PID_KI, PID_KP, SMOOTH_TIME
+from coordinator.config.sections.sensor_options import (
+    FREE_SENSOR_OPTIONS,
+    LATER_SENSOR_OPTIONS,
+    SENSOR_OPTIONS,
+)
 from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.heat.controller import Controller
 from coordinator.heat.pid import Pid, PidGains
 from coordinator.heat.watermark import Watermark
-from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.modules.base import Build, Module, Modules, Value
-from coordinator.modules.fans.fan_unit import LATER_FAN_OPTIONS, FanModule, FanUnit, fan_options, shutdown_speed
-from coordinator.modules.sensors.free_temperatures import find_source
+from coordinator.modules.fans.fan_unit import (
+    LATER_FAN_OPTIONS,
+    FanModule,
+    FanUnit,
+    fan_options,
+    shutdown_speed,
+)
 from coordinator.modules.heaters.heater import LOOK_S, SILENT_LOOKS
-from coordinator.config.sections.heater_options import MAX_DELTA, PID_KD, PID_KI, PID_KP, SMOOTH_TIME
 from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
-from coordinator.config.sections.sensor_options import FREE_SENSOR_OPTIONS, LATER_SENSOR_OPTIONS, SENSOR_OPTIONS
 from coordinator.modules.words import one, parameters, value
 
 if TYPE_CHECKING:

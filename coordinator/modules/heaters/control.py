@@ -2,12 +2,7 @@
 
 from dataclasses import replace
 
-from coordinator.heat.controller import Controller
-from coordinator.heat.mpc import HeaterModel, Mpc, filament_heat
-from coordinator.heat.pid import Pid, PidGains
-from coordinator.heat.watermark import Watermark
 from coordinator.config.errors import ConfigError
-from coordinator.modules.base import Build
 from coordinator.config.sections.heater_options import (
     AMBIENT_TRANSFER,
     BLOCK_HEAT_CAPACITY,
@@ -28,6 +23,11 @@ from coordinator.config.sections.heater_options import (
     STEADY_STATE_RATE,
     TARGET_REACH_TIME,
 )
+from coordinator.heat.controller import Controller
+from coordinator.heat.mpc import HeaterModel, Mpc, filament_heat
+from coordinator.heat.pid import Pid, PidGains
+from coordinator.heat.watermark import Watermark
+from coordinator.modules.base import Build
 
 
 class ControlSettings:

@@ -10,6 +10,13 @@ import contextlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final, Protocol
 
+from coordinator.config.sections.heater_options import (
+    AMBIENT_SENSOR,
+    COOLING_FAN,
+    CYCLE_TIME,
+    HEATER_PIN,
+    MAX_DURATION,
+)
 from coordinator.gcode.parser import WordError
 from coordinator.heat.controller import Controller
 from coordinator.heat.holding import Held, Holding
@@ -18,20 +25,13 @@ from coordinator.heat.verify import HeaterCheck
 from coordinator.modules.base import Build, Modules, Value
 from coordinator.modules.fans.fan_unit import FanModule
 from coordinator.modules.heaters.control import ControlSettings
-from coordinator.config.sections.heater_options import (
-    AMBIENT_SENSOR,
-    COOLING_FAN,
-    CYCLE_TIME,
-    HEATER_PIN,
-    MAX_DURATION,
-)
+from coordinator.modules.heaters.verify_heater import VerifyHeater, usual
 from coordinator.modules.pinned import AHEAD_S, add_pinned
 from coordinator.modules.sensors.temperature_input import SensorModule, TemperatureInput
-from coordinator.modules.heaters.verify_heater import VerifyHeater, usual
 from nodes.devices.analog_in import RANGE_CHECKS
 from nodes.devices.pwm_out import PwmOut
-from nodes.support.errors import CanductorError
 from nodes.node.states import NodeState
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

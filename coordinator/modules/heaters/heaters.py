@@ -3,10 +3,10 @@
 from collections.abc import Awaitable, Callable, Mapping
 from typing import ClassVar, Final
 
-from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, InTime, Reading
-from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.gcode.parser import WordError
 from coordinator.config.options import SectionSpec
+from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, InTime, Reading
+from coordinator.gcode.parser import WordError
+from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module, Value
 from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.sensors.temperature_source import TemperatureSource

@@ -3,11 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar
 
-from coordinator.gcode.commands import Call, GCodeCommand, Reading
-from coordinator.gcode.parser import WordError
 from coordinator.config.options import SectionSpec
-from coordinator.modules.base import Build, Module, Modules, Value
-from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.config.sections.heater_options import (
     EXTRUDER_HEATER_OPTIONS,
     HEATER_OPTIONS,
@@ -15,6 +11,10 @@ from coordinator.config.sections.heater_options import (
     LATER_HEATER_OPTIONS,
     MIN_EXTRUDE_TEMP,
 )
+from coordinator.gcode.commands import Call, GCodeCommand, Reading
+from coordinator.gcode.parser import WordError
+from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.heaters.pid_profile import PidProfiles
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID

@@ -2,9 +2,9 @@
 
 from typing import ClassVar, Final
 
-from coordinator.heat.verify import VerifyOptions
-from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.config.errors import ConfigError, NotActing, nearest
+from coordinator.config.options import FloatOption, SectionSpec
+from coordinator.heat.verify import VerifyOptions
 from coordinator.modules.base import Build, Module, Modules
 
 MAX_ERROR: Final = FloatOption(

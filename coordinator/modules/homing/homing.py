@@ -11,21 +11,21 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
+from coordinator.config.errors import ConfigError
+from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.config.options import SectionSpec
-from coordinator.config.errors import ConfigError
 from coordinator.modules.base import Build, Module, Modules, Value
 from coordinator.modules.homing.homing_plan import AXES, Approach, approaches, landed, second_landed
 from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.runtime.machine import Machine
-    from coordinator.runtime.moves.homing import HomingResult
-    from coordinator.kinematics.base import Point
     from coordinator.config.model import RailDescription
+    from coordinator.kinematics.base import Point
+    from coordinator.runtime.machine import Machine
     from coordinator.runtime.module_context import Live
+    from coordinator.runtime.moves.homing import HomingResult
 
 AWAY_MM: Final = 5.0
 """How far a rail that stands on its endstop goes away first, where homing_retract_dist is 0."""

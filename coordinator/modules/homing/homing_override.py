@@ -3,11 +3,11 @@
 from dataclasses import replace
 from typing import Final
 
-from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Lines, Reading
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec, TextOption
+from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Lines, Reading
 from coordinator.modules.base import Build, Module
-from coordinator.modules.programs.gcode_macro import GCodeTemplate, parameters
 from coordinator.modules.homing.homing import Homing
+from coordinator.modules.programs.gcode_macro import GCodeTemplate, parameters
 
 GCODE: Final = GCodeOption(name="gcode", help="what is done instead of G28, a template; a G28 in it homes")
 AXES: Final = TextOption(

@@ -3,11 +3,11 @@
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from coordinator.config.errors import ConfigError
+from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
+from coordinator.config.sections.printer import MAX_SPEED
 from coordinator.gcode.commands import AtRest, Call, Done, Reading
 from coordinator.gcode.parser import WordError
-from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
-from coordinator.config.errors import ConfigError
-from coordinator.config.sections.printer import MAX_SPEED
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import STRAIGHT, Homing
 from nodes.support.errors import CanductorError

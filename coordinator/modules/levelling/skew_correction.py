@@ -9,12 +9,12 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from coordinator.config.errors import ConfigError
+from coordinator.config.options import FloatOption, SectionSpec
+from coordinator.gcode.builtins.machine import come_to_rest
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Position, Reading, ToProgram
 from coordinator.gcode.events import PositionSet, WeightsChange
-from coordinator.gcode.builtins.machine import come_to_rest
 from coordinator.gcode.parser import Command, WordError, quoted
-from coordinator.config.options import FloatOption, SectionSpec
-from coordinator.config.errors import ConfigError
 from coordinator.modules.base import Build, Module, Modules, Value
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.words import flag, one, parameters, value

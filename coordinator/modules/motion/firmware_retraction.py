@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
+from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
 from coordinator.gcode.parser import WordError
-from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.modules.base import Build, Module, Value
 from coordinator.modules.words import bounded, parameters
 

@@ -3,17 +3,17 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
-from coordinator.gcode.parser import WordError
 from coordinator.config.options import BoolOption, FloatOption, ListOption, SectionSpec
 from coordinator.config.pins import PinOption
+from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module, Value
 from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
 from coordinator.modules.words import one, parameters, value
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
-from nodes.support.errors import CanductorError
 from nodes.node.config import NodeConfig
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

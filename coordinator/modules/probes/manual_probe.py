@@ -7,11 +7,11 @@ from bisect import insort
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
+from coordinator.config.options import SectionSpec
+from coordinator.gcode.builtins.state import go
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading, ToProgram
 from coordinator.gcode.events import Reply
-from coordinator.gcode.builtins.state import go
 from coordinator.gcode.parser import Command, WordError, number, quoted
-from coordinator.config.options import SectionSpec
 from coordinator.modules.base import Build, Module, Value
 
 if TYPE_CHECKING:

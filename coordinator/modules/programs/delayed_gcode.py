@@ -3,10 +3,10 @@
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
+from coordinator.config.errors import nearest
+from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.gcode.parser import Command, WordError, quoted
-from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
-from coordinator.config.errors import nearest
 from coordinator.modules.base import Build, Module, Modules, Value
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, needed, parameters

@@ -6,8 +6,8 @@ Every machine has it, with its defaults where there is no such section.
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
 from coordinator.modules.base import Build, Module, Modules, Value
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, parameters

@@ -7,10 +7,10 @@ behind that. RESUME goes back there and lets the job go on.
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
+from coordinator.config.options import FloatOption, SectionSpec
+from coordinator.gcode.builtins.state import save_state
 from coordinator.gcode.commands import Call, GCodeCommand, Reading, ToProgram
 from coordinator.gcode.events import Reply
-from coordinator.gcode.builtins.state import save_state
-from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.modules.base import Build, Module, Value
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.modules.words import bounded, parameters

@@ -2,8 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.config.options import SectionSpec
+from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.modules.base import Build, Module, Value
 from nodes.support.errors import CanductorError
 

@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from coordinator.config.errors import ConfigError, shown_path
+from coordinator.config.options import SectionSpec, TextOption
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
-from coordinator.config.options import SectionSpec, TextOption
-from coordinator.config.errors import ConfigError, shown_path
 from coordinator.modules.base import Build, Module, Modules, Value
 from coordinator.modules.programs.gcode_macro import literal, plain
 from coordinator.modules.words import needed, parameters

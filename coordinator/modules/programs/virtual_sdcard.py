@@ -4,11 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from coordinator.config.options import GCodeOption, SectionSpec, TextOption
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, ToProgram
+from coordinator.gcode.parser import WordError
 from coordinator.gcode.print_control import Recovering
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.gcode.parser import WordError
-from coordinator.config.options import GCodeOption, SectionSpec, TextOption
 from coordinator.modules.base import Build, Module, Value
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats

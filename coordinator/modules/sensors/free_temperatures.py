@@ -7,9 +7,7 @@ min_temp and max_temp.
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from coordinator.heat.chip_sensors import ChipLine, ChipSensor, FactoryPoints, chip_sensor
 from coordinator.config.errors import ConfigError, nearest, shown
-from coordinator.modules.base import Build, Modules
 from coordinator.config.sections.sensor_options import (
     CHIP_POINTS,
     COMBINATION_METHOD,
@@ -21,12 +19,14 @@ from coordinator.config.sections.sensor_options import (
     SENSOR_PATH,
     SENSOR_TYPE,
 )
+from coordinator.heat.chip_sensors import ChipLine, ChipSensor, FactoryPoints, chip_sensor
+from coordinator.modules.base import Build, Modules
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from nodes.devices.analog_in import AnalogIn, AnalogValue
-from nodes.support.errors import CanductorError
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.states import NodeState
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

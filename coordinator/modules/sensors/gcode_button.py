@@ -3,12 +3,12 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.config.options import GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.modules.base import Build, Module, Modules, Value
-from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.pinned import add_pinned
+from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import flag, one, parameters
 from nodes.devices.button import Button
 

@@ -2,20 +2,7 @@
 
 from typing import TYPE_CHECKING, Final
 
-from coordinator.heat.known_sensors import (
-    PT100,
-    PT100_BOARD_GAIN,
-    PT100_BOARD_PULLUP_OHMS,
-    PT100_BOARD_SUPPLY_V,
-    PT1000,
-    THERMISTORS,
-)
-from coordinator.heat.resistors import SensorError
-from coordinator.heat.sensors import AmplifiedPullUp, PullUp, Sensor, ratio_range
-from coordinator.heat.thermocouples import AMPLIFIERS, amplifier
 from coordinator.config.errors import ConfigError, NotActing, nearest, shown
-from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.pinned import add_pinned
 from coordinator.config.sections.sensor_options import (
     ADC_VOLTAGE,
     FREE_SENSORS,
@@ -28,6 +15,19 @@ from coordinator.config.sections.sensor_options import (
     SENSOR_TYPE,
     VOLTAGE_OFFSET,
 )
+from coordinator.heat.known_sensors import (
+    PT100,
+    PT100_BOARD_GAIN,
+    PT100_BOARD_PULLUP_OHMS,
+    PT100_BOARD_SUPPLY_V,
+    PT1000,
+    THERMISTORS,
+)
+from coordinator.heat.resistors import SensorError
+from coordinator.heat.sensors import AmplifiedPullUp, PullUp, Sensor, ratio_range
+from coordinator.heat.thermocouples import AMPLIFIERS, amplifier
+from coordinator.modules.base import Build, Module, Modules
+from coordinator.modules.pinned import add_pinned
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.modules.sensors.thermistor import KINDS, Circuit, CustomSensor
 from nodes.devices.analog_in import AnalogIn, AnalogValue

@@ -4,10 +4,14 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Final
 
 from coordinator.config.options import SectionSpec, TextOption
+from coordinator.config.sections.sensor_options import (
+    FREE_SENSOR_OPTIONS,
+    LATER_SENSOR_OPTIONS,
+    SENSOR_OPTIONS,
+)
 from coordinator.modules.base import Build, Modules, Value
-from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.heaters.heaters import Heaters
-from coordinator.config.sections.sensor_options import FREE_SENSOR_OPTIONS, LATER_SENSOR_OPTIONS, SENSOR_OPTIONS
+from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_input import SensorModule
 
 if TYPE_CHECKING:

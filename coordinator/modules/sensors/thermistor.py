@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Mapping
 from typing import ClassVar, Final
 
+from coordinator.config.errors import ConfigError
+from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.heat.resistors import ResistanceTable, Resistor, SensorError, SteinhartHart
 from coordinator.heat.sensors import PullUp, Sensor, Voltage
-from coordinator.config.options import FloatOption, SectionSpec
-from coordinator.config.errors import ConfigError
 from coordinator.modules.base import Build, Module
 from nodes.support.records import record
 

@@ -2,9 +2,9 @@
 
 from typing import Final
 
+from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.config.options import SectionSpec
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.print_stats import PrintStats
 

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Final
 
+from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, number
-from coordinator.config.options import SectionSpec
 from coordinator.modules.base import Build, Module, Value
 from coordinator.modules.words import parameters
 

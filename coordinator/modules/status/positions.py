@@ -2,9 +2,9 @@
 
 from typing import TYPE_CHECKING
 
+from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.status import frames
-from coordinator.config.options import SectionSpec
 from coordinator.modules.base import Build, Module
 
 if TYPE_CHECKING:

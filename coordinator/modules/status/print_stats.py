@@ -6,8 +6,8 @@ A service tells it; where there is none, nothing is ever printed.
 from collections.abc import Mapping
 from typing import Final
 
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.config.options import SectionSpec
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.modules.base import Build, Module, Value
 from coordinator.modules.words import bounded, parameters
 

@@ -9,10 +9,10 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from coordinator.gcode.commands import Call
 from coordinator.config.options import SectionSpec
-from coordinator.modules.status.absent_status import absent_statuses
+from coordinator.gcode.commands import Call
 from coordinator.modules.base import Build, Module, Modules
+from coordinator.modules.status.absent_status import absent_statuses
 from coordinator.modules.status.config_view import ConfigView
 from coordinator.modules.status.machine_view import Commands, machine_view
 from coordinator.modules.status.print_stats import PrintStats

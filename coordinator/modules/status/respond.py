@@ -1,9 +1,9 @@
 """[respond]: RESPOND shows a line to the user, with a prefix that tells its kind; so does M118."""
 
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
-from coordinator.gcode.reply_kinds import kind_of_line
-from coordinator.gcode.parser import WordError, quoted
 from coordinator.config.options import ChoiceOption, SectionSpec, TextOption
+from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.parser import WordError, quoted
+from coordinator.gcode.reply_kinds import kind_of_line
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import parameters
 

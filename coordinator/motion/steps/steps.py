@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any
 
-from coordinator.motion.steps._steps import ffi, lib
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
+from coordinator.motion.steps._steps import ffi, lib
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
 

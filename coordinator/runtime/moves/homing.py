@@ -17,14 +17,14 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.runtime.machine import Machine
 from coordinator.assembly.load import CanConnection, RailDescription, StepperDescription
+from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.single import START_LEAD_S, WAY, Ramp, SingleMove, ratio_of
 from nodes.clock.clock import Ticks, extend32
 from nodes.devices.endstop import Endstop
 from nodes.devices.trsync import NO_GROUP, TriggerReason, Trsync, TrsyncState
-from nodes.support.errors import CanductorError
 from nodes.node.node import Node
+from nodes.support.errors import CanductorError
 
 CYCLE_S: Final = 0.025
 """How often steps are sent, and time-outs renewed."""

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from coordinator.runtime.machine import Machine, link_of
 from coordinator.assembly.load import StepperDescription
 from coordinator.motion.specs import StepKinematics, StepperSpec
 from coordinator.motion.steps.steps import StepGenerator
 from coordinator.motion.trapezoid_array import TRAPEZOID
+from coordinator.runtime.machine import Machine, link_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

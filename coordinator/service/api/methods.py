@@ -3,13 +3,13 @@
 from collections.abc import Iterable
 
 from coordinator.ipc.protocol.methods import Method, Registry
-from coordinator.service.core.machine_service import MachineService
 from coordinator.service.api.jobs import job_methods
 from coordinator.service.api.machine import machine_methods
 from coordinator.service.api.motion import motion_methods
 from coordinator.service.api.nodes import node_methods
 from coordinator.service.api.plots import plot_methods
 from coordinator.service.api.tables import table_methods
+from coordinator.service.core.machine_service import MachineService
 
 
 def add_methods(service: MachineService, registry: Registry) -> None:

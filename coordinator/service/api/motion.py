@@ -6,15 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from coordinator.runtime.machine import Machine
 from coordinator.gcode.builtins.basic import BESIDE, HANDLERS
-from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.builtins.machine import is_tool
+from coordinator.gcode.errors import GCodeError
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
 from coordinator.modules.module_set import INTERRUPTING
-from coordinator.streaming.move_source import Told
+from coordinator.runtime.machine import Machine
 from coordinator.service.core.feeder import FeederFull, Ticket
-from coordinator.service.state.figures import axes, position_figures
 from coordinator.service.core.machine_service import MachineService, ServiceState
 from coordinator.service.core.motion import Motion, MotionOver, texts
 from coordinator.service.core.work import (
@@ -28,6 +26,8 @@ from coordinator.service.core.work import (
     WorkError,
     commands_in,
 )
+from coordinator.service.state.figures import axes, position_figures
+from coordinator.streaming.move_source import Told
 from nodes.support.errors import CanductorError
 
 _DEFAULT_SPEED_MM_S: Final = 25.0

@@ -5,11 +5,11 @@ from typing import Any, Final
 
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
 from coordinator.ipc.server.state import FieldFilter
-from coordinator.service.state.figures import field_name
 from coordinator.service.core.machine_service import MachineService
-from nodes.support.errors import CanductorError
+from coordinator.service.state.figures import field_name
 from nodes.dictionary.message_format import Message
 from nodes.node.node import Node
+from nodes.support.errors import CanductorError
 
 _COMMAND_MAX: Final = 512
 _NAME_MAX: Final = 128

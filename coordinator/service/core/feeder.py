@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from coordinator.gcode.builtins.state import come_back, present_state
 from coordinator.gcode.commands import NO_WORDS, Vocabulary
 from coordinator.gcode.events import (
     AS_SOON_AS_POSSIBLE,
@@ -27,9 +28,8 @@ from coordinator.gcode.events import (
 )
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import MachineState, SavedState
-from coordinator.gcode.print_control import Recovering
-from coordinator.gcode.builtins.state import come_back, present_state
 from coordinator.gcode.parser import WordError
+from coordinator.gcode.print_control import Recovering
 from coordinator.motion.planner.planner import Planner
 from coordinator.service.core.work import NO_PROGRESS, LinesWork, Rest, Setting, Work
 from nodes.support.errors import CanductorError

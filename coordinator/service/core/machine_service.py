@@ -12,30 +12,30 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from coordinator.runtime.machine import Machine, MachineStopped
+from coordinator.assembly.load import MachineDescription
 from coordinator.gcode.events import Notice
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.runtime.host import Host
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.ipc.server.state import StateTree
-from coordinator.assembly.load import MachineDescription
-from coordinator.streaming.move_source import Told
-from coordinator.streaming.pipeline import PlanRecord
-from coordinator.service.jobs.fed import FedJobs
-from coordinator.service.state.figures import Figures
-from coordinator.service.jobs.job_folder import JobFolder
-from coordinator.service.jobs.jobs import JobPhase, JobRun
-from coordinator.service.state.log_ring import Entry, LogRing
+from coordinator.runtime.host import Host
+from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.service.core.memory import give_back, keep_small, pass_by_what_stays
 from coordinator.service.core.motion import Motion
 from coordinator.service.core.programs import Programs
-from coordinator.service.jobs.recovery import Recovery
 from coordinator.service.core.tables import TableService
 from coordinator.service.core.work import FileWork
+from coordinator.service.jobs.fed import FedJobs
+from coordinator.service.jobs.job_folder import JobFolder
+from coordinator.service.jobs.jobs import JobPhase, JobRun
+from coordinator.service.jobs.recovery import Recovery
+from coordinator.service.state.figures import Figures
+from coordinator.service.state.log_ring import Entry, LogRing
+from coordinator.streaming.move_source import Told
+from coordinator.streaming.pipeline import PlanRecord
 from coordinator.tables.store import TableStore
 from nodes.dictionary.cache import DictionaryCache
-from nodes.support.errors import CanductorError
 from nodes.node.errors import NodeShutdown
+from nodes.support.errors import CanductorError
 
 REFRESH_S: Final = 0.1
 """How often the state tree is brought up to date."""

@@ -4,18 +4,18 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Sequence
 
-from coordinator.runtime.machine import Machine
-from coordinator.streaming.compensation import Compensation
 from coordinator.gcode.events import Notice
 from coordinator.motion.planner.planner import Planner
+from coordinator.runtime.machine import Machine
+from coordinator.service.core.feeder import Feeder, Ticket
+from coordinator.service.core.motion_lead import MotionLead
+from coordinator.service.core.work import LinesWork, Work
+from coordinator.service.state.toolpath import Toolpath
+from coordinator.service.state.trace import KEEP_S, Moment, MotionTrace
+from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.move_source import JobState, Planned, Told
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.program_machine import machine_state
-from coordinator.service.core.feeder import Feeder, Ticket
-from coordinator.service.core.motion_lead import MotionLead
-from coordinator.service.state.toolpath import Toolpath
-from coordinator.service.state.trace import KEEP_S, Moment, MotionTrace
-from coordinator.service.core.work import LinesWork, Work
 from coordinator.streaming.streamer import Streamer
 
 UNMOVED = Planned((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, "", 1.0, 1.0, 0.0)

@@ -11,13 +11,13 @@ from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.base import Value
 from coordinator.modules.programs.gcode_macro import words_in
 from coordinator.modules.programs.pause_resume import PauseResume
-from coordinator.modules.status.print_stats import PrintStats
 from coordinator.modules.programs.virtual_sdcard import VirtualSdcard
+from coordinator.modules.status.print_stats import PrintStats
 from coordinator.service.core.feeder import FeederFull
-from coordinator.service.jobs.job_folder import JobFolder
-from coordinator.service.jobs.jobs import JobPhase, JobRun
 from coordinator.service.core.motion import MotionOver
 from coordinator.service.core.work import FileWork, LinesWork, Rest
+from coordinator.service.jobs.job_folder import JobFolder
+from coordinator.service.jobs.jobs import JobPhase, JobRun
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:

@@ -8,24 +8,24 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from coordinator.assembly.load import MachineDescription, load_machine
 from coordinator.cli.parser import version
-from coordinator.support.command_options import RunOptions, ServeOptions
-from coordinator.runtime.host import LinuxHost
-from coordinator.support.interrupts import run_to_end
 from coordinator.ipc.discovery.announcement import Announcement, bracketed, host_word
 from coordinator.ipc.discovery.announcer import Announcer
-from coordinator.ipc.server.tcp_listener import raise_files_limit
 from coordinator.ipc.protocol.methods import Registry, Scope, Value
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.session_methods import API_VERSION
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
+from coordinator.ipc.server.tcp_listener import raise_files_limit
 from coordinator.ipc.server.uploads import upload_method
-from coordinator.assembly.load import MachineDescription, load_machine
-from coordinator.service.state.log_ring import Entry
-from coordinator.service.core.machine_service import MachineService, ServiceSettings
+from coordinator.runtime.host import LinuxHost
 from coordinator.service.api.methods import add_methods
+from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.core.typed import Typed
+from coordinator.service.state.log_ring import Entry
+from coordinator.support.command_options import RunOptions, ServeOptions
+from coordinator.support.interrupts import run_to_end
 from coordinator.tables.store import table_folder
 from coordinator.web.access import LINK_S
 from coordinator.web.methods import add_page_methods

@@ -9,22 +9,22 @@ import asyncio
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+from coordinator.ipc.server.state import StateTree
 from coordinator.runtime.machine import Machine
 from coordinator.streaming.compensation import WHICH_AXES, Compensation, corrected_axes, why_not_corrected
-from coordinator.ipc.server.state import StateTree
 from coordinator.tables.axis_table import AxisTable, TableError, figures, notes
 from coordinator.tables.axle_map import StepperTables
 from coordinator.tables.store import TableStore
 from nodes.clock.clock import HostTime
-from nodes.support.errors import CanductorError
-from nodes.node.node import Node
-from nodes.node.states import NodeState
 from nodes.mt.download import Outcome, Place, Report, download
 from nodes.mt.mt import MtStatus, Pair
+from nodes.node.node import Node
+from nodes.node.states import NodeState
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.assembly.load import MachineDescription
-    from nodes.devices.table import ActiveTable, AxleTable, TableState
+    from nodes.mt.table import ActiveTable, AxleTable, TableState
 
 CARE_S: Final = 0.5
 """How often the nodes are looked at for one that came back, and tables for one that is not in use yet."""

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Final
 
 from coordinator.ipc.protocol.methods import Caller, Registry, Scope
-from coordinator.service.core.machine_service import MachineService
 from coordinator.service.api.motion import motion_methods
+from coordinator.service.core.machine_service import MachineService
 from nodes.support.errors import CanductorError
 
 LINES_MAX: Final = 1000

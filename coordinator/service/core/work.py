@@ -13,9 +13,9 @@ from coordinator.gcode.commands import Vocabulary
 from coordinator.gcode.events import End, Event, Full, Idle, Progress
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import MachineState
+from coordinator.gcode.parser import WordError, parse
 from coordinator.gcode.print_control import PrintControl
 from coordinator.gcode.program import Program
-from coordinator.gcode.parser import WordError, parse
 from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus, Planner
 from nodes.support.errors import CanductorError
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 
 from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError, shown
-from coordinator.service.jobs.jobs import JobPhase, JobRun
 from coordinator.service.core.work import FileWork
+from coordinator.service.jobs.jobs import JobPhase, JobRun
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:

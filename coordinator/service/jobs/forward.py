@@ -4,14 +4,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from coordinator.gcode.builtins.state import present_state
 from coordinator.gcode.events import Emergency, End
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import SavedState
 from coordinator.gcode.program import Program
-from coordinator.gcode.builtins.state import present_state
+from coordinator.modules.levelling.skew_correction import Skews
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
-from coordinator.modules.levelling.skew_correction import Skews
 from coordinator.motion.planner.planner import Planner
 from coordinator.streaming.program_machine import machine_state
 from nodes.support.errors import CanductorError

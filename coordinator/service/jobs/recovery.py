@@ -10,20 +10,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from coordinator.gcode.builtins.state import come_back
 from coordinator.gcode.events import Event, Full, Notice
 from coordinator.gcode.print_control import Recovering
 from coordinator.gcode.program import Program
-from coordinator.gcode.builtins.state import come_back
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.service.core.feeder import COME_BACK_MM_S
+from coordinator.service.core.motion import Motion
+from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Setting, Work
 from coordinator.service.jobs.forward import Reached, read_forward
 from coordinator.service.jobs.jobs import JobPhase, JobRun
 from coordinator.service.jobs.journal import ENTRY_S, NAME, Interrupted, Journal, read_journal
-from coordinator.service.core.motion import Motion
-from coordinator.service.jobs.resume_homing import LIFT_MM, LIFT_MM_S, TakeHeight, WayHome, sure_height, way_home
-from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Setting, Work
+from coordinator.service.jobs.resume_homing import (
+    LIFT_MM,
+    LIFT_MM_S,
+    TakeHeight,
+    WayHome,
+    sure_height,
+    way_home,
+)
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from coordinator.gcode.builtins.machine import come_to_rest
 from coordinator.gcode.commands import Done
 from coordinator.gcode.events import Event, Full
-from coordinator.gcode.builtins.machine import come_to_rest
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.homing.homing import Homing
 from coordinator.service.core.work import LinesWork, Setting

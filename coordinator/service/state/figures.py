@@ -8,20 +8,20 @@ from collections import deque
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
-from coordinator.runtime.machine import link_of
 from coordinator.ipc.protocol.methods import Value
 from coordinator.ipc.server.state import StateTree
 from coordinator.motion.planner.planner import AXIS_LETTERS, Position
-from nodes.support.errors import CanductorError
+from coordinator.runtime.machine import link_of
 from nodes.link import BusLoad, IOStats, LinkStats
 from nodes.node.node import Node
 from nodes.node.states import NodeState
+from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
     from coordinator.runtime.machine import Machine
-    from coordinator.service.jobs.jobs import JobRun
     from coordinator.service.core.machine_service import MachineService
     from coordinator.service.core.motion import Motion
+    from coordinator.service.jobs.jobs import JobRun
 
 RECENT_LOOKS: Final = 10
 """A lead is recent for so many looks: about a second."""

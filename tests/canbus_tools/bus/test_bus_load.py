@@ -15,7 +15,7 @@ from canbus_tools.bus.bus_load import (
     TrafficClass,
     frame_bits,
 )
-from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.protocol.frame import Frame, FrameKind
 from nodes.support.errors import CanductorError
 from tests.nodes.wire_bits import bits_on_wire, crc15
 

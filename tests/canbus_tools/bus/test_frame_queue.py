@@ -6,9 +6,9 @@ import can
 import pytest
 
 from canbus_tools.bus.computer import ThisComputer
-from canbus_tools.bus.frame import Frame
 from canbus_tools.bus.frame_queue import FrameQueue
 from canbus_tools.bus.open_bus import BusOptions
+from canbus_tools.protocol.frame import Frame
 from nodes.support.errors import CanductorError
 
 WAIT_S = 60.0

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from canbus_tools.bus.frame import Frame
 from canbus_tools.bus.talk import LISTEN_S, BusTalk, NodeTalk, TalkError
+from canbus_tools.protocol.frame import Frame
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.message_format import Message
 from tests.stages.can_stage import MAIN, MAIN_ID, TOOL_ID, CanStage, SixNodes

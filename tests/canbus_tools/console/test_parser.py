@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from canbus_tools.console.expressions import Quantity
 from canbus_tools.console.parser import (
     ConsoleError,
     NodeCommand,
@@ -17,7 +18,6 @@ from canbus_tools.console.parser import (
     read_repeat,
     values_of,
 )
-from canbus_tools.console.expressions import Quantity
 from nodes.dictionary.message_format import MessageError
 from nodes.virtual.firmware import MAINBOARD, firmware_dictionary
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from canbus_tools.bus.frame import Frame
+from canbus_tools.protocol.frame import Frame
 from canbus_tools.recordings.recordings import read_frames
-from coordinator.cli import main
+from coordinator.cli.main import main
 from nodes.virtual.firmware import MAINBOARD, firmware_path
 from tests.canbus_tools.command import Command
 from tests.nodes.wire_bits import bits_on_wire

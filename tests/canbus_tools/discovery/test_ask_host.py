@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.discovery import ask_host
 from canbus_tools.discovery.ask_host import ask_hosts
 from canbus_tools.discovery.node_info import Facts
-from canbus_tools.bus.open_bus import BusOptions
 
 NODE = {
     "bus": "can0",

@@ -13,7 +13,8 @@ from canbus_tools.discovery.node_discovery import (
     Census,
     CensusResult,
 )
-from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID, ANSWER_NS, QUERY_UNASSIGNED, WHO_IS_HERE, Uuid
+from nodes.bus.assign import ANSWER_NS, Uuid
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, QUERY_UNASSIGNED, WHO_IS_HERE
 
 A, B = Uuid(b"\x01" * 6), Uuid(b"\x02" * 6)
 Answers = Callable[[int, int], list[bytes]]

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
+from canbus_tools.dissector.dissector import ANY, lua
 from canbus_tools.protocol.decoded import Kind
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import DictionarySource, read_dictionary
-from canbus_tools.dissector.dissector import ANY, lua
-from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.protocol.frame import Frame, FrameKind
 from canbus_tools.protocol.protocol import ADMIN_FRAMES, BLOCK, SIGNAL_FRAMES, Direction, data_id
 from coordinator.cli import main as cli
-from nodes.support._wire import lib
-from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.dictionary.dictionary import Dictionary
+from nodes.support._wire import lib
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.transport import CanFrame
 from nodes.virtual.firmware import TOOLHEAD, firmware_dictionary, firmware_path
 from tests.canbus_tools import recorded

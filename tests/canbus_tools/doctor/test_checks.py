@@ -7,7 +7,10 @@ from pathlib import Path
 import pytest
 
 from canbus_tools.bus.bus_load import LoadMeter
+from canbus_tools.bus.link_facts import LinkFacts, parse_link
+from canbus_tools.discovery.inventory import Entry, State, SurveyResult
 from canbus_tools.discovery.node_discovery import Application, Census
+from canbus_tools.discovery.node_info import CanStatus, Facts, Firmware
 from canbus_tools.doctor.facts import (
     AdapterFacts,
     InterfaceFacts,
@@ -18,15 +21,12 @@ from canbus_tools.doctor.facts import (
     WayFacts,
 )
 from canbus_tools.doctor.finding import Finding, Severity
+from canbus_tools.doctor.gather import error_kinds, read_adapter
 from canbus_tools.doctor.interface import check_link, check_presence
 from canbus_tools.doctor.known_faults import faults_of, kernel_version
 from canbus_tools.doctor.population import check_nodes
 from canbus_tools.doctor.traffic import check_traffic
-from canbus_tools.doctor.gather import error_kinds, read_adapter
-from canbus_tools.bus.frame import Frame, FrameKind
-from canbus_tools.discovery.node_info import CanStatus, Facts, Firmware
-from canbus_tools.bus.link_facts import LinkFacts, parse_link
-from canbus_tools.discovery.inventory import Entry, State, SurveyResult
+from canbus_tools.protocol.frame import Frame, FrameKind
 from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
 

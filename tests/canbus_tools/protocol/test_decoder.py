@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from canbus_tools.protocol.decoded import Decoded, Kind
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import LEARNT, DictionarySource
-from canbus_tools.bus.frame import Frame, FrameKind
+from canbus_tools.protocol.frame import Frame, FrameKind
 from canbus_tools.protocol.protocol import Direction
 from nodes.dictionary.dictionary import Dictionary
 from tests import wire_twin as twin

@@ -6,17 +6,17 @@ import pytest
 
 from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.monitor.bus_watch import BusWatch
-from canbus_tools.recordings.candump import candump_line
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import GUESSED, LEARNT, DictionarySource
 from canbus_tools.protocol.filters import Filter
-from canbus_tools.bus.frame import Frame
-from canbus_tools.tools.monitor import Lines, MonitorOptions
+from canbus_tools.protocol.frame import Frame
 from canbus_tools.protocol.protocol import Direction
-from coordinator.cli import main
-from nodes.dictionary.dictionary import Dictionary
+from canbus_tools.recordings.candump import candump_line
+from canbus_tools.tools.monitor import Lines, MonitorOptions
+from coordinator.cli.main import main
 from nodes.dictionary.cache import DictionaryCache
+from nodes.dictionary.dictionary import Dictionary
 from tests import real_dictionaries
 from tests import wire_twin as twin
 from tests.canbus_tools.talk_twin import (

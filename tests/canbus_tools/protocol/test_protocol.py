@@ -5,9 +5,7 @@ import pytest
 from canbus_tools.protocol.protocol import (
     ADMIN_FRAMES,
     BLOCK,
-    BUS_STOP_ID,
     SIGNAL_FRAMES,
-    SYNC_PULSE,
     Direction,
     FieldKind,
     FrameFormat,
@@ -18,6 +16,7 @@ from canbus_tools.protocol.protocol import (
 from nodes.bus import can_bus
 from nodes.clock import sync_pulse
 from nodes.support._wire import lib
+from nodes.support.can_protocol import BUS_STOP_ID, SYNC_PULSE
 from tests import wire_twin as twin
 
 ALL = (*ADMIN_FRAMES, *SIGNAL_FRAMES)

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from canbus_tools.protocol.frame import Frame, FrameKind
 from canbus_tools.recordings import pcap as _pcap
 from canbus_tools.recordings.candump import candump_line, read_candump
-from canbus_tools.bus.frame import Frame, FrameKind
 from canbus_tools.recordings.mcap_file import McapWriter
 from canbus_tools.recordings.recordings import read_frames
 from nodes.support.errors import CanductorError

@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from nodes.mt.mt import MT_CAN_ID, WORD_BYTES, from_bytes
+from nodes.mt.mt import WORD_BYTES, from_bytes
+from nodes.support.can_protocol import MT_CAN_ID
 from nodes.virtual.firmware import TOOLHEAD
 from tests.canbus_tools.command import Command, Said
 from tests.nodes.mt import literal

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from canbus_tools.bus.talk import NodeTalk
-from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID, NEED_NODEID, QUERY_UNASSIGNED, SET_NODEID
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, NEED_NODEID, QUERY_UNASSIGNED, SET_NODEID
 from nodes.transport import CanFrame
 from nodes.virtual.firmware import TOOLHEAD
 from tests.canbus_tools.command import Command

@@ -16,9 +16,9 @@ from prompt_toolkit.document import Document
 from prompt_toolkit.input import create_pipe_input
 from prompt_toolkit.output import DummyOutput
 
+from canbus_tools.bus.talk import NodeTalk
 from canbus_tools.console.prompt import SessionCompleter, prompt
 from canbus_tools.console.session import Session
-from canbus_tools.bus.talk import NodeTalk
 from tests.canbus_tools.command import Command, Said
 from tests.stages.can_stage import BED, MAIN, MAIN_ID, TOOL, TOOL_ID, CanStage, SixNodes
 from tests.stages.terminal_loop import TerminalLoop

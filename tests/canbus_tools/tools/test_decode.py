@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from canbus_tools.protocol.frame import Frame
 from canbus_tools.recordings.candump import candump_line
-from canbus_tools.bus.frame import Frame
 from canbus_tools.recordings.mcap_file import McapWriter
-from coordinator.cli import main
+from coordinator.cli.main import main
 from tests.canbus_tools import recorded
 from tests.canbus_tools.talk_twin import DICTIONARY_JSON, Talk, identify_pieces
 

@@ -5,12 +5,12 @@ from functools import partial
 
 import pytest
 
+from canbus_tools.discovery.inventory import SurveyResult
 from canbus_tools.discovery.node_discovery import Census
 from canbus_tools.doctor.facts import NodeFacts
 from canbus_tools.doctor.facts import Place as Bus
-from canbus_tools.doctor.population import check_nodes
 from canbus_tools.doctor.gather import ASKED
-from canbus_tools.discovery.inventory import SurveyResult
+from canbus_tools.doctor.population import check_nodes
 from nodes.transport import CanFrame
 from tests.canbus_tools.command import Command
 from tests.canbus_tools.findings import BITRATE, examine, expect, problems

@@ -16,7 +16,7 @@ import pytest
 from canbus_tools.inject.fault_options import read_fault
 from canbus_tools.inject.inject_report import status
 from coordinator.cli import main as cli
-from nodes.bus.assign import ADMIN_ID, ADMIN_RESPONSE_ID, NEED_NODEID, QUERY_UNASSIGNED
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, NEED_NODEID, QUERY_UNASSIGNED
 from nodes.support.option_values import UsageError
 from nodes.virtual.faults import Fault, FaultKind
 from nodes.virtual.hub import VirtualBus

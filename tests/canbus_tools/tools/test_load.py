@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from canbus_tools.recordings.candump import candump_line
-from canbus_tools.bus.frame import Frame
-from canbus_tools.tools.load import find_bitrate
-from canbus_tools.recordings.recordings import read_frames
 from canbus_tools.bus.talk import BusTalk
-from coordinator.cli import main
+from canbus_tools.protocol.frame import Frame
+from canbus_tools.recordings.candump import candump_line
+from canbus_tools.recordings.recordings import read_frames
+from canbus_tools.tools.load import find_bitrate
+from coordinator.cli.main import main
 from nodes.transport import CanFrame
 from tests.canbus_tools.command import Command, Said
 from tests.nodes.wire_bits import bits_on_wire

@@ -9,11 +9,11 @@ import sys
 import pytest
 
 from canbus_tools.bus.bus_load import LoadMeter
-from canbus_tools.monitor.bus_watch import SPAN_S, BusWatch
 from canbus_tools.bus.computer import Listener, now_s
+from canbus_tools.monitor.bus_watch import SPAN_S, BusWatch
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.filters import Filter
-from canbus_tools.bus.frame import Frame
+from canbus_tools.protocol.frame import Frame
 from canbus_tools.tools.monitor import Lines, MonitorOptions, fetch
 from nodes.support.errors import CanductorError
 from nodes.virtual.firmware import MAINBOARD, firmware_path

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from canbus_tools.discovery.inventory import DAMAGED_BLOCK
-from nodes.bus.assign import ADMIN_ID, QUERY_UNASSIGNED, SET_NODEID
+from nodes.support.can_protocol import ADMIN_ID, QUERY_UNASSIGNED, SET_NODEID
 from nodes.transport import CanFrame
 from nodes.virtual.firmware import TOOLHEAD
 from tests import wire_twin

@@ -11,11 +11,11 @@ import pytest
 from mcap.reader import make_reader
 
 from canbus_tools.protocol.decoder import BusDecoder
-from canbus_tools.bus.frame import Frame
+from canbus_tools.protocol.frame import Frame
 from canbus_tools.recordings.mcap_file import COUNTERS, FRAMES, MESSAGES
-from canbus_tools.tools.record import DRAIN_S
 from canbus_tools.recordings.recordings import read_frames
-from coordinator.cli import main
+from canbus_tools.tools.record import DRAIN_S
+from coordinator.cli.main import main
 from nodes.transport import CanFrame
 from tests.canbus_tools.command import Command
 from tests.canbus_tools.talk_twin import Talk, download, identify_pieces

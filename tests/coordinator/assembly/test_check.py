@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli.commands.config import check
 from coordinator.assembly import check as check_module
 from coordinator.assembly.check import check_config
+from coordinator.cli.commands.config import check
 
 EXAMPLES = sorted(Path("config").rglob("*.cfg"))
 GOOD = """\

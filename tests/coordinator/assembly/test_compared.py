@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.builtins import basic as basic_commands, machine as machine_commands
 from coordinator.config.unsupported import LATER_SECTIONS
+from coordinator.gcode.builtins import basic as basic_commands
+from coordinator.gcode.builtins import machine as machine_commands
 from coordinator.modules.registry import own_kinds
 
 ROOT = Path(__file__).parents[3]

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.support.command_options import EXAMPLES, PlanOptions
-from coordinator.kinematics.base import Point
 from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.kinematics.base import Point
 from coordinator.modules.homing.homing_override import HomingOverride
 from coordinator.planning.plan import plan_file
+from coordinator.support.command_options import EXAMPLES, PlanOptions
 
 SAMPLES = 2000
 EXAMPLE_FILES = sorted(path for path in EXAMPLES.glob("*.cfg") if path.stem != "none")  # whose head stands

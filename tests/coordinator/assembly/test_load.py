@@ -3,11 +3,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.support.command_options import EXAMPLES
 from coordinator.assembly.load import CanConnection, MachineDescription, UartConnection, load_machine
-from coordinator.config.options import Option, SectionSpec
 from coordinator.assembly.reference import SECTIONS
+from coordinator.config.options import Option, SectionSpec
 from coordinator.config.unsupported import LATER_SECTIONS
+from coordinator.support.command_options import EXAMPLES
 from tests.stages.printer_text import PRINTER_CFG, changed, write
 
 SHARED = Path(__file__).parents[3] / ".." / "shared" / "data" / "config"

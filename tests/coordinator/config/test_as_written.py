@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from coordinator.assembly.load import ConfigError, MachineDescription, load_machine
-from coordinator.modules.programs.idle_timeout import IdleTimeout
 from coordinator.modules.drivers.tmc_driver import Tmc2209
+from coordinator.modules.programs.idle_timeout import IdleTimeout
 from tests.stages.printer_text import PRINTER_CFG, changed, write
 
 DRIVER = "[tmc2209 stepper_x]\nuart_pin: PF0\nrun_current: 0.8\n"

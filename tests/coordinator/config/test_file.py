@@ -5,8 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.config import text as config_text
-from coordinator.config.file import ConfigFile, parse_config
 from coordinator.config.errors import ConfigError, Place
+from coordinator.config.file import ConfigFile, parse_config
 from tests.profiles import examples
 from tests.stages.printer_text import write
 

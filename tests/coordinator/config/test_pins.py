@@ -2,9 +2,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from coordinator.config.errors import ConfigError, Place
 from coordinator.config.options import BadValue
 from coordinator.config.pins import PinDescription, PinName, PinOption
-from coordinator.config.errors import ConfigError, Place
 
 INPUT = PinOption(name="pin", help="an input", pullable=True)
 NODE = st.sampled_from(["mcu", "tool-head", "z_1"])

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coordinator.config.file import SAVED_HEADER, parse_config, parse_saved, saved_values
-from coordinator.config.text import split_lines
 from coordinator.config.saved import ConfigSource, PendingConfig, SaveError, replace_file, with_block
+from coordinator.config.text import split_lines
 
 USER = "# mine: ä\r\n[extruder]\r\ncontrol: pid   # by hand\r\n\r\n[bed_mesh default]\r\n"
 

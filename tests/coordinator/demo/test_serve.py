@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from coordinator.support.command_options import DEMO_GCODE, DEMO_MACHINE, ServeOptions
-from coordinator.demo.serve import with_jobs
 from coordinator.assembly.load import load_machine
+from coordinator.demo.serve import with_jobs
+from coordinator.support.command_options import DEMO_GCODE, DEMO_MACHINE, ServeOptions
 from tests.stages.printer_text import DEMO_CFG, write
 
 

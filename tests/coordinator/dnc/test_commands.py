@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from serial import rfc2217
 
-from coordinator.cli import main
+from coordinator.cli.commands.dnc import DncCommand
+from coordinator.cli.main import main
 from coordinator.cli.parser import read_words
 from coordinator.dnc import commands
-from coordinator.cli.commands.dnc import DncCommand
 from coordinator.dnc.commands import Surroundings
 from coordinator.dnc.options import DncOptions
 from coordinator.dnc.port import Port, PortError

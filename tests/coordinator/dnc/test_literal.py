@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from coordinator.dnc import events
 from coordinator.dnc.blocks import SOH, STX, Header, block_check, write_block
 from coordinator.dnc.engine import Engine
-from coordinator.dnc.options import DncOptions, read_frame
 from coordinator.dnc.lexer import Scanner
+from coordinator.dnc.options import DncOptions, read_frame
 from coordinator.dnc.tokens import Kind
 from tests.coordinator.dnc import literal
 from tests.coordinator.dnc.line import Faults, Line, Owner, Wire

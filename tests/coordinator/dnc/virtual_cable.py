@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import IO, Any, Final
 
-from coordinator.cli.parser import read_words
-from coordinator.support.command_options import Terminated
-from coordinator.dnc import commands
 from coordinator.cli.commands.dnc import DncCommand
+from coordinator.cli.parser import read_words
+from coordinator.dnc import commands
 from coordinator.dnc.commands import Surroundings
 from coordinator.dnc.options import DncOptions
+from coordinator.support.command_options import Terminated
 from nodes.support.errors import CanductorError
 from tests.stages.lockstep import Lockstep, Thread
 

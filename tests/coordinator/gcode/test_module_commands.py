@@ -18,8 +18,8 @@ from coordinator.gcode.commands import (
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import End, Event, Full, Notice, PositionSet, Progress, Reply, Resting, Timed
 from coordinator.gcode.interpreter import MAX_DEPTH, Job
-from coordinator.gcode.program import Program
 from coordinator.gcode.parser import WordError
+from coordinator.gcode.program import Program
 from coordinator.motion.planner.planner import Planner
 from tests.coordinator.motion.planner_helpers import LIMITS, drain
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import msgpack
 
+from coordinator.ipc.protocol.messages import Encoder, Encoding, WireReader
 from coordinator.ipc.server.session_methods import RATE_HZ_MAX, RATE_HZ_MIN
 from coordinator.ipc.server.settings import IpcSettings, Limits
-from coordinator.ipc.protocol.messages import Encoder, Encoding, WireReader
 from tests.coordinator.ipc.served import Served, serving
 from tests.stages import jump_loop
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.server.connection import REQUESTS_PER_TURN
 from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.connection import REQUESTS_PER_TURN
 from tests.coordinator.ipc.served import (
     Served,
     run,

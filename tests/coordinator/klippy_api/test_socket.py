@@ -10,9 +10,9 @@ from typing import Any, NoReturn
 import pytest
 
 from coordinator.cli import main as cli
-from coordinator.runtime.host import LinuxHost
 from coordinator.ipc.server.state import StateTree
 from coordinator.klippy_api.gateway import CLIENTS_MAX, Gateway
+from coordinator.runtime.host import LinuxHost
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from nodes.support.errors import CanductorError
 from tests.stages.jump_loop import run

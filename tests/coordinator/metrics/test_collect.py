@@ -23,8 +23,8 @@ from coordinator.metrics.collect import (
     lead_buckets,
     registry_of,
 )
-from coordinator.service.jobs.jobs import JobPhase
 from coordinator.service.core.machine_service import ServiceState
+from coordinator.service.jobs.jobs import JobPhase
 from nodes.node.states import NodeState
 from tests.profiles import examples
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.support.command_options import EXAMPLES
-from coordinator.gcode.errors import GCodeError
 from coordinator.assembly.check import check_config
+from coordinator.gcode.errors import GCodeError
 from coordinator.modules import registry
+from coordinator.support.command_options import EXAMPLES
 from tests.stages.program_stage import ProgramStage
 
 ROOT = EXAMPLES.parent

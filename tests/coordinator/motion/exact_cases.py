@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from coordinator.motion.specs import StepKinematics, StepperSpec
 from coordinator.verification.exact_path import Setting
 from coordinator.verification.exact_signal import TRAPEZOID
-from coordinator.motion.specs import StepKinematics, StepperSpec
 from tests.coordinator.motion.steps_harness import ORIGIN, X, stepper
 from tests.coordinator.motion.steps_oracle import Move, Position, make_move
 

@@ -4,19 +4,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from coordinator.streaming.compensation import Compensation
-from coordinator.verification.exact_program import program_legs
+from coordinator.assembly.load import load_machine
 from coordinator.gcode.events import End, Full, PositionSet, ShaperChange, SmoothTimeChange, WeightsChange
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
-from coordinator.assembly.load import load_machine
-from coordinator.runtime.devices import MachineDevices, stream_specs
 from coordinator.motion.planner.planner import Planner
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps.steps import MAX_ERROR_S, StepGenerator, StepStats
+from coordinator.runtime.devices import MachineDevices, stream_specs
+from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.pipeline import Pipeline, PlanRecord
 from coordinator.streaming.program_machine import machine_state
 from coordinator.tables.axis_table import AxisTable
+from coordinator.verification.exact_program import program_legs
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary
 from tests.coordinator.motion.exact_check import StepperProof, Verdict, check
 from tests.coordinator.motion.replay import Stream, replay_all

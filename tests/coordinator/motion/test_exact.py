@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from coordinator.motion.specs import StepKinematics
 from coordinator.verification.exact_path import INVERSE, Setting, StepperPath, crossings, legs_of, solve
 from coordinator.verification.exact_signal import Floats, Phases, Shaped, Smoothed
-from coordinator.motion.specs import StepKinematics
 from tests.coordinator.motion.exact_cases import AWAY, LINEAR, PARAMS, SETTING, chain, spec_of, trapezoids
 from tests.coordinator.motion.exact_check import Epoch, StepperProof, check
 from tests.coordinator.motion.replay import Stream, replay, replay_all

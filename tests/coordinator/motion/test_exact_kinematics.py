@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.verification.exact_path import Setting, legs_of
 from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps.steps import MAX_ERROR_S, StepGenerator
+from coordinator.verification.exact_path import Setting, legs_of
 from tests.coordinator.motion.exact_cases import AWAY, LINEAR, PARAMS, SETTING, chain, spec_of, trapezoids
 from tests.coordinator.motion.exact_check import StepperProof, check
 from tests.coordinator.motion.replay import Stream, replay

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from coordinator.verification.exact_shapers import KINDS, TOLERANCE, impulses
 from coordinator.motion.steps.shapers import shaper_impulses
+from coordinator.verification.exact_shapers import KINDS, TOLERANCE, impulses
 from nodes.support.errors import CanductorError
 
 LEFT = {"zv": 0.0, "mzv": 0.0, "zvd": 0.0, "ei": TOLERANCE, "2hump_ei": 0.0, "3hump_ei": TOLERANCE}

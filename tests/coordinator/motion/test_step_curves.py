@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coordinator.motion.steps.shapers import SHAPER_KINDS, shaper_impulses
 from coordinator.motion.specs import StepKinematics, StepperSpec
+from coordinator.motion.steps.shapers import SHAPER_KINDS, shaper_impulses
 from coordinator.motion.steps.steps import StepError
 from tests.coordinator.motion.steps_harness import MAX_ERROR_S, NOISE_S, Run, node_spec, rows, stepper
 from tests.coordinator.motion.steps_oracle import LONG, Move, Position, make_move

@@ -14,13 +14,13 @@ from typing import Any
 
 import pytest
 
-from coordinator.support.command_options import DEMO_MACHINE, PlanOptions
 from coordinator.assembly.load import load_machine
-from coordinator.planning.plan import plan_file
 from coordinator.planning.figures import Peak
+from coordinator.planning.plan import plan_file
 from coordinator.planning.plot import draw
 from coordinator.planning.report import PlanReport, Timeline
 from coordinator.planning.warnings import NodeClock, step_rate_warnings, ticks_per_step
+from coordinator.support.command_options import DEMO_MACHINE, PlanOptions
 from nodes.support.errors import CanductorError
 from nodes.virtual.firmware import MAINBOARD, firmware_dictionary
 

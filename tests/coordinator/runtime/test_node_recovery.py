@@ -7,14 +7,14 @@ from typing import Any
 
 import pytest
 
-from coordinator.runtime.machine import Machine, MachineStopped
-from coordinator.runtime.host import Port
 from coordinator.assembly.load import CanConnection, UartConnection, load_machine
+from coordinator.runtime.host import Port
+from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.runtime.node_recovery import LAST_TRY_S
 from nodes.clock.clock import HostTime
-from nodes.support.errors import CanductorError
-from nodes.node.states import NodeState
 from nodes.link.interfaces import LinkIOLike, OnFrame, OnLost
+from nodes.node.states import NodeState
+from nodes.support.errors import CanductorError
 from tests.nodes import virtual_time
 from tests.nodes.machine import uuid
 from tests.nodes.twin_bus import TwinIO, TwinNode

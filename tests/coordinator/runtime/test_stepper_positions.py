@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.support.command_options import EXAMPLES
-from coordinator.virtual_machine.plant import start_point
-from coordinator.kinematics.dual_carriage import CarriageMode
 from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.kinematics.dual_carriage import CarriageMode
 from coordinator.motion.planner.planner import Position
 from coordinator.runtime.stepper_positions import RailPlaces
+from coordinator.support.command_options import EXAMPLES
+from coordinator.virtual_machine.plant import start_point
 
 CONFIGS = sorted(path for path in EXAMPLES.glob("*.cfg") if path.stem != "none")  # whose head stands
 

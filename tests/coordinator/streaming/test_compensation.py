@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coordinator.cli import main as cli
-from coordinator.streaming.compensation import NO_CORRECTION, Compensation, kept_compensation
 from coordinator.assembly.load import load_machine
+from coordinator.cli import main as cli
 from coordinator.config.model import AxisTablesDescription
 from coordinator.motion.steps.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps.steps import TABLE_POINTS_MAX, StepError, StepGenerator
+from coordinator.streaming.compensation import NO_CORRECTION, Compensation, kept_compensation
 from coordinator.tables.axis_table import AxisTable, Direction, Unit
 from coordinator.tables.store import TableStore
 from tests.coordinator.motion.exact_program import Planned, plan_program

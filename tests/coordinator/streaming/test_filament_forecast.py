@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.streaming.filament_forecast import KEPT_S, FilamentForecast
 from coordinator.motion.planner._planner import ffi
 from coordinator.motion.trapezoid_array import TRAPEZOID
+from coordinator.streaming.filament_forecast import KEPT_S, FilamentForecast
 
 DRIVEN = (0.0, 0.0, 0.0, 1.0)
 AT_REST = (0.0, 0.0, 0.0, 0.0)

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from coordinator.gcode.machine_state import Shaper
 from coordinator.assembly.load import load_machine
+from coordinator.gcode.machine_state import Shaper
 from coordinator.streaming.program_machine import machine_state
 
 CONFIG = Path(__file__).parents[3] / "config"

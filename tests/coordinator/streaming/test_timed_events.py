@@ -1,7 +1,7 @@
 """What is to be done in time is done near its time, and in the program's order."""
 
-from coordinator.streaming.timed_events import AHEAD_S, DueEvents
 from coordinator.gcode.events import AS_SOON_AS_POSSIBLE, Timed
+from coordinator.streaming.timed_events import AHEAD_S, DueEvents
 
 
 def event(line: int, *, at_once: bool = False) -> Timed:

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from coordinator.verification.heat_proof import HeatProof, not_steady, prove_heat
 from coordinator.heat.holding import Held
+from coordinator.verification.heat_proof import HeatProof, not_steady, prove_heat
 from nodes.virtual.plant_log import PlantEvent
 
 S = 1_000_000_000

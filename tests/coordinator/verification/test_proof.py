@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.verification.expected import expected_steps
-from coordinator.verification.proof import PrimaryClock, StepperProof, prove_stepper
 from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.runtime.timebase import ClockMap, ClockPiece
+from coordinator.verification.expected import expected_steps
+from coordinator.verification.proof import PrimaryClock, StepperProof, prove_stepper
 
 FREQ = 1e6
 STEP_MM = 0.01

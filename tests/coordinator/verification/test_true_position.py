@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from coordinator.support.command_options import DEMO_MACHINE
-from coordinator.virtual_machine.plant import machine_plants
-from coordinator.verification.true_position import prove_places
 from coordinator.assembly.load import load_machine
 from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.streaming.pipeline import PlanRecord
+from coordinator.support.command_options import DEMO_MACHINE
+from coordinator.verification.true_position import prove_places
+from coordinator.virtual_machine.plant import machine_plants
 from nodes.virtual.plant import Axis
 from nodes.virtual.plant_page import Motor
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.kinematics.base import Point
 from coordinator.support.command_options import EXAMPLES, DemoOptions
 from coordinator.virtual_machine.plant import START_MM, PlantSettings, machine_plants, start_point
 from coordinator.virtual_machine.plant_heat import HeatSettings, steinhart, table_of
 from coordinator.virtual_machine.stage import Stage
-from coordinator.kinematics.base import Point
-from coordinator.assembly.load import MachineDescription, load_machine
 from nodes.virtual.plant import Axis, Beta, NodePlant, Rtd, Steinhart
 from nodes.virtual.plant_page import Fault, Kind
 from nodes.virtual.sim import SimNode

@@ -13,8 +13,8 @@ import aiohttp
 import pytest
 from yarl import URL
 
-from coordinator.ipc.server.auth import FAILURES_MAX, SHUT_OUT_S
 from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.auth import FAILURES_MAX, SHUT_OUT_S
 from coordinator.ipc.server.server import TOKENS_LOOK_S
 from coordinator.web.access import LINK_S
 from coordinator.web.methods import add_page_methods

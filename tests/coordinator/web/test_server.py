@@ -13,8 +13,8 @@ import aiohttp
 import pytest
 from yarl import URL
 
-from coordinator.ipc.server.tcp_listener import HANDSHAKE_S, HANDSHAKES_MAX
 from coordinator.ipc.server.settings import Limits
+from coordinator.ipc.server.tcp_listener import HANDSHAKE_S, HANDSHAKES_MAX
 from coordinator.web.files import FOLDER
 from coordinator.web.server import CONNECTIONS_MAX, REQUEST_S
 from coordinator.web.settings import WebSettings

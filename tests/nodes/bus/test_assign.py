@@ -5,16 +5,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from nodes.bus.assign import (
-    ADMIN_ID,
-    ADMIN_RESPONSE_ID,
-    PATIENCE_NS,
-    AssignError,
-    Assignment,
-    IdAssignment,
-    Uuid,
-    number_nodes,
-)
+from nodes.bus.assign import PATIENCE_NS, AssignError, Assignment, IdAssignment, Uuid, number_nodes
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
 
 MS = 1_000_000
 

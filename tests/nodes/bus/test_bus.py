@@ -9,8 +9,8 @@ import pytest
 from nodes.bus.assign import AssignError
 from nodes.bus.bus import UartBus
 from nodes.bus.can_bus import CanBus
-from nodes.dictionary.parts import DictionaryError
 from nodes.dictionary.message_format import Message
+from nodes.dictionary.parts import DictionaryError
 from nodes.node.errors import NodeLost
 from nodes.node.states import NodeState
 from tests.nodes import virtual_time

@@ -5,17 +5,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from nodes.bus.assign import (
-    ADMIN_RESPONSE_ID,
-    MAX_NS,
-    QUERY_UNASSIGNED,
-    WHO_IS_HERE,
-    AssignError,
-    Assignment,
-    IdAssignment,
-    Uuid,
-    number_nodes,
-)
+from nodes.bus.assign import MAX_NS, AssignError, Assignment, IdAssignment, Uuid, number_nodes
+from nodes.support.can_protocol import ADMIN_RESPONSE_ID, QUERY_UNASSIGNED, WHO_IS_HERE
 
 MS = 1_000_000
 FRAME_NS = 540_000

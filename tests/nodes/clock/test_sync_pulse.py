@@ -8,10 +8,10 @@ from collections.abc import Callable
 import pytest
 
 from nodes.clock.clock import HostTime, Ticks
-from nodes.dictionary.message_format import Message
-from nodes.node.errors import NodeLost
 from nodes.clock.pulse_fit import SETTLE_PAIRS, PulseFit
 from nodes.clock.sync_pulse import INTERVAL_S, MISSED_MAX, SETTLE_ROUNDS, PulseClock, PulseKeeper, PulseRounds
+from nodes.dictionary.message_format import Message
+from nodes.node.errors import NodeLost
 from tests.nodes import virtual_time
 
 PRIMARY_HZ, SECONDARY_HZ = 168_000_000, 64_000_000

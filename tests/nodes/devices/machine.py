@@ -7,8 +7,8 @@ from typing import Protocol
 from nodes.bus.assign import Uuid
 from nodes.bus.can_bus import CanBus
 from nodes.dictionary.dictionary import Dictionary
-from nodes.node.node import Node
 from nodes.node.config import NodeConfig
+from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.virtual.world import World, run
 from tests.nodes.virtual.world.machines import start_io, uuid

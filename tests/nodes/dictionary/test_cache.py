@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from nodes.bus.can_bus import CanBus
-from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.cache import MAX_FILES, MAX_KEPT, DictionaryCache
+from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.parts import DictionaryError
 from nodes.node.states import NodeState
 from tests.nodes import virtual_time

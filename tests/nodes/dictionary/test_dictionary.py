@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nodes.dictionary.dictionary import BOOTSTRAP, MAX_INFLATED_BYTES, Dictionary
-from nodes.dictionary.parts import OUTPUT, DictionaryError
 from nodes.dictionary.message_format import Message, MessageError, MessageFormat, Value
+from nodes.dictionary.parts import OUTPUT, DictionaryError
 from tests import real_dictionaries
 from tests import wire_twin as twin
 from tests.profiles import examples

@@ -5,8 +5,8 @@
 #include <linux/can.h>
 #include <string.h>
 
-#include "nodes/support/can_bits.h"
 #include "nodes/link/io_api.h"
+#include "nodes/support/can_bits.h"
 #include "tests/check.h"
 
 #define MS 1000000ULL

@@ -8,12 +8,12 @@ from coordinator.simulate.script import ScriptedWorld
 from nodes.bus.assign import Uuid
 from nodes.bus.bus import UartBus
 from nodes.bus.can_bus import CanBus
-from nodes.devices.table import AxleTable
 from nodes.dictionary.dictionary import Dictionary
-from nodes.node.config import NodeConfig
-from nodes.link.interfaces import BuildConfig
 from nodes.mt.download import Place
 from nodes.mt.mt import Pair
+from nodes.mt.table import AxleTable
+from nodes.node.config import NodeConfig
+from nodes.node.connector import BuildConfig
 from nodes.virtual._sim import lib
 from nodes.virtual.world import CanWire, NodeSettings, World, WorldNode
 from tests.nodes.virtual.world.machines import start_io, uuid

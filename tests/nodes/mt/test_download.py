@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from nodes.clock.clock import HostTime
-from nodes.devices.table import Activation, AxleTable
-from nodes.node.config import NodeConfigError
 from nodes.mt.download import BUS_SHARE, Outcome, Place, download
 from nodes.mt.mt import MtError, MtStatus, Pair, to_frames, transmission
+from nodes.mt.table import Activation, AxleTable
+from nodes.node.config import NodeConfigError
 from nodes.virtual.world import run
 from tests.nodes.mt.machines import TableMachine, UartTableMachine, wavy
 

@@ -5,10 +5,10 @@ import asyncio
 import pytest
 
 from nodes.bus.can_bus import CanBus
-from nodes.support.errors import CanductorError
+from nodes.link.interfaces import OnFrame, OnLost
 from nodes.node.errors import NodeError, NodeRestarted
 from nodes.node.states import NodeState
-from nodes.link.interfaces import OnFrame, OnLost
+from nodes.support.errors import CanductorError
 from nodes.transport.frame import BUS_OFF
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid

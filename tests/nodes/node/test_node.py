@@ -10,10 +10,10 @@ from nodes.bus.assign import AssignError
 from nodes.bus.bus import UartBus
 from nodes.bus.can_bus import CanBus
 from nodes.clock.clock import HostTime
-from nodes.node.request_reply import QUERY_TRIES
-from nodes.support.errors import CanductorError
 from nodes.node.errors import NodeError, NodeLost, NodeShutdown
+from nodes.node.request_reply import QUERY_TRIES
 from nodes.node.states import NodeState
+from nodes.support.errors import CanductorError
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
 from tests.nodes.twin_bus import DELAY_S, TwinIO, TwinLink, TwinNode, source_of, without_commands

@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from nodes.node.request_reply import QueryTimeout
-from nodes.node.load import load_of
 from nodes.dictionary.message_format import Message, MessageError
+from nodes.node.load import load_of
+from nodes.node.request_reply import QueryTimeout
 from tests.nodes.machine import Machine
 from tests.nodes.twin_bus import TwinNode
 

@@ -2,17 +2,22 @@
 
 import math
 
-from coordinator.kinematics.delta import MAX_TOWER_SPEED, Delta, Tower
-from coordinator.config.sections.kinematics.frame import Frame, tidy
 from coordinator.config.model import RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
-from coordinator.config.sections.kinematics.printer_options import DELTA_RADIUS, MINIMUM_Z, PRINT_RADIUS, ROUND_RANGE_OPTIONS
 from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, read_tower_homing
-from coordinator.config.sections.rails import read_extra_steppers
-from coordinator.config.sections.steppers import MAX_POSITION, MOTOR, read_stepper
-from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.kinematics.frame import Frame, tidy
+from coordinator.config.sections.kinematics.printer_options import (
+    DELTA_RADIUS,
+    MINIMUM_Z,
+    PRINT_RADIUS,
+    ROUND_RANGE_OPTIONS,
+)
 from coordinator.config.sections.kinematics.tower_checks import check_directions, check_height
+from coordinator.config.sections.rails import read_extra_steppers
+from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.steppers import MAX_POSITION, MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.kinematics.delta import MAX_TOWER_SPEED, Delta, Tower
 
 ARM_LENGTH = FloatOption(
     name="arm_length",

@@ -2,18 +2,18 @@
 
 import math
 
-from coordinator.kinematics.base import linear
-from coordinator.kinematics.deltesian import Arm, Deltesian
-from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of, tidy
 from coordinator.config.model import RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
-from coordinator.config.sections.kinematics.printer_options import MIN_ANGLE, MINIMUM_Z, PRINT_WIDTH
 from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, read_tower_homing
-from coordinator.config.sections.rails import read_extra_steppers, read_rail
-from coordinator.config.sections.steppers import MAX_POSITION, MOTOR, read_stepper
-from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of, tidy
+from coordinator.config.sections.kinematics.printer_options import MIN_ANGLE, MINIMUM_Z, PRINT_WIDTH
 from coordinator.config.sections.kinematics.tower_checks import check_height
+from coordinator.config.sections.rails import read_extra_steppers, read_rail
+from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.steppers import MAX_POSITION, MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.kinematics.base import linear
+from coordinator.kinematics.deltesian import Arm, Deltesian
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
 ARM_LENGTH = FloatOption(

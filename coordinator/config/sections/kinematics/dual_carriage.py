@@ -2,16 +2,16 @@
 
 from dataclasses import replace
 
-from coordinator.kinematics.base import StepFunction
-from coordinator.kinematics.dual_carriage import Carriage, DualCarriage
-from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of
+from coordinator.config.errors import ConfigError
 from coordinator.config.model import DualCarriageDescription, RailDescription, StepperDescription
 from coordinator.config.options import ChoiceOption, FloatOption, SectionReader, SectionSpec, one_of
-from coordinator.config.errors import ConfigError
 from coordinator.config.sections.homing import WAITING
+from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of
 from coordinator.config.sections.rails import RAIL, read_axis
-from coordinator.config.sections.steppers import MAX_POSITION
 from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.steppers import MAX_POSITION
+from coordinator.kinematics.base import StepFunction
+from coordinator.kinematics.dual_carriage import Carriage, DualCarriage
 
 AXIS = ChoiceOption(name="axis", help="the axis on which the second carriage runs", choices=("x", "y"))
 SAFE_DISTANCE = FloatOption(

@@ -1,7 +1,7 @@
 """What the reader of a kinematics gives."""
 
-from coordinator.kinematics.base import Kinematics, Point, WorkSpace
 from coordinator.config.model import DualCarriageDescription, RailDescription, StepperDescription
+from coordinator.kinematics.base import Kinematics, Point, WorkSpace
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 from nodes.support.records import record
 

@@ -4,20 +4,20 @@ import re
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from coordinator.kinematics.base import StepFunction
-from coordinator.kinematics.generic_cartesian import GenericCartesian
+from coordinator.config.errors import ConfigError, Place, nearest, shown
 from coordinator.config.file import RawSection
-from coordinator.config.sections.kinematics.frame import Frame, box_of, home_of
 from coordinator.config.model import NotYetActing, RailDescription, StepperDescription
 from coordinator.config.options import BadValue, ChoiceOption, Option, SectionReader, SectionSpec, TextOption
 from coordinator.config.pins import PinDescription
-from coordinator.config.errors import ConfigError, Place, nearest, shown
-from coordinator.config.sections.kinematics.dual_carriage import SAFE_DISTANCE, describe_dual, park
 from coordinator.config.sections.homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
+from coordinator.config.sections.kinematics.dual_carriage import SAFE_DISTANCE, describe_dual, park
+from coordinator.config.sections.kinematics.frame import Frame, box_of, home_of
 from coordinator.config.sections.rails import RANGE, read_range
-from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.sections.reading import Reading, SecondEndstop
+from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.kinematics.base import StepFunction
+from coordinator.kinematics.generic_cartesian import GenericCartesian
 from nodes.support.records import record
 
 AXIS = ChoiceOption(

@@ -1,14 +1,14 @@
 """A polar machine: the turning bed [stepper_bed], the arm [stepper_arm], and [stepper_z]."""
 
-from coordinator.kinematics.polar import Polar
-from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of
 from coordinator.config.model import NO_ENDSTOP, RailDescription
 from coordinator.config.options import SectionReader, SectionSpec
 from coordinator.config.sections.homing import WAITING
+from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of
 from coordinator.config.sections.rails import POSITION_MAX, read_extra_steppers, read_rail
-from coordinator.config.sections.steppers import TURNING_MOTOR, read_stepper
 from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.steppers import TURNING_MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.kinematics.polar import Polar
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
 BED = SectionSpec(

@@ -2,10 +2,10 @@
 
 import math
 
-from coordinator.kinematics.rotary_delta import Arm, RotaryDelta
-from coordinator.config.sections.kinematics.frame import Frame, tidy
 from coordinator.config.model import RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
+from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, WAITING, read_tower_homing
+from coordinator.config.sections.kinematics.frame import Frame, tidy
 from coordinator.config.sections.kinematics.printer_options import (
     ARMS_PRINT_RADIUS,
     MINIMUM_Z,
@@ -13,12 +13,12 @@ from coordinator.config.sections.kinematics.printer_options import (
     SHOULDER_HEIGHT,
     SHOULDER_RADIUS,
 )
-from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, WAITING, read_tower_homing
-from coordinator.config.sections.rails import read_extra_steppers
-from coordinator.config.sections.steppers import MAX_POSITION, TURNING_MOTOR, read_stepper
-from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.kinematics.tower_checks import check_directions, check_height
+from coordinator.config.sections.rails import read_extra_steppers
+from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.steppers import MAX_POSITION, TURNING_MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.kinematics.rotary_delta import Arm, RotaryDelta
 
 UPPER_LENGTH = FloatOption(
     name="upper_arm_length",

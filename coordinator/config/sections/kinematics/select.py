@@ -4,11 +4,11 @@
 
 from collections.abc import Callable
 
-from coordinator.kinematics.base import Kinematics, WorkSpace
-from coordinator.config.sections.kinematics.frame import Frame, box_of, home_of
 from coordinator.config.options import SectionReader
+from coordinator.config.sections.kinematics.frame import Frame, box_of, home_of
 from coordinator.config.sections.rails import read_rail
 from coordinator.config.sections.reading import Reading
+from coordinator.kinematics.base import Kinematics, WorkSpace
 
 _EMPTY = WorkSpace((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 

@@ -3,17 +3,17 @@
 import math
 import string
 
-from coordinator.kinematics.base import Point
-from coordinator.kinematics.geometry import cross, dot, subtract
-from coordinator.kinematics.winch import MIN_WINCHES, Winch
-from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.model import NO_ENDSTOP, RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
 from coordinator.config.sections.homing import WAITING
+from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.sections.rails import read_extra_steppers
-from coordinator.config.sections.steppers import MAX_POSITION, MOTOR, read_stepper
 from coordinator.config.sections.reading import Reading
+from coordinator.config.sections.steppers import MAX_POSITION, MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.kinematics.base import Point
+from coordinator.kinematics.geometry import cross, dot, subtract
+from coordinator.kinematics.winch import MIN_WINCHES, Winch
 
 ANCHORS = tuple(
     FloatOption(

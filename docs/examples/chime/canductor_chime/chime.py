@@ -2,10 +2,10 @@
 
 from typing import TYPE_CHECKING, Final
 
-from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
-from coordinator.gcode.parser import WordError, quoted
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.config.pins import PinOption
+from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module, Value
 from nodes.devices.digital_out import DigitalOut
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.assembly.check import check_config
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.program import Program
-from coordinator.assembly.check import check_config
-from coordinator.streaming.job_runner import run_job
 from coordinator.simulate import scenario
 from coordinator.simulate.stage import Stage
+from coordinator.streaming.job_runner import run_job
 
 MACHINE = """
 [mcu]

@@ -5,15 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.support.command_options import EXAMPLES
+from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.config.sections.printer import KINEMATICS
 from coordinator.kinematics.delta import Delta
 from coordinator.kinematics.deltesian import Deltesian
 from coordinator.kinematics.dual_carriage import CarriageMode
 from coordinator.kinematics.polar import Polar
 from coordinator.kinematics.rotary_delta import RotaryDelta
 from coordinator.kinematics.winch import Winch
-from coordinator.assembly.load import MachineDescription, load_machine
-from coordinator.config.sections.printer import KINEMATICS
+from coordinator.support.command_options import EXAMPLES
 from tests.stages.printer_text import PRINTER_CFG, changed, example_text, write
 
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.builtins.state import SAVED_MAX
+from coordinator.gcode.errors import GCodeError
 from tests.stages.program_stage import ProgramStage
 
 

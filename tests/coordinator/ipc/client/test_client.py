@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.protocol.address import read_address
 from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.client.client import Client, ConnectionLost, Refused
-from coordinator.ipc.protocol.methods import ApiError, Scope
 from coordinator.ipc.client.connect_errors import why_no_answer
+from coordinator.ipc.protocol.address import read_address
+from coordinator.ipc.protocol.messages import Encoding
+from coordinator.ipc.protocol.methods import ApiError, Scope
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import TcpSettings
-from coordinator.ipc.protocol.messages import Encoding
 from nodes.support.errors import CanductorError
 from tests.coordinator.certificates import make_certificate
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, registry_of, run, serving

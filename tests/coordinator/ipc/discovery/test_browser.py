@@ -386,7 +386,8 @@ def test_a_coordinator_that_is_killed_is_seen_to_go() -> None:
 
 def test_no_other_command_pays_for_it() -> None:
     code = (
-        "import sys; from coordinator.cli.main import main; main(['plan', '--help']); main(['estop', '--help']); "
+        "import sys; from coordinator.cli.main import main; "
+        "main(['plan', '--help']); main(['estop', '--help']); "
         "import coordinator.cli.commands.front_ends, coordinator.service.core.serve;"
         "sys.exit(any(m.split('.')[0] in ('zeroconf', 'ifaddr', 'prometheus_client') for m in sys.modules))"
     )

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.ipc.protocol.json_values import has_more_items
-from coordinator.ipc.server.settings import Limits
 from coordinator.ipc.protocol.messages import Fault, WireReader
+from coordinator.ipc.server.settings import Limits
 from tests.profiles import examples
 
 text = st.text(alphabet='\\",[]{}ab', max_size=12)

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.ipc.server.settings import Limits
 from coordinator.ipc.protocol.messages import Encoder, Encoding, Fault, WireReader
+from coordinator.ipc.server.settings import Limits
 from tests.profiles import examples
 
 LIMITS = Limits(message_timeout_s=5.0)

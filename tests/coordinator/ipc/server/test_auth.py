@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.server.auth import ADDRESSES_MAX, FAILURES_MAX, SHUT_OUT_S, FailureBrake, Grant, Tokens
 from coordinator.ipc.protocol.methods import Scope
+from coordinator.ipc.server.auth import ADDRESSES_MAX, FAILURES_MAX, SHUT_OUT_S, FailureBrake, Grant, Tokens
 from nodes.support.errors import CanductorError
 
 TOKEN = "a" * 31 + "b"

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from coordinator.ipc.server.connection import UNREAD_BYTES
-from coordinator.ipc.server.settings import Limits
 from coordinator.ipc.server.fair_scheduler import TURN_S
+from coordinator.ipc.server.settings import Limits
 from tests.coordinator.ipc.served import (
     Script,
     Served,

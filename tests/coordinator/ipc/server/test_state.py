@@ -5,9 +5,9 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from coordinator.ipc.protocol.messages import Encoder, Encoding
 from coordinator.ipc.server.publisher import Publisher
 from coordinator.ipc.server.state import FIELDS_MAX, REMOVALS_MAX, FieldFilter, StateTree, costly_stars
-from coordinator.ipc.protocol.messages import Encoder, Encoding
 
 paths = st.sampled_from(["a", "a.x", "a.y", "b", "b.x", "ab.x"])
 changes = st.lists(

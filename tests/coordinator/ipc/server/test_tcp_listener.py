@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from coordinator.ipc.client.client import Client
-from coordinator.ipc.server.tcp_listener import FILES_MAX, HANDSHAKE_S, Door, raise_files_limit
 from coordinator.ipc.protocol.methods import Scope
 from coordinator.ipc.server.settings import TcpSettings
+from coordinator.ipc.server.tcp_listener import FILES_MAX, HANDSHAKE_S, Door, raise_files_limit
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, run
 from tests.stages import jump_loop
 

@@ -7,10 +7,10 @@ import pytest
 
 from coordinator.assembly.check import check_config
 from coordinator.assembly.load import load_machine
-from coordinator.modules.drivers.tmc_driver import TmcDriver
-from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
 from coordinator.drivers.tmc_chips import CHIPS, TMC2209, Chip
 from coordinator.drivers.tmc_formulas import currents, largest_current, tstep
+from coordinator.modules.drivers.tmc_driver import TmcDriver
+from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
 from tests.stages.printer_text import SENSORLESS_CFG
 
 SENSE_OHM_AND_LARGEST_A = (

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.modules.heaters.heater import LOOK_S, SILENT_LOOKS
 from coordinator.modules.fans.temperature_fan import TemperatureFan
+from coordinator.modules.heaters.heater import LOOK_S, SILENT_LOOKS
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from nodes.virtual.plant_page import Fault, Kind
 from tests.coordinator.modules.heaters.broken_sensor import Sensor

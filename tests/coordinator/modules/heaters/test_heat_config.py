@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.assembly.load import ConfigError, load_machine
 from coordinator.gcode.commands import Call, InTime
 from coordinator.gcode.parser import WordError, parse
 from coordinator.heat.known_sensors import PT1000, THERMISTORS
-from coordinator.assembly.load import ConfigError, load_machine
 from coordinator.modules.heaters.sections import ExtruderHeater, HeaterBed
-from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
 from coordinator.modules.sensors.temperature_input import TemperatureInput
+from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
 from tests.stages.heat_machine import BASE, BED, HOTEND_PID, build, configured
 
 THREE = "\n[thermistor x]\ntemperature1: 25\ntemperature2: 50\ntemperature3: 70\n"

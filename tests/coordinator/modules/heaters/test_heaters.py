@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.verification.heat_proof import HeatWatch
+from coordinator.assembly.check import check_config
 from coordinator.gcode.parser import WordError
 from coordinator.heat.mpc import Mpc
-from coordinator.assembly.check import check_config
+from coordinator.verification.heat_proof import HeatWatch
 from nodes.support.errors import CanductorError
 from tests.stages.heat_machine import BED, FAN, HOTEND_PID, HeatMachine
 

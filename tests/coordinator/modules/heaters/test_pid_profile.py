@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.parser import WordError
 from coordinator.assembly.check import check_config
+from coordinator.gcode.parser import WordError
 from coordinator.modules.heaters.heaters import Heaters
 from tests.stages.heat_machine import BASE, BED, HOTEND_PID, HeatMachine
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.events import PositionSet, WeightsChange
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
+from coordinator.gcode.events import PositionSet, WeightsChange
 from coordinator.modules.levelling.skew_correction import Skew, Skews
 from tests.stages.program_stage import ProgramStage
 

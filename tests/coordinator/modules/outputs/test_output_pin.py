@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.parser import WordError
 from coordinator.assembly.check import check_config
+from coordinator.gcode.parser import WordError
 from tests.stages.heat_machine import BASE, HOTEND_PID, HeatMachine, build, configured
 
 LAMP = "\n[output_pin lamp]\npin: !PC5\nvalue: 1\n"

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.errors import GCodeError
 from coordinator.config.errors import ConfigError
+from coordinator.gcode.errors import GCodeError
 from coordinator.modules.programs.save_variables import read_variables
 from tests.stages.program_stage import ProgramStage
 

@@ -5,7 +5,12 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from coordinator.modules.sensors.temperature_source import BAD_IN_A_ROW, MAX_WAITERS, SILENT_S, TemperatureSource
+from coordinator.modules.sensors.temperature_source import (
+    BAD_IN_A_ROW,
+    MAX_WAITERS,
+    SILENT_S,
+    TemperatureSource,
+)
 from nodes.support.errors import CanductorError
 from nodes.virtual.world import VirtualLoop, World
 

@@ -2,14 +2,14 @@
 
 import pytest
 
-from coordinator.support.command_options import DEMO_MACHINE
+from coordinator.assembly.load import load_machine
 from coordinator.gcode.events import Emergency, End, Event, Full, Idle, PositionSet, Reply
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
-from coordinator.assembly.load import load_machine
 from coordinator.motion.planner.planner import Planner
 from coordinator.service.core.feeder import ASIDES_MAX, WAITING_MAX, Feeder, FeederFull, Ticket
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Rest, WorkError, commands_in
+from coordinator.support.command_options import DEMO_MACHINE
 
 LIMITS = load_machine(str(DEMO_MACHINE)).limits
 

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.ipc.protocol.methods import ApiError
 from coordinator.assembly.load import load_machine
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.service.jobs.resume_homing import WayHome, sure_height, way_home
 
 CONFIG = Path("config")

@@ -7,8 +7,8 @@ from nodes.bus.assign import Uuid
 from nodes.bus.bus import UartBus
 from nodes.bus.can_bus import CanBus
 from nodes.link import LinkIO
-from nodes.node.states import NodeState
 from nodes.link.interfaces import IoFactory, LinkIOLike, OnFrame, OnLost
+from nodes.node.states import NodeState
 from nodes.virtual.world import CanPort, CanWire, Port, UartSettings, World, WorldNode, run
 from tests.nodes.machine import make_config, stepper_x
 

@@ -5,10 +5,10 @@ from collections.abc import Awaitable, Callable
 from typing import Final
 
 from nodes.clock.clock import ClockEstimate, ClockEstimator
+from nodes.clock.wire_time import narrow
+from nodes.node.connector import Connector
 from nodes.node.request_reply import Answer, Conversation, QueryTimeout
 from nodes.support.errors import CanductorError
-from nodes.link.interfaces import Connector
-from nodes.clock.wire_time import narrow
 
 SILENCE_S: Final = 0.25
 """A node that owes an acknowledgement and says nothing for so long may have restarted: the bus is asked."""

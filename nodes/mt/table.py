@@ -3,10 +3,10 @@
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, Protocol
 
+from nodes.mt.mt import AXLES, MtStatus, Pair, checksum, digest
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.errors import NodeError
 from nodes.support.records import record
-from nodes.mt.mt import AXLES, MtStatus, Pair, checksum, digest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

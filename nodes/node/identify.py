@@ -11,11 +11,11 @@ usual, and a node does not execute a command whose parameters it cannot read.
 from collections.abc import Callable
 from typing import Final
 
-from nodes.node.request_reply import Conversation, QueryTimeout
-from nodes.dictionary.dictionary import MAX_COMPRESSED_BYTES, Dictionary
 from nodes.dictionary.cache import CachedDictionary, DictionaryCache
+from nodes.dictionary.dictionary import MAX_COMPRESSED_BYTES, Dictionary
 from nodes.dictionary.parts import DictionaryError
 from nodes.node.errors import NodeLost
+from nodes.node.request_reply import Conversation, QueryTimeout
 
 IDENTIFY_PIECE: Final = 40
 PIECE_TRIES: Final = 16

@@ -1,0 +1,30 @@
+"""The fixed CAN ids of the protocol, and the commands of its admin frames."""
+
+from typing import Final
+
+BUS_STOP_ID: Final = 0x010
+"""Frame ``<reason> <node id of the origin>``: every node of this project's firmware shuts down at once."""
+TRIGGER_ID: Final = 0x020
+"""The first of TRIGGER_GROUPS ids: an endstop of this group triggered."""
+TRIGGER_GROUPS: Final = 16
+FIRST_DATA_ID: Final = 0x100
+"""Bytes to node N travel in FIRST_DATA_ID + 2 N, bytes from it in the id above."""
+DATA_NODEID_MAX: Final = 255
+ADMIN_ID: Final = 0x3F0
+"""From the host to all nodes; the first byte is the command."""
+ADMIN_RESPONSE_ID: Final = 0x3F1
+MT_CAN_ID: Final = 0x3F2
+"""Table downloads, from the host to all nodes."""
+
+QUERY_UNASSIGNED: Final = 0x00
+SET_NODEID: Final = 0x01
+REQUEST_BOOTLOADER: Final = 0x02
+SET_NODEID_BOOTLOADER: Final = 0x11
+NEED_NODEID: Final = 0x20
+NODE_IS_HERE: Final = 0x21
+SYNC_PULSE: Final = 0x40
+WHO_IS_HERE: Final = 0x41
+
+UUID_SIZE: Final = 6
+FIRST_NODEID: Final = 4
+LAST_NODEID: Final = 255
