@@ -36,10 +36,11 @@ from typing import Any
 
 import msgpack
 
-from coordinator.ipc.protocol.methods import Caller, Method, Registry, Scope, Value
+from coordinator.ipc.protocol.methods import Caller, Method, Registry, Scope
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import IpcSettings
 from coordinator.ipc.server.state import StateTree
+from coordinator.support.values import Value
 
 FIELDS = 500
 ROOT = Path(__file__).resolve().parents[1]

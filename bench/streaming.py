@@ -28,7 +28,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from coordinator.assembly.load import CanConnection, MachineDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import CanConnection, MachineDescription
 from coordinator.gcode.program import Program
 from coordinator.runtime.machine import Machine
 from coordinator.streaming.job_runner import run_job

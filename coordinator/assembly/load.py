@@ -3,24 +3,15 @@
 import re
 from dataclasses import replace
 
-from coordinator.config.errors import ConfigError, MissingSection, Place, nearest
+from coordinator.config.errors import ConfigError, MissingSection, Place
 from coordinator.config.file import ConfigFile, RawSection, parse_config, saved_values
 from coordinator.config.model import (
-    CanConnection,
-    DualCarriageDescription,
-    ExtruderDescription,
-    ExtruderStepperDescription,
-    HomingDescription,
     MachineDescription,
-    NodeDescription,
-    NodePolicy,
+    ModuleSection,
+    ModuleSections,
     NotYetActing,
-    RailDescription,
-    ShaperDescription,
     StepperDescription,
-    UartConnection,
 )
-from coordinator.config.pins import PinDescription
 from coordinator.config.saved import ConfigSource
 from coordinator.config.sections.extruder import (
     limits_without_extruder,
@@ -38,29 +29,10 @@ from coordinator.config.sections.shaper import read_shapers
 from coordinator.config.sections.steppers import is_extra_stepper
 from coordinator.config.sections.tables import read_axis_tables
 from coordinator.config.unsupported import LATER_SECTIONS
-from coordinator.modules.module_set import ModuleSource, ModuleSources
+from coordinator.modules.module_set import build_modules
 from coordinator.modules.registry import known_kinds, module_for, modules_beside, own_kinds
 from coordinator.motion.specs import MotionLimits
-
-__all__ = [
-    "CanConnection",
-    "ConfigError",
-    "DualCarriageDescription",
-    "ExtruderDescription",
-    "ExtruderStepperDescription",
-    "HomingDescription",
-    "MachineDescription",
-    "NodeDescription",
-    "NodePolicy",
-    "NotYetActing",
-    "PinDescription",
-    "Place",
-    "RailDescription",
-    "ShaperDescription",
-    "StepperDescription",
-    "UartConnection",
-    "load_machine",
-]
+from coordinator.support.quoting import nearest
 
 _SINGLE_SECTIONS = (
     *("printer", "stepper_x", "stepper_y", "stepper_z", "extruder", "input_shaper"),
@@ -118,7 +90,7 @@ def describe(config: ConfigFile) -> MachineDescription:
         extruders=extruders,
         extruder_steppers=followers,
         shapers=shapers,
-        modules=_module_sources(reading),
+        modules=_module_sections(reading),
         not_yet_acting=(),
         notes=(),
         axis_tables=axis_tables,
@@ -131,7 +103,7 @@ def describe(config: ConfigFile) -> MachineDescription:
     ]
     _check_names(description)
     check_policies(description.nodes, description.steppers)
-    built = description.modules.build(description)  # made once to find mistakes
+    built = build_modules(description)  # once here, to find mistakes
     reading.pins = built.pins
     return replace(
         description,
@@ -144,23 +116,24 @@ def describe(config: ConfigFile) -> MachineDescription:
     )
 
 
-def _module_sources(reading: Reading) -> ModuleSources:
-    """Return what the modules are made from; raises ConfigError."""
-    sources: list[ModuleSource] = []
+def _module_sections(reading: Reading) -> ModuleSections:
+    """Return what the modules are built from; raises ConfigError."""
+    sections: list[ModuleSection] = []
     for section in reading.config.sections.values():
-        sources += [ModuleSource(section, kind, whole=False) for kind in modules_beside(section.name)]
+        if any(modules_beside(section.name)):
+            sections.append(ModuleSection(section, whole=False))
         if not _is_acting(section) and (kind := module_for(section.kind, section.place)) is not None:
             if kind.NAMED and not (kind.NAMELESS or section.instance):
                 error = f"[{section.kind}] needs a name; write [{section.kind} NAME]"
                 section.report(ConfigError(section.place, error))
-            sources.append(ModuleSource(section, kind, whole=True))
+            sections.append(ModuleSection(section, whole=True))
             reading.used.add(section.name)
     config = {
         section.name: {option.name: option.value for option in section.options.values()}
         for section in reading.config.sections.values()
     }
     used = {section.name: section.used for section in reading.config.sections.values()}
-    return ModuleSources(tuple(sources), reading.pins, config, used)
+    return ModuleSections(tuple(sections), reading.pins, config, used)
 
 
 def _named(limits: MotionLimits, frame: Frame) -> MotionLimits:

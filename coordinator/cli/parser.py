@@ -351,7 +351,7 @@ def _run(given: argparse.Namespace) -> Job:
         serve=read_serving(given, given.config) if serves else None,
     )
     if options.serve is not None:
-        return lambda: _runner("coordinator.service.core.serve", "serve_machine")(options)
+        return lambda: _runner("coordinator.front_ends.serve", "serve_machine")(options)
     return lambda: _runner("coordinator.cli.commands.run", "run_machine")(options)
 
 

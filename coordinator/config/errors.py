@@ -1,12 +1,7 @@
 """How a mistake in a configuration is told: the place first, then what is wrong, then what to do."""
 
-from collections.abc import Iterable
-
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
-
-_SHOWN_CHARS = 60
-_SHOWN_PATH_CHARS = 300
 
 
 @record
@@ -45,28 +40,3 @@ class MissingSection(ConfigError):  # noqa: N818 (what is wrong, as the others)
     def __init__(self, path: str, name: str, why: str = "") -> None:
         super().__init__(Place(path, 0), f"there is no section [{name}]; add it{why and ': '}{why}")
         self.name = name
-
-
-def shown(text: str) -> str:
-    """Quote what the user wrote so that it fits into a sentence: one line, printable, not long."""
-    line = " ".join(text.split())
-    if len(line) > _SHOWN_CHARS:
-        line = line[: _SHOWN_CHARS - 1] + "…"
-    return "'" + "".join(c if c.isprintable() else "?" for c in line) + "'"
-
-
-def shown_path(path: str) -> str:
-    """Quote a path; of a long one the end is what tells."""
-    line = "".join(c if c.isprintable() else "?" for c in path)
-    return f"'{line}'" if len(line) <= _SHOWN_PATH_CHARS else f"'…{line[-_SHOWN_PATH_CHARS:]}'"
-
-
-def nearest(word: str, valid: Iterable[str], *, pattern: str = "{}") -> str:
-    """Return "; did you mean …?" when one of the valid names looks like the word, else nothing."""
-    if len(word) > _SHOWN_CHARS:
-        return ""
-    import difflib  # noqa: PLC0415 (start-up time)
-
-    lower = {name.lower(): name for name in valid}
-    found = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
-    return f"; did you mean {pattern.format(lower[found[0]])}?" if found else ""

@@ -14,8 +14,9 @@ from collections.abc import Iterable
 from dataclasses import field
 
 from coordinator.config import text as config_text
-from coordinator.config.errors import ConfigError, Place, shown
+from coordinator.config.errors import ConfigError, Place
 from coordinator.config.text import ReadBudget
+from coordinator.support.quoting import shown
 from nodes.support.records import record
 
 SAVED_PREFIX = "#*#"

@@ -1,14 +1,15 @@
 """The machine as the configuration describes it: frozen, checked, ready to be built."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
 from coordinator.config.errors import Place
-from coordinator.config.pins import PinDescription
+from coordinator.config.file import RawSection
+from coordinator.config.pins import PinDescription, PinRegistry
 from coordinator.config.saved import ConfigSource
 from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
-from coordinator.modules.module_set import ModuleSources
 from coordinator.motion.specs import MotionLimits
 from nodes.support.records import record
 
@@ -237,6 +238,29 @@ class AxisTablesDescription:
 
 
 @record
+class ModuleSection:
+    """A section that modules read."""
+
+    section: RawSection
+    whole: bool
+    """Whether it belongs to one module; else modules read further options of a section read elsewhere."""
+
+
+@record
+class ModuleSections:
+    """What the modules of a machine are built from each time it starts (modules/module_set.py)."""
+
+    sections: tuple[ModuleSection, ...]
+    """In the order of the file."""
+    pins: PinRegistry
+    """As the machine's own sections left it."""
+    config: Mapping[str, Mapping[str, str]]
+    """The configuration as text: options by section."""
+    settings: Mapping[str, Mapping[str, object]]
+    """As it was read: values and defaults."""
+
+
+@record
 class NotYetActing:
     """What was recognised but belongs to a module that is not built yet."""
 
@@ -273,7 +297,7 @@ class MachineDescription:
     """By number."""
     extruder_steppers: tuple[ExtruderStepperDescription, ...]
     shapers: tuple[ShaperDescription, ...]
-    modules: ModuleSources
+    modules: ModuleSections
     not_yet_acting: tuple[NotYetActing, ...]
     notes: tuple[str, ...]
     """Sentences about what has no effect."""

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import field
 from typing import Any, Generic, TypeVar
 
-from coordinator.config.errors import ConfigError, NotActing, Place, nearest, shown
+from coordinator.config.errors import ConfigError, NotActing, Place
 from coordinator.config.file import RawOption, RawSection
+from coordinator.support.quoting import nearest, shown
 from nodes.support.records import record
 
 T = TypeVar("T")

@@ -8,9 +8,10 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import field, replace
 
-from coordinator.config.errors import ConfigError, NotActing, Place, nearest, shown
+from coordinator.config.errors import ConfigError, NotActing, Place
 from coordinator.config.file import RawOption, RawSection
 from coordinator.config.options import BadValue, Option
+from coordinator.support.quoting import nearest, shown
 from nodes.support.records import record
 
 PRIMARY_NODE = "mcu"

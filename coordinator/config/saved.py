@@ -11,10 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from coordinator.config.errors import ConfigError, shown, shown_path
+from coordinator.config.errors import ConfigError
 from coordinator.config.file import SAVED_HEADER, SAVED_PREFIX, parse_saved, saved_header
 from coordinator.config.text import split_lines
 from coordinator.support.atomic_file import write_whole
+from coordinator.support.quoting import shown, shown_path
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
 

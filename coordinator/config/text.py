@@ -6,7 +6,8 @@ import stat
 from dataclasses import field
 from pathlib import Path
 
-from coordinator.config.errors import ConfigError, Place, shown_path
+from coordinator.config.errors import ConfigError, Place
+from coordinator.support.quoting import shown_path
 from nodes.support.records import record
 
 MAX_FILES = 200

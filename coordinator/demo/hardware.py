@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from coordinator.assembly.load import MachineDescription
+from coordinator.config.model import MachineDescription
 from nodes.virtual.edge_log import Clocks, Directions
 from nodes.virtual.plant import Axis
 from nodes.virtual.plant_log import PlantEvent

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from coordinator.assembly.load import MachineDescription, StepperDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription, StepperDescription
 from coordinator.demo.hardware import Hardware, NodeLog
 from coordinator.demo.report import DemoReport, NodeReport
 from coordinator.gcode.program import Program

@@ -5,9 +5,9 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from coordinator.assembly.load import MachineDescription, load_machine
-from coordinator.modules.programs.virtual_sdcard import VirtualSdcard
-from coordinator.service.core.serve import ServeReport, serve
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription
+from coordinator.front_ends.serve import ServeReport, serve
 from coordinator.support.command_options import DEMO_GCODE, DemoOptions, ServeOptions
 from coordinator.virtual_machine.stage import Stage
 
@@ -25,7 +25,7 @@ def serve_demo(options: DemoOptions) -> ServeReport:
 
 def with_jobs(options: ServeOptions, description: MachineDescription, folder: Path) -> ServeOptions:
     """Return OPTIONS with a job folder in FOLDER unless they name one or the machine has its own."""
-    has_jobs = any(source.kind is VirtualSdcard for source in description.modules.sources)
+    has_jobs = "virtual_sdcard" in description.modules.config
     if options.jobs is not None or has_jobs:
         return options
     return dataclasses.replace(options, jobs=_demo_jobs(folder))

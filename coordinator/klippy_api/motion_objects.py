@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from coordinator.assembly.load import MachineDescription
+    from coordinator.config.model import MachineDescription
     from coordinator.service.core.motion import Motion
 
 Objects = dict[str, dict[str, Any]]

@@ -15,8 +15,8 @@ from typing import Final
 
 from prometheus_client.exposition import choose_encoder
 
-from coordinator.ipc.protocol.methods import Value
 from coordinator.metrics.collect import registry_of
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 CONNECTIONS_MAX: Final = 8

@@ -17,11 +17,12 @@ A restart makes new modules: all state is in the object. Everything happens on t
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
-from coordinator.config.errors import ConfigError, NotActing, Place, nearest, shown
+from coordinator.config.errors import ConfigError, NotActing, Place
 from coordinator.config.file import RawSection
 from coordinator.config.options import BadValue, ListOption, Option, SectionReader, SectionSpec
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
 from coordinator.gcode.commands import GCodeCommand
+from coordinator.support.quoting import nearest, shown
 from nodes.node.config import NodeConfig
 
 if TYPE_CHECKING:  # planning needs neither, and they draw in asyncio
@@ -30,8 +31,7 @@ if TYPE_CHECKING:  # planning needs neither, and they draw in asyncio
     from coordinator.runtime.module_context import Live
     from nodes.node.node import Node
 
-Value = None | bool | int | float | str | list["Value"] | dict[str, "Value"]
-"""What a status may hold."""
+from coordinator.support.values import Value
 
 
 class Device(Protocol):

@@ -3,37 +3,39 @@
 import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import field
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from coordinator.config.errors import ConfigError, NotActing, Place
 from coordinator.config.file import RawSection
+from coordinator.config.model import MachineDescription, ModuleSection
 from coordinator.config.pins import PinRegistry
 from coordinator.config.unsupported import LATER_SECTIONS
 from coordinator.gcode.absent_commands import ABSENT
 from coordinator.gcode.builtins.basic import BESIDE, HANDLERS
 from coordinator.gcode.builtins.command_help import HELPS
 from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
-from coordinator.modules.base import Build, Device, Module, Value
+from coordinator.modules.base import Build, Device, Module
 from coordinator.modules.drivers.motor_power import MotorPower
 from coordinator.modules.drivers.stepper_buzz import StepperBuzz
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.programs.idle_timeout import IdleTimeout
 from coordinator.modules.programs.save_config import SaveConfig
+from coordinator.modules.registry import module_for, modules_beside
 from coordinator.modules.status.console import Console
 from coordinator.modules.status.positions import Positions
+from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
 from nodes.support.errors import CanductorError
 from nodes.support.records import record
 
 if TYPE_CHECKING:
-    from coordinator.config.model import MachineDescription
     from coordinator.motion.planner.planner import Planner
     from coordinator.runtime.module_context import Live
     from nodes.node.node import Node
 
 M = TypeVar("M", bound=Module)
+K = TypeVar("K")
 IDLE_TIMEOUT: Final = "idle_timeout"
 FREE_NAMES: Final = frozenset(("G2", "G3", "G5", "G17", "G18", "G19", "M118", "M201", "M203", "M205"))
 """Commands of ours that other hosts do not have by themselves: macros take their names as they come."""
@@ -62,33 +64,31 @@ class LeftOut:
     """What it depends on that does not act."""
 
 
-@record
-class ModuleSources:
-    """What the modules of a machine are made from, as often as it is started."""
+def build_modules(machine: MachineDescription) -> "ModuleSet":
+    """Build the modules of MACHINE, linked with each other; raises ConfigError."""
+    given = machine.modules
+    sources = [source for section in given.sections for source in _sources(section)]
+    without: dict[str, NotActing] = {}
+    while True:
+        built = ModuleSet(machine, given.pins.copy(), given.config, given.settings)
+        for source in sources:
+            built.build_or_leave_out(source, without)
+        built.add_always()
+        try:
+            built.link()
+        except _LinkNotActing as found:
+            # What depends on it may have to be left out, too: all are built again.
+            without[found.module] = found.error
+        else:
+            return built
 
-    sources: tuple[ModuleSource, ...]
-    pins: PinRegistry
-    """As the machine's own sections left it."""
-    config: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    """The configuration as text: options by section."""
-    settings: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
-    """As it was read: values and defaults."""
 
-    def build(self, machine: "MachineDescription") -> "ModuleSet":
-        """Make those of MACHINE, linked with each other; raises ConfigError."""
-        without: dict[str, NotActing] = {}
-        while True:
-            built = ModuleSet(machine, self.pins.copy(), self.config, self.settings)
-            for source in self.sources:
-                built.build_or_leave_out(source, without)
-            built.add_always()
-            try:
-                built.link()
-            except _LinkNotActing as found:
-                # What depends on it may have to be left out, too: all is made again.
-                without[found.module] = found.error
-            else:
-                return built
+def _sources(given: ModuleSection) -> Iterator[ModuleSource]:
+    section = given.section
+    if not given.whole:
+        yield from (ModuleSource(section, kind, whole=False) for kind in modules_beside(section.name))
+    elif (own := module_for(section.kind, section.place)) is not None:
+        yield ModuleSource(section, own, whole=True)
 
 
 class _LinkNotActing(Exception):  # noqa: N818 (no mistake)
@@ -124,7 +124,7 @@ class ModuleSet:
 
     def __init__(
         self,
-        machine: "MachineDescription",
+        machine: MachineDescription,
         pins: PinRegistry,
         config: Mapping[str, Mapping[str, str]] | None = None,
         settings: Mapping[str, Mapping[str, object]] | None = None,
@@ -297,7 +297,7 @@ class ModuleSet:
         """What each command of programs does, by its name."""
         return {**HELPS, **{name: command.help for name, command in self._commands.items()}}
 
-    def find(self, name: str, kind: type[M]) -> M | None:
+    def find(self, name: str, kind: type[K]) -> K | None:
         """Return the module of section NAME, or None when there is none of KIND."""
         return next((m for m in self._modules if m.name == name and isinstance(m, kind)), None)
 
@@ -309,7 +309,7 @@ class ModuleSet:
         """Tell whether NAME, a section or a heater of that name, is one that does not act yet."""
         return name in self.left_out or f"heater_generic {name}" in self.left_out
 
-    def of(self, kind: type[M]) -> Iterator[M]:
+    def of(self, kind: type[K]) -> Iterator[K]:
         """Yield all modules of KIND."""
         for module in self._modules:
             if isinstance(module, kind):

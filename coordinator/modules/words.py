@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
-from coordinator.config.errors import nearest
 from coordinator.gcode.parser import Command, WordError, number, quoted
+from coordinator.support.quoting import nearest
 
 T = TypeVar("T", float, None)
 

@@ -5,7 +5,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription
 from coordinator.gcode.events import (
     Emergency,
     End,
@@ -19,6 +20,7 @@ from coordinator.gcode.events import (
 )
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
+from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
 from coordinator.motion.steps.steps import StepError, StepGenerator
 from coordinator.planning.figures import PlanFigures
@@ -44,7 +46,7 @@ ASSUMED_MOVE_COUNT = 1024
 def plan_file(options: PlanOptions) -> PlanReport:
     """Plan OPTIONS.gcode for OPTIONS.config; raises CanductorError."""
     description = load_machine(str(options.config))
-    modules = description.modules.build(description)
+    modules = build_modules(description)
     devices = MachineDevices(description, modules)
     dictionaries = _dictionaries(description, options)
     for node in description.nodes:

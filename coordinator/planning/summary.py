@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from coordinator.assembly.load import CanConnection, MachineDescription
+from coordinator.config.model import CanConnection, MachineDescription
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.planning.figures import Bus, Peak, PlanFigures, WatchedNode
 from coordinator.planning.report import AxisReport, BusReport, NodeReport, PlanReport, StepperReport, Timeline

@@ -3,15 +3,15 @@
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from coordinator.assembly.load import (
+from coordinator.config.model import (
     CanConnection,
     MachineDescription,
     NodePolicy,
     RailDescription,
     StepperDescription,
 )
-from coordinator.modules.module_set import ModuleSet
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
+from coordinator.runtime.machine_modules import MachineModules
 from nodes.devices.endstop import Endstop
 from nodes.devices.stepper import Stepper
 from nodes.devices.trsync import Trsync
@@ -29,7 +29,7 @@ class MachineDevices:
     Call ``build_config`` for every node with its dictionary first; the specs are known afterwards.
     """
 
-    def __init__(self, description: MachineDescription, modules: ModuleSet) -> None:
+    def __init__(self, description: MachineDescription, modules: MachineModules) -> None:
         self.description = description
         self.modules = modules
         self.steppers: dict[str, Stepper] = {s.name: _stepper(s) for s in description.steppers}

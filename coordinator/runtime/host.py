@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from coordinator.assembly.load import CanConnection, UartConnection
+from coordinator.config.model import CanConnection, UartConnection
 from nodes.clock.clock import HostTime
 from nodes.link import LinkIO
 from nodes.link.interfaces import IoFactory, LinkIOLike, OnFrame, OnLost

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from coordinator.assembly.load import (
+from coordinator.config.model import (
     CanConnection,
     MachineDescription,
     NodeDescription,
@@ -19,13 +19,14 @@ from coordinator.config.sections.nodes import check_distinct
 from coordinator.motion.specs import NodeStreamSpec
 from coordinator.runtime.bus_overload import LoadWatch
 from coordinator.runtime.devices import MachineDevices, stream_specs
+from coordinator.runtime.filament_forecast import FilamentForecast
 from coordinator.runtime.host import Host
+from coordinator.runtime.machine_modules import MachineModules
 from coordinator.runtime.module_context import Live
 from coordinator.runtime.node_recovery import JobGate, NodeCare
 from coordinator.runtime.stepper_positions import RailPlaces
 from coordinator.runtime.timebase import ClockMap, TimeBase
 from coordinator.runtime.wire import Wire
-from coordinator.streaming.filament_forecast import FilamentForecast
 from nodes.bus.assign import Uuid
 from nodes.bus.bus import UartBus
 from nodes.bus.can_bus import CanBus
@@ -61,7 +62,9 @@ def _ignore(_: str) -> None:
 
 
 class Machine:
-    """All nodes of DESCRIPTION as one machine, on the ports and in the time of HOST; lives on one loop.
+    """All nodes of DESCRIPTION as one machine with MODULES, on the ports and in the time of HOST.
+
+    It lives on one event loop.
 
     ``start``, then ``close`` whatever happened. When a node is lost or shuts down whose policy is fatal, all
     others are stopped at once and ``stopped`` tells why; others are brought back (NodeCare). ON_NOTICE gets
@@ -74,6 +77,7 @@ class Machine:
         self,
         description: MachineDescription,
         host: Host,
+        modules: MachineModules,
         *,
         on_notice: Callable[[str], None] = _ignore,
         cache: DictionaryCache | None = None,
@@ -83,7 +87,7 @@ class Machine:
         self.description = description
         self.host = host
         self.policies = {node.name: node.policy for node in description.nodes}
-        self.modules = description.modules.build(description)
+        self.modules = modules
         self.devices = MachineDevices(description, self.modules)
         self.rails = RailPlaces(description)
         self.nodes: dict[str, Node] = {}

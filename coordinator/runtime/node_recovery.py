@@ -5,7 +5,7 @@ import contextlib
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Final, Protocol
 
-from coordinator.assembly.load import NodePolicy
+from coordinator.config.model import NodePolicy
 from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.assembly.load import MachineDescription, StepperDescription
+from coordinator.config.model import MachineDescription, StepperDescription
 from coordinator.kinematics.base import Point, Weights
 from coordinator.kinematics.dual_carriage import CarriageState
 from coordinator.motion.planner.planner import Position

@@ -8,7 +8,7 @@ from coordinator.simulate.boards import Board
 from coordinator.simulate.faults import NS, Fault
 from coordinator.simulate.scenario import HOST
 from coordinator.simulate.script import ScriptedWorld
-from coordinator.simulate.values import ScenarioError
+from coordinator.support.toml_values import ScenarioError
 from nodes.virtual.plant_page import Fault as State
 from nodes.virtual.plant_page import Kind
 from nodes.virtual.sim_plant import SimPlant

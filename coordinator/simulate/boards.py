@@ -10,7 +10,7 @@ import numpy as np
 from coordinator.simulate.scenario import NodeSetting
 from coordinator.simulate.script import ScriptedWorld
 from coordinator.simulate.truth import BoardTruth
-from coordinator.simulate.values import Dice
+from coordinator.support.toml_values import Dice
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
 from nodes.support._wire import ffi, lib
 from nodes.virtual.sim import SimNode

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from coordinator.simulate.scenario import HOST, FaultSetting, Scenario
-from coordinator.simulate.values import Dice
+from coordinator.support.toml_values import Dice
 
 NS: Final = 1_000_000_000
 SILENCE_S: Final = 1.5

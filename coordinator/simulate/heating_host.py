@@ -6,13 +6,15 @@ import sys
 from coordinator.assembly.load import load_machine
 from coordinator.gcode.commands import Call, InTime
 from coordinator.gcode.parser import parse
+from coordinator.modules.module_set import build_modules
 from coordinator.runtime.host import LinuxHost
 from coordinator.runtime.machine import Machine
 
 
 async def main(path: str, celsius: float) -> None:
     """Heat the hotend of the machine in PATH until the machine stops; raises why it did."""
-    machine = Machine(load_machine(path), LinuxHost())
+    description = load_machine(path)
+    machine = Machine(description, LinuxHost(), build_modules(description))
     await machine.start()
     try:
         command = parse(f"M104 S{celsius:g}".encode())

@@ -16,14 +16,16 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.assembly.load import MachineDescription, RailDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription, RailDescription
+from coordinator.modules.module_set import build_modules
 from coordinator.runtime.host import Host, LinuxHost
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.homing import CYCLE_S, HomingMove
 from coordinator.runtime.moves.single import Ramp, SingleMove, ratio_of
 from coordinator.simulate.scenario import BusSetting, Scenario
 from coordinator.simulate.stage import Stage
-from coordinator.simulate.values import Dice, Range
+from coordinator.support.toml_values import Dice, Range
 from coordinator.virtual_machine.plant import AXES, PlantSettings, machine_plants
 from coordinator.virtual_machine.real_nodes import CONFIG, real_nodes
 from nodes.support.errors import CanductorError
@@ -101,7 +103,9 @@ class _Performance:
 
     async def run(self, times: int) -> list[Homing]:
         """Home X and Y in turn."""
-        machine = Machine(self._described, self._host, on_notice=lambda _: None)
+        machine = Machine(
+            self._described, self._host, build_modules(self._described), on_notice=lambda _: None
+        )
         await machine.start()
         try:
             return [await self._home(machine, rail) for _ in range(times) for rail in self._described.stops]

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from coordinator.assembly.load import StepperDescription
+from coordinator.config.model import StepperDescription
 from coordinator.gcode.program import Program
 from coordinator.runtime.machine import Machine, link_of
 from coordinator.simulate import checker, truth
@@ -16,9 +16,9 @@ from coordinator.simulate.program import make_program
 from coordinator.simulate.result import Result
 from coordinator.simulate.scenario import OutputSetting, Scenario
 from coordinator.simulate.stage import Stage
-from coordinator.simulate.values import ScenarioError
 from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.streaming.pipeline import PlanRecord
+from coordinator.support.toml_values import ScenarioError
 from nodes.link import Link
 from nodes.support.errors import CanductorError
 

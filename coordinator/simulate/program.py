@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
 from coordinator.simulate.scenario import Program
-from coordinator.simulate.values import Dice
+from coordinator.support.toml_values import Dice
 
 ORIGIN_MM: Final = 10.0
 EXTRUSION: Final = 0.04

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from coordinator.simulate import scenario
-from coordinator.simulate.values import Range
+from coordinator.support.toml_values import Range
 
 TABLES: dict[str, type[Any]] = {
     "[nodes.NAME]": scenario.NodeSetting,

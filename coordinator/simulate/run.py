@@ -16,9 +16,9 @@ from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.checker import Violation
 from coordinator.simulate.result import Result, ScenarioList, SimulationReport
 from coordinator.simulate.scenario import Scenario
-from coordinator.simulate.values import ScenarioError
 from coordinator.support.command_options import Report, SimulateOptions
 from coordinator.support.progress import Progress, ProgressDisplay
+from coordinator.support.toml_values import ScenarioError
 from nodes.support.errors import CanductorError
 
 SEED_LIMIT_S: Final = 120.0

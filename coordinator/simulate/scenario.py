@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.config.errors import shown
-from coordinator.simulate.values import (
+from coordinator.support.quoting import shown
+from coordinator.support.toml_values import (
     Range,
     ScenarioError,
     choice,

@@ -7,13 +7,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from coordinator.assembly.load import (
-    CanConnection,
-    MachineDescription,
-    NodeDescription,
-    UartConnection,
-    load_machine,
-)
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import CanConnection, MachineDescription, NodeDescription, UartConnection
 from coordinator.runtime.host import Port as HostPort
 from coordinator.simulate.actor import SimActor, bit_errors
 from coordinator.simulate.boards import PS_PER_NS, Board
@@ -22,7 +17,7 @@ from coordinator.simulate.faults import NS, Faults
 from coordinator.simulate.scenario import BusSetting, NodeSetting, Scenario
 from coordinator.simulate.script import ScriptedWorld
 from coordinator.simulate.truth import BoardTruth
-from coordinator.simulate.values import Dice, ScenarioError
+from coordinator.support.toml_values import Dice, ScenarioError
 from coordinator.verification.expected import Floats, Ints
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from nodes.clock.clock import HostTime

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.assembly.load import StepperDescription
+from coordinator.config.model import StepperDescription
 from coordinator.simulate.checker import ExecutedSteps, concatenate
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.verification.expected import ExpectedSteps, Ints, expected_steps

@@ -6,7 +6,7 @@ taken up makes no step by itself: docs/tables.md tells how it comes into effect.
 
 from typing import TYPE_CHECKING, Final
 
-from coordinator.assembly.load import MachineDescription
+from coordinator.config.model import MachineDescription
 from coordinator.motion.specs import MotionLimits, StepKinematics
 from coordinator.motion.steps.steps import TABLE_POINTS_MAX, AxisCorrection, StepGenerator
 from coordinator.tables.axis_table import AxisTable, Unit

@@ -4,11 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from coordinator.assembly.load import MachineDescription
+from coordinator.config.model import MachineDescription
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import Notice
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
+from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.host import Host, LinuxHost
 from coordinator.runtime.machine import Machine, MachineStopped, link_of
@@ -81,6 +82,7 @@ async def run_job(
     machine = Machine(
         description,
         host or LinuxHost(),
+        build_modules(description),
         on_notice=lambda text: on_told(Notice(0, text)),
         cache=cache,
     )

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from coordinator.runtime.filament_forecast import FilamentForecast
     from coordinator.streaming.compensation import Compensation
-    from coordinator.streaming.filament_forecast import FilamentForecast
 
 BatchSink = Callable[[int, bytes], None]
 """Takes a node's index and a piece of its stream (nodes/link/batch.h)."""

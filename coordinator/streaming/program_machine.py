@@ -1,6 +1,6 @@
 """From the configured machine to what a program may change of it."""
 
-from coordinator.assembly.load import MachineDescription
+from coordinator.config.model import MachineDescription
 from coordinator.gcode.machine_state import Extruder, MachineState, Shaper
 from coordinator.kinematics.extruder import ExtruderMotion
 

@@ -6,7 +6,7 @@ What homing found decides: an endstop that was missed by a step shifts everythin
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
-from coordinator.assembly.load import MachineDescription
+from coordinator.config.model import MachineDescription
 from coordinator.streaming.pipeline import PlanRecord
 from nodes.support.records import record
 from nodes.virtual.plant import Axis

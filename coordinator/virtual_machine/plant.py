@@ -10,8 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.assembly.load import MachineDescription, RailDescription, StepperDescription
-from coordinator.config.model import SECOND_CARRIAGE
+from coordinator.config.model import SECOND_CARRIAGE, MachineDescription, RailDescription, StepperDescription
 from coordinator.kinematics.base import Point
 from coordinator.motion.specs import StepKinematics
 from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat

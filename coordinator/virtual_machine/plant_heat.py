@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
-from coordinator.assembly.load import MachineDescription
 from coordinator.config.file import ConfigFile, RawSection, parse_config
+from coordinator.config.model import MachineDescription
 from coordinator.config.options import BadValue
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
 from coordinator.config.sections.nodes import make_pin_registry

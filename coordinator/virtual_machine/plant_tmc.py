@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
-from coordinator.assembly.load import MachineDescription
 from coordinator.config.file import ConfigFile, RawSection, parse_config
+from coordinator.config.model import MachineDescription
 from coordinator.config.pins import PinDescription, PinOption
 from coordinator.config.sections.nodes import make_pin_registry
 from coordinator.drivers.tmc_chips import CHIPS

@@ -5,8 +5,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
-from coordinator.assembly.load import CanConnection, load_machine
-from coordinator.simulate.values import Dice
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import CanConnection
+from coordinator.support.toml_values import Dice
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from nodes.virtual.hub import VirtualBus
 from nodes.virtual.plant_page import PlantPage

@@ -10,12 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from coordinator.assembly.load import (
-    CanConnection,
-    MachineDescription,
-    NodeDescription,
-    UartConnection,
-)
+from coordinator.config.model import CanConnection, MachineDescription, NodeDescription, UartConnection
 from coordinator.support.command_options import DemoOptions
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants, start_point
 from coordinator.virtual_machine.plant_heat import HeatSettings

@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Registry, Scope, Value
+from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Registry, Scope
+from coordinator.support.values import Value
 from coordinator.web.access import LINK_S
 
 if TYPE_CHECKING:

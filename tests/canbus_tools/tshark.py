@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from canbus_tools.dissector import dissector
+from canbus_tools.dissector.dissector import dissector
 from canbus_tools.protocol.frame import Frame, FrameKind
 from nodes.dictionary.dictionary import Dictionary
 

@@ -7,13 +7,14 @@ from typing import Any
 import msgpack
 
 from coordinator.ipc.protocol.messages import Encoder, Encoding, Fault, WireReader
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope, Value
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope
 from coordinator.ipc.server.auth import Grant, Tokens
 from coordinator.ipc.server.publisher import Publisher
 from coordinator.ipc.server.session import Common, Session
 from coordinator.ipc.server.session_methods import add_session_methods
 from coordinator.ipc.server.settings import Limits
 from coordinator.ipc.server.state import StateTree
+from coordinator.support.values import Value
 
 LIMITS = Limits(
     message_bytes=2_000,

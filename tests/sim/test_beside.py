@@ -7,6 +7,7 @@ import pytest
 
 from coordinator.gcode.builtins.basic import BESIDE
 from coordinator.ipc.protocol.methods import ApiError
+from coordinator.modules.module_set import build_modules
 from tests.stages.printer import PRINTING, Printer, gcode
 from tests.stages.served import Served
 
@@ -99,7 +100,7 @@ def test_the_page_names_all_of_them(tmp_path: Path) -> None:
     )
     printer = Printer(tmp_path, sections + "[delayed_gcode tick]\ngcode:\n    M117\n")
     description = printer.load()
-    known = description.modules.build(description).vocabulary.commands
+    known = build_modules(description).vocabulary.commands
     own = {name for name in known if not name.startswith("_") and not name.startswith(("KEEP", "M221"))}
     beside = {name for name in own if known[name].beside} | BESIDE
     page = Path("docs/gcode.md").read_text(encoding="utf-8").partition("## Beside a job")[2]

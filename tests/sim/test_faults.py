@@ -6,7 +6,7 @@ from collections.abc import Callable
 from coordinator.simulate import scenario
 from coordinator.simulate.faults import NS, Fault, Faults
 from coordinator.simulate.scenario import FaultSetting
-from coordinator.simulate.values import Dice, Range
+from coordinator.support.toml_values import Dice, Range
 
 BUS_OF = {"mcu": "can0", "toolhead": "can0", "zboard": "/dev/ttyUSB0"}
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coordinator.modules.module_set import build_modules
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.homing import TIMEOUT_S, HomingError, HomingMove, HomingResult
 from coordinator.simulate import scenario as scenarios
@@ -71,7 +72,12 @@ class Home:
             return runner.run(self._main())
 
     async def _main(self) -> HomingResult:
-        machine = Machine(self.stage.description, self.stage.host, on_notice=self.told.append)
+        machine = Machine(
+            self.stage.description,
+            self.stage.host,
+            build_modules(self.stage.description),
+            on_notice=self.told.append,
+        )
         await machine.start()
         try:
             rail = self.stage.description.rails[0]

@@ -9,7 +9,7 @@ import pytest
 from coordinator.simulate import scenario
 from coordinator.simulate.checker import Ending, OutputTruth, check_output
 from coordinator.simulate.play import play
-from coordinator.simulate.values import ScenarioError
+from coordinator.support.toml_values import ScenarioError
 
 MS = 1_000_000
 STOP = Ending(cause="a stop", stopped_ns=1000 * MS, stop_s=0.1)

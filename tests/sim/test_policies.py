@@ -7,6 +7,7 @@ import pytest
 
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
+from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.machine import Machine
 from coordinator.streaming.move_source import JobState
@@ -72,7 +73,7 @@ def test_a_job_that_is_held_reads_no_further_until_it_is_released(tmp_path: Path
             if held_cycles == 10:
                 streamer.release()
 
-        real = Machine(machine.description, machine.host)
+        real = Machine(machine.description, machine.host, build_modules(machine.description))
         await real.start()
         try:
             with Program.open(gcode) as program:

@@ -11,7 +11,7 @@ from coordinator.gcode.program import Program as GCode
 from coordinator.motion.planner.planner import Planner
 from coordinator.simulate import reference, scenario
 from coordinator.simulate.program import make_program
-from coordinator.simulate.values import Dice, Range, ScenarioError
+from coordinator.support.toml_values import Dice, Range, ScenarioError
 
 GOOD = """\
 about = "A test."

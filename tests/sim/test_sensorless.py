@@ -11,9 +11,9 @@ from coordinator.gcode.errors import GCodeError
 from coordinator.modules.drivers.tmc_driver import TmcDriver
 from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.simulate.scenario import BusSetting
-from coordinator.simulate.values import Range
 from coordinator.streaming.job_runner import Outcome
 from coordinator.streaming.move_source import Told
+from coordinator.support.toml_values import Range
 from coordinator.virtual_machine.plant import PlantSettings
 from nodes.support.errors import CanductorError
 from nodes.virtual.plant_page import Fault, Kind, PlantPage
@@ -21,7 +21,7 @@ from tests.stages.machine_stage import MachineStage
 from tests.stages.printer_text import SENSORLESS_CFG
 
 if TYPE_CHECKING:
-    from coordinator.modules.base import Value
+    from coordinator.support.values import Value
 
 EXAMPLE = Path(__file__).parents[2] / "config" / "sensorless.cfg"
 FULL_STEP_MM = 40 / 200

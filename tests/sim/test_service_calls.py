@@ -9,7 +9,7 @@ import pytest
 
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.simulate.scenario import NodeSetting
-from coordinator.simulate.values import Range
+from coordinator.support.toml_values import Range
 from tests.stages.demo_machine import SQUARE, DemoMachine
 from tests.stages.served import Served, zigzag
 

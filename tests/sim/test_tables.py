@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.assembly.load import MachineDescription
-from coordinator.config.model import AxisTablesDescription
+from coordinator.config.model import AxisTablesDescription, MachineDescription
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage

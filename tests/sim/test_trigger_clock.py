@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coordinator.modules.module_set import build_modules
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.homing import LOOK_S, HomingMove, HomingResult
 from coordinator.simulate import scenario as scenarios
@@ -92,7 +93,12 @@ class Switches:
         """Home at SPEED, mm/s."""
 
         async def main() -> tuple[HomingResult, ...]:
-            machine = Machine(self.stage.description, self.stage.host, on_notice=lambda _: None)
+            machine = Machine(
+                self.stage.description,
+                self.stage.host,
+                build_modules(self.stage.description),
+                on_notice=lambda _: None,
+            )
             await machine.start()
             try:
                 rails, ways = self.stage.description.stops, dict.fromkeys(self.at, -1.0)

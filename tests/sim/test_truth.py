@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from coordinator.assembly.load import StepperDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import StepperDescription
 from coordinator.simulate import scenario, truth
 from coordinator.simulate.truth import BoardTruth
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from coordinator.assembly.load import load_machine
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, InTime, Reading
 from coordinator.gcode.parser import parse
-from coordinator.modules.base import Value
-from coordinator.modules.module_set import ModuleSet
+from coordinator.modules.module_set import ModuleSet, build_modules
 from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.simulate.scenario import BusSetting
-from coordinator.simulate.values import Range
+from coordinator.support.toml_values import Range
+from coordinator.support.values import Value
 from coordinator.virtual_machine.plant import PlantSettings
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.node.config import NodeConfig
@@ -60,7 +60,7 @@ def build(folder: Path, text: str) -> ModuleSet:
     path = folder / "printer.cfg"
     path.write_text(BASE + text)
     machine = load_machine(str(path))
-    return machine.modules.build(machine)
+    return build_modules(machine)
 
 
 def configured(modules: ModuleSet, node: str) -> list[str]:
@@ -94,7 +94,12 @@ class HeatMachine(MachineStage):
         """Run MAIN with the machine connected."""
 
         async def whole() -> None:
-            self.machine = Machine(self.description, self.host, on_notice=self.notices.append)
+            self.machine = Machine(
+                self.description,
+                self.host,
+                build_modules(self.description),
+                on_notice=self.notices.append,
+            )
             await self.machine.start()
             try:
                 await main()

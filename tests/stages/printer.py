@@ -3,8 +3,9 @@
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
-from coordinator.assembly.load import MachineDescription, load_machine
-from coordinator.modules.base import Value
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription
+from coordinator.support.values import Value
 from coordinator.virtual_machine.plant import PlantSettings
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from tests.stages.machine_stage import MachineStage

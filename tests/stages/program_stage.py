@@ -12,6 +12,7 @@ from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import End, Event, Full, Notice, Progress, Reply, Resting
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
+from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
 from coordinator.streaming.program_machine import machine_state
 from tests.stages.printer_text import PRINTER_CFG, write
@@ -49,7 +50,7 @@ class ProgramStage:
     def __init__(self, folder: Path, sections: str = "", machine: str = PRINTER_CFG) -> None:
         self.path = write(folder, machine + "\n" + sections)
         self.description = load_machine(self.path)
-        self.modules: ModuleSet = self.description.modules.build(self.description)
+        self.modules: ModuleSet = build_modules(self.description)
         self.planner = Planner(self.description.limits)
         self.machine: MachineState = machine_state(self.description)
         self.moves: list[tuple[float, ...]] = []

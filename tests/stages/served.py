@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from coordinator.assembly.load import MachineDescription
+from coordinator.config.model import MachineDescription
 from coordinator.ipc.protocol.methods import Caller, Registry, Scope
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.uploads import upload_method

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.assembly.load import CanConnection, UartConnection, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import CanConnection, UartConnection
 from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
 from coordinator.virtual_machine.stage import Stage
 from tests.canbus_tools.command import Command

@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
-from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription
 from coordinator.gcode.program import Program
 from coordinator.runtime.host import Computer, LinuxHost
 from coordinator.streaming.compensation import kept_compensation

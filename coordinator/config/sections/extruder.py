@@ -2,7 +2,7 @@
 
 import math
 
-from coordinator.config.errors import ConfigError, nearest
+from coordinator.config.errors import ConfigError
 from coordinator.config.file import RawSection
 from coordinator.config.model import ExtruderDescription, ExtruderStepperDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec, TextOption
@@ -13,6 +13,7 @@ from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_EXTRUDER_OPTIONS
 from coordinator.kinematics.base import FILAMENT, StepFunction, WorkSpace
 from coordinator.motion.specs import MotionLimits
+from coordinator.support.quoting import nearest
 
 NOZZLE_DIAMETER = FloatOption(
     name="nozzle_diameter", help="bore of the nozzle", unit="mm", above=0, maximum=20

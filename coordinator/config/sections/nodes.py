@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable
 
-from coordinator.config.errors import ConfigError, Place, nearest, shown
+from coordinator.config.errors import ConfigError, Place
 from coordinator.config.file import ConfigFile, RawSection
 from coordinator.config.model import (
     CanConnection,
@@ -25,6 +25,7 @@ from coordinator.config.options import (
 from coordinator.config.pins import MULTI_PIN, PRIMARY_NODE, PinOption, PinRegistry
 from coordinator.config.sections.virtual_endstops import note_diag_pins
 from coordinator.config.unsupported import LATER_MCU_OPTIONS
+from coordinator.support.quoting import nearest, shown
 
 SERIAL = TextOption(
     name="serial",

@@ -5,10 +5,10 @@ The driver raises its DIAG, so the endstop's pin is ``diag_pin`` of the driver's
 
 from typing import Final
 
-from coordinator.config.errors import nearest, shown
 from coordinator.config.file import ConfigFile
 from coordinator.config.options import BadValue, SectionReader
 from coordinator.config.pins import PinName, PinOption, PinRegistry
+from coordinator.support.quoting import nearest, shown
 
 STALL_KINDS: Final = ("tmc2209",)
 """First words of the sections of drivers that can feel the end of an axis."""

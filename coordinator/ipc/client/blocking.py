@@ -9,7 +9,7 @@ from typing import Any, Self, TypeVar
 
 from coordinator.ipc.client.client import Client
 from coordinator.ipc.client.feeds import Update
-from coordinator.ipc.protocol.methods import Value
+from coordinator.support.values import Value
 
 T = TypeVar("T")
 

@@ -11,9 +11,10 @@ from coordinator.ipc.client.connect_errors import doubt, why_no_answer, why_refu
 from coordinator.ipc.client.feeds import Event, Feed, Update, Watch
 from coordinator.ipc.protocol.address import Address, read_address
 from coordinator.ipc.protocol.messages import LENGTH_MAX, Encoder, Encoding, Fault, WireReader
-from coordinator.ipc.protocol.methods import ApiError, Scope, Value
+from coordinator.ipc.protocol.methods import ApiError, Scope
 from coordinator.ipc.server.session_methods import API_VERSION
 from coordinator.ipc.server.settings import Limits
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 __all__ = ["Client", "ConnectionLost", "Event", "Hello", "Refused", "Update"]

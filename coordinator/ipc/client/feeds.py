@@ -5,8 +5,9 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from coordinator.ipc.protocol.methods import ApiError, Value
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.ipc.server.state import FieldFilter
+from coordinator.support.values import Value
 
 EVENTS_MAX: Final = 1_024
 """Notifications that wait to be taken."""

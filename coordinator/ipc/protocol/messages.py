@@ -16,9 +16,9 @@ from typing import Any, Final
 import msgpack
 
 from coordinator.ipc.protocol.json_values import has_more_items
-from coordinator.ipc.protocol.methods import Value
 from coordinator.ipc.protocol.packed_values import has_more_values
 from coordinator.ipc.server.settings import Limits
+from coordinator.support.values import Value
 
 LENGTH: Final = struct.Struct(">I")
 LENGTH_MAX: Final = 2**24 - 1

@@ -6,10 +6,8 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 from typing import Any, Final
 
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
-
-Value = None | bool | int | float | str | list[Any] | dict[str, Any]
-"""What a message may carry; lists and maps hold the same again, map keys are strings."""
 
 INT_MIN: Final = -(2**63)
 INT_MAX: Final = 2**63 - 1

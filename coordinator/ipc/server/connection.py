@@ -6,9 +6,10 @@ import socket
 from collections.abc import Awaitable, Callable
 from typing import Final
 
-from coordinator.ipc.protocol.methods import ApiError, Value
+from coordinator.ipc.protocol.methods import ApiError
 from coordinator.ipc.server.fair_scheduler import Turns
 from coordinator.ipc.server.session import Request, Session
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 REQUESTS_PER_TURN: Final = 64

@@ -3,8 +3,8 @@
 from typing import Final
 
 from coordinator.ipc.protocol.messages import Encoder, Encoding
-from coordinator.ipc.protocol.methods import Value
 from coordinator.ipc.server.state import FieldFilter, StateTree
+from coordinator.support.values import Value
 
 FILTERS_MAX: Final = 256
 """Different filters that are kept for those who will watch the same."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from coordinator.ipc.protocol.messages import Encoder, Encoding, Fault
-from coordinator.ipc.protocol.methods import ApiError, Registry, Value
+from coordinator.ipc.protocol.methods import ApiError, Registry
 from coordinator.ipc.server.auth import FailureBrake, Grant, Tokens, digest_of, stamp_of
 from coordinator.ipc.server.connection import Connection
 from coordinator.ipc.server.fair_scheduler import Turns
@@ -21,6 +21,7 @@ from coordinator.ipc.server.settings import IpcSettings, Limits, TcpSettings
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, Door
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 TOKENS_LOOK_S: Final = 1.0

@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from coordinator.ipc.protocol.messages import Encoding, Fault, WireReader
-from coordinator.ipc.protocol.methods import ApiError, Caller, Method, Registry, Scope, Value, shown
+from coordinator.ipc.protocol.methods import ApiError, Caller, Method, Registry, Scope, shown
 from coordinator.ipc.server import session_methods
 from coordinator.ipc.server.auth import Grant
 from coordinator.ipc.server.publisher import Publisher, Subscription
 from coordinator.ipc.server.settings import Limits
 from coordinator.ipc.server.state import FieldFilter
+from coordinator.support.values import Value
 
 MESSAGES_PER_TURN: Final = 64
 """Messages taken from the bytes before others get their turn."""

@@ -4,18 +4,9 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.ipc.protocol.messages import Fault
-from coordinator.ipc.protocol.methods import (
-    ApiError,
-    Caller,
-    Kind,
-    Method,
-    Param,
-    Registry,
-    Scope,
-    Value,
-    printable,
-)
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope, printable
 from coordinator.ipc.server.state import costly_stars
+from coordinator.support.values import Value
 
 if TYPE_CHECKING:
     from coordinator.ipc.server.session import Session

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from coordinator.ipc.protocol.methods import Value
+from coordinator.support.values import Value
 
 FIELDS_MAX: Final = 16_384
 """Fields in a tree; further ones are refused and counted."""

@@ -10,7 +10,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Final
 
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, Value, shown
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
+from coordinator.support.values import Value
 
 PART_MAX: Final = 32_768
 """Characters of one part; however they are written, a message holds them."""

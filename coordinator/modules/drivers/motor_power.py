@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
+from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
 
 if TYPE_CHECKING:

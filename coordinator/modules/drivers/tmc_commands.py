@@ -2,13 +2,14 @@
 
 from typing import TYPE_CHECKING, ClassVar
 
-from coordinator.config.errors import ConfigError, nearest
+from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec
 from coordinator.drivers.tmc_chips import Field
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import one, parameters, value
+from coordinator.support.quoting import nearest
 from nodes.devices.tmcuart import TmcUart
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ import contextlib
 from collections.abc import AsyncIterator, Iterator, Mapping
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from coordinator.config.errors import ConfigError, NotActing, nearest, shown
+from coordinator.config.errors import ConfigError, NotActing
 from coordinator.drivers.tmc_chips import FAULTS, FORGOTTEN, TMC2208, TMC2209, UNDERVOLTAGE, Chip
 from coordinator.drivers.tmc_chips import shown as register_shown
-from coordinator.modules.base import Build, Value
+from coordinator.modules.base import Build
 from coordinator.modules.drivers.tmc_commands import TmcCommands
 from coordinator.modules.drivers.tmc_options import (
     DIAG_PIN,
@@ -25,6 +25,8 @@ from coordinator.modules.drivers.tmc_options import (
     driver_spec,
 )
 from coordinator.modules.homing.virtual_endstop import StallEndstop
+from coordinator.support.quoting import nearest, shown
+from coordinator.support.values import Value
 from nodes.devices.tmcuart import TmcError
 from nodes.support.errors import CanductorError
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from coordinator.config.errors import ConfigError, nearest, shown
+from coordinator.config.errors import ConfigError
 from coordinator.config.options import FloatOption, IntOption, ListOption, SectionSpec
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.drivers.motor_power import MotorPower
@@ -15,6 +15,7 @@ from coordinator.modules.fans.fan_unit import (
 )
 from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.heaters.heaters import Heaters
+from coordinator.support.quoting import nearest, shown
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from coordinator.config.options import BoolOption, FloatOption, IntOption, Option
 from coordinator.config.pins import PinOption
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
 from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
+from coordinator.support.values import Value
 from nodes.devices.counter import Counter
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut

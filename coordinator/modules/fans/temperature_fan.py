@@ -18,7 +18,7 @@ from coordinator.gcode.parser import WordError
 from coordinator.heat.controller import Controller
 from coordinator.heat.pid import Pid, PidGains
 from coordinator.heat.watermark import Watermark
-from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.fans.fan_unit import (
     LATER_FAN_OPTIONS,
     FanModule,
@@ -31,6 +31,7 @@ from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.modules.words import one, parameters, value
+from coordinator.support.values import Value
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

@@ -22,12 +22,13 @@ from coordinator.heat.controller import Controller
 from coordinator.heat.holding import Held, Holding
 from coordinator.heat.mpc import Mpc
 from coordinator.heat.verify import HeaterCheck
-from coordinator.modules.base import Build, Modules, Value
+from coordinator.modules.base import Build, Modules
 from coordinator.modules.fans.fan_unit import FanModule
 from coordinator.modules.heaters.control import ControlSettings
 from coordinator.modules.heaters.verify_heater import VerifyHeater, usual
 from coordinator.modules.pinned import AHEAD_S, add_pinned
 from coordinator.modules.sensors.temperature_input import SensorModule, TemperatureInput
+from coordinator.support.values import Value
 from nodes.devices.analog_in import RANGE_CHECKS
 from nodes.devices.pwm_out import PwmOut
 from nodes.node.states import NodeState

@@ -7,10 +7,11 @@ from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, InTime, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
 from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.modules.words import numbers, one, parameters, value
+from coordinator.support.values import Value
 
 FAN_STEPS_MAX: Final = 12
 

@@ -3,16 +3,18 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from coordinator.config.errors import ConfigError, nearest, shown
+from coordinator.config.errors import ConfigError
 from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.config.sections.heater_options import PID_KD, PID_KI, PID_KP
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, InTime, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.heat.pid import Pid, PidGains
-from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.words import one, parameters, value
+from coordinator.support.quoting import nearest, shown
+from coordinator.support.values import Value
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

@@ -13,12 +13,13 @@ from coordinator.config.sections.heater_options import (
 )
 from coordinator.gcode.commands import Call, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError
-from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.heaters.pid_profile import PidProfiles
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.modules.words import numbers
+from coordinator.support.values import Value
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

@@ -2,10 +2,11 @@
 
 from typing import ClassVar, Final
 
-from coordinator.config.errors import ConfigError, NotActing, nearest
+from coordinator.config.errors import ConfigError, NotActing
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.heat.verify import VerifyOptions
 from coordinator.modules.base import Build, Module, Modules
+from coordinator.support.quoting import nearest
 
 MAX_ERROR: Final = FloatOption(
     name="max_error",

@@ -15,9 +15,10 @@ from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing_plan import AXES, Approach, approaches, landed, second_landed
 from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:

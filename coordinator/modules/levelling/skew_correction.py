@@ -15,10 +15,11 @@ from coordinator.gcode.builtins.machine import come_to_rest
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Position, Reading, ToProgram
 from coordinator.gcode.events import PositionSet, WeightsChange
 from coordinator.gcode.parser import Command, WordError, quoted
-from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.words import flag, one, parameters, value
 from coordinator.motion.specs import StepKinematics
+from coordinator.support.values import Value
 from nodes.support.records import record
 
 if TYPE_CHECKING:

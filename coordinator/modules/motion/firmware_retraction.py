@@ -7,8 +7,9 @@ from typing import Final
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
 from coordinator.gcode.parser import WordError
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
 from coordinator.modules.words import bounded, parameters
+from coordinator.support.values import Value
 
 LENGTH = FloatOption(
     name="retract_length", help="How far G10 draws back", default=0.0, unit="mm", minimum=0.0, maximum=100.0

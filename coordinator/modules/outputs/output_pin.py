@@ -7,9 +7,10 @@ from coordinator.config.options import BoolOption, FloatOption, ListOption, Sect
 from coordinator.config.pins import PinOption
 from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
 from coordinator.gcode.parser import WordError
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
 from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
 from coordinator.modules.words import one, parameters, value
+from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
 from nodes.node.config import NodeConfig

@@ -12,7 +12,8 @@ from coordinator.gcode.builtins.state import go
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading, ToProgram
 from coordinator.gcode.events import Reply
 from coordinator.gcode.parser import Command, WordError, number, quoted
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
+from coordinator.support.values import Value
 
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job

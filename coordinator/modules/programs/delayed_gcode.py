@@ -3,13 +3,14 @@
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
-from coordinator.config.errors import nearest
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.gcode.parser import Command, WordError, quoted
-from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, needed, parameters
+from coordinator.support.quoting import nearest
+from coordinator.support.values import Value
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

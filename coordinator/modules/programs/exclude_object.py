@@ -9,13 +9,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from coordinator.config.errors import nearest
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, ToProgram
 from coordinator.gcode.parser import Command, WordError, number, quoted
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
 from coordinator.modules.words import flag, needed, parameters
 from coordinator.motion.planner.planner import FeedStatus
+from coordinator.support.quoting import nearest
+from coordinator.support.values import Value
 
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job

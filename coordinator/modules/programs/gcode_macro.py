@@ -5,13 +5,15 @@ import re
 from collections.abc import Mapping
 from typing import Any, Final
 
-from coordinator.config.errors import ConfigError, Place, nearest
+from coordinator.config.errors import ConfigError, Place
 from coordinator.config.options import GCodeOption, Option, SectionSpec, TextOption
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
 from coordinator.gcode.parser import Command, WordError, parse, quoted
 from coordinator.gcode.templates.templates import Asked, Template, TemplateError, line_of
-from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.printer_status import PrinterStatus
+from coordinator.support.quoting import nearest
+from coordinator.support.values import Value
 
 GCODE = GCodeOption(name="gcode", help="What is done: g-code, with Jinja2 between { } and {% %}")
 RENAME = TextOption(

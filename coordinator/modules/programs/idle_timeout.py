@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
-from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, parameters
+from coordinator.support.values import Value
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

@@ -11,9 +11,10 @@ from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.builtins.state import save_state
 from coordinator.gcode.commands import Call, GCodeCommand, Reading, ToProgram
 from coordinator.gcode.events import Reply
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.modules.words import bounded, parameters
+from coordinator.support.values import Value
 
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job

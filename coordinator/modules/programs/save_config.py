@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:

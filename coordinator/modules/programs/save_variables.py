@@ -10,14 +10,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from coordinator.config.errors import ConfigError, shown_path
+from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec, TextOption
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
-from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
 from coordinator.modules.words import needed, parameters
 from coordinator.support.atomic_file import write_whole
+from coordinator.support.quoting import shown_path
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:

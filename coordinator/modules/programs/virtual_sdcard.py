@@ -9,10 +9,11 @@ from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, ToPr
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.print_control import Recovering
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.modules.words import bounded, flag, needed, parameters
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:

@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Final
 from coordinator.config.options import BoolOption, FloatOption, GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
-from coordinator.modules.base import Build, Module, Modules, Value
+from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.modules.words import flag, needed, one, parameters
+from coordinator.support.values import Value
 from nodes.devices.button import Button
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ min_temp and max_temp.
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from coordinator.config.errors import ConfigError, nearest, shown
+from coordinator.config.errors import ConfigError
 from coordinator.config.sections.sensor_options import (
     CHIP_POINTS,
     COMBINATION_METHOD,
@@ -23,6 +23,7 @@ from coordinator.heat.chip_sensors import ChipLine, ChipSensor, FactoryPoints, c
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from coordinator.modules.sensors.temperature_source import TemperatureSource
+from coordinator.support.quoting import nearest, shown
 from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.states import NodeState

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Final
 
-from coordinator.config.errors import ConfigError, NotActing, nearest, shown
+from coordinator.config.errors import ConfigError, NotActing
 from coordinator.config.sections.sensor_options import (
     ADC_VOLTAGE,
     FREE_SENSORS,
@@ -30,6 +30,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.modules.sensors.thermistor import KINDS, Circuit, CustomSensor
+from coordinator.support.quoting import nearest, shown
 from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.node.states import NodeState
 

@@ -9,10 +9,11 @@ from coordinator.config.sections.sensor_options import (
     LATER_SENSOR_OPTIONS,
     SENSOR_OPTIONS,
 )
-from coordinator.modules.base import Build, Modules, Value
+from coordinator.modules.base import Build, Modules
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_input import SensorModule
+from coordinator.support.values import Value
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live

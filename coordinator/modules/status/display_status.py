@@ -6,8 +6,9 @@ from typing import Final
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, number
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
 from coordinator.modules.words import parameters
+from coordinator.support.values import Value
 
 TEXT_MAX: Final = 500
 """Characters of a message."""

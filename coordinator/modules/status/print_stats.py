@@ -8,8 +8,9 @@ from typing import Final
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
 from coordinator.modules.words import bounded, parameters
+from coordinator.support.values import Value
 
 _LAYERS_MAX: Final = 1e6
 NOTHING: Final[Mapping[str, Value]] = {

@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from coordinator.assembly.load import CanConnection, RailDescription, StepperDescription
+from coordinator.config.model import CanConnection, RailDescription, StepperDescription
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.single import START_LEAD_S, WAY, Ramp, SingleMove, ratio_of
 from nodes.clock.clock import Ticks, extend32

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from coordinator.assembly.load import StepperDescription
+from coordinator.config.model import StepperDescription
 from coordinator.motion.specs import StepKinematics, StepperSpec
 from coordinator.motion.steps.steps import StepGenerator
 from coordinator.motion.trapezoid_array import TRAPEZOID

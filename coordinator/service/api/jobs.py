@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from coordinator.gcode.print_control import Recovering
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, Value, shown
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.motion import MotionOver
 from coordinator.service.core.work import FileWork
@@ -13,6 +13,7 @@ from coordinator.service.jobs.fed import FAILURE_MAX, NAME_MAX, PIECE_BYTES_MAX,
 from coordinator.service.jobs.job_folder import FILES_MAX, NAME_BYTES_MAX, JobFolder, NoSuchJob
 from coordinator.service.jobs.jobs import JobPhase, JobRun
 from coordinator.service.state.figures import job_figures
+from coordinator.support.values import Value
 
 _LISTED_MAX: Final = 1000
 _JOB: Final = (

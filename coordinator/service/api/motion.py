@@ -9,7 +9,7 @@ from typing import Any, Final
 from coordinator.gcode.builtins.basic import BESIDE, HANDLERS
 from coordinator.gcode.builtins.machine import is_tool
 from coordinator.gcode.errors import GCodeError
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
 from coordinator.modules.module_set import INTERRUPTING
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.feeder import FeederFull, Ticket
@@ -28,6 +28,7 @@ from coordinator.service.core.work import (
 )
 from coordinator.service.state.figures import axes, position_figures
 from coordinator.streaming.move_source import Told
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 _DEFAULT_SPEED_MM_S: Final = 25.0

@@ -3,10 +3,11 @@
 from collections.abc import Iterator
 from typing import Any, Final
 
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
 from coordinator.ipc.server.state import FieldFilter
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.state.figures import field_name
+from coordinator.support.values import Value
 from nodes.dictionary.message_format import Message
 from nodes.node.node import Node
 from nodes.support.errors import CanductorError

@@ -8,10 +8,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.motion import Motion
 from coordinator.service.state.trace import KEEP_S, Moves
+from coordinator.support.values import Value
 from nodes.dictionary.dictionary import Dictionary
 
 POINTS_AT_ONCE: Final = 4000

@@ -3,9 +3,10 @@
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.machine_service import MachineService
+from coordinator.support.values import Value
 from coordinator.tables.axis_table import POINTS, AxisTable, TableError, Unit
 from nodes.mt.download import Report
 

@@ -12,11 +12,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from coordinator.assembly.load import MachineDescription
+from coordinator.config.model import MachineDescription
 from coordinator.gcode.events import Notice
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.ipc.server.state import StateTree
+from coordinator.modules.module_set import build_modules
 from coordinator.runtime.host import Host
 from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.service.core.memory import give_back, keep_small, pass_by_what_stays
@@ -176,6 +177,7 @@ class MachineService:
         machine = self.machine = Machine(
             description,
             self.host,
+            build_modules(description),
             on_notice=lambda text: self.log.add("notice", text),
             cache=self._cache,
             reset_nodes=self._reset_nodes,

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Final
 from coordinator.gcode.print_control import Recovering
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.ipc.protocol.methods import ApiError
-from coordinator.modules.base import Value
 from coordinator.modules.programs.gcode_macro import words_in
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.modules.programs.virtual_sdcard import VirtualSdcard
@@ -18,6 +17,7 @@ from coordinator.service.core.motion import MotionOver
 from coordinator.service.core.work import FileWork, LinesWork, Rest
 from coordinator.service.jobs.job_folder import JobFolder
 from coordinator.service.jobs.jobs import JobPhase, JobRun
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.assembly.load import MachineDescription
+    from coordinator.config.model import MachineDescription
     from nodes.mt.table import ActiveTable, AxleTable, TableState
 
 CARE_S: Final = 0.5

@@ -10,6 +10,7 @@ from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import SavedState
 from coordinator.gcode.program import Program
 from coordinator.modules.levelling.skew_correction import Skews
+from coordinator.modules.module_set import build_modules
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner
@@ -17,8 +18,8 @@ from coordinator.streaming.program_machine import machine_state
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.assembly.load import MachineDescription
-    from coordinator.modules.module_set import ModuleSet
+    from coordinator.config.model import MachineDescription
+    from coordinator.runtime.machine_modules import MachineModules
 
 _DYNAMICS: Final = ("accel", "max_velocity", "square_corner_velocity", "minimum_cruise_ratio", "plane")
 
@@ -42,7 +43,7 @@ class Reached:
 
 def read_forward(description: "MachineDescription", program: Program, end_bytes: int) -> Reached:
     """Read PROGRAM up to END_BYTES without doing anything; raises CanductorError. It may take a while."""
-    modules = description.modules.build(description)
+    modules = build_modules(description)
     planner = Planner(description.limits)
     machine = machine_state(description)
     program.end_bytes = end_bytes
@@ -79,7 +80,7 @@ def _drain(planner: Planner) -> float:
     return high_mm
 
 
-def _variables(modules: "ModuleSet") -> Mapping[str, Mapping[str, Any]]:
+def _variables(modules: "MachineModules") -> Mapping[str, Mapping[str, Any]]:
     return {macro.name: dict(macro.variables) for macro in modules.of(GCodeMacro)}
 
 

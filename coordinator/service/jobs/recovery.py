@@ -34,8 +34,8 @@ from coordinator.service.jobs.resume_homing import (
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.modules.module_set import ModuleSet
     from coordinator.motion.planner.planner import Planner
+    from coordinator.runtime.machine_modules import MachineModules
     from coordinator.service.core.machine_service import MachineService
 
 NEAR_K: Final = 2.0
@@ -286,7 +286,7 @@ class Recovery:
         return RecoverWork(program, line=line, reached=reached, held=found.held, objects=objects)
 
 
-def _hot(modules: "ModuleSet") -> Mapping[str, Any]:
+def _hot(modules: "MachineModules") -> Mapping[str, Any]:
     """Return what is heated, blown and left out, as its modules tell it."""
     status = modules.status()
     heaters: dict[str, float] = {}

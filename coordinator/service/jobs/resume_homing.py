@@ -17,8 +17,8 @@ from coordinator.service.core.work import LinesWork, Setting
 from nodes.support.records import record
 
 if TYPE_CHECKING:
-    from coordinator.assembly.load import MachineDescription
-    from coordinator.modules.module_set import ModuleSet
+    from coordinator.config.model import MachineDescription
+    from coordinator.runtime.machine_modules import MachineModules
 
 LIFT_MM: Final = 5.0
 """Above what is printed, on the way to where the job goes on."""
@@ -46,7 +46,12 @@ class WayHome:
 
 
 def way_home(
-    described: "MachineDescription", modules: "ModuleSet", homed: str, *, part_mm: float, z_mm: float | None
+    described: "MachineDescription",
+    modules: "MachineModules",
+    homed: str,
+    *,
+    part_mm: float,
+    z_mm: float | None,
 ) -> WayHome:
     """Return how the axes become known that are not among HOMED (letters).
 
@@ -56,7 +61,7 @@ def way_home(
     if not missing:
         return WayHome()
     home = f"home {' '.join(missing)} where the part is not in the way, then try again"
-    homing = modules.shared(Homing)
+    homing = next(modules.of(Homing))
     if homing.instead is not None or "G28" in modules.vocabulary.commands:
         raise ApiError("not_ready", f"a section of this machine says what G28 does, maybe in Z: {home}")
     name = described.kinematics.name

@@ -8,10 +8,10 @@ from collections import deque
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
-from coordinator.ipc.protocol.methods import Value
 from coordinator.ipc.server.state import StateTree
 from coordinator.motion.planner.planner import AXIS_LETTERS, Position
 from coordinator.runtime.machine import link_of
+from coordinator.support.values import Value
 from nodes.link import BusLoad, IOStats, LinkStats
 from nodes.node.node import Node
 from nodes.node.states import NodeState

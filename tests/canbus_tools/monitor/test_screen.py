@@ -10,12 +10,12 @@ from textual.widgets import DataTable, Input, RichLog, Static
 from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.bus.computer import now_s
 from canbus_tools.monitor.bus_watch import BusWatch
+from canbus_tools.monitor.options import MonitorOptions
 from canbus_tools.monitor.screen import KEPT, LINES_AT_ONCE, LOG_LINES, MonitorScreen
 from canbus_tools.monitor.text import read_filter
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.filters import Filter
 from canbus_tools.protocol.frame import Frame
-from canbus_tools.tools.monitor import MonitorOptions
 from nodes.support.option_values import UsageError
 from tests.stages.can_stage import MAIN, MAIN_ID, CanStage, conversation_parts
 from tests.stages.simulated_computer import WireListener

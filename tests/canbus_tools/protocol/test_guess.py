@@ -6,6 +6,7 @@ import pytest
 
 from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.monitor.bus_watch import BusWatch
+from canbus_tools.monitor.options import MonitorOptions
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import GUESSED, LEARNT, DictionarySource
@@ -13,7 +14,7 @@ from canbus_tools.protocol.filters import Filter
 from canbus_tools.protocol.frame import Frame
 from canbus_tools.protocol.protocol import Direction
 from canbus_tools.recordings.candump import candump_line
-from canbus_tools.tools.monitor import Lines, MonitorOptions
+from canbus_tools.tools.monitor import Lines
 from coordinator.cli.main import main
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary

@@ -13,18 +13,10 @@ from canbus_tools.protocol.protocol import (
     frame_format,
     owner_of,
 )
-from nodes.bus import can_bus
-from nodes.clock import sync_pulse
 from nodes.support._wire import lib
-from nodes.support.can_protocol import BUS_STOP_ID, SYNC_PULSE
 from tests import wire_twin as twin
 
 ALL = (*ADMIN_FRAMES, *SIGNAL_FRAMES)
-
-
-def test_numbers_kept_here_are_those_of_the_host() -> None:
-    assert can_bus.BUS_STOP_ID == BUS_STOP_ID
-    assert sync_pulse.SYNC_PULSE == SYNC_PULSE
 
 
 def test_data_ids() -> None:

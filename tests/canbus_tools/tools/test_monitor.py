@@ -11,10 +11,11 @@ import pytest
 from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.bus.computer import Listener, now_s
 from canbus_tools.monitor.bus_watch import SPAN_S, BusWatch
+from canbus_tools.monitor.options import MonitorOptions
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.filters import Filter
 from canbus_tools.protocol.frame import Frame
-from canbus_tools.tools.monitor import Lines, MonitorOptions, fetch
+from canbus_tools.tools.monitor import Lines, fetch
 from nodes.support.errors import CanductorError
 from nodes.virtual.firmware import MAINBOARD, firmware_path
 from tests.canbus_tools.command import Command

@@ -3,8 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.assembly.load import CanConnection, MachineDescription, UartConnection, load_machine
+from coordinator.assembly.load import load_machine
 from coordinator.assembly.reference import SECTIONS
+from coordinator.config.model import CanConnection, MachineDescription, UartConnection
 from coordinator.config.options import Option, SectionSpec
 from coordinator.config.unsupported import LATER_SECTIONS
 from coordinator.support.command_options import EXAMPLES

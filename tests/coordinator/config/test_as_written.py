@@ -4,8 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.assembly.load import ConfigError, MachineDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.errors import ConfigError
+from coordinator.config.model import MachineDescription
 from coordinator.modules.drivers.tmc_driver import Tmc2209
+from coordinator.modules.module_set import build_modules
 from coordinator.modules.programs.idle_timeout import IdleTimeout
 from tests.stages.printer_text import PRINTER_CFG, changed, write
 
@@ -171,7 +174,7 @@ def test_a_current_that_the_resistor_does_not_allow_is_cut_with_a_notice(tmp_pat
     assert (
         "is 1.9 A, but with sense_resistor 0.11 ohm the driver gives at most 1.768 A, which is used" in note
     )
-    driver = machine.modules.build(machine).find("tmc2209 stepper_x", Tmc2209)
+    driver = build_modules(machine).find("tmc2209 stepper_x", Tmc2209)
     assert driver is not None
     assert driver.run_a == pytest.approx(1.768, abs=1e-3)
     assert driver.hold_a == driver.run_a
@@ -185,13 +188,13 @@ def test_a_fan_of_no_heater_is_told(tmp_path: Path) -> None:
 
 def test_every_machine_has_an_idle_timeout(tmp_path: Path) -> None:
     machine = load(tmp_path, PRINTER_CFG)
-    modules = machine.modules.build(machine)
+    modules = build_modules(machine)
     idle = modules.find("idle_timeout", IdleTimeout)
     assert idle is not None
     assert idle.status()["idle_timeout"] == 600
     assert modules.knows("SET_IDLE_TIMEOUT")
     given = load(tmp_path, PRINTER_CFG + "[idle_timeout]\ntimeout: 60\n")
-    (only,) = given.modules.build(given).of(IdleTimeout)
+    (only,) = build_modules(given).of(IdleTimeout)
     assert only.status()["idle_timeout"] == 60
 
 

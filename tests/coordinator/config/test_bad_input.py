@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.assembly.load import ConfigError, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.errors import ConfigError
 from tests.profiles import examples
 from tests.stages.printer_text import PRINTER_CFG, changed, write
 

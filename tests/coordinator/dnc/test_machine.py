@@ -16,8 +16,9 @@ from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.files import FileRefused
 from coordinator.dnc.machine import LINES_MAX, MachineSink
 from coordinator.dnc.options import DncOptions
-from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, Value
+from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
 from coordinator.ipc.server.uploads import upload_method
+from coordinator.support.values import Value
 from tests.coordinator.dnc.virtual_cable import PROGRAM, Ended, VirtualCable
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, serving
 from tests.stages.loop_thread import in_thread

@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Registry, Scope, Value
+from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Registry, Scope
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
+from coordinator.support.values import Value
 from tests.stages import jump_loop
 
 TOKENS = {scope: f"{scope.word}-token-of-at-least-32-characters" for scope in Scope}

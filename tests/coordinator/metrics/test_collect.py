@@ -12,7 +12,6 @@ from prometheus_client.openmetrics.exposition import generate_latest as generate
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
-from coordinator.ipc.protocol.methods import Value
 from coordinator.metrics import catalog
 from coordinator.metrics.catalog import GROUPS, JOB_STATES, NODE_STATES, SERVICE_STATES, Kind
 from coordinator.metrics.collect import (
@@ -25,6 +24,7 @@ from coordinator.metrics.collect import (
 )
 from coordinator.service.core.machine_service import ServiceState
 from coordinator.service.jobs.jobs import JobPhase
+from coordinator.support.values import Value
 from nodes.node.states import NodeState
 from tests.profiles import examples
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.protocol.methods import Value
 from coordinator.metrics.server import (
     CONNECTIONS_MAX,
     REQUEST_BYTES_MAX,
@@ -15,6 +14,7 @@ from coordinator.metrics.server import (
     MetricsServer,
     MetricsSettings,
 )
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 from tests.stages import jump_loop
 

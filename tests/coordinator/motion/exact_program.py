@@ -8,6 +8,7 @@ from coordinator.assembly.load import load_machine
 from coordinator.gcode.events import End, Full, PositionSet, ShaperChange, SmoothTimeChange, WeightsChange
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
+from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps.steps import MAX_ERROR_S, StepGenerator, StepStats
@@ -62,7 +63,7 @@ def plan_program(
     TABLES by axis correct it; with STAGE, corrections may act even without any.
     """
     description = load_machine(str(config))
-    devices = MachineDevices(description, description.modules.build(description))
+    devices = MachineDevices(description, build_modules(description))
     first = description.nodes[0].name
     dictionaries = {
         node.name: firmware_dictionary(MAINBOARD if node.name == first else TOOLHEAD)

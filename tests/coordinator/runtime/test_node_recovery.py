@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 
-from coordinator.assembly.load import CanConnection, UartConnection, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import CanConnection, UartConnection
+from coordinator.modules.module_set import build_modules
 from coordinator.runtime.host import Port
 from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.runtime.node_recovery import LAST_TRY_S
@@ -95,7 +97,7 @@ class Stage:
         self.said: list[str] = []
         self.job = Job()
         description = load_machine(write(folder, text))
-        self.machine = Machine(description, self.host, on_notice=self.said.append)
+        self.machine = Machine(description, self.host, build_modules(description), on_notice=self.said.append)
 
     def run(self, check: Callable[[], Coroutine[Any, Any, None]]) -> None:
         async def main() -> None:

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription
 from coordinator.kinematics.dual_carriage import CarriageMode
 from coordinator.motion.planner.planner import Position
 from coordinator.runtime.stepper_positions import RailPlaces

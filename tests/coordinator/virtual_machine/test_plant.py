@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription
 from coordinator.kinematics.base import Point
 from coordinator.support.command_options import EXAMPLES, DemoOptions
 from coordinator.virtual_machine.plant import START_MM, PlantSettings, machine_plants, start_point

@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
-from coordinator.config.errors import ConfigError, Place, nearest, shown
+from coordinator.config.errors import ConfigError, Place
 from coordinator.config.file import RawSection
 from coordinator.config.model import NotYetActing, RailDescription, StepperDescription
 from coordinator.config.options import BadValue, ChoiceOption, Option, SectionReader, SectionSpec, TextOption
@@ -18,6 +18,7 @@ from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
 from coordinator.kinematics.base import StepFunction
 from coordinator.kinematics.generic_cartesian import GenericCartesian
+from coordinator.support.quoting import nearest, shown
 from nodes.support.records import record
 
 AXIS = ChoiceOption(

@@ -6,7 +6,8 @@ from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.config.pins import PinOption
 from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
 from coordinator.gcode.parser import WordError, quoted
-from coordinator.modules.base import Build, Module, Value
+from coordinator.modules.base import Build, Module
+from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
 
 if TYPE_CHECKING:

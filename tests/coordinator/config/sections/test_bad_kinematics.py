@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.assembly.load import ConfigError, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.errors import ConfigError
 from coordinator.config.sections.printer import KINEMATICS
 from tests.stages.printer_text import changed, example_text, write
 

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription
 from coordinator.config.sections.printer import KINEMATICS
 from coordinator.kinematics.delta import Delta
 from coordinator.kinematics.deltesian import Deltesian

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.assembly.load import ConfigError, NodePolicy, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.errors import ConfigError
+from coordinator.config.model import NodePolicy
 from tests.stages.printer_text import PRINTER_CFG, changed, write
 
 LIGHT = "\n[mcu light]\ncanbus_uuid: 0102030405aa\npolicy: {}\n"

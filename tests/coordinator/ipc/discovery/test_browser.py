@@ -388,7 +388,7 @@ def test_no_other_command_pays_for_it() -> None:
     code = (
         "import sys; from coordinator.cli.main import main; "
         "main(['plan', '--help']); main(['estop', '--help']); "
-        "import coordinator.cli.commands.front_ends, coordinator.service.core.serve;"
+        "import coordinator.cli.commands.front_ends, coordinator.front_ends.serve;"
         "sys.exit(any(m.split('.')[0] in ('zeroconf', 'ifaddr', 'prometheus_client') for m in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0

@@ -11,6 +11,7 @@ from coordinator.drivers.tmc_chips import CHIPS, TMC2209, Chip
 from coordinator.drivers.tmc_formulas import currents, largest_current, tstep
 from coordinator.modules.drivers.tmc_driver import TmcDriver
 from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
+from coordinator.modules.module_set import build_modules
 from tests.stages.printer_text import SENSORLESS_CFG
 
 SENSE_OHM_AND_LARGEST_A = (
@@ -74,7 +75,7 @@ def test_the_endstop_of_a_driver_is_its_diag_pin(tmp_path: Path) -> None:
     assert (x.homing.endstop_pin.node, x.homing.endstop_pin.name) == ("mcu", "PE0")
     assert (y.homing.endstop_pin.node, y.homing.endstop_pin.pull) == ("toolhead", 1)
     assert machine.not_yet_acting == ()
-    modules = machine.modules.build(machine)
+    modules = build_modules(machine)
     assert modules.find(section_of(x.homing.virtual_endstop), StallEndstop) is not None
     assert modules.names(TmcDriver) == ["tmc2209 stepper_x", "tmc2209 stepper_y", "tmc2208 stepper_z"]
     assert {"INIT_TMC", "DUMP_TMC", "SET_TMC_CURRENT", "SET_TMC_FIELD"} <= modules.vocabulary.commands.keys()
@@ -85,7 +86,7 @@ def test_options_become_registers(tmp_path: Path) -> None:
     changed = "run_current: 0.8\ncoolstep_threshold: 20\ndriver_SEMIN: 3\ndriver_multistep_filt: False\n"
     path.write_text(SENSORLESS_CFG.replace("run_current: 0.8\n", changed, 1))
     machine = load_machine(str(path))
-    driver = machine.modules.build(machine).find("tmc2209 stepper_x", TmcDriver)
+    driver = build_modules(machine).find("tmc2209 stepper_x", TmcDriver)
     assert driver is not None
     values = driver.settings.registers(both_edges=False)
 

@@ -9,6 +9,7 @@ from coordinator.gcode.commands import Vocabulary
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
+from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
 from coordinator.streaming.program_machine import machine_state
 from coordinator.streaming.streamer import Streamer
@@ -67,7 +68,7 @@ def test_a_hot_one_takes_it_in_the_same_program(tmp_path: Path) -> None:
 def test_a_plan_is_never_cold(tmp_path: Path) -> None:
     stage = HeatMachine(tmp_path, HEATER)
     described = stage.description
-    vocabulary = described.modules.build(described).vocabulary
+    vocabulary = build_modules(described).vocabulary
     work = job(stage, vocabulary, "G28", "M109 S200", "G1 X10 E0.5 F3000")
     events_of(work, lambda: drain(work.planner))
     assert work.planner.moves == 1

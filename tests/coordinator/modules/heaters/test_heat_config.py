@@ -4,11 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.assembly.load import ConfigError, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.errors import ConfigError
 from coordinator.gcode.commands import Call, InTime
 from coordinator.gcode.parser import WordError, parse
 from coordinator.heat.known_sensors import PT1000, THERMISTORS
 from coordinator.modules.heaters.sections import ExtruderHeater, HeaterBed
+from coordinator.modules.module_set import build_modules
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
 from tests.stages.heat_machine import BASE, BED, HOTEND_PID, build, configured
@@ -121,7 +123,7 @@ def test_an_extruder_without_heater_is_never_cold(tmp_path: Path) -> None:
     path = tmp_path / "printer.cfg"
     path.write_text(BASE[: BASE.index("heater_pin")])
     machine = load_machine(str(path))
-    modules = machine.modules.build(machine)
+    modules = build_modules(machine)
     (heater,) = modules.of(ExtruderHeater)
     assert heater.can_extrude
     assert not modules.vocabulary.too_cold("extruder")

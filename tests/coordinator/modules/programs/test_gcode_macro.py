@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from coordinator.config.errors import ConfigError
-from coordinator.modules.base import Value
 from coordinator.modules.status.display_status import DisplayStatus
 from coordinator.modules.status.printer_status import PrinterStatus
+from coordinator.support.values import Value
 from tests.stages.program_stage import ProgramStage
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.assembly.check import check_config
-from coordinator.modules.base import Value
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 from tests.stages.heat_machine import BASE, BED, HOTEND_PID, HeatMachine
 

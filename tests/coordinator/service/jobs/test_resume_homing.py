@@ -6,6 +6,7 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.ipc.protocol.methods import ApiError
+from coordinator.modules.module_set import build_modules
 from coordinator.service.jobs.resume_homing import WayHome, sure_height, way_home
 
 CONFIG = Path("config")
@@ -13,7 +14,7 @@ CONFIG = Path("config")
 
 def way(path: Path, homed: str = "", *, z_mm: float | None = 12.0, part_mm: float = 12.0) -> WayHome:
     described = load_machine(str(path))
-    return way_home(described, described.modules.build(described), homed, part_mm=part_mm, z_mm=z_mm)
+    return way_home(described, build_modules(described), homed, part_mm=part_mm, z_mm=z_mm)
 
 
 def with_text(folder: Path, before: str, after: str) -> Path:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from coordinator.config.errors import nearest, shown
+from coordinator.support.quoting import nearest, shown
 from nodes.support.errors import CanductorError
 
 T = TypeVar("T")

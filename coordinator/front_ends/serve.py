@@ -8,11 +8,12 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.assembly.load import load_machine
 from coordinator.cli.parser import version
+from coordinator.config.model import MachineDescription
 from coordinator.ipc.discovery.announcement import Announcement, bracketed, host_word
 from coordinator.ipc.discovery.announcer import Announcer
-from coordinator.ipc.protocol.methods import Registry, Scope, Value
+from coordinator.ipc.protocol.methods import Registry, Scope
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.session_methods import API_VERSION
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
@@ -26,6 +27,7 @@ from coordinator.service.core.typed import Typed
 from coordinator.service.state.log_ring import Entry
 from coordinator.support.command_options import RunOptions, ServeOptions
 from coordinator.support.interrupts import run_to_end
+from coordinator.support.values import Value
 from coordinator.tables.store import table_folder
 from coordinator.web.access import LINK_S
 from coordinator.web.methods import add_page_methods

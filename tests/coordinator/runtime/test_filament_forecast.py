@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.motion.planner._planner import ffi
 from coordinator.motion.trapezoid_array import TRAPEZOID
-from coordinator.streaming.filament_forecast import KEPT_S, FilamentForecast
+from coordinator.runtime.filament_forecast import KEPT_S, FilamentForecast
 
 DRIVEN = (0.0, 0.0, 0.0, 1.0)
 AT_REST = (0.0, 0.0, 0.0, 0.0)

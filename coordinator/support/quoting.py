@@ -1,0 +1,30 @@
+"""Quotes what a user wrote inside a message, and suggests the name that was meant."""
+
+import difflib
+from collections.abc import Iterable
+
+_SHOWN_CHARS = 60
+_SHOWN_PATH_CHARS = 300
+
+
+def shown(text: str) -> str:
+    """Quote what the user wrote so that it fits into a sentence: one line, printable, not long."""
+    line = " ".join(text.split())
+    if len(line) > _SHOWN_CHARS:
+        line = line[: _SHOWN_CHARS - 1] + "…"
+    return "'" + "".join(c if c.isprintable() else "?" for c in line) + "'"
+
+
+def shown_path(path: str) -> str:
+    """Quote a path; of a long one the end is what tells."""
+    line = "".join(c if c.isprintable() else "?" for c in path)
+    return f"'{line}'" if len(line) <= _SHOWN_PATH_CHARS else f"'…{line[-_SHOWN_PATH_CHARS:]}'"
+
+
+def nearest(word: str, valid: Iterable[str], *, pattern: str = "{}") -> str:
+    """Return "; did you mean …?" when one of the valid names looks like the word, else nothing."""
+    if len(word) > _SHOWN_CHARS:
+        return ""
+    lower = {name.lower(): name for name in valid}
+    found = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
+    return f"; did you mean {pattern.format(lower[found[0]])}?" if found else ""
