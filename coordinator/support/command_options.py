@@ -14,8 +14,9 @@ from nodes.support.records import record
 
 def _examples() -> Path:
     """Return the folder of the example machines: inside an installed package, or config/ of a checkout."""
-    installed = Path(__file__).parent / "example_machines"
-    return installed if installed.is_dir() else Path(__file__).parent.parent / "config"
+    package = Path(__file__).parents[1]
+    installed = package / "example_machines"
+    return installed if installed.is_dir() else package.parent / "config"
 
 
 EXAMPLES = _examples()
