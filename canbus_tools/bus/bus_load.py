@@ -16,6 +16,7 @@ and one entry for the frames of all ids beyond.
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from enum import Enum
 from typing import Final, NamedTuple
 
@@ -26,7 +27,6 @@ from canbus_tools.protocol.protocol import SIGNAL_FRAMES, Direction, owner_of
 from nodes.support._can_bits import ffi, lib
 from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 BITRATE_MIN, BITRATE_MAX = 10_000, 1_000_000
 WINDOW_S: Final = 1.0
@@ -109,7 +109,7 @@ class Part(NamedTuple):
     """Of what the bus could have carried in the time, 0..1."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Window:
     """One stretch of time."""
 
@@ -123,7 +123,7 @@ class Window:
     """0..1; a little more may come of frames that began before the window."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BusLoad:
     """What a LoadMeter found."""
 

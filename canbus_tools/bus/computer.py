@@ -7,6 +7,7 @@ import asyncio
 import time
 from collections.abc import Callable, Coroutine
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -15,7 +16,6 @@ from canbus_tools.bus.open_bus import BusOptions, open_bus
 from canbus_tools.protocol.frame import Frame
 from nodes.link import LinkIO
 from nodes.link.types import FrameHandler
-from nodes.support.records import record
 from nodes.transport import ByteTransport, CanFrame, CanTransport, open_uart
 from nodes.transport.python_can_bridge import PythonCanBridge
 from nodes.transport.socketcan import SocketCanTransport
@@ -32,7 +32,7 @@ class StartIO(Protocol):
     ) -> LinkIO: ...
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Port:
     """An open CAN interface or serial line, for the project's own links."""
 

@@ -3,10 +3,10 @@
 import json
 import subprocess
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 _TIMEOUT_S: Final = 5.0
 DRIVER_CAN, DRIVER_VCAN = "can", "vcan"
@@ -16,7 +16,7 @@ class NoInterface(CanductorError):  # noqa: N818 (it says what is the case)
     """There is no such interface."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkFacts:
     """An interface. None: the kernel does not say; a vcan has no bit rate, no errors and no state."""
 

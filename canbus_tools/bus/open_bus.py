@@ -1,18 +1,18 @@
 """Opening the CAN bus that a tool works on, with the options python-can's own tools have."""
 
 import argparse
+from dataclasses import dataclass
 from typing import Any
 
 import can
 
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, whole
-from nodes.support.records import record
 
 BITRATE_MIN, BITRATE_MAX = 10_000, 1_000_000
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BusOptions:
     """Which bus."""
 

@@ -8,7 +8,7 @@ the next block, executes nothing and changes nothing. Those that answer are aske
 import asyncio
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Final
 
@@ -23,7 +23,6 @@ from nodes.bus.assign import Uuid
 from nodes.link import Frame
 from nodes.support.can_protocol import FIRST_NODEID
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 PROBED: Final = range(FIRST_NODEID, 68)
 """Hosts hand out 4, 5, 6, …; ids beyond are tried when something was heard from them, or when asked for."""
@@ -58,7 +57,7 @@ class State(Enum):
     """``trouble`` says why."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
     """One node."""
 
@@ -76,7 +75,7 @@ class Entry:
     trouble: str = ""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class SurveyResult:
     """All nodes that were found: by id, then those that wait."""
 

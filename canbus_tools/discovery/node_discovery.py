@@ -26,7 +26,6 @@ from nodes.support.can_protocol import (
     UUID_SIZE,
     WHO_IS_HERE,
 )
-from nodes.support.records import record
 
 ROUNDS: Final = 5
 ROUND_NS: Final = 40_000_000
@@ -60,7 +59,7 @@ SET_COMMANDS: Final[Mapping[int, Application]] = {
 }
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class WaitingNode:
     """A node that waits for an id."""
 
@@ -73,7 +72,7 @@ class WaitingNode:
     """More than one board has this uuid."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class NodeHere:
     """A node of our firmware that has an id."""
 
@@ -83,7 +82,7 @@ class NodeHere:
     twins: bool
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class CensusResult:
     """Who answered, in the order of uuids and ids, and what else was heard."""
 

@@ -1,6 +1,7 @@
 """What one node says about itself, asked in its own words as far as its firmware knows the questions."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from canbus_tools.bus.talk import BusTalk, NodeTalk
@@ -10,7 +11,6 @@ from nodes.dictionary.message_format import Message
 from nodes.dictionary.parts import DictionaryError
 from nodes.support.can_protocol import UUID_SIZE
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 T = TypeVar("T")
 BUS_STATES: Final = "canbus_bus_state"
@@ -23,7 +23,7 @@ _QUESTIONS: Final = (
 )
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Firmware:
     """What a dictionary says of a build."""
 
@@ -60,7 +60,7 @@ class Firmware:
         )
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CanStatus:
     """The node's own counters of its CAN controller."""
 
@@ -71,7 +71,7 @@ class CanStatus:
     """active, warn, passive or off."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Facts:
     """What a node said. None: its firmware does not know the question."""
 

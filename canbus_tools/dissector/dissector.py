@@ -8,6 +8,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +24,6 @@ from nodes.dictionary.parts import OutputFormat
 from nodes.support.can_protocol import DATA_NODEID_MAX, FIRST_DATA_ID
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, whole
-from nodes.support.records import record
 
 WIDTHS: Final = {"%u": 32, "%i": 32, "%hu": 16, "%hi": 16, "%c": 8}
 """Bits of a number with this code."""
@@ -44,7 +44,7 @@ HEAD: Final = """\
 """
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DissectorOptions:
     """What is to be written."""
 
@@ -102,7 +102,7 @@ def write_dissector(options: DissectorOptions) -> "DissectorReport":
     return DissectorReport(output=options.output, messages=_count(dictionaries.values()))
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DissectorReport:
     """What was written."""
 

@@ -1,15 +1,14 @@
 """What the doctor knows, before it judges."""
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 
 from canbus_tools.bus.bus_load import BusLoad
 from canbus_tools.bus.link_facts import LinkFacts
 from canbus_tools.discovery.inventory import SurveyResult
-from nodes.support.records import record
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AdapterFacts:
     """What drives the interface."""
 
@@ -20,7 +19,7 @@ class AdapterFacts:
     usb_name: str = ""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class InterfaceFacts:
     """A SocketCAN interface."""
 
@@ -32,7 +31,7 @@ class InterfaceFacts:
     adapter: AdapterFacts = AdapterFacts()
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WayFacts:
     """What was overheard of one node; blocks are the protocol's."""
 
@@ -47,7 +46,7 @@ class WayFacts:
     rtt_p99_s: float | None = None
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TrafficFacts:
     """What was heard."""
 
@@ -68,7 +67,7 @@ class TrafficFacts:
     after: LinkFacts | None = None
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PingFacts:
     """Questions put to one node, and how that went."""
 
@@ -83,7 +82,7 @@ class PingFacts:
     rtt_p99_s: float
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NodeFacts:
     """Who is there."""
 
@@ -95,7 +94,7 @@ class NodeFacts:
     """Frames heard by bit rate, where other bit rates were tried."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
     """Which bus, for the commands that the doctor names."""
 

@@ -1,8 +1,7 @@
 """One thing that the doctor has to say."""
 
+from dataclasses import dataclass
 from enum import Enum
-
-from nodes.support.records import record
 
 
 class Severity(Enum):
@@ -16,7 +15,7 @@ class Severity(Enum):
     """Good to know; no reason for a bad exit status."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
     """What was seen, what it means, what to do."""
 

@@ -1,14 +1,13 @@
 """What is publicly known of kernels, drivers and adapters that reorder frames; each with its source."""
 
 import re
+from dataclasses import dataclass
 from typing import Final
-
-from nodes.support.records import record
 
 _RELEASE: Final = re.compile(r"(\d+)\.(\d+)")
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class KnownFault:
     """A driver that is at fault in kernels before one version."""
 

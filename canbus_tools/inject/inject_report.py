@@ -3,10 +3,9 @@
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any, Final, TextIO
 
-from nodes.support.records import record
 from nodes.virtual.hub import BusStats, ClientStats, VirtualBus
 
 _DAMAGE: Final = {
@@ -64,7 +63,7 @@ def status(before: BusStats, now: BusStats, passed_s: float, ran_s: float) -> st
     return "  ".join(parts)
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class InjectReport:
     """The figures of a run."""
 

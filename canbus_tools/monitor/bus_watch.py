@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from canbus_tools.bus.bus_load import LoadMeter
@@ -10,7 +11,6 @@ from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.frame import Frame, FrameKind
 from canbus_tools.protocol.protocol import owner_of
 from canbus_tools.protocol.traffic import NodeTraffic
-from nodes.support.records import record
 
 HISTORY: Final = 120
 """Loads that are remembered."""
@@ -18,7 +18,7 @@ SPAN_S: Final = 2.0
 """Rates are means over so long."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NodeRates:
     """One node, and its traffic per second over the last SPAN_S."""
 
@@ -31,7 +31,7 @@ class NodeRates:
     """Share of the bus that its frames took, 0..1."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BusRates:
     """The bus over the last SPAN_S."""
 

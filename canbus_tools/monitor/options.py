@@ -1,14 +1,14 @@
 """What ``canductor can monitor`` is asked for."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.protocol.filters import Filter
 from nodes.dictionary.dictionary import Dictionary
-from nodes.support.records import record
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MonitorOptions:
     """Which bus, and what to show of it."""
 

@@ -4,6 +4,7 @@ import math
 import textwrap
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from rich.text import Text
@@ -14,7 +15,6 @@ from canbus_tools.protocol.filters import ALL, Filter
 from canbus_tools.protocol.protocol import Direction
 from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.option_values import UsageError, whole
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from canbus_tools.monitor.options import MonitorOptions
@@ -75,7 +75,7 @@ def _load_style(share: float) -> str:
 # ---------------------------------------------------------------------------------------------------- table
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Column:
     """A column of the table of nodes."""
 

@@ -5,7 +5,7 @@ acts; the project's own nodes and hosts take the same numbers from ``nodes.bus.a
 """
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
@@ -28,7 +28,6 @@ from nodes.support.can_protocol import (
     UUID_SIZE,
     WHO_IS_HERE,
 )
-from nodes.support.records import record
 
 
 class Direction(Enum):
@@ -69,7 +68,7 @@ class FieldKind(Enum):
     UUID = "a board's bytes as they stand, shown as hex digits"
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Field:
     """One field of a frame."""
 
@@ -95,7 +94,7 @@ class Field:
         return self.values.get(value, digits)
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FrameFormat:
     """A frame that is a whole message by itself."""
 
@@ -259,7 +258,7 @@ for _frame in (*ADMIN_FRAMES, *SIGNAL_FRAMES):
 # ----------------------------------------------------------------------------------------------------- blocks
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BlockFormat:
     """A message block: ``<length> <sequence> <content> <crc high> <crc low> <sync>``.
 

@@ -6,7 +6,7 @@
 import asyncio
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
 
@@ -33,14 +33,13 @@ from nodes.mt.download import Outcome, Place, Report, download
 from nodes.mt.mt import WORD_BYTES
 from nodes.mt.table import AxleTable
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 _VIRTUAL: Final = "virtual"
 SLOW_TRIES: Final = 3
 """Word by word, for axles whose nodes say that they missed some."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class DeviceReport:
     """What was sent, and who says what."""
 

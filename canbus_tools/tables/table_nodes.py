@@ -7,6 +7,7 @@ configured otherwise.
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from canbus_tools.bus.talk import BusTalk, NodeTalk, TalkError
@@ -21,7 +22,6 @@ from nodes.mt.pace import NS_PER_S, PacedWords
 from nodes.mt.table import CONSTANT, AxleTable, TableState
 from nodes.node.config import NodeConfig
 from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES
-from nodes.support.records import record
 
 NO_TABLE: Final = 255
 POLLS_PER_WORD: Final = 4
@@ -157,7 +157,7 @@ async def _found(node: TableTalk, tables: Sequence[AxleTable]) -> list[AxleTable
 # --------------------------------------------------------------------------------------- polled register
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Said:
     """What a node says of one axle's table, after it was sent or only asked."""
 

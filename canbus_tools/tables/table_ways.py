@@ -7,6 +7,7 @@ rate.
 
 import contextlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import serial
@@ -19,7 +20,6 @@ from nodes.mt.download import BURST_FRAMES, SLOW_BITRATE
 from nodes.mt.mt import WORD_BYTES, MtError, to_bytes, to_frames, transmission
 from nodes.mt.pace import NS_PER_S, PacedFrames, PacedWords
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 from nodes.transport import CanFrame
 
 SILENCE_S: Final = 0.15
@@ -30,7 +30,7 @@ BITS_OF_BYTE: Final = 10
 WRITE_TIMEOUT_S: Final = 5.0
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Sent:
     """One transmission that went out."""
 

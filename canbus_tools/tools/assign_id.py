@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
@@ -14,7 +14,6 @@ from canbus_tools.discovery.node_info import Facts, interview
 from nodes.bus.assign import AssignError, Uuid
 from nodes.support.can_protocol import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID
 from nodes.support.option_values import UsageError, whole
-from nodes.support.records import record
 
 TRIES: Final = 3
 """Nobody acknowledges an id, and frames get lost."""
@@ -62,7 +61,7 @@ def assign(
     return computer.run(run())
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AssignReport:
     """The node has its id."""
 

@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from canbus_tools.bus.computer import Computer
@@ -17,7 +18,6 @@ from canbus_tools.discovery.inventory import survey
 from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file, whole
-from nodes.support.records import record
 from nodes.transport import BAUD_DEFAULT
 
 NODEID_MAX = 255
@@ -25,7 +25,7 @@ BAUD_MIN, BAUD_MAX = 1200, 12_000_000
 _UUID = re.compile(r"[0-9a-fA-F]{12}\Z")
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ConsoleOptions:
     """Which node, and what to say to it."""
 
@@ -86,7 +86,7 @@ def run_console(computer: Computer, options: ConsoleOptions) -> "ConsoleReport":
     return computer.run(_run(computer, options))
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ConsoleReport:
     """How the session ended."""
 

@@ -6,6 +6,7 @@ import re
 import select
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -22,7 +23,6 @@ from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file
-from nodes.support.records import record
 
 LINES_HELD: Final = 500
 """Lines written at once."""
@@ -33,7 +33,7 @@ BUSES_MAX: Final = 64
 _MOMENT: Final = re.compile(r"(\+?)(\d{1,12}(?:\.\d{1,9})?)\Z")
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Moment:
     """A time in a recording, in seconds: as the recording counts, or from its first frame."""
 

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
@@ -17,7 +18,6 @@ from canbus_tools.doctor.traffic import check_traffic
 from canbus_tools.support.text_table import count, paragraph
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, number
-from nodes.support.records import record
 
 LISTEN_S: Final = 3.0
 LISTEN_S_MIN, LISTEN_S_MAX = 0.2, 600.0
@@ -154,7 +154,7 @@ def _unusable(said: str, place: Place) -> Finding:
     )
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Diagnosis:
     """All findings, the worst first."""
 

@@ -15,7 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack, ExitStack
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, cast
 
@@ -23,7 +23,6 @@ from canbus_tools.inject.fault_options import declare_faults, read_faults
 from canbus_tools.inject.inject_report import InjectReport, StatusLine
 from canbus_tools.inject.socketcand_server import PORT, SocketcandServer
 from nodes.support.option_values import UsageError, number, whole
-from nodes.support.records import record
 from nodes.virtual.faults import Fault
 from nodes.virtual.hub import BITRATE_MAX, BusStats, VirtualBus
 from nodes.virtual.processes import Flavour, NodeProcess
@@ -35,7 +34,7 @@ TICK_S: Final = 0.5
 DEFAULT_PATH: Final = Path(tempfile.gettempdir()) / "canductor-bus"
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class InjectOptions:
     """What is to be run."""
 

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,7 +31,6 @@ from canbus_tools.recordings.recordings import read_frames
 from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, number, whole
-from nodes.support.records import record
 
 DURATION_S: Final = 10.0
 DURATION_S_MAX: Final = 86_400.0
@@ -181,7 +181,7 @@ def _draw(path: Path, picture: str) -> None:
 # ----------------------------------------------------------------------------------------------------- report
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class LoadReport:
     """What was measured."""
 

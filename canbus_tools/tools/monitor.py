@@ -5,6 +5,7 @@ import json
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Final
 
 from canbus_tools.bus.bus_load import BITRATE_MAX, LoadMeter
@@ -27,7 +28,6 @@ from nodes.dictionary.dictionary import Dictionary
 from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, number, whole
-from nodes.support.records import record
 
 FETCHED: Final = "fetched from the node"
 EVERY_NODE: Final = "all"
@@ -188,7 +188,7 @@ def json_line(said: Decoded) -> str:
     return json.dumps({"time_s": said.time_s, **json_of(said)}, separators=(",", ":"))
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class MonitorReport:
     """What was seen, in numbers."""
 

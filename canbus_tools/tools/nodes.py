@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
@@ -14,7 +14,6 @@ from canbus_tools.discovery.node_discovery import Application
 from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.can_protocol import LAST_NODEID
 from nodes.support.option_values import UsageError, whole
-from nodes.support.records import record
 
 HEADINGS: Final = (
     "id",
@@ -91,7 +90,7 @@ def list_nodes(
     return NodesReport(options, computer.run(find()))
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class NodesReport:
     """Every node."""
 

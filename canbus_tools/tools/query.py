@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
@@ -11,7 +12,6 @@ from canbus_tools.discovery.ask_bus import take_census, where
 from canbus_tools.discovery.node_discovery import ROUNDS, Application, CensusResult, WaitingNode
 from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.option_values import whole
-from nodes.support.records import record
 
 NAMES: Final[Mapping[Application, str]] = {
     Application.KLIPPER: "Klipper-type firmware",
@@ -52,7 +52,7 @@ def query(computer: Computer, options: BusOptions, rounds: int = ROUNDS) -> "Que
     return QueryReport(options, found, (computer.monotonic_ns() - started_ns) * 1e-9)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class QueryReport:
     """Who waits."""
 

@@ -4,6 +4,7 @@ import argparse
 import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
@@ -18,7 +19,6 @@ from nodes.bus.assign import AssignError, Uuid
 from nodes.support.can_protocol import LAST_NODEID, UUID_SIZE
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import whole
-from nodes.support.records import record
 
 RESET: Final = "reset"
 LEAVE_S: Final = 0.3
@@ -67,7 +67,7 @@ def release(
     return computer.run(run())
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReleaseReport:
     """The node waits."""
 

@@ -1,10 +1,11 @@
 """How a mistake in a configuration is told: the place first, then what is wrong, then what to do."""
 
+from dataclasses import dataclass
+
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Place:
     """A line of a configuration file; prints as ``printer.cfg:12``."""
 

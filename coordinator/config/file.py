@@ -11,13 +11,12 @@ Nothing here knows what an option means.
 
 import re
 from collections.abc import Iterable
-from dataclasses import field
+from dataclasses import dataclass, field
 
 from coordinator.config import text as config_text
 from coordinator.config.errors import ConfigError, Place
 from coordinator.config.text import ReadBudget
 from coordinator.support.quoting import shown
-from nodes.support.records import record
 
 SAVED_PREFIX = "#*#"
 SAVED_HEADER = "#*# <---------------------- SAVE_CONFIG ---------------------->"
@@ -28,7 +27,7 @@ _SEPARATOR = re.compile(r"[:=]")
 _MAX_NAME_CHARS = 200
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class RawOption:
     """One option as written; the value has no comments and no outer white space; lines end in a line feed."""
 
@@ -46,7 +45,7 @@ class RawOption:
         return place.path == self.place.path and place.line in (self.place.line, *self.numbers)
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class RawSection:
     """One section, merged from all places that name it."""
 
@@ -85,7 +84,7 @@ class RawSection:
         return self.name.partition(" ")[2]
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class ConfigFile:
     """A parsed configuration."""
 

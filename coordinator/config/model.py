@@ -1,7 +1,7 @@
 """The machine as the configuration describes it: frozen, checked, ready to be built."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
@@ -11,14 +11,13 @@ from coordinator.config.pins import PinDescription, PinRegistry
 from coordinator.config.saved import ConfigSource
 from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
 from coordinator.motion.specs import MotionLimits
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.kinematics.dual_carriage import DualCarriage
     from coordinator.kinematics.extruder import ExtruderMotion
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class CanConnection:
     """A node on a CAN bus."""
 
@@ -29,7 +28,7 @@ class CanConnection:
     place: Place
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class UartConnection:
     """A node on a serial line."""
 
@@ -51,7 +50,7 @@ class NodePolicy(Enum):
     """The node's features are off until it is back; it may even be absent at start."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class NodeDescription:
     """One micro-controller; ``mcu`` is the primary whose clock is print time."""
 
@@ -63,7 +62,7 @@ class NodeDescription:
     """Where the policy is given; the section where it is not."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class StepperDescription:
     """One motor driver."""
 
@@ -100,7 +99,7 @@ class StepperDescription:
         return self.function.weights
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class HomingDescription:
     """How a rail finds its origin. Without an endstop on a pin G28 takes it as home."""
 
@@ -137,7 +136,7 @@ NO_ENDSTOP = HomingDescription()
 SECOND_CARRIAGE = "dual_carriage"
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class RailDescription:
     """What is homed as one: an axis, tower, arm or carriage with its steppers."""
 
@@ -176,7 +175,7 @@ class RailDescription:
         return (first, *others) if own else (self,)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ExtruderDescription:
     """One extruder's mechanics."""
 
@@ -195,7 +194,7 @@ class ExtruderDescription:
     """Of the machine while it prints with this extruder."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ExtruderStepperDescription:
     """A further stepper that moves filament along with an extruder."""
 
@@ -206,7 +205,7 @@ class ExtruderStepperDescription:
     """Name of the extruder whose motion it follows at start; empty: none."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class DualCarriageDescription:
     """Two carriages on one axis."""
 
@@ -215,7 +214,7 @@ class DualCarriageDescription:
     carriages: "DualCarriage"
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ShaperDescription:
     """How one axis is shaped from the start."""
 
@@ -228,7 +227,7 @@ class ShaperDescription:
     place: Place
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class AxisTablesDescription:
     """That axes may have compensation tables, which nodes of this project's firmware keep too."""
 
@@ -237,7 +236,7 @@ class AxisTablesDescription:
     place: Place
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ModuleSection:
     """A section that modules read."""
 
@@ -246,7 +245,7 @@ class ModuleSection:
     """Whether it belongs to one module; else modules read further options of a section read elsewhere."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ModuleSections:
     """What the modules of a machine are built from each time it starts (modules/module_set.py)."""
 
@@ -260,7 +259,7 @@ class ModuleSections:
     """As it was read: values and defaults."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class NotYetActing:
     """What was recognised but belongs to a module that is not built yet."""
 
@@ -276,7 +275,7 @@ class NotYetActing:
         return f"{self.place}: {what} recognised, not yet acting" + (self.reason and f": {self.reason}")
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class MachineDescription:
     """Everything the configuration says about the machine."""
 

@@ -7,13 +7,12 @@ handed back.
 
 import re
 from collections.abc import Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from coordinator.config.errors import ConfigError, NotActing, Place
 from coordinator.config.file import RawOption, RawSection
 from coordinator.support.quoting import nearest, shown
-from nodes.support.records import record
 
 T = TypeVar("T")
 _FLOAT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
@@ -31,7 +30,7 @@ class BadValue(ValueError):  # noqa: N818 (the answer of a parser, not a failure
     """The text is no value of the option; the argument says why where the rule alone does not."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Option(Generic[T]):
     """One option of a section."""
 
@@ -60,7 +59,7 @@ class Option(Generic[T]):
         return value
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Bounded(Option[T]):
     """Bounds common to the numeric kinds."""
 
@@ -105,7 +104,7 @@ class _Bounded(Option[T]):
         raise AssertionError(self.name)
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FloatOption(_Bounded[float]):
     """A decimal number."""
 
@@ -125,7 +124,7 @@ class FloatOption(_Bounded[float]):
         return self._any()
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class IntOption(_Bounded[int]):
     """A whole number."""
 
@@ -150,7 +149,7 @@ class IntOption(_Bounded[int]):
         return int(self._any())
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BoolOption(Option[bool]):
     """A truth value."""
 
@@ -169,7 +168,7 @@ class BoolOption(Option[bool]):
         return False
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ChoiceOption(Option[str]):
     """One word of several."""
 
@@ -194,7 +193,7 @@ class ChoiceOption(Option[str]):
         return self.choices[0]
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TextOption(Option[str]):
     """A line of text, by a pattern if one is given."""
 
@@ -216,7 +215,7 @@ class TextOption(Option[str]):
         return ""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GCodeOption(Option[str]):
     """Lines of g-code, or a template that makes them; also none."""
 
@@ -233,7 +232,7 @@ class GCodeOption(Option[str]):
         return ""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ListOption(Option[tuple[str, ...]]):
     """Words separated by commas or line ends."""
 
@@ -256,7 +255,7 @@ class ListOption(Option[tuple[str, ...]]):
         return ()
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GearRatioOption(Option[float]):
     """A chain of gears, ``50:10, 2:1``; the value is the motor's turns per turn of the output."""
 
@@ -294,7 +293,7 @@ def one_of(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class SectionSpec:
     """All a section may contain; the reference page is made from it."""
 
@@ -308,7 +307,7 @@ class SectionSpec:
     """Stands for all options whose names begin with its own, which ends in ``_``."""
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class SectionReader:
     """Reads one section by its specification and remembers what was read.
 

@@ -6,13 +6,12 @@ A pin is ``[!][^|~][node:]name``, or with the marks after the node as in ``toolh
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 
 from coordinator.config.errors import ConfigError, NotActing, Place
 from coordinator.config.file import RawOption, RawSection
 from coordinator.config.options import BadValue, Option
 from coordinator.support.quoting import nearest, shown
-from nodes.support.records import record
 
 PRIMARY_NODE = "mcu"
 MULTI_PIN = "multi_pin"
@@ -21,7 +20,7 @@ _MAX_PIN_CHARS = 100
 _EXCLUSIVE = ""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class PinName:
     """A pin as written in an option."""
 
@@ -32,7 +31,7 @@ class PinName:
     """1 pull-up, -1 pull-down, 0 none."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class PinDescription:
     """A pin with aliases resolved; whether the node has it only its dictionary knows: see ``number``."""
 
@@ -61,7 +60,7 @@ NO_PIN = PinName(PRIMARY_NODE, "")
 """Stands in for a pin after a mistake."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PinOption(Option[PinName]):
     """A pin."""
 
@@ -104,7 +103,7 @@ class PinOption(Option[PinName]):
 _ANY_PIN = PinOption(name="pin", help="any pin", pullable=True)
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class PinRegistry:
     """Who uses which pin."""
 

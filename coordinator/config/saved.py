@@ -8,6 +8,7 @@ import os
 import re
 import stat
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -17,7 +18,6 @@ from coordinator.config.text import split_lines
 from coordinator.support.atomic_file import write_whole
 from coordinator.support.quoting import shown, shown_path
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 NOTICE: Final = "DO NOT EDIT THIS BLOCK OR BELOW. The machine writes it; its values override those above."
 _SAVED_SECTION = re.compile(re.escape(SAVED_PREFIX) + r" ?\[([^\[\]]+)\]\s*")
@@ -31,7 +31,7 @@ class SaveError(CanductorError):
     """What is to be saved cannot be written; the file is as it was."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ConfigSource:
     """A configuration file as it was read."""
 

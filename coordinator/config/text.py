@@ -3,12 +3,11 @@
 import fnmatch
 import os
 import stat
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from coordinator.config.errors import ConfigError, Place
 from coordinator.support.quoting import shown_path
-from nodes.support.records import record
 
 MAX_FILES = 200
 MAX_BYTES = 2_000_000
@@ -17,7 +16,7 @@ MAX_DIRECTORY_ENTRIES = 20_000
 _WILDCARDS = "*?["
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class ReadBudget:
     """What one configuration may still read; shared by a file and all it includes."""
 

@@ -1,9 +1,9 @@
 """What goes over the line: characters, block check, headers and blocks of text."""
 
+from dataclasses import dataclass
 from typing import Final
 
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 SOH: Final = 0x01
 STX: Final = 0x02
@@ -88,7 +88,7 @@ def is_text(content: bytes, data_bits: int = 8) -> bool:
     return not any(c < SPACE or c == 0x7F or (data_bits == 7 and c > 0x7F) for c in bare)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Header:
     """Which file, and in which direction. NAME may be empty: the next file, then."""
 

@@ -21,7 +21,6 @@ from coordinator.dnc.port import Port
 from coordinator.dnc.tables import check_table
 from coordinator.dnc.verify import Compare, Twice
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 NOT_YET_S: Final = 0.02
 UNREADABLE: Final = "what comes cannot be read; are baud rate and frame those of the control?"
@@ -58,7 +57,7 @@ class Surroundings:
 HERE: Final = Surroundings()
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class DncReport:
     """What became of a command's transfers."""
 

@@ -1,6 +1,7 @@
 """What a side does with files: takes them into a folder or a machine, gives them out, tells the directory."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from enum import Enum, auto
 from typing import IO, Final, Protocol
 
@@ -10,7 +11,6 @@ from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.files import FileRefused, Folder, check_lines, read_lines
 from coordinator.dnc.listing import Listing, read_listing, write_listing
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 
 class Pause(Enum):
@@ -74,7 +74,7 @@ class FileSource:
         self._content.close()
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
     """What became of one transfer."""
 

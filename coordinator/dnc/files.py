@@ -7,12 +7,12 @@ import re
 import secrets
 import stat
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final
 
 from coordinator.dnc.blocks import BadText, is_text
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 Check = Callable[[bytes, str], None]
 """Gets a file's content and name; raises CanductorError if it may not be kept."""
@@ -46,7 +46,7 @@ class FileRefused(CanductorError):  # noqa: N818
         self.text = text
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Entry:
     """A file of the folder."""
 

@@ -5,18 +5,18 @@ it takes and whatever follows; at last ``FREE:`` and a number of sectors.
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Final
 
 from coordinator.dnc.files import Entry
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 SECTOR_BYTES: Final = 512
 _IGNORED_LINES: Final = 4
 _IGNORED_CHARACTERS: Final = 6
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Listing:
     """What a directory tells."""
 

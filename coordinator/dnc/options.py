@@ -1,9 +1,9 @@
 """What both sides of a line have to agree on, and how patient this side is."""
 
+from dataclasses import dataclass
 from typing import Final
 
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 BAUD_RATES: Final = (110, 150, 300, 600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400)
 TRANSMISSIONS_MAX: Final = 15
@@ -11,7 +11,7 @@ BLOCK_MAX: Final = 1024
 PARITIES: Final = {"N": "none", "E": "even", "O": "odd"}
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Frame:
     """One character on the line, as in 7E1."""
 
@@ -38,7 +38,7 @@ def read_frame(text: str) -> Frame:
     return Frame(int(word[0]), word[1], int(word[2]))
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DncOptions:
     """All of the protocol that can be chosen; times in seconds."""
 

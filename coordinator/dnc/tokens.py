@@ -1,8 +1,7 @@
 """What may be on a line, once its bytes are read."""
 
+from dataclasses import dataclass
 from enum import Enum, auto
-
-from nodes.support.records import record
 
 
 class Kind(Enum):
@@ -31,7 +30,7 @@ class Kind(Enum):
     """What means nothing; CONTENT is an ACK if one was in it."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Sign:
     """What was on the line, and when its last character was."""
 

@@ -4,12 +4,11 @@ TMC2208/TMC2202/TMC2224 rev. 1.13, TMC2209 rev. 1.09: chapter "Register Map".
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Final
 
-from nodes.support.records import record
 
-
-@record
+@dataclass(frozen=True, slots=True)
 class Field:
     """Some bits of a register: COUNT of them from SHIFT on."""
 
@@ -32,7 +31,7 @@ class Field:
         return register & ~(self.maximum << self.shift) | value << self.shift
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Register:
     """One register."""
 
@@ -47,7 +46,7 @@ class Register:
         return next(field for field in self.fields if field.name == name)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Chip:
     """One kind of driver."""
 

@@ -1,9 +1,8 @@
 """Motor current and speed in the units of the drivers' registers, by the formulas of the data sheets."""
 
 import math
+from dataclasses import dataclass
 from typing import Final
-
-from nodes.support.records import record
 
 CLOCK_HZ: Final = 12_000_000.0
 """Of the drivers' own oscillator."""
@@ -16,7 +15,7 @@ _INNER_OHM: Final = 0.02
 _SCALES: Final = 32
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Currents:
     """What the registers have for it."""
 

@@ -6,10 +6,9 @@ skipped with a notice, as is any command that nobody knows, and what a machine h
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import Enum
 from typing import Final
-
-from nodes.support.records import record
 
 
 class Effect(Enum):
@@ -22,7 +21,7 @@ class Effect(Enum):
     """Lights, displays, measurements that are only told."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class AbsentCommand:
     """One of them."""
 

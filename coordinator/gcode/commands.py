@@ -14,12 +14,11 @@ BuiltIn      is what the interpreter makes of another name: a command that a mac
 """
 
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from coordinator.gcode.parser import Command
 from coordinator.gcode.reply_kinds import ReplyKind
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 Position = tuple[float, float, float, float]
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Call:
     """One command as it is read."""
 
@@ -53,7 +52,7 @@ class Call:
         return self.command.only_parameters(known)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Done:
     """What came of something that was done at rest."""
 
@@ -72,7 +71,7 @@ class Done:
     """Of the replies."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class AtOnce:
     """Act now, if there is anything to do, and answer REPLIES."""
 
@@ -83,14 +82,14 @@ class AtOnce:
     """Of the replies."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class InTime:
     """ACT is called on the control loop, ahead of the print time (s) at which it is to take effect."""
 
     act: Callable[[float], None]
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class AtRest:
     """PERFORM runs on the control loop while the machine stands; it may be cancelled."""
 
@@ -99,7 +98,7 @@ class AtRest:
     """What a program that is only planned takes for granted."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Lines:
     """TEXT takes the command's place; before that, REPLIES are told."""
 
@@ -109,7 +108,7 @@ class Lines:
     """Names the place that a line of the text (from 1) comes from, for messages."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ToProgram:
     """ACT changes what holds for the program's lines to come; False: with the planner emptied, once more.
 
@@ -119,7 +118,7 @@ class ToProgram:
     act: "Callable[[Job], bool]"
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class BuiltIn:
     """The interpreter's own command of NAME acts."""
 
@@ -129,7 +128,7 @@ class BuiltIn:
 Reading = AtOnce | InTime | AtRest | Lines | ToProgram | BuiltIn
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class GCodeCommand:
     """A command of NAME (``M104``, ``SET_FAN_SPEED``)."""
 
@@ -156,7 +155,7 @@ def renamed(command: GCodeCommand | None, name: str, rename: str, *, beside: boo
     return GCodeCommand(rename, command.help, read, beside=command.beside)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Vocabulary:
     """What the machine's modules make of a program's words."""
 

@@ -26,10 +26,9 @@ from dataclasses import dataclass
 
 from coordinator.gcode.commands import Done
 from coordinator.gcode.reply_kinds import ReplyKind
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Progress:
     """A piece of the program was read."""
 
@@ -39,17 +38,17 @@ class Progress:
     """None where the length is not known."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Idle:
     """The program's source has nothing at present, but has not ended: someone is typing."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Full:
     """The planner has no room for the next line."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Wait:
     """M400: all moves are planned to a standstill that is reached at PRINT_TIME_S."""
 
@@ -57,7 +56,7 @@ class Wait:
     print_time_s: float
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class PositionSet:
     """G28: from PRINT_TIME_S the machine stands at POSITION (X Y Z E, mm); AXES (letters) were set.
 
@@ -70,7 +69,7 @@ class PositionSet:
     print_time_s: float
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ShaperChange:
     """SET_INPUT_SHAPER: from PRINT_TIME_S on AXIS (letter) is shaped so; FREQUENCY_HZ 0: not at all."""
 
@@ -83,7 +82,7 @@ class ShaperChange:
     print_time_s: float
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class WeightsChange:
     """Another carriage, mode or extruder: from PRINT_TIME_S on these steppers (by name) follow X Y Z E so."""
 
@@ -92,7 +91,7 @@ class WeightsChange:
     print_time_s: float
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class SmoothTimeChange:
     """SET_PRESSURE_ADVANCE: from PRINT_TIME_S on the advance of EXTRUDER is spread over SMOOTH_S."""
 
@@ -105,7 +104,7 @@ class SmoothTimeChange:
 AS_SOON_AS_POSSIBLE = -1
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Timed:
     """Something that takes effect at its place among the moves, without stopping them."""
 
@@ -137,7 +136,7 @@ class Resting:
     """Set by whoever does not want it any more; the driver then ends it."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Reply:
     """An answer that the program asked for (M114)."""
 
@@ -146,7 +145,7 @@ class Reply:
     kind: ReplyKind = ReplyKind.INFORMATION
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Notice:
     """Something the user should know; each is told once per job."""
 
@@ -154,14 +153,14 @@ class Notice:
     text: str
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Emergency:
     """M112."""
 
     line: int
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class End:
     """The program has ended; the machine comes to a standstill at PRINT_TIME_S."""
 

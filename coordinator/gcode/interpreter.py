@@ -6,7 +6,7 @@ real-time streamer drive the same ``step`` and act on its events (events.py).
 
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 from coordinator.gcode.absent_commands import ABSENT
@@ -46,7 +46,6 @@ from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.gcode.status import gcode_figures
 from coordinator.motion.planner.language import READ_IN_C
 from coordinator.motion.planner.planner import Feed, FeedStatus, Planner
-from nodes.support.records import record
 
 QUOTE = "'"
 MAX_NOTICES = 100
@@ -57,7 +56,7 @@ MAX_PLACES = 4
 """Of such commands that a message names all; of more, it names the outermost and the innermost one."""
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class Recorded:
     """Commands of one name that wait for a module which does not exist yet."""
 
@@ -67,7 +66,7 @@ class Recorded:
     last_text: str
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class _Inner:
     """The lines that take a command's place; read one by one, they count as the line of that command."""
 

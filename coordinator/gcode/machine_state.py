@@ -5,20 +5,19 @@ change to step generation at its print time.
 """
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 
 from coordinator.kinematics.base import Weights
 from coordinator.kinematics.dual_carriage import CarriageState, DualCarriage
 from coordinator.kinematics.extruder import ExtruderMotion
 from coordinator.motion.specs import MotionLimits
-from nodes.support.records import record
 
 SHAPER_AXES = "XYZ"
 SHAPER_PERIODS = 2.0
 """No shaper is wider than this many periods of its frequency."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Shaper:
     """How an axis is shaped."""
 
@@ -33,7 +32,7 @@ class Shaper:
         return SHAPER_PERIODS / self.frequency_hz if self.frequency_hz else 0.0
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class Extruder:
     """What a program may change of one extruder."""
 
@@ -52,7 +51,7 @@ class Extruder:
             self.window_s = self.smooth_s
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class SavedState:
     """What holds for the lines to come, as SAVE_GCODE_STATE found it; X Y Z E, mm."""
 
@@ -70,7 +69,7 @@ class SavedState:
     """Letters of the axes that were homed."""
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class MachineState:
     """What the machine is like for the next line."""
 

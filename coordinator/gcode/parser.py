@@ -3,10 +3,9 @@
 import math
 import re
 from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass
 from functools import lru_cache, reduce
 from operator import xor
-
-from nodes.support.records import record
 
 _CODE = re.compile(r"([GMTgmt])(\d{1,9})(\.\d{1,9})?(?![\d_.])", re.ASCII)
 _NAME = re.compile(r"[A-Za-z_]\w*(?=[ \t;]|$)", re.ASCII)
@@ -23,7 +22,7 @@ class WordError(ValueError):
     """What is wrong with a line, as the end of a sentence."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Command:
     """One command: its NAME (``G1``, ``M204``, ``SET_VELOCITY_LIMIT``) and the text of its parameters."""
 

@@ -1,14 +1,13 @@
 """What a program may do about the job, its own or that which another one prints."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
-
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Recovering:
     """How an interrupted job is to go on."""
 

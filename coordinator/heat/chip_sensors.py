@@ -20,9 +20,8 @@ sam3x, sam4e   SAM3X/A and SAM4E data sheets, "Temperature Sensor"
 =============  =====================================================================================
 """
 
+from dataclasses import dataclass
 from typing import Final
-
-from nodes.support.records import record
 
 REFERENCE_V: Final = 3.3
 SLOPE_TRUST: Final = 0.35
@@ -31,7 +30,7 @@ PLACE_TRUST_K: Final = 60.0
 """The same of the temperature they give where the data sheet has its typical one."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class FactoryPoints:
     """Where a chip keeps two measurements of its factory: half words of so many BITS, taken at VOLTS."""
 
@@ -43,7 +42,7 @@ class FactoryPoints:
     bits: int = 12
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ChipSensor:
     """What a chip's sensor gives: VOLTS at CELSIUS, VOLTS_PER_K more for each kelvin."""
 
@@ -70,7 +69,7 @@ class ChipSensor:
         return line if steep and near else None
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ChipLine:
     """The temperature by what the converter reads, 0 to 1: CELSIUS_AT where it reads RATIO_AT."""
 

@@ -4,15 +4,14 @@ Steady state begins SETTLING_S after the target was reached, as M109 and M190 wa
 target changes. Neither a fan that starts nor filament that passes ends it: to hold against them is the task.
 """
 
+from dataclasses import dataclass
 from typing import Final
-
-from nodes.support.records import record
 
 SETTLING_S: Final = 10.0
 """So long after a heater has reached its target it may still swing."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Held:
     """What was measured in steady state."""
 
@@ -39,7 +38,7 @@ class Held:
         return max(self.high_c - self.target_c, self.target_c - self.low_c)
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class _Steady:
     """A target that is held: running sums, whatever the time."""
 

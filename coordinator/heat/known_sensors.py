@@ -4,13 +4,13 @@ A thermistor's curve goes through three points of its data sheet, or follows fro
 gives no more; SOURCES says which.
 """
 
+from dataclasses import dataclass
 from typing import Final
 
 from coordinator.heat.resistors import Platinum, SteinhartHart
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class KnownThermistor:
     """A thermistor that is known by name."""
 

@@ -13,10 +13,10 @@ OBSERVER_SPEED · k: fast against the sensor's lag, yet not so fast that noise i
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from coordinator.heat.controller import NEAR_K, SLOW_K_PER_S, Slope
-from nodes.support.records import record
 
 OBSERVER_SPEED: Final = 1.5
 OBSERVER_FASTEST_PER_S: Final = 1.0
@@ -28,7 +28,7 @@ UNEXPLAINED_PART: Final = 0.5
 DEFAULT_AMBIENT_C: Final = 25.0
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class HeaterModel:
     """What a heater is; from MPC_CALIBRATE."""
 
@@ -59,7 +59,7 @@ def filament_heat(diameter_mm: float, density_g_per_cm3: float, heat_capacity_j_
     return math.pi * (diameter_mm / 2) ** 2 / 1000 * density_g_per_cm3 * heat_capacity_j_per_g_k
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class _Estimate:
     block_c: float
     sensor_c: float

@@ -1,9 +1,9 @@
 """PID control of a heater."""
 
+from dataclasses import dataclass
 from typing import Final
 
 from coordinator.heat.controller import NEAR_K, SLOW_K_PER_S, Slope
-from nodes.support.records import record
 
 PARAMETER_BASE: Final = 255.0
 """Users' pid_Kp, pid_Ki and pid_Kd stand for a power of 0 to 255."""
@@ -11,7 +11,7 @@ LONGEST_STEP_S: Final = 2.0
 """Of a longer gap between measurements the integral takes no more than this."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class PidGains:
     """As users write them: per K, per K·s and per K/s, for a power of 0 to 255."""
 

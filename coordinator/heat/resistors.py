@@ -6,11 +6,11 @@ does, so that a broken sensor reads as absurdly cold or hot and never as an exce
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 from coordinator.heat.tables import Line, TableError
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 ZERO_C: Final = 273.15
 """0 °C in K."""
@@ -35,7 +35,7 @@ class Resistor(Protocol):
         ...
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class SteinhartHart:
     """An NTC thermistor by 1/T = A + B ln R + C (ln R)³, T in K, R in Ω; B above and C not below 0."""
 
@@ -94,7 +94,7 @@ class SteinhartHart:
         return HOTTEST_C if inverse <= 1 / (HOTTEST_C + ZERO_C) else 1 / inverse - ZERO_C
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Platinum:
     """A platinum resistor of ZERO_OHMS at 0 °C by Callendar and Van Dusen, coefficients of IEC 60751."""
 
@@ -123,7 +123,7 @@ _PT_B: Final = -5.775e-7
 _PT_C: Final = -4.183e-12
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ResistanceTable:
     """A resistor measured at some temperatures; straight lines between and beyond them."""
 

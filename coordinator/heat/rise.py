@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from coordinator.heat.pid_tune import TuneError
-from nodes.support.records import record
 
 MAX_POINTS: Final = 2000
 TRIES: Final = 60
@@ -50,7 +49,7 @@ class Rise:
             self._stride *= 2
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Fit:
     """What explains a rise."""
 

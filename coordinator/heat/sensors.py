@@ -5,11 +5,11 @@ A *ratio* is what the converter reads as a part of its reference voltage, 0 to 1
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 from coordinator.heat.resistors import MIN_OHMS, Resistor, SensorError
 from coordinator.heat.tables import Line, TableError
-from nodes.support.records import record
 
 RAIL: Final = 1e-6
 """A ratio nearer to 0 or 1 than this is taken as this near: wires that are open or touch."""
@@ -27,7 +27,7 @@ class Sensor(Protocol):
         ...
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class PullUp:
     """RESISTOR to ground with INLINE_OHMS in its line, and PULLUP_OHMS to the reference voltage."""
 
@@ -51,7 +51,7 @@ class PullUp:
         return self.resistor.celsius(max(ohms, MIN_OHMS))
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class AmplifiedPullUp:
     """RESISTOR below PULLUP_OHMS at SUPPLY_V, its voltage times GAIN at a converter for ADC_V."""
 
@@ -76,7 +76,7 @@ class AmplifiedPullUp:
         return self.supply_v * self.gain / self.adc_v
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Voltage:
     """A voltage that follows the temperature by LINE (°C to V), OFFSET_V added, at a converter for ADC_V."""
 
@@ -109,7 +109,7 @@ def _within_rails(ratio: float) -> float:
     return min(max(ratio, RAIL), 1 - RAIL)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class RatioRange:
     """What a converter may read while a sensor is in order."""
 

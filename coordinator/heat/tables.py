@@ -3,16 +3,16 @@
 import itertools
 from bisect import bisect_right
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 
 class TableError(CanductorError):
     """Points that no line can be drawn through."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Line:
     """Straight lines through points with rising x and rising or falling y; beyond the ends they go on."""
 

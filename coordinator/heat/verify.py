@@ -4,9 +4,8 @@ Three faults are found: it does not come nearer to a target (loose or broken hea
 does not hold one, and it goes on heating when it has been off for long (a switch that is stuck).
 """
 
+from dataclasses import dataclass
 from typing import Final
-
-from nodes.support.records import record
 
 OFF_BEFORE_S: Final = 30.0
 """How long a heater must have been off before its heat cannot be what is left in it."""
@@ -18,7 +17,7 @@ LONGEST_STEP_S: Final = 5.0
 """Of a longer gap between looks the error takes no more than this."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class VerifyOptions:
     """As users write them; the defaults are those of a hot end."""
 

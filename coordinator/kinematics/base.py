@@ -5,10 +5,10 @@ what step generation divides by the way per step: mm, or rad where the rail turn
 """
 
 import math
+from dataclasses import dataclass
 from typing import Protocol
 
 from coordinator.motion.specs import StepKinematics
-from nodes.support.records import record
 
 Point = tuple[float, float, float]
 Weights = tuple[float, float, float, float]
@@ -18,7 +18,7 @@ FILAMENT: Weights = (0.0, 0.0, 0.0, 1.0)
 """Of a stepper that moves the filament."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class StepFunction:
     """How step generation gets a rail's position from the axes; see StepKinematics for the parameters."""
 
@@ -38,7 +38,7 @@ def linear(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> StepFunction:
     return StepFunction(weights=(x, y, z, 0.0))
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class WorkSpace:
     """Where the head may be: a box, of which a cylinder around Z may be all that counts, and a cone above.
 

@@ -1,10 +1,11 @@
 """Cartesian: each rail moves one axis. Formulas: none, a rail's position is the axis' position."""
 
+from dataclasses import dataclass
+
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Cartesian:
     """Three axes with motors of their own."""
 

@@ -5,11 +5,12 @@ Both motors turning the same way move along X, against each other along Y: a = x
 that a motor alone moves its rail by the same way as on a cartesian machine.
 """
 
+from dataclasses import dataclass
+
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class CoreXY:
     """Rail x has the motor that moves by x + y, rail y the one that moves by x - y."""
 

@@ -3,11 +3,12 @@
 a = x + z, c = x - z, and so x = (a + c) / 2, z = (a - c) / 2. Source: as corexy.py, with Z for Y.
 """
 
+from dataclasses import dataclass
+
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class CoreXZ:
     """Rail x has the motor that moves by x + z, rail z the one that moves by x - z."""
 

@@ -10,11 +10,11 @@ that the head counts as a point here. Step generation takes DELTA with params (A
 """
 
 import math
+from dataclasses import dataclass
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace
 from coordinator.kinematics.geometry import spheres_meet
 from coordinator.motion.specs import StepKinematics
-from nodes.support.records import record
 
 USUAL_TOWER_SPEED = 3.0
 """How much faster than the head a carriage may be: where a rod lies flatter, the head is slower instead."""
@@ -24,7 +24,7 @@ _FLATTEST = math.sin(math.atan(MAX_TOWER_SPEED))
 """Share of a rod's length that is horizontal then: speed ratio = horizontal / vertical."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Tower:
     """One tower with its rod."""
 
@@ -35,7 +35,7 @@ class Tower:
     """Z of the head in the middle when the carriage is at its endstop."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Delta:
     """A linear delta."""
 

@@ -8,13 +8,13 @@ Step generation takes DELTESIAN with params (A², ax).
 """
 
 import math
+from dataclasses import dataclass
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
 from coordinator.motion.specs import StepKinematics
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Arm:
     """One tower with its rod."""
 
@@ -25,7 +25,7 @@ class Arm:
     """Z of the head in the middle when the carriage is at its endstop."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Deltesian:
     """A deltesian."""
 

@@ -13,11 +13,10 @@ along moves in any mode. Source: the definition of the modes.
 Everything here is a value; a change of mode happens at standstill and gives a new ``CarriageState``.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from coordinator.kinematics.base import Weights
-from nodes.support.records import record
 
 
 class CarriageMode(Enum):
@@ -32,7 +31,7 @@ class CarriageMode(Enum):
 SCALES = {CarriageMode.PRIMARY: 1, CarriageMode.COPY: 1, CarriageMode.MIRROR: -1, CarriageMode.INACTIVE: 0}
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Carriage:
     """One of the two."""
 
@@ -45,7 +44,7 @@ class Carriage:
     """Names, and weights when this carriage is the primary."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class CarriageState:
     """What both carriages do."""
 
@@ -70,7 +69,7 @@ class CarriageState:
         return one, two
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class DualCarriage:
     """Both carriages of an axis."""
 

@@ -8,13 +8,12 @@ Everything here is a value; a change happens at standstill and gives a new ``Ext
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from coordinator.kinematics.base import FILAMENT, NO_WEIGHTS, Weights
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ExtruderMotion:
     """Who follows whom."""
 

@@ -6,16 +6,16 @@ rows: p = M₃⁻¹·u₃; further motors (a second belt of one axis) follow fro
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
 from coordinator.kinematics.geometry import cross, dot, solve
-from nodes.support.records import record
 
 MIN_INDEPENDENCE = 1e-6
 """Smallest determinant of three motors' weights, each scaled to length 1, that counts as independent."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class GenericCartesian:
     """Any machine whose motors move by sums of the axes."""
 

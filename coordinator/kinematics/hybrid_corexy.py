@@ -4,11 +4,12 @@ The belt that moves the head along X is carried along Y by the gantry: a = x - y
 Source: the way of a belt whose free length is x - y, as described for the Markforged printers.
 """
 
+from dataclasses import dataclass
+
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class HybridCoreXY:
     """Rail x has the motor that moves by x - y; rail y moves y alone."""
 

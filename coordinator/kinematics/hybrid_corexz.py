@@ -3,11 +3,12 @@
 a = x - z, c = z, and so x = a + c. Source: as hybrid_corexy.py, with Z for Y.
 """
 
+from dataclasses import dataclass
+
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class HybridCoreXZ:
     """Rail x has the motor that moves by x - z; rail z moves z alone."""
 

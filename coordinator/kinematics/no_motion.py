@@ -1,17 +1,18 @@
 """A machine whose head nothing moves: heaters, fans and sensors alone, perhaps an extruder."""
 
+from dataclasses import dataclass, field
+
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class NoMotion:
     """No rails at all."""
 
     name = "none"
     rails: tuple[str, ...] = ()
     homing_order: tuple[tuple[str, ...], ...] = ()
-    work_space: WorkSpace = WorkSpace((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    work_space: WorkSpace = field(default_factory=lambda: WorkSpace((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return none."""

@@ -8,13 +8,13 @@ that must not go there has an arm whose position_min is above 0.
 """
 
 import math
+from dataclasses import dataclass
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
 from coordinator.motion.specs import StepKinematics
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Polar:
     """A polar machine."""
 

@@ -15,11 +15,11 @@ Step generation takes ROTARY_DELTA with params (U, L, R, H, cos φ, sin φ).
 """
 
 import math
+from dataclasses import dataclass
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace
 from coordinator.kinematics.geometry import spheres_meet
 from coordinator.motion.specs import StepKinematics
-from nodes.support.records import record
 
 MIN_LEVERAGE = 1 / 3
 """Smallest share of the lower arm that is in the elbow's direction: an elbow is at most three times as fast
@@ -29,7 +29,7 @@ _HALVINGS = 30
 _RADII = 50
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Arm:
     """One arm."""
 
@@ -39,7 +39,7 @@ class Arm:
     """Direction in which it stands, rad from X towards Y."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class RotaryDelta:
     """A rotary delta."""
 

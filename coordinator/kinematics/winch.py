@@ -9,11 +9,11 @@ Step generation takes WINCH with params (ax, ay, az).
 """
 
 import math
+from dataclasses import dataclass
 
 from coordinator.kinematics.base import Point, StepFunction, WorkSpace
 from coordinator.kinematics.geometry import along, cross, dot, solve, spheres_meet, subtract
 from coordinator.motion.specs import StepKinematics
-from nodes.support.records import record
 
 MIN_WINCHES = 3
 _FLAT = 1e-3
@@ -22,7 +22,7 @@ _CLEARANCE = 0.01
 """Share of the anchors' spread that the head stays below their plane."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Winch:
     """A machine of three winches or more; the first three anchors are not on one line."""
 

@@ -6,11 +6,11 @@ A message that cannot be understood is dropped without an answer; one that is to
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Final, NoReturn
 
 from coordinator.ipc.protocol.json_values import has_more_items
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 END: Final = b"\x03"
 MESSAGE_BYTES_MAX: Final = 262_144
@@ -29,7 +29,7 @@ class Unreadable(CanductorError):  # noqa: N818
     """A message that is dropped; the text says why."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Request:
     """One call of a client."""
 

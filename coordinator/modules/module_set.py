@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from coordinator.config.errors import ConfigError, NotActing, Place
@@ -27,7 +28,6 @@ from coordinator.modules.status.positions import Positions
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.motion.planner.planner import Planner
@@ -43,7 +43,7 @@ INTERRUPTING: Final = frozenset(("PAUSE", "CANCEL_PRINT"))
 """Commands that pause or cancel a job, whatever macros they may be."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ModuleSource:
     """A section and the module that it is for."""
 
@@ -53,7 +53,7 @@ class ModuleSource:
     """Whether the whole section is the module's."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class LeftOut:
     """A section whose module was left out."""
 

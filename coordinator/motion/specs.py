@@ -1,8 +1,7 @@
 """What motion is told about the machine: plain values, checked by whoever builds them."""
 
+from dataclasses import dataclass
 from enum import IntEnum
-
-from nodes.support.records import record
 
 AXIS_RANGE_OPTIONS = (
     "position_min and position_max of [stepper_x]",
@@ -12,7 +11,7 @@ AXIS_RANGE_OPTIONS = (
 """Where each axis has its rail."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class MotionLimits:
     """What every move must respect. Lengths in mm, times in s; vectors are X Y Z."""
 
@@ -59,7 +58,7 @@ class MotionLimits:
     """For messages: which options of the configuration say how far X, Y and Z may go."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class NodeStreamSpec:
     """How one node takes step commands. Ids come from its dictionary."""
 
@@ -92,7 +91,7 @@ class StepKinematics(IntEnum):
     """Distance from the anchor; params: x, y, z."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class StepperSpec:
     """One stepper."""
 

@@ -1,16 +1,16 @@
 """What a plan asks of machine and buses over print time: the skin of motion/plan_stats.h."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from coordinator.motion.stats._plan_stats import ffi, lib
-from nodes.support.records import record
 
 BIN_S = 1.0
 """Length of a bin at the start; it doubles whenever the bins run out (68 minutes, and so on)."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class WatchedNode:
     """A node whose stream is counted, and the bus it goes over."""
 
@@ -22,7 +22,7 @@ class WatchedNode:
     queue_step_id: int
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Peak:
     """The greatest of a quantity."""
 
@@ -32,7 +32,7 @@ class Peak:
     """Of the program; 0: there was none."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Bus:
     """The load of one bus over print time."""
 

@@ -1,14 +1,13 @@
 """What ``canductor plan`` tells: figures, warnings, and how they read."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 from coordinator.motion.planner.values import Slowed
 from coordinator.planning.figures import Peak
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class AxisReport:
     """The most one axis is asked for: mm/s and mm/s² of X, Y, Z, or of filament for E."""
 
@@ -17,7 +16,7 @@ class AxisReport:
     accel: Peak
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class StepperReport:
     """What one stepper is asked to do."""
 
@@ -31,7 +30,7 @@ class StepperReport:
     worst_error_us: float
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class NodeReport:
     """What one node is sent."""
 
@@ -49,7 +48,7 @@ class NodeReport:
     """Commands whose slot is only free after they are due."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class BusReport:
     """What one bus carries; its load over time stands in the timeline."""
 
@@ -68,7 +67,7 @@ class BusReport:
     """Print time in bins above the share of the bit rate that is given out."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Timeline:
     """Figures by bin of print time: bin i is from i·bin_s to (i + 1)·bin_s."""
 
@@ -81,7 +80,7 @@ class Timeline:
     """By bus: share of the bit rate."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class PlanReport:
     """The figures of a plan; ``to_json`` gives them by these names."""
 

@@ -3,7 +3,7 @@
 import math
 import resource
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from coordinator.config.model import CanConnection, MachineDescription
@@ -21,7 +21,6 @@ from coordinator.planning.warnings import (
 from coordinator.streaming.pipeline import Pipeline
 from coordinator.support.command_options import PlanOptions
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 
 def watched_nodes(
@@ -46,7 +45,7 @@ def watched_nodes(
     return result
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Made:
     """A plan that is finished."""
 

@@ -1,11 +1,11 @@
 """What in a plan would go wrong on the machine, as sentences with the g-code line."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from coordinator.motion.planner.values import Slowed
 from coordinator.planning.figures import Peak
 from coordinator.planning.report import BusReport, NodeReport, StepperReport
-from nodes.support.records import record
 
 CEILING = 0.9
 """Share of a bus's bit rate that its links give out; what is left carries everything unplanned."""
@@ -23,7 +23,7 @@ TICKS_PER_STEP_OF = {
 """Other chips, by how their name (constant MCU) begins."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class NodeClock:
     """What a node's dictionary says of its speed."""
 

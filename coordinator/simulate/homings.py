@@ -11,6 +11,7 @@ import asyncio
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -29,7 +30,6 @@ from coordinator.support.toml_values import Dice, Range
 from coordinator.virtual_machine.plant import AXES, PlantSettings, machine_plants
 from coordinator.virtual_machine.real_nodes import CONFIG, real_nodes
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 from nodes.virtual.plant_page import PlantPage
 
 MACHINE: Final = Path(__file__).parent / "machines" / "homing.cfg"
@@ -44,7 +44,7 @@ SPEED: Final = (0.4, 1.2)
 SETTLED_S: Final = 0.1
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Homing:
     """One homing, and what the plant knows about it."""
 

@@ -8,6 +8,7 @@ runs away, counts from when it did. ``--real`` adds hosts that are processes, ki
 import argparse
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
@@ -15,7 +16,6 @@ from coordinator.simulate import safety_real
 from coordinator.simulate.safety_rig import Found, Rig
 from coordinator.simulate.safety_row import MAX_DURATION_S, Row, table
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 from nodes.virtual.plant_page import Fault, Kind
 
 STOP_S: Final = 0.02
@@ -30,7 +30,7 @@ HOLD: Final = ("M140 S110", "M104 S200", "TEMPERATURE_WAIT SENSOR=extruder MINIM
 """The bed is still heated when the hotend holds."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Case:
     """Something goes wrong."""
 

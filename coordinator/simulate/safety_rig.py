@@ -7,6 +7,7 @@ the log of the boards' pins, which none of them can reach, and from the plant.
 import asyncio
 import contextlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +21,6 @@ from coordinator.streaming.job_runner import run_job
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 from nodes.virtual.plant_page import Fault, Kind
 
 MACHINE: Final = Path(__file__).parent / "machines" / "safety.cfg"
@@ -38,7 +38,7 @@ PATIENCE_S: Final = 600.0
 NS: Final = 1e-9
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class HeaterFound:
     """What the log says of one heater's pin."""
 
@@ -49,7 +49,7 @@ class HeaterFound:
     """From the cause to its last falling edge; 0 when that was before."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Found:
     """What became of it."""
 

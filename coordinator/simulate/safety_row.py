@@ -1,15 +1,14 @@
 """What is told of a case in which something goes wrong with the heaters on."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
-
-from nodes.support.records import record
 
 MAX_DURATION_S: Final = 1.5
 """As it is without the option: within this a node ends its heat by itself."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Row:
     """A case and one heater."""
 

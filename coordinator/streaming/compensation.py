@@ -4,6 +4,7 @@ The control loop says which tables are wanted; the motion worker takes them up w
 taken up makes no step by itself: docs/tables.md tells how it comes into effect.
 """
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from coordinator.config.model import MachineDescription
@@ -11,7 +12,6 @@ from coordinator.motion.specs import MotionLimits, StepKinematics
 from coordinator.motion.steps.steps import TABLE_POINTS_MAX, AxisCorrection, StepGenerator
 from coordinator.tables.axis_table import AxisTable, Unit
 from coordinator.tables.store import TableStore
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -27,7 +27,7 @@ Z_SHARE: Final = 0.2
 """Of Z's top speed, at which Z takes up what a correction jumps by: screws start at no more at once."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class AxisState:
     """For front ends: what is done with the table of an axis."""
 

@@ -1,13 +1,12 @@
 """What drives the pipeline: a source of moves, and who looks on while they go by."""
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from coordinator.gcode.events import Event, Notice, Reply
 from coordinator.gcode.machine_state import MachineState
 from coordinator.motion.planner.planner import Planner, Position
-from nodes.support.records import record
 
 Told = Reply | Notice
 
@@ -60,7 +59,7 @@ class Witness(Protocol):
         """Take note of commands for a moving node, on the control loop."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Planned:
     """Where the planner was after the latest visit, in mm; X Y Z E."""
 
@@ -86,7 +85,7 @@ class Planned:
     """Of the program: 25.4 after G20."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class JobState:
     """How far a job is."""
 

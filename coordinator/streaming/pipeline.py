@@ -6,7 +6,7 @@ program and keeps no clock. Not thread-safe: one thread at a time.
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from coordinator.gcode.events import (
@@ -23,7 +23,6 @@ from coordinator.motion.planner.planner import Planner, Position
 from coordinator.motion.steps.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps.steps import StepGenerator
 from coordinator.streaming.move_source import MoveSource
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     import numpy as np
@@ -41,7 +40,7 @@ MoveWatch = Callable[[Any, int], None]
 BATCH_ROOM = 1 << 16
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Acting:
     """What acts between trapezoids and steppers."""
 
@@ -53,7 +52,7 @@ class Acting:
     """By filament stepper: the window over which pressure advance is spread."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Stretch:
     """Trapezoids between which nothing is declared or changed."""
 
@@ -65,7 +64,7 @@ class Stretch:
     acting: Acting
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class PlanRecord:
     """What was planned, for whoever checks it: trapezoids in order, and where positions were declared."""
 

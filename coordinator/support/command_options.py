@@ -4,12 +4,11 @@ Imports nothing that is slow: ``canductor plan`` is measured from its first inst
 """
 
 from collections.abc import Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 
 def _examples() -> Path:
@@ -43,7 +42,7 @@ class Report(Protocol):
         """Return the same for a reader; when not ok it says what failed and what to do."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ServeOptions:
     """How a machine is served to front ends."""
 
@@ -79,7 +78,7 @@ class ServeOptions:
     """Whether others than this computer may read them."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DemoOptions:
     """``canductor demo``."""
 
@@ -110,7 +109,7 @@ class DemoOptions:
     Under the empty name: what carries those not named."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RunOptions:
     """``canductor run``."""
 
@@ -122,7 +121,7 @@ class RunOptions:
     """Serve the machine to front ends; None: print GCODE, or what comes on standard input, and end."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PlanOptions:
     """``canductor plan``."""
 
@@ -142,7 +141,7 @@ class PlanOptions:
     """By axis: its compensation table, a CSV or a COMP_FILE of type 0 in mm."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SimulateOptions:
     """``canductor simulate``."""
 

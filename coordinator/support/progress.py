@@ -6,10 +6,9 @@ Whoever runs the job calls ``update`` as often as is handy; drawing is limited h
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Self, TextIO
-
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -19,7 +18,7 @@ LIVE_INTERVAL_S = 0.2
 PLAIN_INTERVAL_S = 5.0
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NodeFigures:
     """How the link to one node does; None where nothing is known yet."""
 
@@ -33,7 +32,7 @@ class NodeFigures:
     clock_error_us: float | None = None
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Progress:
     """One state of a job."""
 

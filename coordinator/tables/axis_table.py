@@ -8,12 +8,12 @@ import bisect
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
 from nodes.mt.mt import VALUES, Pair
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 X_PER_UNIT: Final = 10_000
 """MT's X: 100 nm, or 0.0001 degrees."""
@@ -44,7 +44,7 @@ class Direction(StrEnum):
     REVERSE = "reverse"
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AxisTable:
     """The table of AXIS; raises TableError for one that cannot be.
 

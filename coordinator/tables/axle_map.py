@@ -3,6 +3,7 @@
 Stepper k (from 1, in the order of the machine's rails) has the axles 2k - 1 for forward and 2k for reverse.
 """
 
+from dataclasses import dataclass
 from typing import Final
 
 from coordinator.config.model import MachineDescription
@@ -11,12 +12,11 @@ from nodes.devices.stepper import Stepper
 from nodes.mt.mt import AXLES
 from nodes.mt.table import CONSTANT, AxleTable
 from nodes.node.config import NodeConfig
-from nodes.support.records import record
 
 STEPPERS_MAX: Final = len(AXLES) // 2
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class StepperTables:
     """The two tables of one stepper."""
 

@@ -14,7 +14,6 @@ from coordinator.heat.controller import NEAR_K
 from coordinator.heat.holding import SETTLING_S, Held
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.virtual_machine.plant_heat import plant_word
-from nodes.support.records import record
 from nodes.virtual.plant_log import PlantEvent
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ AROUND_NS: Final = 100_000_000
 """How far beside its steady state the truth is looked at: the log tells it every 50 ms."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class HeatProof:
     """One heater in one steady state."""
 

@@ -4,11 +4,11 @@ What homing found decides: an endstop that was missed by a step shifts everythin
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from coordinator.config.model import MachineDescription
 from coordinator.streaming.pipeline import PlanRecord
-from nodes.support.records import record
 from nodes.virtual.plant import Axis
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ STEPS_OFF: Final = 2.0
 motor felt the end may be so many full steps: a motor follows its field no better."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class PlaceProof:
     """One axis or tower that was homed."""
 

@@ -5,7 +5,7 @@ switches by the steppers of all nodes that move its axis. The heat is in ``plant
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import field, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -16,7 +16,6 @@ from coordinator.motion.specs import StepKinematics
 from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat
 from coordinator.virtual_machine.plant_tmc import machine_drivers
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 from nodes.virtual.plant import Axis, NodePlant, Stepper, Switch, Term
 
 AXES: Final = "xyz"
@@ -30,7 +29,7 @@ DIGITS: Final = 12
 _SMALL: Final = 1e-9
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PlantSettings:
     """How the machine is to be."""
 
@@ -47,7 +46,7 @@ class PlantSettings:
     """How far beside the head a side of an axis begins that has an endstop of its own, by its first motor."""
     switch_noise_mm: float = 0.0
     """How far beside its place each approach finds an endstop, at most."""
-    heat: HeatSettings = HeatSettings()
+    heat: HeatSettings = field(default_factory=HeatSettings)
 
 
 def machine_plants(

@@ -14,7 +14,6 @@ from coordinator.config.model import MachineDescription
 from coordinator.config.options import BadValue
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
 from coordinator.config.sections.nodes import make_pin_registry
-from nodes.support.records import record
 from nodes.virtual.plant import (
     Beta,
     Body,
@@ -39,7 +38,7 @@ PULLUP_OHM: Final = 4700.0
 Curve = Beta | Steinhart | Rtd | Linear | Table
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class HeatSettings:
     """How heat is to be."""
 
@@ -55,7 +54,7 @@ class HeatSettings:
     """How warm heated things begin, by the first word of their sections; others are as warm as the air."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Thing:
     """A typical thing that is heated."""
 

@@ -1,13 +1,13 @@
 """An analog input on a node: sampled on and on, reported, and watched by the node itself."""
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from nodes.devices.ticks import start_clock, ticks_for
 from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,7 +23,7 @@ RANGE_CHECKS: Final = 4
 """So many sums in a row have to be out of range: the node then shuts down."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class AnalogValue:
     """A measurement."""
 

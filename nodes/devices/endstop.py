@@ -1,12 +1,12 @@
 """An endstop on a node: an input that is sampled while an axis moves towards it."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from nodes.devices.trsync import TriggerReason
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from nodes.node.node import Node  # planning needs no node, which draws in asyncio
@@ -18,7 +18,7 @@ SAMPLE_COUNT: Final = 4
 """Samples in a row that have to agree: a spike of the cable is shorter."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class EndstopState:
     """What an endstop's node says."""
 

@@ -1,13 +1,13 @@
 """Stop groups on a node (trsync): what has to stop when something triggers, anywhere on the machine."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
 from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from nodes.node.node import Node  # planning needs no node, which draws in asyncio
@@ -30,7 +30,7 @@ class TriggerReason(IntEnum):
     """Nobody renewed the time-out: host and node had lost each other."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class TrsyncState:
     """What a stop group reports."""
 

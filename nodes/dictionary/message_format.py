@@ -7,11 +7,11 @@ and reused, so a format must be used from one thread only (the control loop's).
 import re
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from nodes.support._wire import ffi, lib
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 Value = int | bytes
 """What a parameter carries: a number, or the raw bytes of a buffer."""
@@ -27,7 +27,7 @@ class MessageError(CanductorError):
     """A message cannot be encoded: unknown name, wrong parameters, or a value its parameter cannot hold."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Message:
     """A decoded message: its name and its parameters by name, in the order of the format.
 
@@ -57,7 +57,7 @@ class Message:
         return " ".join((self.name, *words))
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Code:
     """What a parameter's code says: the C codec's type and the numbers it takes.
 

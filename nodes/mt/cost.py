@@ -1,12 +1,12 @@
 """What a transmission of MT costs, and how long it takes at least: what measured times are told against."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from nodes.mt.mt import CLOSING, LIT
 from nodes.support._can_bits import lib
 from nodes.support.can_protocol import MT_CAN_ID
-from nodes.support.records import record
 
 AROUND: Final = 10
 """Words of a transmission that are neither values nor LIT: what begins and ends it."""
@@ -26,7 +26,7 @@ def frame_bits(frames: Sequence[bytes], can_id: int = MT_CAN_ID) -> list[int]:
     return [int(lib.can_frame_bits(can_id, len(frame), frame)) for frame in frames]
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class RegisterCost:
     """By a polled register: one word every DELAY_S, and no faster, since the drive would miss one."""
 
@@ -53,7 +53,7 @@ class RegisterCost:
         )
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class SerialCost:
     """As bytes of a serial line, 10 bits each."""
 
@@ -70,7 +70,7 @@ class SerialCost:
         return f"{self.size} bytes at {self.baud} baud: {self.bound_s:.3f} s"
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class CanCost:
     """One broadcast on a bus of BITRATE, of which the sender takes SHARE and others took LOAD just before."""
 

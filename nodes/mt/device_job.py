@@ -1,12 +1,12 @@
 """What is to be sent to drives without a coordinator, as the command line tells the tool that does it."""
 
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
 from nodes.mt.mt import AXLES, Pair
 from nodes.support.can_protocol import MT_CAN_ID
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 BAUD: Final = 250_000
 
@@ -18,7 +18,7 @@ class DeviceKind(StrEnum):
     SERIAL = "serial"
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Load:
     """One transmission: PAIRS (none: remove the table) for AXLES."""
 
@@ -26,7 +26,7 @@ class Load:
     pairs: tuple[Pair, ...]
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceJob:
     """LOADS for what is at DEVICE; without any, the nodes are only asked what AXLES keep."""
 

@@ -7,6 +7,7 @@ frames, so how many nodes a broadcast reached decides whether there is another.
 
 import asyncio
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 from nodes.mt.cost import CanCost, frame_bits
@@ -16,7 +17,6 @@ from nodes.mt.table import AxleTable, TableNode, TableState
 from nodes.node.request_reply import QueryTimeout
 from nodes.support.can_protocol import MT_CAN_ID
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 BROADCASTS_MAX: Final = 6
 LINK_TRIES: Final = 2
@@ -52,7 +52,7 @@ class Bus(Protocol):
     def send_frame(self, can_id: int, data: bytes, /) -> None: ...  # noqa: D102
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Place:
     """Where a table goes: TABLE on NODE, which is on BUS; None: on a serial line."""
 
@@ -61,7 +61,7 @@ class Place:
     bus: Bus | None
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Outcome:
     """What became of it at one place."""
 
@@ -82,7 +82,7 @@ class Outcome:
         return 0 if self.state is None else self.state.generation
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Cast:
     """The broadcasts on one bus."""
 
@@ -102,7 +102,7 @@ class Cast:
         )
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Report:
     """What a download did and cost."""
 

@@ -1,12 +1,12 @@
 """A table on a node that MT brings (firmware/objects/table.h): its configuration, and what the node has."""
 
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, Protocol
 
 from nodes.mt.mt import AXLES, MtStatus, Pair, checksum, digest
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.errors import NodeError
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,7 +46,7 @@ class TableNode(Protocol):
     ) -> "Message": ...
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class TableState:
     """What a node says of the table it keeps."""
 
@@ -80,7 +80,7 @@ class Activation(IntEnum):
     """Another table had been kept by then."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class ActiveTable:
     """Which of the tables kept is in use."""
 

@@ -8,16 +8,16 @@ The text's format and what each part does: docs/plant.md.
 import dataclasses
 import math
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 NAME_MAX: Final = 63
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Stepper:
     """A motor with its driver, on pins of the plant's own node."""
 
@@ -33,7 +33,7 @@ class Stepper:
     both_edges: bool = False
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Term:
     """What the stepper of that name on NODE adds to an axis with each step."""
 
@@ -42,7 +42,7 @@ class Term:
     mm_per_step: float
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Axis:
     """A place along a line that steppers of any nodes move: ORIGIN with all counts at 0.
 
@@ -56,7 +56,7 @@ class Axis:
     max: float = math.inf
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Switch:
     """An endstop: pressed while its axis is at AT or beyond, in DIRECTION (1 or -1).
 
@@ -74,7 +74,7 @@ class Switch:
     """Pressed is a low level."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Tmc:
     """The driver of a stepper of the same node, CHIP (tmc2208, tmc2209), on a UART.
 
@@ -92,7 +92,7 @@ class Tmc:
     """SG_RESULT while nothing holds the motor."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Diag:
     """A pin that DIAG of a driver of any node is wired to."""
 
@@ -101,7 +101,7 @@ class Diag:
     tmc: str
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Body:
     """Something that gets warm."""
 
@@ -113,7 +113,7 @@ class Body:
     """None: as warm as the surroundings."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Couple:
     """Two bodies that heat flows between."""
 
@@ -122,7 +122,7 @@ class Couple:
     conductance: float
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Heater:
     """Full power while its pin is on; with hardware PWM in proportion."""
 
@@ -133,7 +133,7 @@ class Heater:
     inverted: bool = False
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Fan:
     """A fan, at full duty with RPM turns per minute, which it follows with a lag; perhaps a tachometer."""
 
@@ -147,7 +147,7 @@ class Fan:
     """Per turn."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Cooling:
     """A fan (on any node) that blows at a body: loss at full duty, beside the body's own."""
 
@@ -157,7 +157,7 @@ class Cooling:
     conductance: float
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Beta:
     """A thermistor by its resistance at one temperature and its Beta, below a pull-up resistor."""
 
@@ -167,7 +167,7 @@ class Beta:
     pullup: float = 4700.0
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Steinhart:
     """A thermistor by the coefficients of Steinhart and Hart, below a pull-up resistor."""
 
@@ -177,7 +177,7 @@ class Steinhart:
     pullup: float = 4700.0
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rtd:
     """A resistor r0·(1 + a·T + b·T²) below a pull-up resistor; by default a PT1000."""
 
@@ -187,7 +187,7 @@ class Rtd:
     pullup: float = 4700.0
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Linear:
     """An amplifier: ZERO + SLOPE·T as a share of the converter's full scale."""
 
@@ -195,14 +195,14 @@ class Linear:
     slope: float
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
     """At most 64 points of °C (rising) and share of the converter's full scale; straight between them."""
 
     points: tuple[tuple[float, float], ...]
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sensor:
     """A sensor in a body of any node; it follows with a lag, and has noise in steps of the converter."""
 
@@ -229,7 +229,7 @@ _FIELD_NAMES: Final = {
 """Where a field is named otherwise in the text."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NodePlant:
     """All that stands around one node; the text and its file are made from it."""
 

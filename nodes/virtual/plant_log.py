@@ -6,13 +6,13 @@ whenever a heater's changes), ``fan`` (duty), ``switch`` (1: pressed), ``lost`` 
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class PlantEvent:
     """One line."""
 

@@ -5,6 +5,7 @@ The layout is that of firmware/boards/virtual/plant_page.h.
 
 import mmap
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final, Self
@@ -12,7 +13,6 @@ from typing import Any, Final, Self
 import numpy as np
 
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 _MAGIC: Final = 0x31544E4C50444E43
 _NAME: Final = 64
@@ -85,7 +85,7 @@ _FAULTS: Final[Mapping[Kind, tuple[Fault, ...]]] = {
 }
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Motor:
     """Where a stepper truly is."""
 
@@ -96,7 +96,7 @@ class Motor:
     """Steps that moved nothing: the driver was off, or the axis stood against its stop."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Item:
     """A part of the plant as it was last worked out."""
 

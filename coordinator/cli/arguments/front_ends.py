@@ -4,6 +4,7 @@ import argparse
 import importlib
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -11,13 +12,12 @@ from coordinator.cli.arguments.table import declare_table
 from coordinator.support.command_options import Report
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file, number, whole
-from nodes.support.records import record
 from nodes.support.secret_file import read_secret
 
 SHELLS: Final = ("bash", "zsh", "fish")
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Target:
     """Which machine, and who asks."""
 

@@ -1,6 +1,7 @@
 """What ``canductor config`` does."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from coordinator.assembly import reference as tables
@@ -10,10 +11,9 @@ from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import NotYetActing
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class CheckReport:
     """What is wrong with a configuration."""
 
@@ -78,7 +78,7 @@ def check(path: str) -> CheckReport:
     return CheckReport(path, problems, described.notes, described.not_yet_acting)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Reference:
     """Tables of sections and their options."""
 

@@ -3,6 +3,7 @@
 import argparse
 import importlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, cast
 
@@ -11,7 +12,6 @@ from coordinator.dnc.options import BLOCK_MAX, TRANSMISSIONS_MAX, DncOptions, re
 from coordinator.support.command_options import Report
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file, number, whole
-from nodes.support.records import record
 
 CONTROL: Final = "control"
 PERIPHERAL: Final = "peripheral"
@@ -19,7 +19,7 @@ HERE: Final = Target(address=None, token=None, certificate=None, timeout_s=5.0)
 """The only machine of this user that runs here."""
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DncJob:
     """What one of the commands is to do."""
 
@@ -268,7 +268,7 @@ def _drip(given: argparse.Namespace) -> Callable[[], Report]:
     return DncCommand("drip", job)
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class DncCommand:
     """What the words ask for: the function NAME of ``coordinator.dnc.commands`` with JOB."""
 

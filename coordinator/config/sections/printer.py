@@ -1,11 +1,11 @@
 """The section [printer], and how it and [extruder] limit every move."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.file import RawSection
 from coordinator.config.options import ChoiceOption, FloatOption, SectionReader, SectionSpec, one_of
-from nodes.support.records import record
 
 # Far above any machine, low enough that squares and sums stay exact and a slipped digit group is seen.
 MAX_SPEED = 100_000.0
@@ -96,7 +96,7 @@ PRINTER = SectionSpec(
 )
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class PrinterSection:
     """[printer] as read; units as in MotionLimits."""
 

@@ -1,5 +1,7 @@
 """Rails along an axis: the range, the endstop, and all steppers that move it."""
 
+from dataclasses import dataclass
+
 from coordinator.config.model import RailDescription, StepperDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
 from coordinator.config.sections.homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
@@ -14,10 +16,9 @@ from coordinator.config.sections.steppers import (
 )
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
 from coordinator.kinematics.base import StepFunction
-from nodes.support.records import record
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _UpperEnd(FloatOption):
     """The end of a range."""
 

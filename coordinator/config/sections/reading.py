@@ -1,16 +1,15 @@
 """What every reader of a machine's sections shares: the file, the pins, and what was read so far."""
 
-from dataclasses import field
+from dataclasses import dataclass, field
 
 from coordinator.config.errors import MissingSection, Place
 from coordinator.config.file import ConfigFile, RawSection
 from coordinator.config.model import NotYetActing
 from coordinator.config.options import SectionReader
 from coordinator.config.pins import PinDescription, PinRegistry
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class SecondEndstop:
     """The endstop of a further stepper of a rail."""
 
@@ -21,7 +20,7 @@ class SecondEndstop:
     """The virtual endstop that it is of; empty: it is a switch."""
 
 
-@record(frozen=False)
+@dataclass(slots=True)
 class Reading:
     """One reading of a configuration."""
 

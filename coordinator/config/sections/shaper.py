@@ -1,16 +1,17 @@
 """[input_shaper]: which resonance each axis is shaped against."""
 
+from dataclasses import dataclass
+
 from coordinator.config.model import ShaperDescription
 from coordinator.config.options import BadValue, FloatOption, Option, SectionReader, SectionSpec, one_of
 from coordinator.config.sections.reading import Reading
 from coordinator.motion.steps.shapers import SHAPER_KINDS, split_kind
-from nodes.support.records import record
 
 MAX_FREQUENCY_HZ = 1000.0
 AXES = "xyz"
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ShaperOption(Option[str]):
     """A kind of shaper, those with ei perhaps with their tolerance."""
 

@@ -6,11 +6,11 @@ need none, and it takes longer to load than they take to begin.
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     import jinja2
@@ -40,7 +40,7 @@ class Asked(Exception):  # noqa: N818 (an end that a template asks for)
         self.emergency = emergency
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Rendered:
     """What a template made."""
 

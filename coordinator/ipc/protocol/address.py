@@ -1,15 +1,15 @@
 """Where a machine is found: its address in words."""
 
 import socket
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import host_sockets, socket_folder
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Address:
     """A Unix socket (PATH) or a TCP port (HOST, PORT), with or without TLS."""
 

@@ -11,11 +11,10 @@ second carriage     alone, behind the first one
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from coordinator.kinematics.base import Point
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.config.model import MachineDescription, RailDescription
@@ -30,7 +29,7 @@ _TOWERS: Final = ("delta", "deltesian", "rotary_delta")
 _ARM: Final = "arm"
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Approach:
     """What one move brings home."""
 

@@ -1,6 +1,6 @@
 """[safe_z_home]: Z is homed at a place of its own, with the head lifted before anything moves sideways."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from coordinator.config.errors import ConfigError
@@ -11,7 +11,6 @@ from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import STRAIGHT, Homing
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.runtime.module_context import Live
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 HOP_MAX_MM: Final = 1000.0
 
 
-@record(kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceOption(Option[tuple[float, float]]):
     """X and Y."""
 

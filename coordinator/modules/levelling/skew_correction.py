@@ -6,7 +6,7 @@ believe to be at x, y, z. So steppers follow the other way round: it is a change
 
 import math
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from coordinator.config.errors import ConfigError
@@ -20,7 +20,6 @@ from coordinator.modules.homing.homing import Homing
 from coordinator.modules.words import flag, one, parameters, value
 from coordinator.motion.specs import StepKinematics
 from coordinator.support.values import Value
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job
@@ -46,7 +45,7 @@ def _option(plane: str) -> FloatOption:
 OPTIONS: Final = {plane: _option(plane) for plane in _PLANES}
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Skew:
     """How axes lean: mm of the first axis of a plane with each mm of the second."""
 

@@ -1,6 +1,7 @@
 """[thermistor NAME] and [adc_temperature NAME]: sensors of the user's own."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from coordinator.config.errors import ConfigError
@@ -8,12 +9,11 @@ from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.heat.resistors import ResistanceTable, Resistor, SensorError, SteinhartHart
 from coordinator.heat.sensors import PullUp, Sensor, Voltage
 from coordinator.modules.base import Build, Module
-from nodes.support.records import record
 
 MAX_POINTS: Final = 40
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Circuit:
     """What a sensor is connected with, as the section that uses it says."""
 

@@ -1,12 +1,12 @@
 """What the planner keeps of the G-code language beside positions: offsets, arcs, what is left out."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final
 
 from coordinator.motion.planner._planner import ffi, lib
 from coordinator.motion.planner.values import FeedStatus, Position, check_number
-from nodes.support.records import record
 
 AXES: Final = "XYZE"
 ARC_LETTERS: Final = "XYZEFIJKR"
@@ -56,7 +56,7 @@ _ARC_FAULTS: Final[Mapping[ArcFault, str]] = {
 }
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Aside:
     """How far the line at hand was, while other lines come between."""
 

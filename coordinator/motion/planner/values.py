@@ -2,13 +2,12 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coordinator.motion.planner._planner import lib
 from coordinator.motion.specs import MotionLimits
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,7 +53,7 @@ class FaultKind(IntEnum):
     COLD = lib.PLANNER_COLD
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Fault:
     """A move the machine must not make."""
 
@@ -115,7 +114,7 @@ SPEED_LIMITS = (
 """By PLANNER_LIMIT_...: options of the configuration."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Slowed:
     """Moves that ask for a higher speed than a limit allows; they are made at that limit."""
 
@@ -130,7 +129,7 @@ class Slowed:
     allowed_mm_s: float
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Trapezoids:
     """Consecutive trapezoids in the planner's memory: valid until they are released."""
 

@@ -2,13 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps._steps import ffi, lib
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 MAX_ERROR_S = 12.5e-6
 """How far a step may be from its true time by default."""
@@ -24,7 +23,7 @@ class StepError(CanductorError):
     """Of the step or move that cannot be; None: it is no matter of time."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class StepperStats:
     """What one stepper's stream amounts to so far."""
 
@@ -48,7 +47,7 @@ class StepperStats:
     """Steps/s."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class AxisCorrection:
     """What is added to an axis's planned position, at the end of the last move that was appended."""
 
@@ -62,7 +61,7 @@ class AxisCorrection:
     """The part of it that the table does not want: it fades along the moves that follow."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class NodeStats:
     """What one node's stream amounts to so far."""
 
@@ -79,7 +78,7 @@ class NodeStats:
     """Bytes of the batch not yet taken."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class StepStats:
     """Totals since construction."""
 

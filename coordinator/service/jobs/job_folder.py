@@ -4,13 +4,13 @@ import contextlib
 import os
 import stat
 from collections.abc import Iterator
+from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path, PurePosixPath
 from typing import Final
 
 from coordinator.gcode.program import Program
 from nodes.support.errors import CanductorError
-from nodes.support.records import record
 
 DEPTH_MAX: Final = 8
 FILES_MAX: Final = 10_000
@@ -24,7 +24,7 @@ class NoSuchJob(CanductorError):  # noqa: N818
     """There is no such file for a job."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class JobFile:
     """A file that can be printed."""
 

@@ -14,7 +14,6 @@ from coordinator.gcode.events import Event, Full
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.homing.homing import Homing
 from coordinator.service.core.work import LinesWork, Setting
-from nodes.support.records import record
 
 if TYPE_CHECKING:
     from coordinator.config.model import MachineDescription
@@ -33,7 +32,7 @@ _STRAIGHT: Final = frozenset(
 """Kinematics that home X and Y without moving the head in Z."""
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class WayHome:
     """What is done."""
 

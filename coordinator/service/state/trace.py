@@ -5,6 +5,7 @@ The motion worker adds moves, the control loop reads; both see one immutable tup
 
 import contextlib
 from collections import deque
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 
 from coordinator.motion.planner.planner import ffi_memory
 from coordinator.motion.trapezoid_array import TRAPEZOID
-from nodes.support.records import record
 
 KEEP_S: Final = 10.0
 MOVES_MAX: Final = 20_000
@@ -25,7 +25,7 @@ BATCH_BYTES_MAX: Final = 1 << 20
 Moves = NDArray[np.void]
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Moment:
     """The machine at a print time."""
 

@@ -1,12 +1,13 @@
 """What the reader of a kinematics gives."""
 
+from dataclasses import dataclass
+
 from coordinator.config.model import DualCarriageDescription, RailDescription, StepperDescription
 from coordinator.kinematics.base import Kinematics, Point, WorkSpace
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
-from nodes.support.records import record
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class Frame:
     """All that moves the head."""
 

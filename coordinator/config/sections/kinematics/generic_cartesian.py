@@ -19,7 +19,6 @@ from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
 from coordinator.kinematics.base import StepFunction
 from coordinator.kinematics.generic_cartesian import GenericCartesian
 from coordinator.support.quoting import nearest, shown
-from nodes.support.records import record
 
 AXIS = ChoiceOption(
     name="axis", help="the axis of the carriage; by default its name, if that is one", choices=("x", "y", "z")
@@ -83,7 +82,7 @@ CARRIAGES = SumOption(name="carriages", help="what the stepper's way is, per way
 STEPPER = SectionSpec(help="A motor of a generic_cartesian machine", options=(*MOTOR, CARRIAGES))
 
 
-@record
+@dataclass(frozen=True, slots=True)
 class _Motor:
     """A stepper with its way per mm of each axis, and the axis' second carriage if it moves that."""
 
