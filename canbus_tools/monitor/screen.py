@@ -4,7 +4,7 @@ import asyncio
 import signal
 from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 from rich.text import Text
 from textual import events, on
@@ -15,14 +15,12 @@ from textual.widgets import DataTable, Footer, Input, RichLog, Static
 
 from canbus_tools.bus.computer import Computer, Listener, now_s
 from canbus_tools.monitor.bus_watch import BusRates, BusWatch
+from canbus_tools.monitor.options import MonitorOptions
 from canbus_tools.monitor.text import COLUMNS, bar_line, cells, log_line, read_filter
 from canbus_tools.protocol.decoded import Decoded, Kind
 from canbus_tools.protocol.filters import Filter
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError
-
-if TYPE_CHECKING:
-    from canbus_tools.monitor.options import MonitorOptions
 
 REFRESH_S: Final = 0.25
 KEPT: Final = 20_000

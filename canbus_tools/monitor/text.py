@@ -5,19 +5,17 @@ import textwrap
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 from rich.text import Text
 
 from canbus_tools.monitor.bus_watch import BusRates, BusWatch, NodeRates
+from canbus_tools.monitor.options import MonitorOptions
 from canbus_tools.protocol.decoded import Decoded, Kind
 from canbus_tools.protocol.filters import ALL, Filter
 from canbus_tools.protocol.protocol import Direction
 from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.option_values import UsageError, whole
-
-if TYPE_CHECKING:
-    from canbus_tools.monitor.options import MonitorOptions
 
 BUSY, FULL = 0.5, 0.8
 """Loads from which the bar is yellow, and red."""

@@ -13,6 +13,7 @@ from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import BusTalk, NodeTalk, TalkError, refuse_if_in_use
 from canbus_tools.bus.uart_talk import open_uart_talk
+from canbus_tools.console.prompt import prompt
 from canbus_tools.console.session import Quit, Session
 from canbus_tools.discovery.inventory import survey
 from nodes.bus.assign import Uuid
@@ -117,8 +118,6 @@ async def _run(computer: Computer, options: ConsoleOptions) -> ConsoleReport:
             if options.commands or options.script or not sys.stdin.isatty():
                 await _run_lines(session, options)
             else:
-                from canbus_tools.console.prompt import prompt  # noqa: PLC0415 (only where there is a prompt)
-
                 await prompt(session, _history_file())
         finally:
             session.close()

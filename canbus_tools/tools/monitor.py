@@ -16,6 +16,7 @@ from canbus_tools.bus.until_stopped import StopFlag, stop_flag
 from canbus_tools.discovery.inventory import survey
 from canbus_tools.monitor.bus_watch import BusWatch
 from canbus_tools.monitor.options import MonitorOptions
+from canbus_tools.monitor.screen import MonitorScreen
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
@@ -93,8 +94,6 @@ def _run_lines(computer: Computer, options: MonitorOptions, watch: BusWatch, que
 
 
 def _run_screen(computer: Computer, options: MonitorOptions, watch: BusWatch, queue: Listener) -> int:
-    from canbus_tools.monitor.screen import MonitorScreen  # noqa: PLC0415 (only where there is one)
-
     before = signal.getsignal(signal.SIGTERM)
     screen = MonitorScreen(computer, options, watch, queue)
     screen.run()

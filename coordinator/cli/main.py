@@ -4,10 +4,13 @@
 one sentence on stderr, with --json also one object on stdout.
 """
 
+import json
 import os
 import select
 import signal
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 
 from coordinator.cli.parser import Answered, Job, help_of, print_help, read_words, version
@@ -92,8 +95,6 @@ def _fail(sentence: str, status: int, as_json: bool) -> int:
 
 
 def _say_json(values: Mapping[str, object]) -> None:
-    import json  # noqa: PLC0415 (start-up time)
-
     _say(json.dumps(values, allow_nan=False))
 
 
@@ -103,9 +104,6 @@ def _say(line: str) -> None:
 
 def _report_bug(as_json: bool) -> int:
     """Keep the traceback in a file: on the terminal it helps nobody."""
-    import tempfile  # noqa: PLC0415 (start-up time)
-    import traceback  # noqa: PLC0415 (start-up time)
-
     error = sys.exception() if sys.version_info >= (3, 12) else sys.exc_info()[1]
     with tempfile.NamedTemporaryFile(
         "w", prefix="canductor-", suffix=".log", delete=False, encoding="utf-8"

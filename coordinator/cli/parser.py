@@ -11,8 +11,9 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, cast
+from typing import Any, NoReturn, cast
 
+from canbus_tools.bus.computer import Computer
 from coordinator.cli.arguments.serving import declare_serving, is_asked_to_serve, read_serving
 from coordinator.support.command_options import (
     DemoOptions,
@@ -23,9 +24,6 @@ from coordinator.support.command_options import (
     find_machine,
 )
 from nodes.support.option_values import UsageError, assignments, existing_file, share, whole
-
-if TYPE_CHECKING:
-    from canbus_tools.bus.computer import Computer
 
 Job = Callable[[], Report]
 
@@ -152,7 +150,7 @@ def whole_parser() -> argparse.ArgumentParser:
     for name in OTHER_COMMANDS:
         _declare_other(commands, name)
     can = commands.add_parser("can", allow_abbrev=False, help=_in_list(TOOL_COMMANDS["can"]))
-    add_tools(can, all_tools=True)
+    add_tools(can)
     declare_tool(commands, "console")
     return parser
 
@@ -247,7 +245,7 @@ def _tool(words: Sequence[str], computer: "Computer | None") -> Job:
         declare_tool(commands, "console", computer)
     else:
         can = commands.add_parser("can", allow_abbrev=False, description=TOOL_COMMANDS["can"])
-        add_tools(can, words, computer=computer)
+        add_tools(can, computer)
     arguments = parser.parse_args(list(words))
     if "make_job" not in arguments:
         raise UsageError("the CAN tool is missing")

@@ -3,18 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import TYPE_CHECKING
 
 from coordinator.config.errors import Place
 from coordinator.config.file import RawSection
 from coordinator.config.pins import PinDescription, PinRegistry
 from coordinator.config.saved import ConfigSource
 from coordinator.kinematics.base import Kinematics, Point, StepFunction, Weights
+from coordinator.kinematics.dual_carriage import DualCarriage
+from coordinator.kinematics.extruder import ExtruderMotion
 from coordinator.motion.specs import MotionLimits
-
-if TYPE_CHECKING:
-    from coordinator.kinematics.dual_carriage import DualCarriage
-    from coordinator.kinematics.extruder import ExtruderMotion
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,8 +336,6 @@ class MachineDescription:
     @property
     def extruder_motion(self) -> "ExtruderMotion":
         """Which filament steppers follow which extruder at start."""
-        from coordinator.kinematics.extruder import ExtruderMotion  # noqa: PLC0415 (start-up time)
-
         followed = {extruder.stepper.name: extruder.name for extruder in self.extruders}
         followed |= {follower.stepper.name: follower.extruder for follower in self.extruder_steppers}
         names = tuple(extruder.name for extruder in self.extruders)

@@ -9,17 +9,21 @@ from pathlib import Path
 from typing import IO, Final, Protocol
 
 from coordinator.cli.commands.dnc import DncJob
+from coordinator.cli.commands.front_ends import send as send_to_machine
+from coordinator.cli.commands.front_ends import tls_of
 from coordinator.dnc.blocks import INPUT, OUTPUT, Header
 from coordinator.dnc.driver import Driver, Line
 from coordinator.dnc.endpoint import Desk, FileSource, Library, Outcome, Sink, Source, Take
 from coordinator.dnc.engine import Engine
 from coordinator.dnc.feeds import SlowSource
 from coordinator.dnc.files import Check, Entry, Folder, check_lines, check_name
+from coordinator.dnc.machine import MachineSink
 from coordinator.dnc.numbers import numbered
 from coordinator.dnc.options import DncOptions
 from coordinator.dnc.port import Port
 from coordinator.dnc.tables import check_table
 from coordinator.dnc.verify import Compare, Twice
+from coordinator.ipc.client.blocking import BlockingClient
 from nodes.support.errors import CanductorError
 
 NOT_YET_S: Final = 0.02
@@ -285,10 +289,6 @@ def _open_stream(file: Path, stack: contextlib.ExitStack, around: Surroundings) 
 
 
 def _drip_to_machine(job: DncJob, around: Surroundings) -> DncReport:
-    from coordinator.cli.commands.front_ends import tls_of  # noqa: PLC0415 (likewise)
-    from coordinator.dnc.machine import MachineSink  # noqa: PLC0415 (others do without)
-    from coordinator.ipc.client.blocking import BlockingClient  # noqa: PLC0415 (likewise)
-
     at = job.machine
     options = {"token": at.token, "tls": tls_of(at), "timeout_s": at.timeout_s, "name": "canductor dnc"}
     sinks: list[MachineSink] = []
@@ -313,8 +313,6 @@ def _drip_to_machine(job: DncJob, around: Surroundings) -> DncReport:
 
 
 def _print(job: DncJob, file: Path) -> None:
-    from coordinator.cli.commands.front_ends import send as send_to_machine  # noqa: PLC0415 (others do without)
-
     send_to_machine(job.machine, file, file.name, replace=job.overwrite, start=True, quiet=job.json)
 
 

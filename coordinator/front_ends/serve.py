@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from ipaddress import ip_address
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from coordinator.assembly.load import load_machine
 from coordinator.cli.parser import version
@@ -20,6 +19,8 @@ from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.tcp_listener import raise_files_limit
 from coordinator.ipc.server.uploads import upload_method
+from coordinator.klippy_api.gateway import Gateway
+from coordinator.metrics.server import MetricsServer, MetricsSettings
 from coordinator.runtime.host import LinuxHost
 from coordinator.service.api.methods import add_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
@@ -31,16 +32,12 @@ from coordinator.support.values import Value
 from coordinator.tables.store import table_folder
 from coordinator.web.access import LINK_S
 from coordinator.web.methods import add_page_methods
+from coordinator.web.server import WebServer
 from coordinator.web.settings import WebSettings
 from nodes.dictionary.cache import DictionaryCache
 from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import socket_folder
 from nodes.support.state_folder import state_folder
-
-if TYPE_CHECKING:
-    from coordinator.klippy_api.gateway import Gateway
-    from coordinator.metrics.server import MetricsServer
-    from coordinator.web.server import WebServer
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,8 +165,6 @@ class _Hall:
         path = self._options.klippy_api
         if path is None:
             return
-        from coordinator.klippy_api.gateway import Gateway  # noqa: PLC0415 (if needed)
-
         self._gateway = Gateway(
             service, self._options.config, on_notice=lambda text: service.log.add("notice", text)
         )
@@ -213,7 +208,6 @@ class _Hall:
         """Open the endpoint for Prometheus if asked for; raises CanductorError with the server closed."""
         if self._options.metrics is None:
             return None
-        from coordinator.metrics.server import MetricsServer, MetricsSettings  # noqa: PLC0415 (if needed)
 
         def fields() -> dict[str, Value]:
             figures = {f"api.{name}": value for name, value in self._server.figures().items()}

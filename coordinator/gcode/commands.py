@@ -19,11 +19,10 @@ from typing import TYPE_CHECKING
 
 from coordinator.gcode.parser import Command
 from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.motion.planner.planner import Planner
 
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job
-    from coordinator.motion.planner.planner import Planner
-
 Position = tuple[float, float, float, float]
 
 

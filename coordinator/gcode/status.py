@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple, cast
 
+from coordinator.gcode.machine_state import MachineState
+from coordinator.motion.planner.planner import Planner
+
 if TYPE_CHECKING:
     from coordinator.gcode.interpreter import Job
-    from coordinator.gcode.machine_state import MachineState
-    from coordinator.motion.planner.planner import Planner
 
 
 class Place(NamedTuple):

@@ -2,12 +2,10 @@
 
 from collections import deque
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from coordinator.klippy_api.subscription import Subscription
 from coordinator.klippy_api.wire import Framer, Request, TooLong, Unreadable, is_urgent, read_request
-
-if TYPE_CHECKING:
-    from coordinator.klippy_api.subscription import Subscription
 
 RUNNING_MAX: Final = 64
 """Calls of one client that run; more are answered with an error."""

@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from coordinator.cli.parser import version
 from coordinator.gcode.commands import AtOnce, Call
@@ -20,12 +20,10 @@ from coordinator.klippy_api.wire import Request
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.service.api.motion import RESTARTS, run_script
+from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.work import LINES_MAX
 from coordinator.streaming.move_source import Told
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.service.core.machine_service import MachineService
 
 Result = Mapping[str, Any]
 Endpoint = Callable[[Client, Request], Result | Awaitable[Result]]

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.ipc.server.fair_scheduler import Turns
@@ -12,12 +12,9 @@ from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer
 from coordinator.klippy_api.client import RUNNING_MAX, Client
 from coordinator.klippy_api.endpoints import Endpoints, Result
 from coordinator.klippy_api.wire import Request, Unreadable, error_message, event_message, result_message
-from coordinator.service.core.machine_service import ServiceState
+from coordinator.service.core.machine_service import MachineService, ServiceState
+from coordinator.service.state.log_ring import Entry
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.service.core.machine_service import MachineService
-    from coordinator.service.state.log_ring import Entry
 
 UPDATE_S: Final = 0.25
 """Between two updates of what clients watch."""

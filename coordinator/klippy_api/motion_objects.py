@@ -1,10 +1,9 @@
 """``toolhead``, ``gcode_move``, ``motion_report``: where the head is and what holds for the lines to come."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from coordinator.config.model import MachineDescription
-    from coordinator.service.core.motion import Motion
+from coordinator.config.model import MachineDescription
+from coordinator.service.core.motion import Motion
 
 Objects = dict[str, dict[str, Any]]
 

@@ -1,15 +1,12 @@
 """``mcu`` and ``mcu NAME``: firmware, load and traffic of each node, with the peer's names and units."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from coordinator.runtime.machine import link_of
+from coordinator.runtime.machine import Machine, link_of
 from nodes.node.load import STATS_INTERVAL_S
+from nodes.node.node import Node
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.runtime.machine import Machine
-    from nodes.node.node import Node
 
 
 def object_name(node: str) -> str:

@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from coordinator.klippy_api.motion_objects import motion_objects, resting_objects
 from coordinator.klippy_api.node_objects import firmware_of, node_objects
@@ -14,11 +14,8 @@ from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.modules.status.config_view import ConfigView
 from coordinator.modules.status.machine_view import available_kb
 from coordinator.modules.status.print_stats import NOTHING
-from coordinator.service.core.machine_service import ServiceState
-
-if TYPE_CHECKING:
-    from coordinator.runtime.machine import Machine
-    from coordinator.service.core.machine_service import MachineService
+from coordinator.runtime.machine import Machine
+from coordinator.service.core.machine_service import MachineService, ServiceState
 
 STATS_S: Final = 1.0
 """Load and traffic of nodes and computer are looked at again after so long."""

@@ -15,23 +15,20 @@ A restart makes new modules: all state is in the object. Everything happens on t
 """
 
 from collections.abc import Callable, Collection, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from coordinator.config.errors import ConfigError, NotActing, Place
 from coordinator.config.file import RawSection
+from coordinator.config.model import MachineDescription
 from coordinator.config.options import BadValue, ListOption, Option, SectionReader, SectionSpec
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
 from coordinator.gcode.commands import GCodeCommand
+from coordinator.motion.planner.planner import Planner
+from coordinator.runtime.module_context import Live
 from coordinator.support.quoting import nearest, shown
-from nodes.node.config import NodeConfig
-
-if TYPE_CHECKING:  # planning needs neither, and they draw in asyncio
-    from coordinator.config.model import MachineDescription
-    from coordinator.motion.planner.planner import Planner
-    from coordinator.runtime.module_context import Live
-    from nodes.node.node import Node
-
 from coordinator.support.values import Value
+from nodes.node.config import NodeConfig
+from nodes.node.node import Node
 
 
 class Device(Protocol):

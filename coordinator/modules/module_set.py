@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 from coordinator.config.errors import ConfigError, NotActing, Place
 from coordinator.config.file import RawSection
@@ -18,6 +18,7 @@ from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
 from coordinator.modules.base import Build, Device, Module
 from coordinator.modules.drivers.motor_power import MotorPower
 from coordinator.modules.drivers.stepper_buzz import StepperBuzz
+from coordinator.modules.heaters.sections import ExtruderHeater
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.programs.idle_timeout import IdleTimeout
@@ -25,14 +26,12 @@ from coordinator.modules.programs.save_config import SaveConfig
 from coordinator.modules.registry import module_for, modules_beside
 from coordinator.modules.status.console import Console
 from coordinator.modules.status.positions import Positions
+from coordinator.motion.planner.planner import Planner
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
+from nodes.node.node import Node
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.motion.planner.planner import Planner
-    from coordinator.runtime.module_context import Live
-    from nodes.node.node import Node
 
 M = TypeVar("M", bound=Module)
 K = TypeVar("K")
@@ -344,8 +343,6 @@ class ModuleSet:
         return frozenset(found)
 
     def _too_cold(self, extruder: str) -> bool:
-        from coordinator.modules.heaters.sections import ExtruderHeater  # noqa: PLC0415 (start-up time)
-
         if extruder in self.left_out:
             return self._live is not None  # nobody knows how hot it is; a plan takes it for granted
         found = self.find(extruder, ExtruderHeater)

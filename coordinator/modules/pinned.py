@@ -1,18 +1,14 @@
 """A device whose pins are known by file and line: what is wrong with them is told there."""
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Mapping
+from typing import Final
 
 from coordinator.config.options import FloatOption
 from coordinator.config.pins import PinDescription
 from coordinator.modules.base import Build, Device
 from nodes.devices.pwm_out import SOFTWARE_FASTEST_S
 from nodes.node.config import NodeConfig
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from nodes.node.node import Node
-
+from nodes.node.node import Node
 
 AHEAD_S: Final = 0.4
 """How far ahead values are sent: late ones would stop the node, and hosts are sometimes slow."""

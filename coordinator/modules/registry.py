@@ -1,17 +1,14 @@
 """Which module a section is for. Third parties add theirs by the entry point group ``canductor.modules``."""
 
 import re
+from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Final
+from importlib.metadata import EntryPoint, entry_points
+from typing import Final
 
 from coordinator.config.errors import ConfigError, Place
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from importlib.metadata import EntryPoint
-
-    from coordinator.modules.base import Module
+from coordinator.modules.base import Module
 
 ENTRY_POINTS: Final = "canductor.modules"
 """Name: the section's first word; value: ``package.module:Class``."""
@@ -88,8 +85,6 @@ def module_for(kind: str, place: Place) -> "type[Module] | None":
     other = _others().get(kind)
     if other is None:
         return None
-    from coordinator.modules.base import Module  # noqa: PLC0415 (start-up time)
-
     try:
         found = other.load()
     # Whatever code that is not ours raises, its user learns which package it was.
@@ -123,8 +118,6 @@ def _load(path: str) -> "type[Module]":
 
 @cache
 def _others() -> "dict[str, EntryPoint]":
-    from importlib.metadata import entry_points  # noqa: PLC0415 (start-up time: it draws in the mail parser)
-
     return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
 
 

@@ -3,7 +3,7 @@
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import BinaryIO
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
@@ -27,17 +27,17 @@ from coordinator.planning.figures import PlanFigures
 from coordinator.planning.report import PlanReport
 from coordinator.planning.summary import Made, watched_nodes, write_files
 from coordinator.runtime.devices import MachineDevices, stream_specs
+from coordinator.streaming.compensation import Compensation, why_not_corrected
 from coordinator.streaming.pipeline import Pipeline
 from coordinator.streaming.program_machine import machine_state
 from coordinator.support.command_options import PlanOptions
 from coordinator.support.progress import Progress as Shown
 from coordinator.support.progress import ProgressDisplay
+from coordinator.tables.axis_table import TableError
+from coordinator.tables.files import read_table
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
 from nodes.virtual.firmware import MAINBOARD, TOOLHEAD, firmware_dictionary
-
-if TYPE_CHECKING:
-    from coordinator.streaming.compensation import Compensation
 
 ASSUMED_MOVE_COUNT = 1024
 """Queue slots of a node that is not there to be asked."""
@@ -89,10 +89,6 @@ def plan_file(options: PlanOptions) -> PlanReport:
 
 def _compensation(description: MachineDescription, options: PlanOptions) -> "Compensation":
     """Return what corrects the axes by the tables of OPTIONS; raises TableError."""
-    from coordinator.streaming.compensation import Compensation, why_not_corrected  # noqa: PLC0415 (start-up time)
-    from coordinator.tables.axis_table import TableError  # noqa: PLC0415
-    from coordinator.tables.files import read_table  # noqa: PLC0415
-
     compensation = Compensation(description.limits)
     for axis, path in options.tables.items():
         table = read_table(path, axis=axis)

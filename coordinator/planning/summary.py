@@ -1,5 +1,6 @@
 """From a finished plan to its report, and to the files that keep it."""
 
+import json
 import math
 import resource
 from collections.abc import Mapping, Sequence
@@ -9,6 +10,7 @@ from pathlib import Path
 from coordinator.config.model import CanConnection, MachineDescription
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.planning.figures import Bus, Peak, PlanFigures, WatchedNode
+from coordinator.planning.plot import draw
 from coordinator.planning.report import AxisReport, BusReport, NodeReport, PlanReport, StepperReport, Timeline
 from coordinator.planning.warnings import (
     CEILING,
@@ -185,15 +187,11 @@ def write_files(options: PlanOptions, report: PlanReport) -> PlanReport:
         plots.append(options.output / "plan.svg")
     if not plots:
         return report
-    from coordinator.planning.plot import draw  # noqa: PLC0415 (start-up time: only who wants it)
-
     picture = draw(report.gcode, report.timeline)
     for path in plots:
         _write(path, picture)
     paths += plots
     if options.output:
-        import json  # noqa: PLC0415 (likewise)
-
         paths.append(options.output / "plan.json")
         _write(paths[-1], json.dumps({"ok": True, **report.to_json()}, indent=1, allow_nan=False) + "\n")
     return replace(report, written=tuple(map(str, paths)))

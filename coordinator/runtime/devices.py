@@ -1,7 +1,6 @@
 """The configured machine's devices: what each node is configured as, and what motion has to know of it."""
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
 
 from coordinator.config.model import (
     CanConnection,
@@ -12,15 +11,13 @@ from coordinator.config.model import (
 )
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.runtime.machine_modules import MachineModules
+from coordinator.tables.axle_map import StepperTables, stepper_tables
 from nodes.devices.endstop import Endstop
 from nodes.devices.stepper import Stepper
 from nodes.devices.trsync import Trsync
 from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
 from nodes.node.config import NodeConfig
-
-if TYPE_CHECKING:
-    from coordinator.tables.axle_map import StepperTables
 
 
 class MachineDevices:
@@ -45,8 +42,6 @@ class MachineDevices:
     def _tables(self) -> "list[StepperTables]":
         if self.description.axis_tables is None:
             return []
-        from coordinator.tables.axle_map import stepper_tables  # noqa: PLC0415 (start-up time)
-
         return stepper_tables(self.description, self.steppers)
 
     def build_config(self, node: str, dictionary: Dictionary) -> NodeConfig:

@@ -9,10 +9,13 @@ from collections.abc import Mapping
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Final
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import NDArray
 
+from coordinator.motion.planner._planner import ffi
+from coordinator.motion.trapezoid_array import TRAPEZOID
+
+if TYPE_CHECKING:
     Chunk = tuple[NDArray[np.float64], NDArray[np.float64]]
     """Print times, and how much new filament has passed by then, mm in all."""
 
@@ -59,11 +62,6 @@ class FilamentForecast:
         tracks = [self._tracks[name] for name in self._active if name in self._tracks]
         if not tracks or not count:
             return
-        import numpy as np  # noqa: PLC0415 (start-up time)
-
-        from coordinator.motion.planner._planner import ffi  # noqa: PLC0415
-        from coordinator.motion.trapezoid_array import TRAPEZOID  # noqa: PLC0415
-
         data: Any = ffi.buffer(trapezoids, count * TRAPEZOID.itemsize)
         moves = np.frombuffer(data, TRAPEZOID)
         up, cruise, down = moves["accel_s"], moves["cruise_s"], moves["decel_s"]
@@ -104,8 +102,6 @@ class FilamentForecast:
 
 def _passed(chunks: "list[Chunk]", at_s: float) -> float:
     """Return how much had passed at AT_S; nothing more behind the last move that is known."""
-    import numpy as np  # noqa: PLC0415
-
     for times, passed in reversed(chunks):
         if at_s >= times[0]:
             return float(np.interp(at_s, times, passed))

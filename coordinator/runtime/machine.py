@@ -5,7 +5,6 @@ import contextlib
 import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from coordinator.config.model import (
     CanConnection,
@@ -23,6 +22,7 @@ from coordinator.runtime.filament_forecast import FilamentForecast
 from coordinator.runtime.host import Host
 from coordinator.runtime.machine_modules import MachineModules
 from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_runner import Runner
 from coordinator.runtime.node_recovery import JobGate, NodeCare
 from coordinator.runtime.stepper_positions import RailPlaces
 from coordinator.runtime.timebase import ClockMap, TimeBase
@@ -37,9 +37,6 @@ from nodes.node.config import NodeConfig
 from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_runner import Runner
 
 
 class MachineStopped(CanductorError):  # noqa: N818

@@ -1,16 +1,14 @@
 """What the running machine needs of its modules; ``coordinator.modules`` provides it."""
 
 from collections.abc import Collection, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from coordinator.config.pins import PinRegistry
 from coordinator.gcode.commands import Vocabulary
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 M = TypeVar("M")
 

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.checker import Violation
+from coordinator.simulate.play import play
 from coordinator.simulate.result import Result, ScenarioList, SimulationReport
 from coordinator.simulate.scenario import Scenario
 from coordinator.support.command_options import Report, SimulateOptions
@@ -117,13 +118,10 @@ def run_all(tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
 
 def _begin_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command itself hears Ctrl-C and ends the pool
-    import coordinator.simulate.play  # noqa: F401, PLC0415 (import once, not in the first seed)
 
 
 def run_one(scenario: Scenario, seed: int, limit_s: float = SEED_LIMIT_S) -> Result:
     """Run one seed; a bug that shows as an exception is a violation like any other."""
-    from coordinator.simulate.play import play  # noqa: PLC0415 (--list needs no native code)
-
     began_s = time.process_time()
     try:
         with _limit(limit_s):

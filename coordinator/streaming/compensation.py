@@ -4,18 +4,16 @@ The control loop says which tables are wanted; the motion worker takes them up w
 taken up makes no step by itself: docs/tables.md tells how it comes into effect.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from pathlib import Path
+from typing import Final
 
 from coordinator.config.model import MachineDescription
 from coordinator.motion.specs import MotionLimits, StepKinematics
 from coordinator.motion.steps.steps import TABLE_POINTS_MAX, AxisCorrection, StepGenerator
 from coordinator.tables.axis_table import AxisTable, Unit
 from coordinator.tables.store import TableStore
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-    from pathlib import Path
 
 AXES: Final = "xyz"
 WHICH_AXES: Final = (

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from coordinator.config.model import MachineDescription
 from coordinator.gcode.errors import GCodeError
@@ -14,6 +13,7 @@ from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.host import Host, LinuxHost
 from coordinator.runtime.machine import Machine, MachineStopped, link_of
 from coordinator.runtime.timebase import ClockMap
+from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.move_source import JobState, Told
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.program_machine import machine_state
@@ -23,9 +23,6 @@ from nodes.dictionary.cache import DictionaryCache
 from nodes.link import LinkStats
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.streaming.compensation import Compensation
 
 OnProgress = Callable[[Progress], None]
 

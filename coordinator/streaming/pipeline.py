@@ -7,7 +7,10 @@ program and keeps no clock. Not thread-safe: one thread at a time.
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from coordinator.gcode.events import (
     AS_SOON_AS_POSSIBLE,
@@ -22,14 +25,10 @@ from coordinator.gcode.machine_state import SHAPER_AXES, Shaper
 from coordinator.motion.planner.planner import Planner, Position
 from coordinator.motion.steps.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps.steps import StepGenerator
+from coordinator.motion.trapezoid_array import TRAPEZOID
+from coordinator.runtime.filament_forecast import FilamentForecast
+from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.move_source import MoveSource
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from coordinator.runtime.filament_forecast import FilamentForecast
-    from coordinator.streaming.compensation import Compensation
 
 BatchSink = Callable[[int, bytes], None]
 """Takes a node's index and a piece of its stream (nodes/link/batch.h)."""
@@ -90,10 +89,6 @@ class PlanRecord:
 
     def every(self) -> "NDArray[np.void]":
         """Return all trapezoids."""
-        import numpy as np  # noqa: PLC0415 (start-up time: only proofs keep a record)
-
-        from coordinator.motion.trapezoid_array import TRAPEZOID  # noqa: PLC0415
-
         return np.concatenate(self.pieces) if self.pieces else np.empty(0, TRAPEZOID)
 
     def epochs(self) -> "list[tuple[Position, NDArray[np.void]]]":

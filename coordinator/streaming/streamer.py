@@ -7,20 +7,18 @@ one worker thread (``motion_worker.py``); the loop only hands finished batches t
 import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import Emergency, End, Event, Notice, Resting
 from coordinator.runtime.machine import Machine, MachineStopped, link_of
+from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.move_source import JobState, MoveSource, Planned, Told, Witness
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.standstill_task import RestTask
 from coordinator.streaming.timed_events import Due, DueEvents
 from coordinator.streaming.worker import START_LEAD_S, Cycle, MotionWorker
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.streaming.compensation import Compensation
 
 CYCLE_S: Final = 0.05
 BUSY_START_LEAD_S: Final = 0.6

@@ -6,7 +6,7 @@ interpreter lock; the control loop (``streamer.py``) looks at the rest of it onl
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import (
@@ -27,13 +27,11 @@ from coordinator.gcode.status import motion_figures
 from coordinator.motion.planner.planner import Planner
 from coordinator.motion.steps.steps import StepGenerator
 from coordinator.runtime.machine import Machine
+from coordinator.runtime.timebase import ClockMap
+from coordinator.streaming.compensation import Compensation
 from coordinator.streaming.move_source import MoveSource, Planned, Told, Witness
 from coordinator.streaming.pipeline import Pipeline, PlanRecord
 from coordinator.streaming.timed_events import Due
-
-if TYPE_CHECKING:
-    from coordinator.runtime.timebase import ClockMap
-    from coordinator.streaming.compensation import Compensation
 
 PLAN_AHEAD_S: Final = 2.0
 """Moves are planned so far ahead of now; beyond, the g-code waits. A pause takes so long; what it leaves

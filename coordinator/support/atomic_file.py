@@ -3,6 +3,7 @@
 import contextlib
 import os
 import stat
+import tempfile
 from pathlib import Path
 
 
@@ -12,8 +13,6 @@ def write_whole(path: Path, data: bytes, *, like: os.stat_result | None = None) 
     A power cut, too: the new content is on the disk before the name leads to it. Only the user may read a new
     file; LIKE gives it the mode and, where allowed, the owner of another one.
     """
-    import tempfile  # noqa: PLC0415 (start-up time: it draws in random numbers)
-
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:

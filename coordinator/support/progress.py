@@ -8,11 +8,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Self, TextIO
+from typing import Self, TextIO
 
-if TYPE_CHECKING:
-    from rich.live import Live
-    from rich.table import Table
+from rich.console import Console
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
 
 LIVE_INTERVAL_S = 0.2
 PLAIN_INTERVAL_S = 5.0
@@ -107,9 +109,6 @@ class ProgressDisplay:
     def __enter__(self) -> Self:
         if self._is_live:
             # rich is slow to import: only who looks at it pays for it.
-            from rich.console import Console  # noqa: PLC0415
-            from rich.live import Live  # noqa: PLC0415
-
             self._live = Live(console=Console(file=self._stdout), auto_refresh=False)
             self._live.start()
         return self
@@ -142,10 +141,6 @@ class ProgressDisplay:
             self._stderr.flush()
 
     def _picture(self, progress: Progress) -> "Table":
-        from rich.progress_bar import ProgressBar  # noqa: PLC0415
-        from rich.table import Table  # noqa: PLC0415
-        from rich.text import Text  # noqa: PLC0415
-
         picture = Table.grid(padding=(0, 1))
         picture.add_row(Text(f"{self._title}: {summary(progress)}"))
         picture.add_row(ProgressBar(total=1.0, completed=progress.share, width=60))

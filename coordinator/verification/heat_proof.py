@@ -8,17 +8,15 @@ farther still, by what comes after the switching: of it the mean of whole cycles
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.heat.controller import NEAR_K
 from coordinator.heat.holding import SETTLING_S, Held
+from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.heaters.heaters import Heaters
+from coordinator.runtime.machine import Machine
 from coordinator.virtual_machine.plant_heat import plant_word
 from nodes.virtual.plant_log import PlantEvent
-
-if TYPE_CHECKING:
-    from coordinator.modules.heaters.heater import HeaterUnit
-    from coordinator.runtime.machine import Machine
 
 AROUND_NS: Final = 100_000_000
 """How far beside its steady state the truth is looked at: the log tells it every 50 ms."""

@@ -5,17 +5,15 @@ What homing found decides: an endstop that was missed by a step shifts everythin
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from coordinator.config.model import MachineDescription
 from coordinator.streaming.pipeline import PlanRecord
 from nodes.virtual.plant import Axis
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from nodes.virtual.plant_page import Motor
+from nodes.virtual.plant_page import Motor
 
 STEPS_OFF: Final = 2.0
 """A homed axis may be so many steps beside where it believes to be: one for each of two roundings. One whose

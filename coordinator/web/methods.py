@@ -1,13 +1,11 @@
 """Methods of the interface that let browsers into the live page, and put them out."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Registry, Scope
 from coordinator.support.values import Value
 from coordinator.web.access import LINK_S
-
-if TYPE_CHECKING:
-    from coordinator.web.server import WebServer
+from coordinator.web.server import WebServer
 
 
 def add_page_methods(registry: Registry, page: "WebServer") -> None:

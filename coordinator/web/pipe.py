@@ -5,12 +5,11 @@ The connection sees what it sees of a socket: it is told to wait when the browse
 
 import asyncio
 from collections import deque
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-if TYPE_CHECKING:
-    from aiohttp import web
+from aiohttp import web
 
-    from coordinator.ipc.server.connection import Connection
+from coordinator.ipc.server.connection import Connection
 
 LOW_SHARE: Final = 4
 """Sending goes on when a quarter of the limit is left."""

@@ -8,13 +8,14 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from aiohttp import WSMsgType, web
 
 from coordinator.ipc.protocol.messages import Fault
 from coordinator.ipc.protocol.methods import ApiError, Scope
 from coordinator.ipc.server.auth import Grant, digest_of
+from coordinator.ipc.server.connection import Connection
 from coordinator.ipc.server.server import Adopted, IpcServer, tls_context
 from coordinator.ipc.server.tcp_listener import Door
 from coordinator.web.access import LINK_S, SESSION_S, PageAccess, PageSession, is_key_of
@@ -24,9 +25,6 @@ from coordinator.web.pipe import Pipe
 from coordinator.web.session_file import read_sessions, write_sessions
 from coordinator.web.settings import WebSettings
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.ipc.server.connection import Connection
 
 SOCKET_PATH: Final = "/socket"
 LOGIN_PATH: Final = "/login"

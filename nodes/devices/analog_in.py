@@ -1,18 +1,15 @@
 """An analog input on a node: sampled on and on, reported, and watched by the node itself."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from nodes.devices.ticks import start_clock, ticks_for
 from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
+from nodes.node.node import Node
 
 COMMANDS: Final = ("config_analog_in", "query_analog_in")
 SAMPLES: Final = 8

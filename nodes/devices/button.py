@@ -1,16 +1,13 @@
 """A switch on a node: pressed or not, each change told once, in order."""
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
 from nodes.devices.ticks import start_clock, ticks_for
 from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
+from nodes.node.node import Node
 
 COMMANDS: Final = ("config_buttons", "buttons_add", "buttons_query", "buttons_ack")
 REPEAT_SAMPLES: Final = 50

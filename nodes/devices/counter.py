@@ -1,16 +1,14 @@
 """A counter on a node: changes of an input, for the speed of a fan."""
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
+from nodes.clock.clock import ticks_since
 from nodes.devices.ticks import start_clock, ticks_for
 from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
+from nodes.node.node import Node
 
 COMMANDS: Final = ("config_counter", "query_counter")
 _WHOLE: Final = 1 << 32
@@ -70,8 +68,6 @@ class Counter:
 
     def _came(self, message: Message) -> None:
         """Take a report: from the last change of the report before to the last one of this."""
-        from nodes.clock.clock import ticks_since  # noqa: PLC0415 (planning needs no clock, which draws in numpy)
-
         now = message.integer("count"), message.integer("count_clock")
         last, self._last = self._last, now
         if last is None:

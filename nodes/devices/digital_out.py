@@ -1,13 +1,11 @@
 """A digital output on a node."""
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from nodes.devices.timed_output import TimedOutput
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
-
-if TYPE_CHECKING:
-    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
+from nodes.node.node import Node
 
 COMMANDS: Final = ("config_digital_out", "queue_digital_out", "update_digital_out")
 

@@ -1,13 +1,11 @@
 """Pulse-width modulated outputs on a node: by its hardware, or by its software on any pin."""
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from nodes.devices.ticks import ticks_for
 from nodes.devices.timed_output import TimedOutput
 from nodes.node.config import NodeConfig, NodeConfigError
-
-if TYPE_CHECKING:
-    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
+from nodes.node.node import Node
 
 HARDWARE_COMMANDS: Final = ("config_pwm_out", "queue_pwm_out")
 SOFTWARE_COMMANDS: Final = ("config_digital_out", "set_digital_out_pwm_cycle", "queue_digital_out")

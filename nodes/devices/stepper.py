@@ -1,13 +1,11 @@
 """A stepper motor on a node: its configuration, and where it stands."""
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.errors import NodeError
-
-if TYPE_CHECKING:
-    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
+from nodes.node.node import Node
 
 BOTH_EDGE_CONSTANTS: Final = ("STEPPER_BOTH_EDGE", "STEPPER_STEP_BOTH_EDGE")
 COMMANDS: Final = (

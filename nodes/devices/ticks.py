@@ -1,11 +1,11 @@
 """Seconds to a node's ticks, bounded as the commands carry them."""
 
-from typing import TYPE_CHECKING, Final
+import asyncio
+from typing import Final
 
+from nodes.clock.clock import HostTime
 from nodes.node.config import NodeConfig, NodeConfigError
-
-if TYPE_CHECKING:
-    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
+from nodes.node.node import Node
 
 LONGEST_TICKS: Final = (1 << 31) - 1
 """Clocks further apart than this cannot be told from the past."""
@@ -30,10 +30,6 @@ def clock_after(node: "Node", seconds: float) -> int:
 
     Raises NodeError while that clock is not known.
     """
-    import asyncio  # noqa: PLC0415 (planning needs none)
-
-    from nodes.clock.clock import HostTime  # noqa: PLC0415 (it draws in numpy)
-
     at_s = asyncio.get_running_loop().time() + seconds
     return node.best_clock.ticks_at(HostTime(round(at_s * 1e9)))
 

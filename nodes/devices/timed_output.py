@@ -9,18 +9,15 @@ further values wait here until one is free. Of values too close together for tha
 while they wait are left out but for the last of them, which comes a little late.
 """
 
+import asyncio
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from nodes.devices.ticks import clock_after, ticks_for
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
+from nodes.node.node import Node
 from nodes.node.states import NodeState
-
-if TYPE_CHECKING:
-    import asyncio
-
-    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
 
 FREE_AFTER_S: Final = 0.002
 """So long behind a value's clock, as the host knows that clock, its slot is free for certain."""
@@ -87,8 +84,6 @@ class TimedOutput:
 
     def _wait(self, node: "Node") -> None:
         """Come back when the first slot is free."""
-        import asyncio  # noqa: PLC0415 (planning needs none)
-
         if self._timer is None:
             due_s = (self._held[0] - clock_after(node, -FREE_AFTER_S)) / node.clock_freq_hz
             self._timer = asyncio.get_running_loop().call_later(max(due_s, 0.0), self._go_on, node)

@@ -4,18 +4,15 @@ A write is not answered; but a driver counts the writes that it has understood (
 writes it is known whether all of them arrived.
 """
 
+import asyncio
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from nodes.devices import tmc_datagram
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
+from nodes.node.node import Node
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    import asyncio
-
-    from nodes.node.node import Node  # planning needs neither
 
 COMMANDS: Final = ("config_tmcuart", "tmcuart_send")
 BAUD: Final = 40_000
@@ -108,8 +105,6 @@ class TmcUart:
         return answer.data("read")
 
     def _alone(self) -> "asyncio.Lock":
-        import asyncio  # noqa: PLC0415 (planning needs none)
-
         if self._lock is None:
             self._lock = asyncio.Lock()
         return self._lock

@@ -3,14 +3,12 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig
 from nodes.node.errors import NodeError
-
-if TYPE_CHECKING:
-    from nodes.node.node import Node  # planning needs no node, which draws in asyncio
+from nodes.node.node import Node
 
 COMMANDS: Final = ("config_trsync", "trsync_start", "trsync_set_timeout", "trsync_trigger")
 GROUPS_CONSTANT: Final = "CAN_TRIGGER_GROUPS"

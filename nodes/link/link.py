@@ -3,13 +3,12 @@
 import asyncio
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from typing_extensions import Buffer
 
 from nodes.link.handle import BusHandle
 from nodes.link.types import Flow, LinkError, LinkSettings, LinkStats, Response
-
-if TYPE_CHECKING:
-    from typing_extensions import Buffer
 
 _S_PER_NS = 1e-9
 

@@ -1,20 +1,17 @@
 """A table on a node that MT brings (firmware/objects/table.h): its configuration, and what the node has."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
+from nodes.devices.stepper import Stepper
+from nodes.dictionary.dictionary import Dictionary
+from nodes.dictionary.message_format import Message, Value
+from nodes.link.interfaces import LinkLike
 from nodes.mt.mt import AXLES, MtStatus, Pair, checksum, digest
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.errors import NodeError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from nodes.devices.stepper import Stepper
-    from nodes.dictionary.dictionary import Dictionary
-    from nodes.dictionary.message_format import Message, Value
-    from nodes.link.interfaces import LinkLike  # planning needs no node, which draws in asyncio
 
 COMMANDS: Final = ("config_table", "table_query", "table_bytes", "table_activate", "table_query_active")
 CONSTANT: Final = "MT_AXLES"

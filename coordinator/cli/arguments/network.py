@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable
+from ipaddress import ip_address
 from typing import Any
 
 from nodes.support.option_values import UsageError
@@ -28,8 +29,6 @@ def read_metrics(given: argparse.Namespace) -> tuple[str, int] | None:
         if given.metrics_open:
             raise UsageError("--metrics-open goes with --metrics [ADDRESS:]PORT")
         return None
-    from ipaddress import ip_address  # noqa: PLC0415 (start-up time)
-
     host, _, port = str(given.metrics).rpartition(":")
     host = "127.0.0.1" if host in ("", "localhost") else host.removeprefix("[").removesuffix("]")
     number = int(port) if port.isascii() and port.isdecimal() and len(port) <= 5 else 0

@@ -2,6 +2,7 @@
 
 import argparse
 import re
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
 
@@ -93,8 +94,6 @@ def _web_address(given: argparse.Namespace) -> tuple[str, int] | None:
     """Return where the live page is to be; beyond loopback only with what protects it."""
     if given.web is None:
         return None
-    from ipaddress import ip_address  # noqa: PLC0415 (start-up time)
-
     text = given.web if ":" in given.web else f"127.0.0.1:{given.web}"
     host, port = _host_port("--web", text, "[ADDRESS:]PORT such as 8080 or 0.0.0.0:8080")
     host = "127.0.0.1" if host == "localhost" else host

@@ -1,17 +1,15 @@
 """The words of ``canductor table`` that go to a device instead of a machine that runs."""
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.tables.axis_table import AxisTable, Direction, TableError
 from nodes.mt.device_job import BAUD, DeviceJob, DeviceKind, Load
 from nodes.mt.mt import AXLES
 from nodes.support.can_protocol import MT_CAN_ID
 from nodes.support.option_values import UsageError, number, share, whole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 SHARE: Final = 0.2
 """Of a CAN bus, if not given: what a coordinator takes for tables, too."""

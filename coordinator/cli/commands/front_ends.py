@@ -8,7 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import shtab
+
 from coordinator.cli.arguments.front_ends import Target
+from coordinator.cli.commands.discover import find_machines
+from coordinator.cli.parser import whole_parser
 from coordinator.ipc.client.client import Client, Update
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.ipc.server.uploads import PART_MAX
@@ -212,16 +216,10 @@ def _show_progress(sent: int, size: int, *, quiet: bool) -> None:
 
 def discover(timeout_s: float) -> Report:
     """List the machines that answer within TIMEOUT_S."""
-    from coordinator.cli.commands.discover import find_machines  # noqa: PLC0415 (an emergency stop shall not pay for it)
-
     return run_to_end(lambda: find_machines(timeout_s))
 
 
 def completion(shell: str) -> Answer:
     """Return the script that makes SHELL complete the words of canductor."""
-    import shtab  # noqa: PLC0415 (an emergency stop shall not pay for it)
-
-    from coordinator.cli.parser import whole_parser  # noqa: PLC0415 (likewise)
-
     script = shtab.complete(whole_parser(), shell)
     return Answer(script, script.rstrip())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from coordinator.gcode.builtins import machine as machine_commands
@@ -14,8 +15,6 @@ from coordinator.motion.planner.language import ARC_LETTERS, Plane
 from coordinator.motion.planner.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
     from coordinator.gcode.interpreter import Job
 
     Handler = Callable[[Job, Command], bool]

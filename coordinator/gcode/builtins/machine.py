@@ -8,6 +8,7 @@ generation as an event with its print time.
 from __future__ import annotations
 
 import re
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -18,8 +19,6 @@ from coordinator.kinematics.dual_carriage import CarriageMode, CarriageState, Du
 from coordinator.motion.steps.shapers import split_kind
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
     from coordinator.gcode.interpreter import Job
 
 MAX_FREQUENCY_HZ = 1000.0

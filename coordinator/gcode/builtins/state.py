@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Final
 
 from coordinator.gcode.events import Reply
 from coordinator.gcode.machine_state import SavedState
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.gcode.status import frames, gcode_figures
-from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus
+from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus, Planner
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
-
     from coordinator.gcode.interpreter import Job
-    from coordinator.motion.planner.planner import Planner
-
 MOVE_SPEED_MM_S: Final = 50.0
 """Of the moves that these commands make, unless they say otherwise."""
 SAVED_MAX: Final = 100

@@ -8,15 +8,13 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+import jinja2
+from jinja2 import TemplateSyntaxError, nodes
+
+from coordinator.gcode.templates.sandbox import Meter, Sandbox, TooMuch
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    import jinja2
-    from jinja2 import nodes
-
-    from coordinator.gcode.templates.sandbox import Sandbox
 
 _FILE: Final = "<g-code template>"
 _MARK = re.compile("\x1e(\\d+)\x1f")
@@ -67,8 +65,6 @@ class Template:
 
 
 def _pieces(compiled: "jinja2.Template", values: Mapping[str, object]) -> list[str]:
-    from coordinator.gcode.templates.sandbox import Meter, TooMuch  # noqa: PLC0415
-
     sandbox = _sandbox()
     sandbox.meter = meter = Meter()
     pieces: list[str] = []
@@ -107,8 +103,6 @@ def _line_of(error: BaseException) -> int:
 
 @lru_cache(maxsize=1000)
 def _check(text: str) -> None:
-    from jinja2 import TemplateSyntaxError  # noqa: PLC0415
-
     try:
         _sandbox().prepared(text)
     except TemplateSyntaxError as error:
@@ -117,8 +111,6 @@ def _check(text: str) -> None:
 
 @lru_cache(maxsize=1000)
 def _compile(text: str) -> "jinja2.Template":
-    from jinja2 import TemplateSyntaxError  # noqa: PLC0415
-
     sandbox = _sandbox()
     tree = sandbox.prepared(text)
     _mark(tree)
@@ -131,8 +123,6 @@ def _compile(text: str) -> "jinja2.Template":
 
 @cache
 def _sandbox() -> "Sandbox":
-    from coordinator.gcode.templates.sandbox import Sandbox  # noqa: PLC0415
-
     return Sandbox()
 
 

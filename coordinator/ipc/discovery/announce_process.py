@@ -13,14 +13,14 @@ import json
 import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Iterable
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
+
+from zeroconf import Error
+from zeroconf.asyncio import AsyncServiceInfo, AsyncZeroconf
 
 from coordinator.ipc.discovery.announcement import SERVICE_TYPE, Announcement, usable_addresses
 from coordinator.ipc.discovery.multicast import Place, open_mdns, places, reached_at, spoken_on
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from zeroconf.asyncio import AsyncServiceInfo, AsyncZeroconf
 
 RESCAN_S: Final = 10.0
 """How often it is looked whether this computer's addresses are still the same."""
@@ -94,8 +94,6 @@ class Announcing:
             self._say("failed", str(error))
 
     async def _begin(self, here: tuple[Place, ...]) -> None:
-        from zeroconf import Error  # noqa: PLC0415 (see multicast.py)
-
         reached = reached_at(self._bound, here)
         addresses = usable_addresses(str(place.address) for place in reached)
         if not addresses:
@@ -116,8 +114,6 @@ class Announcing:
         self._say("announced", f"announced as {label}: {', '.join(self._machine.at)}")
 
     def _service(self, instance: str) -> "AsyncServiceInfo":
-        from zeroconf.asyncio import AsyncServiceInfo  # noqa: PLC0415
-
         machine = self._machine
         return AsyncServiceInfo(
             SERVICE_TYPE,

@@ -4,13 +4,13 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Protocol, Self
+from typing import Any, Final, Protocol, Self
+
+from zeroconf import Error
+from zeroconf.asyncio import AsyncServiceBrowser, AsyncServiceInfo, AsyncZeroconf
 
 from coordinator.ipc.discovery.announcement import SERVICE_TYPE, Announcement
 from coordinator.ipc.discovery.multicast import open_mdns, places
-
-if TYPE_CHECKING:
-    from zeroconf.asyncio import AsyncZeroconf
 
 INSTANCES_MAX: Final = 256
 """Announcements that are looked at; further ones are counted."""
@@ -121,8 +121,6 @@ class _Multicast:
     """Multicast DNS on all networks of this computer."""
 
     def __init__(self, mdns: "AsyncZeroconf", heard: Heard) -> None:
-        from zeroconf.asyncio import AsyncServiceBrowser  # noqa: PLC0415 (see multicast.py)
-
         def handle(*, name: str, state_change: Any, **_: object) -> None:
             heard(name, state_change.name != "Removed")
 
@@ -139,9 +137,6 @@ class _Multicast:
 
     async def resolve(self, instance: str) -> Announcement | None:
         """Ask the network."""
-        from zeroconf import Error  # noqa: PLC0415
-        from zeroconf.asyncio import AsyncServiceInfo  # noqa: PLC0415
-
         # What strangers call themselves need not be a name of the type asked for.
         with contextlib.suppress(Error, ValueError):
             info = AsyncServiceInfo(SERVICE_TYPE, instance)

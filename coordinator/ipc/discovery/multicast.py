@@ -7,12 +7,13 @@ import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv6Address, ip_address
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import ifaddr
+from zeroconf import Error, IPVersion
+from zeroconf.asyncio import AsyncZeroconf
 
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from zeroconf.asyncio import AsyncZeroconf
 
 INTERFACE_ADDRESSES_MAX: Final = 64
 """Addresses of this computer on which multicast DNS is spoken; it has a socket for each."""
@@ -28,8 +29,6 @@ class Place:
 
 def places() -> tuple[Place, ...]:
     """Return all of this computer's addresses that mean something beyond one link."""
-    import ifaddr  # noqa: PLC0415 (with zeroconf, for those who need it)
-
     found = []
     for adapter in ifaddr.get_adapters():
         for ip in adapter.ips:
@@ -65,9 +64,6 @@ def spoken_on(reached: Iterable[Place], here: Iterable[Place]) -> tuple[str, ...
 
 def open_mdns(addresses: Iterable[str]) -> "AsyncZeroconf":
     """Return multicast DNS on the interfaces that have ADDRESSES; raises CanductorError."""
-    from zeroconf import Error, IPVersion  # noqa: PLC0415
-    from zeroconf.asyncio import AsyncZeroconf  # noqa: PLC0415
-
     logging.getLogger("zeroconf").setLevel(logging.CRITICAL)  # strangers' garbage is no news
     chosen = list(addresses)
     if not chosen:

@@ -3,21 +3,19 @@
 SET_STEPPER_ENABLE is for trying out: it switches one, and those that share its pin.
 """
 
-from typing import TYPE_CHECKING, Final
+import asyncio
+from collections.abc import Collection, Iterable, Mapping
+from typing import Final
 
 from coordinator.config.options import SectionSpec
+from coordinator.config.pins import PinDescription
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
-
-    from coordinator.config.pins import PinDescription
-    from coordinator.runtime.module_context import Live
-    from nodes.node.node import Node
+from nodes.node.node import Node
 
 WAKE_S: Final = 0.1
 """Drivers need a moment after they were switched on or off, before what comes next."""
@@ -140,8 +138,6 @@ class MotorPower(Module):
         return await self._some(self._lines, on, Done(unhomed="" if on else "XYZ"))
 
     async def _some(self, lines: "Iterable[EnableLine]", on: bool, done: Done) -> Done:
-        import asyncio  # noqa: PLC0415 (planning needs none)
-
         for line in lines:
             self._switch(line, on=on)
         await asyncio.sleep(2 * WAKE_S)

@@ -1,16 +1,15 @@
 """STEPPER_BUZZ: one motor goes a little way to and fro, to see which one it is and that it is wired."""
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from coordinator.config.model import StepperDescription
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-
-if TYPE_CHECKING:
-    from coordinator.config.model import StepperDescription
-    from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import Live
+from coordinator.runtime.moves.single import Ramp, SingleMove
 
 TIMES: Final = 10
 WAY_MM: Final = 1.0
@@ -53,8 +52,6 @@ class StepperBuzz(Module):
         return AtRest(buzz, done)
 
     async def _buzz(self, stepper: "StepperDescription") -> None:
-        from coordinator.runtime.moves.single import Ramp, SingleMove  # noqa: PLC0415 (planning needs no asyncio)
-
         assert self._live is not None
         way = WAY_RAD if stepper.function.turns else WAY_MM
         speed = 2 * way / THERE_S

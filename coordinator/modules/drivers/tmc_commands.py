@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec
+from coordinator.config.pins import PinDescription
 from coordinator.drivers.tmc_chips import Field
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
@@ -13,7 +14,6 @@ from coordinator.support.quoting import nearest
 from nodes.devices.tmcuart import TmcUart
 
 if TYPE_CHECKING:
-    from coordinator.config.pins import PinDescription
     from coordinator.modules.drivers.tmc_driver import TmcDriver
 
 

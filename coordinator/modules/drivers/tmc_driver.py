@@ -5,11 +5,13 @@ that comes back. Every WATCH_S the driver is asked how it is; with a fault that 
 the machine stops and says why.
 """
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Iterator, Mapping
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 from coordinator.config.errors import ConfigError, NotActing
+from coordinator.config.model import StepperDescription
 from coordinator.drivers.tmc_chips import FAULTS, FORGOTTEN, TMC2208, TMC2209, UNDERVOLTAGE, Chip
 from coordinator.drivers.tmc_chips import shown as register_shown
 from coordinator.modules.base import Build
@@ -25,17 +27,12 @@ from coordinator.modules.drivers.tmc_options import (
     driver_spec,
 )
 from coordinator.modules.homing.virtual_endstop import StallEndstop
+from coordinator.runtime.module_context import Live
 from coordinator.support.quoting import nearest, shown
 from coordinator.support.values import Value
 from nodes.devices.tmcuart import TmcError
+from nodes.node.node import Node
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    import asyncio
-
-    from coordinator.config.model import StepperDescription
-    from coordinator.runtime.module_context import Live
-    from nodes.node.node import Node
 
 WATCH_S: Final = 1.0
 """How often a driver is asked how it is."""
@@ -92,8 +89,6 @@ class TmcDriver(StallEndstop):
 
     async def connect(self, live: "Live") -> None:
         """Set the driver; raises CanductorError when it cannot be."""
-        import asyncio  # noqa: PLC0415 (planning needs none)
-
         self._live = live
         self._is_new = asyncio.Event()
         both_edges = live.machine.devices.steppers[self.stepper.name].steps_on_both_edges
@@ -219,8 +214,6 @@ class TmcDriver(StallEndstop):
     # ------------------------------------------------------------------------------------------- watch
 
     async def _keep_watch(self) -> None:
-        import asyncio  # noqa: PLC0415 (planning needs none)
-
         assert self._live is not None
         assert self._is_new is not None
         silent = 0

@@ -1,16 +1,14 @@
 """The options of sections for stepper drivers, and the registers that follow from them."""
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from coordinator.config.errors import ConfigError
+from coordinator.config.model import StepperDescription
 from coordinator.config.options import BoolOption, FloatOption, IntOption, Option, SectionSpec
 from coordinator.config.pins import PinOption
 from coordinator.drivers.tmc_chips import Chip, Field
 from coordinator.drivers.tmc_formulas import Currents, currents, largest_current, tstep
 from coordinator.modules.base import Build
-
-if TYPE_CHECKING:
-    from coordinator.config.model import StepperDescription
 
 MAX_CURRENT_A: Final = 2.0
 """RMS; no chip of these carries more."""

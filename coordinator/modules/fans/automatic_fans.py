@@ -1,6 +1,6 @@
 """[heater_fan NAME] and [controller_fan NAME]: fans that run while something else is hot or at work."""
 
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import FloatOption, IntOption, ListOption, SectionSpec
@@ -15,10 +15,8 @@ from coordinator.modules.fans.fan_unit import (
 )
 from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.heaters.heaters import Heaters
+from coordinator.runtime.module_context import Live
 from coordinator.support.quoting import nearest, shown
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 LOOK_S: Final = 1.0
 FULL: Final = shutdown_speed(1.0)

@@ -1,22 +1,20 @@
 """A fan: its output, what starts it, and its tachometer, for whatever module has one."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from coordinator.config.options import BoolOption, FloatOption, IntOption, Option
 from coordinator.config.pins import PinOption
 from coordinator.modules.base import Build, Module
 from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
 from nodes.devices.counter import Counter
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
 from nodes.node.config import NodeConfig
+from nodes.node.node import Node
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
-    from nodes.node.node import Node
 
 PIN: Final = PinOption(name="pin", help="output that drives the fan")
 MAX_POWER: Final = FloatOption(

@@ -4,7 +4,7 @@ While its sensor says nothing, or what cannot be, it runs at its highest speed: 
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.config.sections.heater_options import MAX_DELTA, PID_KD, PID_KI, PID_KP, SMOOTH_TIME
@@ -31,10 +31,8 @@ from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.modules.words import one, parameters, value
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 FULL: Final = shutdown_speed(1.0)
 TARGET_TEMP: Final = FloatOption(

@@ -8,7 +8,7 @@ them it ends the heat a moment before the node would have to stop, since the nod
 
 import contextlib
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 from coordinator.config.sections.heater_options import (
     AMBIENT_SENSOR,
@@ -28,14 +28,12 @@ from coordinator.modules.heaters.control import ControlSettings
 from coordinator.modules.heaters.verify_heater import VerifyHeater, usual
 from coordinator.modules.pinned import AHEAD_S, add_pinned
 from coordinator.modules.sensors.temperature_input import SensorModule, TemperatureInput
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
 from nodes.devices.analog_in import RANGE_CHECKS
 from nodes.devices.pwm_out import PwmOut
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 LOOK_S: Final = 1.0
 """How often it is looked whether there still are measurements."""

@@ -9,6 +9,7 @@ from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module
 from coordinator.modules.heaters.heater import HeaterUnit
+from coordinator.modules.heaters.tuning import calibrate_mpc, calibrate_pid
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.modules.words import numbers, one, parameters, value
 from coordinator.support.values import Value
@@ -162,8 +163,6 @@ class Heaters(Module):
     def _pid(self, call: Call) -> Reading:
         given = parameters(call.command, ("HEATER", "TARGET", "WRITE_FILE", "TOLERANCE"))
         unit, target = self._unit(call, given), value(call.command, given, "TARGET")
-        from coordinator.modules.heaters.tuning import calibrate_pid  # noqa: PLC0415 (start-up time)
-
         return self._calibration(unit, target, lambda: calibrate_pid(unit, target))
 
     def _mpc(self, call: Call) -> Reading:
@@ -174,8 +173,6 @@ class Heaters(Module):
             raise WordError(f"FAN_BREAKPOINTS of MPC_CALIBRATE must be 2 to {FAN_STEPS_MAX}")
         if unit.settings.heater_w is None:
             raise WordError(f"MPC_CALIBRATE needs the option heater_power of [{unit.name}], in W")
-        from coordinator.modules.heaters.tuning import calibrate_mpc  # noqa: PLC0415 (start-up time)
-
         return self._calibration(unit, target, lambda: calibrate_mpc(unit, target, steps))
 
     @staticmethod

@@ -1,7 +1,7 @@
 """[pid_profile HEATER NAME]: PID constants for other circumstances; PID_PROFILE loads and saves them."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
@@ -13,11 +13,9 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.words import one, parameters, value
+from coordinator.runtime.module_context import Live
 from coordinator.support.quoting import nearest, shown
 from coordinator.support.values import Value
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 KIND: Final = "pid_profile"
 DEFAULT: Final = "default"

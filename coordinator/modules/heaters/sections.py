@@ -1,7 +1,7 @@
 """[heater_bed], [heater_generic NAME] and the heaters of extruders."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from coordinator.config.options import SectionSpec
 from coordinator.config.sections.heater_options import (
@@ -19,10 +19,8 @@ from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.heaters.pid_profile import PidProfiles
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.modules.words import numbers
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 
 class HeaterModule(Module):

@@ -9,24 +9,24 @@ level. A rail without an endstop on a pin is taken as home. What moves when is i
 import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.errors import ConfigError
+from coordinator.config.model import RailDescription
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.reply_kinds import ReplyKind
+from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing_plan import AXES, Approach, approaches, landed, second_landed
 from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
+from coordinator.runtime.machine import Machine
+from coordinator.runtime.module_context import Live
+from coordinator.runtime.moves.homing import HomingMove, HomingResult
+from coordinator.runtime.moves.single import Ramp, SingleMove
+from coordinator.runtime.moves.straight import move_by
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.config.model import RailDescription
-    from coordinator.kinematics.base import Point
-    from coordinator.runtime.machine import Machine
-    from coordinator.runtime.module_context import Live
-    from coordinator.runtime.moves.homing import HomingResult
 
 AWAY_MM: Final = 5.0
 """How far a rail that stands on its endstop goes away first, where homing_retract_dist is 0."""
@@ -176,8 +176,6 @@ class Homing(Module):
         described = self._described
         if self._live is None or not STRAIGHT & {described.kinematics.name}:
             return place
-        from coordinator.runtime.moves.straight import move_by  # noqa: PLC0415 (planning needs no asyncio)
-
         for axis, letter in enumerate("XYZ"):
             way_mm = self._way_within(axis, place[axis]) if letter in letters else 0.0
             if not way_mm:
@@ -209,8 +207,6 @@ class Homing(Module):
                 await self._go(approach, ways, abs(way_mm))
 
     async def _move(self, approach: Approach, way_mm: float, speed: float) -> "Sequence[HomingResult]":
-        from coordinator.runtime.moves.homing import HomingMove  # noqa: PLC0415 (planning needs no asyncio)
-
         async with contextlib.AsyncExitStack() as stack:
             for rail in approach.rails:
                 if (feeler := self._feels(rail)) is not None:
@@ -232,8 +228,6 @@ class Homing(Module):
         await self._go(approach, ways, approach.rails[0].homing.retract_distance or AWAY_MM)
 
     async def _go(self, approach: Approach, ways: Mapping[str, float], way_mm: float) -> None:
-        from coordinator.runtime.moves.single import Ramp, SingleMove  # noqa: PLC0415 (as above)
-
         rail = approach.rails[0]
         ramp = Ramp(way_mm, rail.homing.retract_speed, self._accel(approach.axis, rail))
         await SingleMove(self._machine, ramp, ways=ways).run()

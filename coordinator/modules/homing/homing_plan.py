@@ -12,12 +12,10 @@ second carriage     alone, behind the first one
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from coordinator.config.model import MachineDescription, RailDescription
 from coordinator.kinematics.base import Point
-
-if TYPE_CHECKING:
-    from coordinator.config.model import MachineDescription, RailDescription
 
 WAY_SHARE: Final = 1.5
 """An endstop has to switch within so many lengths of its axis."""

@@ -1,7 +1,7 @@
 """[safe_z_home]: Z is homed at a place of its own, with the head lifted before anything moves sideways."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
@@ -10,10 +10,9 @@ from coordinator.gcode.commands import AtRest, Call, Done, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import STRAIGHT, Homing
+from coordinator.runtime.module_context import Live
+from coordinator.runtime.moves.straight import move_by
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 HOP_MAX_MM: Final = 1000.0
 
@@ -144,8 +143,6 @@ class SafeZHome(Module):
 
     async def _move(self, call: Call, way: tuple[float, float, float], speed: float, accel: float) -> Call:
         """Move by WAY; return CALL with the place that this led to, by the steps that were made."""
-        from coordinator.runtime.moves.straight import move_by  # noqa: PLC0415 (planning needs no asyncio)
-
         assert self._live is not None
         x, y, z = await move_by(self._live.machine, way, speed, accel)
         at = call.position

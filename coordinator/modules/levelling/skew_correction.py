@@ -7,23 +7,21 @@ believe to be at x, y, z. So steppers follow the other way round: it is a change
 import math
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.builtins.machine import come_to_rest
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Position, Reading, ToProgram
 from coordinator.gcode.events import PositionSet, WeightsChange
+from coordinator.gcode.interpreter import Job
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.words import flag, one, parameters, value
 from coordinator.motion.specs import StepKinematics
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
-
-if TYPE_CHECKING:
-    from coordinator.gcode.interpreter import Job
-    from coordinator.runtime.module_context import Live
 
 SKEW_MAX: Final = 0.2
 """Of any plane: some 11 degrees. More is a mistake of who measured."""

@@ -5,15 +5,14 @@ moved alone leaves all axes unknown.
 """
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.options import BoolOption, SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import Live
+from coordinator.runtime.moves.single import Ramp, SingleMove
 
 ENABLE: Final = BoolOption(
     name="enable_force_move",
@@ -78,8 +77,6 @@ class ForceMove(Module):
         return AtRest(move, done)
 
     async def _move(self, name: str, distance_mm: float, speed: float, accel: float) -> None:
-        from coordinator.runtime.moves.single import Ramp, SingleMove  # noqa: PLC0415 (planning needs no asyncio)
-
         assert self._live is not None
         if distance_mm:
             ramp = Ramp(abs(distance_mm), speed, accel)

@@ -1,7 +1,7 @@
 """[output_pin NAME] and [static_digital_output NAME]: outputs that programs set, or that have one value."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 from coordinator.config.options import BoolOption, FloatOption, ListOption, SectionSpec
 from coordinator.config.pins import PinOption
@@ -10,15 +10,13 @@ from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
 from coordinator.modules.words import one, parameters, value
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
 from nodes.node.config import NodeConfig
+from nodes.node.node import Node
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
-    from nodes.node.node import Node
 
 PIN: Final = PinOption(name="pin", help="the output")
 PWM: Final = BoolOption(name="pwm", help="whether it may be anything from off to on, by PWM", default=False)

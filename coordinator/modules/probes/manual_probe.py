@@ -5,19 +5,17 @@ TESTZ also halves: between the height at hand and the next one that was tried ab
 
 from bisect import insort
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.builtins.state import go
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading, ToProgram
 from coordinator.gcode.events import Reply
+from coordinator.gcode.interpreter import Job
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
-
-if TYPE_CHECKING:
-    from coordinator.gcode.interpreter import Job
-    from coordinator.runtime.module_context import Live
 
 SPEED: Final = 5.0
 """mm/s of TESTZ, unless the beginning says otherwise."""

@@ -1,7 +1,7 @@
 """[delayed_gcode NAME]: g-code that is run after a while, by itself; and again, if it says so."""
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
@@ -9,11 +9,9 @@ from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, needed, parameters
+from coordinator.runtime.module_context import Live
 from coordinator.support.quoting import nearest
 from coordinator.support.values import Value
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 GCODE = GCodeOption(name="gcode", help="What is done: g-code, with Jinja2 between { and {% %}")
 INITIAL = FloatOption(

@@ -7,20 +7,17 @@ filament then is where the next object expects it, neither further forward nor f
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, ToProgram
+from coordinator.gcode.interpreter import Job
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import flag, needed, parameters
-from coordinator.motion.planner.planner import FeedStatus
+from coordinator.motion.planner.planner import FeedStatus, Planner
 from coordinator.support.quoting import nearest
 from coordinator.support.values import Value
-
-if TYPE_CHECKING:
-    from coordinator.gcode.interpreter import Job
-    from coordinator.motion.planner.planner import Planner
 
 OBJECTS_MAX: Final = 1000
 POINTS_MAX: Final = 1000

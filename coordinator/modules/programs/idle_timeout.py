@@ -4,17 +4,15 @@ Every machine has it, with its defaults where there is no such section.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, parameters
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 TIMEOUT = FloatOption(
     name="timeout",

@@ -5,19 +5,17 @@ behind that. RESUME goes back there and lets the job go on.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.builtins.state import save_state
 from coordinator.gcode.commands import Call, GCodeCommand, Reading, ToProgram
 from coordinator.gcode.events import Reply
+from coordinator.gcode.interpreter import Job
 from coordinator.modules.base import Build, Module
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.modules.words import bounded, parameters
 from coordinator.support.values import Value
-
-if TYPE_CHECKING:
-    from coordinator.gcode.interpreter import Job
 
 VELOCITY = FloatOption(
     name="recover_velocity",

@@ -1,15 +1,13 @@
 """SAVE_CONFIG, RESTART and FIRMWARE_RESTART: what was calibrated is kept, and the machine begins anew."""
 
-from typing import TYPE_CHECKING
+import asyncio
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.modules.base import Build, Module
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 
 class SaveConfig(Module):
@@ -61,8 +59,6 @@ class SaveConfig(Module):
         return AtRest(lambda: self._restart(firmware=firmware))
 
     async def _save(self) -> Done | None:
-        import asyncio  # noqa: PLC0415 (planning needs none)
-
         assert self._live is not None
         machine = self._live.machine
         if not machine.unsaved.pending:

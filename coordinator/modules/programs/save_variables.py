@@ -8,7 +8,7 @@ it is told in memory.
 import threading
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec, TextOption
@@ -17,13 +17,11 @@ from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
 from coordinator.modules.words import needed, parameters
+from coordinator.runtime.module_context import Live
 from coordinator.support.atomic_file import write_whole
 from coordinator.support.quoting import shown_path
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 FILENAME = TextOption(name="filename", help="The file, relative to that of the configuration; ~ is your home")
 VARIABLES_MAX: Final = 1000

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.options import GCodeOption, SectionSpec, TextOption
 from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, ToProgram
+from coordinator.gcode.interpreter import Job
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.print_control import Recovering
 from coordinator.gcode.reply_kinds import ReplyKind
@@ -15,9 +16,6 @@ from coordinator.modules.status.print_stats import PrintStats
 from coordinator.modules.words import bounded, flag, needed, parameters
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.gcode.interpreter import Job
 
 PATH = TextOption(
     name="path",

@@ -1,7 +1,7 @@
 """[filament_switch_sensor NAME]: a switch that is pressed while there is filament; without it jobs pause."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.options import BoolOption, FloatOption, GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
@@ -11,11 +11,9 @@ from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.modules.words import flag, needed, one, parameters
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
 from nodes.devices.button import Button
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 PIN: Final = PinOption(
     name="switch_pin", help="input of the switch; with filament it is high, with ! low", pullable=True

@@ -4,8 +4,9 @@ No node watches over them, so no heater may depend upon them; the host stops the
 min_temp and max_temp.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.sections.sensor_options import (
@@ -21,19 +22,16 @@ from coordinator.config.sections.sensor_options import (
 )
 from coordinator.heat.chip_sensors import ChipLine, ChipSensor, FactoryPoints, chip_sensor
 from coordinator.modules.base import Build, Modules
+from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from coordinator.modules.sensors.temperature_source import TemperatureSource
+from coordinator.runtime.module_context import Live
 from coordinator.support.quoting import nearest, shown
 from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.node.config import NodeConfig, NodeConfigError
+from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from coordinator.runtime.module_context import Live
-    from nodes.node.node import Node
 
 LOWEST_C: Final = -273.15
 HIGHEST_C: Final = 1500.0
@@ -179,8 +177,6 @@ class CombinedTemperature(TemperatureSource):
 
     def __init__(self, build: Build, min_c: float, max_c: float) -> None:
         super().__init__(build.name, min_c, max_c)
-        from coordinator.modules.heaters.heaters import Heaters  # noqa: PLC0415 (it imports what sensors are)
-
         self._heaters = build.shared(Heaters)
         self._names = build.get(SENSOR_LIST)
         self._method = build.get(COMBINATION_METHOD)

@@ -1,7 +1,7 @@
 """[gcode_button NAME]: g-code that is run when a button is pressed, or let go."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.options import GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
@@ -10,11 +10,9 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import flag, one, parameters
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
 from nodes.devices.button import Button
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 PIN: Final = PinOption(name="pin", help="input of the button; pressed is high, with ! low", pullable=True)
 PRESS: Final = GCodeOption(name="press_gcode", help="What is done when it is pressed")

@@ -1,6 +1,6 @@
 """A temperature on an analog input, for whatever module has one."""
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.config.errors import ConfigError, NotActing
 from coordinator.config.sections.sensor_options import (
@@ -30,12 +30,10 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.modules.sensors.thermistor import KINDS, Circuit, CustomSensor
+from coordinator.runtime.module_context import Live
 from coordinator.support.quoting import nearest, shown
 from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.node.states import NodeState
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 PT100_BOARD: Final = "PT100 INA826"
 KNOWN_SENSORS: Final = (*THERMISTORS, "PT1000", PT100_BOARD, *AMPLIFIERS)

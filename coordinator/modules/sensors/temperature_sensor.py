@@ -1,7 +1,7 @@
 """[temperature_sensor NAME]: a temperature that is only watched."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, ClassVar, Final
+from typing import ClassVar, Final
 
 from coordinator.config.options import SectionSpec, TextOption
 from coordinator.config.sections.sensor_options import (
@@ -13,10 +13,8 @@ from coordinator.modules.base import Build, Modules
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_input import SensorModule
+from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
 
 GCODE_ID: Final = TextOption(
     name="gcode_id",

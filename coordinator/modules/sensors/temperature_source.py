@@ -1,15 +1,12 @@
 """A temperature that is measured again and again, wherever it comes from, and those who wait for it."""
 
+import asyncio
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.modules.base import Modules
+from coordinator.runtime.module_context import Live
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    import asyncio  # planning waits for nothing
-
-    from coordinator.runtime.module_context import Live
 
 SILENT_S: Final = 10.0
 """Who waits for a measurement that should come three times a second gives up after so long; a host may stand
@@ -78,8 +75,6 @@ class TemperatureSource:
 
     async def next(self) -> None:
         """Wait for the next measurement; raises CanductorError when there will be none."""
-        import asyncio  # noqa: PLC0415
-
         if self._over is not None:
             raise CanductorError(self._over)
         if len(self._waiting) >= MAX_WAITERS:

@@ -1,5 +1,6 @@
 """What people at a console ask a machine: HELP, STATUS, M115."""
 
+from importlib.metadata import version
 from typing import Final
 
 from coordinator.config.options import SectionSpec
@@ -43,6 +44,4 @@ class Console(Module):
         return AtOnce((f"{stats.state} {stats.told['filename']}",))
 
     def _identify(self, _call: Call) -> Reading:
-        from importlib.metadata import version  # noqa: PLC0415 (start-up time: it draws in the mail parser)
-
         return AtOnce((f"FIRMWARE_NAME:{NAME} FIRMWARE_VERSION:{version(NAME)}",), kind=ReplyKind.PLAIN)

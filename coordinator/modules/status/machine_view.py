@@ -4,14 +4,12 @@ import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from coordinator.modules.base import Modules
+from coordinator.runtime.module_context import Live
+from nodes.node.node import Node
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.modules.base import Modules
-    from coordinator.runtime.module_context import Live
-    from nodes.node.node import Node
 
 _MEMORY: Final = Path("/proc/meminfo")
 

@@ -1,14 +1,10 @@
 """GET_POSITION: where the machine is in all frames, from what the nodes count to the program's numbers."""
 
-from typing import TYPE_CHECKING
-
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.status import frames
 from coordinator.modules.base import Build, Module
-
-if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import Live
 
 
 class Positions(Module):

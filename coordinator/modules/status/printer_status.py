@@ -5,9 +5,12 @@ asked for everybody's status, once for each rendering that looks at one; a loop 
 than PATIENCE_S, and the status it gave last is used.
 """
 
+import asyncio
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
+
+from jinja2 import ChainableUndefined
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import Call
@@ -16,13 +19,7 @@ from coordinator.modules.status.absent_status import absent_statuses
 from coordinator.modules.status.config_view import ConfigView
 from coordinator.modules.status.machine_view import Commands, machine_view
 from coordinator.modules.status.print_stats import PrintStats
-
-if TYPE_CHECKING:
-    import asyncio
-
-    from jinja2 import ChainableUndefined
-
-    from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import Live
 
 PATIENCE_S: Final = 0.2
 Shown = Mapping[str, Mapping[str, object]]
@@ -48,8 +45,6 @@ class PrinterStatus(Module):
 
     async def connect(self, live: "Live") -> None:
         """Ask the loop from now on."""
-        import asyncio  # noqa: PLC0415 (start-up time)
-
         self._live = live
         self._loop, self._loop_thread = asyncio.get_running_loop(), threading.get_ident()
 
@@ -147,8 +142,6 @@ class Section(dict[str, Any]):
         self._name = name
 
     def __missing__(self, field: str) -> "ChainableUndefined":
-        from jinja2 import ChainableUndefined  # noqa: PLC0415 (planning without macros needs none)
-
         return ChainableUndefined(f"printer[{self._name!r}] has no {field!r}")
 
 

@@ -4,15 +4,14 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 
 from coordinator.motion.planner._planner import lib
 from coordinator.motion.specs import MotionLimits
-
-if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
+from coordinator.motion.trapezoid_array import TRAPEZOID
 
 Position = tuple[float, float, float, float]
 
@@ -143,10 +142,6 @@ class Trapezoids:
 
     def array(self) -> "npt.NDArray[np.void]":
         """Return a numpy view (dtype TRAPEZOID of trapezoid_array) of the same memory."""
-        import numpy as np  # noqa: PLC0415 (start-up time: planning does without)
-
-        from coordinator.motion.trapezoid_array import TRAPEZOID  # noqa: PLC0415
-
         return np.frombuffer(self.memory, TRAPEZOID, self.count, self.offset)
 
 

@@ -5,8 +5,9 @@ anything, and whatever is left of it when the steppers are stopped on their node
 """
 
 import asyncio
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -15,9 +16,6 @@ from coordinator.motion.specs import StepKinematics, StepperSpec
 from coordinator.motion.steps.steps import StepGenerator
 from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.runtime.machine import Machine, link_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
 
 START_LEAD_S: Final = 0.4
 """From now to the first step: time to arm what has to stop it, and for the steps to reach the nodes."""

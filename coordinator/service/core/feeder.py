@@ -9,7 +9,7 @@ passes between them are single attributes and deques, whose operations are atomi
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.gcode.builtins.state import come_back, present_state
 from coordinator.gcode.commands import NO_WORDS, Vocabulary
@@ -30,12 +30,10 @@ from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import MachineState, SavedState
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.print_control import Recovering
+from coordinator.motion.planner.language import Aside
 from coordinator.motion.planner.planner import Planner
 from coordinator.service.core.work import NO_PROGRESS, LinesWork, Rest, Setting, Work
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.motion.planner.language import Aside
 
 WAITING_MAX: Final = 64
 """Works that may wait; more are refused."""

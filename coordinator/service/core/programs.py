@@ -12,6 +12,7 @@ from coordinator.modules.programs.gcode_macro import words_in
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.modules.programs.virtual_sdcard import VirtualSdcard
 from coordinator.modules.status.print_stats import PrintStats
+from coordinator.runtime.machine import Machine
 from coordinator.service.core.feeder import FeederFull
 from coordinator.service.core.motion import MotionOver
 from coordinator.service.core.work import FileWork, LinesWork, Rest
@@ -21,7 +22,6 @@ from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.runtime.machine import Machine
     from coordinator.service.core.machine_service import MachineService
 
 _STATES: Final[Mapping[JobPhase, str]] = {

@@ -7,8 +7,9 @@ an axis at one moment, and only while the machine stands.
 
 import asyncio
 from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from coordinator.config.model import MachineDescription
 from coordinator.ipc.server.state import StateTree
 from coordinator.runtime.machine import Machine
 from coordinator.streaming.compensation import WHICH_AXES, Compensation, corrected_axes, why_not_corrected
@@ -18,13 +19,10 @@ from coordinator.tables.store import TableStore
 from nodes.clock.clock import HostTime
 from nodes.mt.download import Outcome, Place, Report, download
 from nodes.mt.mt import MtStatus, Pair
+from nodes.mt.table import ActiveTable, AxleTable, TableState
 from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.config.model import MachineDescription
-    from nodes.mt.table import ActiveTable, AxleTable, TableState
 
 CARE_S: Final = 0.5
 """How often the nodes are looked at for one that came back, and tables for one that is not in use yet."""

@@ -2,8 +2,9 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from coordinator.config.model import MachineDescription
 from coordinator.gcode.builtins.state import present_state
 from coordinator.gcode.events import Emergency, End
 from coordinator.gcode.interpreter import Job
@@ -14,12 +15,9 @@ from coordinator.modules.module_set import build_modules
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner
+from coordinator.runtime.machine_modules import MachineModules
 from coordinator.streaming.program_machine import machine_state
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.config.model import MachineDescription
-    from coordinator.runtime.machine_modules import MachineModules
 
 _DYNAMICS: Final = ("accel", "max_velocity", "square_corner_velocity", "minimum_cruise_ratio", "plane")
 

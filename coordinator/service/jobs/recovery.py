@@ -17,6 +17,8 @@ from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
+from coordinator.motion.planner.planner import Planner
+from coordinator.runtime.machine_modules import MachineModules
 from coordinator.service.core.feeder import COME_BACK_MM_S
 from coordinator.service.core.motion import Motion
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Setting, Work
@@ -34,8 +36,6 @@ from coordinator.service.jobs.resume_homing import (
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.motion.planner.planner import Planner
-    from coordinator.runtime.machine_modules import MachineModules
     from coordinator.service.core.machine_service import MachineService
 
 NEAR_K: Final = 2.0

@@ -6,18 +6,16 @@ stand where it stood when the job was interrupted: nobody may have moved it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from coordinator.config.model import MachineDescription
 from coordinator.gcode.builtins.machine import come_to_rest
 from coordinator.gcode.commands import Done
 from coordinator.gcode.events import Event, Full
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.homing.homing import Homing
+from coordinator.runtime.machine_modules import MachineModules
 from coordinator.service.core.work import LinesWork, Setting
-
-if TYPE_CHECKING:
-    from coordinator.config.model import MachineDescription
-    from coordinator.runtime.machine_modules import MachineModules
 
 LIFT_MM: Final = 5.0
 """Above what is printed, on the way to where the job goes on."""

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Final
 
 from coordinator.ipc.server.state import StateTree
 from coordinator.motion.planner.planner import AXIS_LETTERS, Position
-from coordinator.runtime.machine import link_of
+from coordinator.runtime.machine import Machine, link_of
+from coordinator.service.core.motion import Motion
+from coordinator.service.jobs.jobs import JobRun
 from coordinator.support.values import Value
 from nodes.link import BusLoad, IOStats, LinkStats
 from nodes.node.node import Node
@@ -18,11 +20,7 @@ from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
-    from coordinator.runtime.machine import Machine
     from coordinator.service.core.machine_service import MachineService
-    from coordinator.service.core.motion import Motion
-    from coordinator.service.jobs.jobs import JobRun
-
 RECENT_LOOKS: Final = 10
 """A lead is recent for so many looks: about a second."""
 _NOT_IN_A_PATH = re.compile(r"[^A-Za-z0-9_-]")

@@ -1,14 +1,25 @@
 """From [printer] kinematics to the frame of the machine: which sections it needs, how they fit together."""
 
-# ruff: noqa: PLC0415 (start-up time: a machine has one kinematics)
-
 from collections.abc import Callable
 
 from coordinator.config.options import SectionReader
+from coordinator.config.sections.kinematics.delta import read_delta
+from coordinator.config.sections.kinematics.deltesian import read_deltesian
+from coordinator.config.sections.kinematics.dual_carriage import read_dual_carriage
 from coordinator.config.sections.kinematics.frame import Frame, box_of, home_of
+from coordinator.config.sections.kinematics.generic_cartesian import read_generic
+from coordinator.config.sections.kinematics.polar import read_polar
+from coordinator.config.sections.kinematics.rotary_delta import read_rotary_delta
+from coordinator.config.sections.kinematics.winch import read_winch
 from coordinator.config.sections.rails import read_rail
 from coordinator.config.sections.reading import Reading
 from coordinator.kinematics.base import Kinematics, WorkSpace
+from coordinator.kinematics.cartesian import Cartesian
+from coordinator.kinematics.corexy import CoreXY
+from coordinator.kinematics.corexz import CoreXZ
+from coordinator.kinematics.hybrid_corexy import HybridCoreXY
+from coordinator.kinematics.hybrid_corexz import HybridCoreXZ
+from coordinator.kinematics.no_motion import NoMotion
 
 _EMPTY = WorkSpace((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
@@ -18,8 +29,6 @@ def read_frame(reading: Reading, kinematics: str, printer: SectionReader) -> Fra
     frame = _frame_reader(kinematics)(reading, printer)
     if "dual_carriage" not in reading.config.sections:
         return frame
-    from coordinator.config.sections.kinematics.dual_carriage import read_dual_carriage
-
     return read_dual_carriage(reading, frame)
 
 
@@ -27,34 +36,21 @@ def _frame_reader(kinematics: str) -> Callable[[Reading, SectionReader], Frame]:
     read: Callable[[Reading, SectionReader], Frame]
     match kinematics:
         case "delta":
-            from coordinator.config.sections.kinematics.delta import read_delta
-
             read = read_delta
         case "deltesian":
-            from coordinator.config.sections.kinematics.deltesian import read_deltesian
-
             read = read_deltesian
         case "generic_cartesian":
-            from coordinator.config.sections.kinematics.generic_cartesian import read_generic
-
             read = read_generic
         case "none":
-            from coordinator.kinematics.no_motion import NoMotion
 
             def read(reading: Reading, printer: SectionReader) -> Frame:
                 del reading, printer
                 return Frame(NoMotion(), (), (0.0, 0.0, 0.0))
         case "polar":
-            from coordinator.config.sections.kinematics.polar import read_polar
-
             read = read_polar
         case "rotary_delta":
-            from coordinator.config.sections.kinematics.rotary_delta import read_rotary_delta
-
             read = read_rotary_delta
         case "winch":
-            from coordinator.config.sections.kinematics.winch import read_winch
-
             read = read_winch
         case _:
             build = _axes_kinematics(kinematics)
@@ -71,24 +67,14 @@ def _axes_kinematics(kinematics: str) -> Callable[[WorkSpace], Kinematics]:
     axes: Callable[[WorkSpace], Kinematics]
     match kinematics:
         case "corexy":
-            from coordinator.kinematics.corexy import CoreXY
-
             axes = CoreXY
         case "corexz":
-            from coordinator.kinematics.corexz import CoreXZ
-
             axes = CoreXZ
         case "hybrid_corexy":
-            from coordinator.kinematics.hybrid_corexy import HybridCoreXY
-
             axes = HybridCoreXY
         case "hybrid_corexz":
-            from coordinator.kinematics.hybrid_corexz import HybridCoreXZ
-
             axes = HybridCoreXZ
         case _:
-            from coordinator.kinematics.cartesian import Cartesian
-
             axes = Cartesian
     return axes
 
