@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from nodes.clock.clock import HostTime
 from nodes.mt.cost import FRAME_BITS_MAX, RegisterCost
-from nodes.mt.download import BUS_SHARE, Report, download
+from nodes.mt.download import BUS_SHARE, DownloadReport, download
 from nodes.mt.mt import transmission
 from nodes.mt.table import Activation
 from nodes.virtual.world import run
@@ -52,7 +52,7 @@ def one_table(points: int, name: str, load: float, loss: float) -> None:
     """One table for all axles."""
     machine = TableMachine(1, capacity=points)
 
-    async def act() -> list[Report]:
+    async def act() -> list[DownloadReport]:
         return [await download(wavy(points), machine.places, now_ns=machine.now_ns)]
 
     reports = performed(machine, act, load, loss)
@@ -66,7 +66,7 @@ def own_tables(points: int) -> None:
     """Each axle its own."""
     machine = TableMachine(2, capacity=points)
 
-    async def act() -> list[Report]:
+    async def act() -> list[DownloadReport]:
         return [
             await download(wavy(points, number), [place], now_ns=machine.now_ns)
             for number, place in enumerate(machine.places)
@@ -119,7 +119,7 @@ def performed(machine: TableMachine, act: Callable[[], Awaitable[T]], load: floa
     return run(machine.world, body(), limit_s=600)
 
 
-def told(what: str, reports: Sequence[Report]) -> None:
+def told(what: str, reports: Sequence[DownloadReport]) -> None:
     """Print what became of them."""
     outcomes = [outcome for report in reports for outcome in report.outcomes]
     elapsed_ms = sum(report.elapsed_s for report in reports) * 1e3

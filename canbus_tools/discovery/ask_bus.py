@@ -1,11 +1,11 @@
-"""Asking a live bus who is there: drives the census on an open bus, and options common to those who ask."""
+"""Runs node discovery on an open bus; options common to the tools that ask nodes."""
 
 import argparse
 from typing import Final
 
 from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.bus.talk import LISTEN_S, BusTalk
-from canbus_tools.discovery.node_discovery import ROUNDS, Census, CensusResult
+from canbus_tools.discovery.node_discovery import ROUNDS, DiscoveredNodes, NodeDiscovery
 from nodes.link import Frame
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import number
@@ -17,14 +17,14 @@ _LISTEN_MIN_S: Final = 0.1
 _LISTEN_MAX_S: Final = 60.0
 
 
-async def take_census(bus: BusTalk, rounds: int = ROUNDS) -> CensusResult:
+async def discover_nodes(bus: BusTalk, rounds: int = ROUNDS) -> DiscoveredNodes:
     """Ask who is on BUS, ROUNDS times or more; raises CanductorError when the bus cannot be used."""
-    census = Census(rounds)
+    discovery = NodeDiscovery(rounds)
 
     def came(frame: Frame) -> None:
         if frame.can_id == BUS_OFF:
             raise_later.append(bus_off(bus.name))
-        census.frame(frame.can_id, frame.data)
+        discovery.frame(frame.can_id, frame.data)
 
     raise_later: list[CanductorError] = []
     end = bus.on_frame(came)
@@ -32,22 +32,22 @@ async def take_census(bus: BusTalk, rounds: int = ROUNDS) -> CensusResult:
         # By a clock of its own, of the time that was waited: what this computer overslept beyond that, the
         # nodes' answers may have had to wait, too.
         now_ns = 0
-        census.start(now_ns)
-        while census.deadline_ns is not None and not raise_later:
+        discovery.start(now_ns)
+        while discovery.deadline_ns is not None and not raise_later:
             try:
-                for frame in census.frames_to_send():
+                for frame in discovery.frames_to_send():
                     bus.send_frame(frame.can_id, frame.data)
             except CanductorError:
                 await bus.wait(_CAUSE_S)  # which raises what ended the bus, and that tells more
                 raise
-            await bus.wait((census.deadline_ns - now_ns) * 1e-9)
-            now_ns = census.deadline_ns
-            census.timer(now_ns)
+            await bus.wait((discovery.deadline_ns - now_ns) * 1e-9)
+            now_ns = discovery.deadline_ns
+            discovery.timer(now_ns)
     finally:
         end()
     if raise_later:
         raise raise_later[0]
-    return census.result()
+    return discovery.result()
 
 
 def bus_off(bus: str) -> CanductorError:

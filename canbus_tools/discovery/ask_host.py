@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from canbus_tools.bus.open_bus import BusOptions
-from canbus_tools.discovery.node_info import Facts, Firmware
+from canbus_tools.discovery.node_info import Firmware, NodeInfo
 from nodes.bus.assign import AssignError, Uuid
 from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import host_sockets
@@ -23,14 +23,14 @@ _REQUESTS: Final = (
 )
 
 
-async def ask_hosts(options: BusOptions, timeout_s: float = TIMEOUT_S) -> dict[int, Facts]:
+async def ask_hosts(options: BusOptions, timeout_s: float = TIMEOUT_S) -> dict[int, NodeInfo]:
     """Return what this user's coordinators say of their nodes on a bus, by id; nothing where none runs.
 
     One that says nothing is waited for TIMEOUT_S.
     """
     answers = await asyncio.gather(*(_ask(path, timeout_s) for path in host_sockets()))
     bus = _bus_name(options)
-    told: dict[int, Facts] = {}
+    told: dict[int, NodeInfo] = {}
     for node in (node for nodes in answers for node in nodes if isinstance(node, Mapping)):
         nodeid = node.get("nodeid")
         if node.get("bus") == bus and isinstance(nodeid, int):
@@ -65,14 +65,14 @@ async def _ask(path: Path, timeout_s: float) -> list[object]:
     return []
 
 
-def _facts(node: Mapping[str, object]) -> Facts:
+def _facts(node: Mapping[str, object]) -> NodeInfo:
     uuid, clock_hz, nodeid = node.get("uuid"), node.get("clock_freq_hz"), node.get("nodeid")
     try:
         known = Uuid.parse(uuid) if isinstance(uuid, str) else None
     except (AssignError, CanductorError):
         known = None
     state = node.get("state")
-    return Facts(
+    return NodeInfo(
         firmware=Firmware(
             mcu=_text(node, "mcu"),
             version=_text(node, "firmware_version"),

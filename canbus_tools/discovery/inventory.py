@@ -14,11 +14,11 @@ from typing import Final
 
 from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.bus.talk import DATA_IDS, LISTEN_S, BusTalk, data_ids
-from canbus_tools.discovery.ask_bus import take_census
+from canbus_tools.discovery.ask_bus import discover_nodes
 from canbus_tools.discovery.ask_host import ask_hosts
-from canbus_tools.discovery.node_discovery import ROUNDS, Application, CensusResult, NodeHere, WaitingNode
-from canbus_tools.discovery.node_info import Facts, interview
-from canbus_tools.discovery.passive_discovery import Overhearing
+from canbus_tools.discovery.node_discovery import ROUNDS, Application, DiscoveredNodes, NodeHere, WaitingNode
+from canbus_tools.discovery.node_info import NodeInfo, read_node_info
+from canbus_tools.discovery.passive_discovery import PassiveDiscovery
 from nodes.bus.assign import Uuid
 from nodes.link import Frame
 from nodes.support.can_protocol import FIRST_NODEID
@@ -29,19 +29,19 @@ PROBED: Final = range(FIRST_NODEID, 68)
 DAMAGED_BLOCK: Final = b"\x05\x10\x00\x00\x7e\x7e"
 """An empty block with a wrong checksum; the second sync byte ends it for parsers that look for one behind."""
 PROBE_PASSES: Final = 3
-"""Frames get lost; of nodes that a census does not know one answer is all there is."""
+"""Frames get lost; of nodes that discovery did not find one answer is all there is."""
 PROBES_AT_ONCE: Final = 4
 PROBE_PAUSE_S: Final = 0.002
 """Between so many: a fifth of the bus at 1 Mbit/s, all of it for 40 ms at 250 kbit/s."""
 PROBE_ANSWER_S: Final = 0.03
 """For the last answers; adapters on USB may hold frames back for 16 ms."""
-INTERVIEWS_AT_ONCE: Final = 8
+READ_AT_ONCE: Final = 8
 HEAR_OUT_S: Final = 0.1
 HEAR_OUT_TIMES: Final = 22
 """At most so often: a host that asks for clocks every 0.98 s has asked three times since the beginning."""
 
 
-class State(Enum):
+class NodePresence(Enum):
     """What a node is doing, as far as can be told."""
 
     WAITING = "waiting"
@@ -58,29 +58,29 @@ class State(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Entry:
+class InventoryEntry:
     """One node."""
 
     nodeid: int | None
     uuid: Uuid | None
     application: Application
-    state: State
-    facts: Facts | None = None
+    state: NodePresence
+    facts: NodeInfo | None = None
     twins: bool = False
     """Another board has the same uuid."""
-    told: Facts | None = None
+    told: NodeInfo | None = None
     """Of a node in use: what the coordinator says that drives it."""
-    overheard: Facts | None = None
+    passive: NodeInfo | None = None
     """Of a node in use: what its traffic tells by a dictionary of the cache that explains it."""
     trouble: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class SurveyResult:
+class Inventory:
     """All nodes that were found: by id, then those that wait."""
 
-    entries: tuple[Entry, ...]
-    census: CensusResult
+    entries: tuple[InventoryEntry, ...]
+    discovery: DiscoveredNodes
     probed: tuple[int, ...]
     """Ids to which a damaged block was sent."""
 
@@ -90,84 +90,84 @@ class SurveyResult:
         rows = Counter(entry.uuid for entry in self.entries)
         return len(self.entries) + sum(entry.twins and rows[entry.uuid] == 1 for entry in self.entries)
 
-    def by_uuid(self, uuid: Uuid) -> list[Entry]:
+    def by_uuid(self, uuid: Uuid) -> list[InventoryEntry]:
         """Return the nodes that have a uuid."""
         return [entry for entry in self.entries if entry.uuid == uuid]
 
-    def by_nodeid(self, nodeid: int) -> list[Entry]:
+    def by_nodeid(self, nodeid: int) -> list[InventoryEntry]:
         """Return the nodes that have an id."""
         return [entry for entry in self.entries if entry.nodeid == nodeid]
 
 
-async def survey(
+async def take_inventory(
     bus: BusTalk, *, probed: Iterable[int] = PROBED, listen_s: float = LISTEN_S, rounds: int = ROUNDS
-) -> SurveyResult:
+) -> Inventory:
     """Find all nodes on BUS, after listening for LISTEN_S; raises CanductorError when the bus fails."""
     started_s = asyncio.get_running_loop().time()
-    census = await take_census(bus, rounds)
+    discovery = await discover_nodes(bus, rounds)
     await bus.wait(max(0.0, started_s + listen_s - asyncio.get_running_loop().time()))
-    here = {node.nodeid for node in census.here}
+    here = {node.nodeid for node in discovery.here}
     candidates = tuple(sorted({*probed, *here, *bus.talking} - bus.hosted))
     answering = await probe(bus, candidates)
     hosted = frozenset(bus.hosted)
-    shared = _shared_ids(census)
-    # Who said that it is here is asked even when no probe was answered: an interview asks again and again.
+    shared = _shared_ids(discovery)
+    # A node that answered WHO_IS_HERE is asked even when no probe was answered: reading repeats each question.
     asked = sorted((answering | here) - hosted - shared)
-    facts = dict(zip(asked, await _interview_all(bus, asked), strict=True))
+    facts = dict(zip(asked, await _read_all_node_info(bus, asked), strict=True))
     silent = {n for n in here - answering if isinstance(facts.get(n), CanductorError)}
-    entries = [_assigned(n, facts[n], census, silent=n in silent) for n in asked]
-    entries += [_not_asked(node, shared) for node in census.here if node.nodeid not in facts]
+    entries = [_assigned(n, facts[n], discovery, silent=n in silent) for n in asked]
+    entries += [_not_asked(node, shared) for node in discovery.here if node.nodeid not in facts]
     entries += [_hosted(nodeid, answers=nodeid in bus.talking) for nodeid in sorted(hosted - here)]
     entries.sort(key=lambda entry: (entry.nodeid or 0, entry.uuid.raw if entry.uuid else b""))
-    entries += [_waiting(node) for node in await _still_waiting(bus, census, {e.uuid for e in entries})]
-    return SurveyResult(_mark_twins(entries), census, candidates)
+    entries += [_waiting(node) for node in await _still_waiting(bus, discovery, {e.uuid for e in entries})]
+    return Inventory(_mark_twins(entries), discovery, candidates)
 
 
-async def survey_all(
+async def take_full_inventory(
     bus: BusTalk, options: BusOptions, *, probed: Iterable[int], listen_s: float
-) -> SurveyResult:
-    """Find all nodes as ``survey`` does, and of nodes in use what their host or else their traffic tells."""
-    overhearing = Overhearing(bus.cache)
-    end = bus.on_frame(overhearing.frame)
+) -> Inventory:
+    """Find all nodes; of nodes in use, add what their host reports, or else what their traffic shows."""
+    passive = PassiveDiscovery(bus.cache)
+    end = bus.on_frame(passive.frame)
     try:
-        found = await survey(bus, probed=probed, listen_s=listen_s)
+        found = await take_inventory(bus, probed=probed, listen_s=listen_s)
         told = await ask_hosts(options)
-        await _hear_out(bus, frozenset(bus.hosted - told.keys()), overhearing)
+        await _listen_out(bus, frozenset(bus.hosted - told.keys()), passive)
     finally:
         end()
-    entries = [_in_use(entry, told, overhearing) for entry in found.entries]
+    entries = [_in_use(entry, told, passive) for entry in found.entries]
     return replace(found, entries=_mark_twins(entries))
 
 
-async def _hear_out(bus: BusTalk, hosted: Iterable[int], overhearing: Overhearing) -> None:
+async def _listen_out(bus: BusTalk, hosted: Iterable[int], passive: PassiveDiscovery) -> None:
     """Wait for a node's second word about its clock where that may tell what it is."""
     for _ in range(HEAR_OUT_TIMES):
-        if not any(overhearing.is_open(nodeid) for nodeid in hosted):
+        if not any(passive.is_open(nodeid) for nodeid in hosted):
             return
         await bus.wait(HEAR_OUT_S)
 
 
-def _in_use(entry: Entry, told: Mapping[int, Facts], overhearing: Overhearing) -> Entry:
-    if entry.state is not State.IN_USE or entry.nodeid is None:
+def _in_use(entry: InventoryEntry, told: Mapping[int, NodeInfo], passive: PassiveDiscovery) -> InventoryEntry:
+    if entry.state is not NodePresence.IN_USE or entry.nodeid is None:
         return entry
     if said := told.get(entry.nodeid):
         return replace(entry, told=said, uuid=entry.uuid or said.uuid)
-    facts = overhearing.facts(entry.nodeid)
+    facts = passive.facts(entry.nodeid)
     uuid = entry.uuid or (facts.uuid if facts else None)
-    return replace(entry, overheard=facts, uuid=uuid)
+    return replace(entry, passive=facts, uuid=uuid)
 
 
 async def _still_waiting(
-    bus: BusTalk, census: CensusResult, with_id: Collection[Uuid | None]
+    bus: BusTalk, discovery: DiscoveredNodes, with_id: Collection[Uuid | None]
 ) -> Iterable[WaitingNode]:
     """Return who waits; of a uuid that was found with an id as well, only when it still does: a second board.
 
     Else another host gave the board its id meanwhile.
     """
-    if not any(node.uuid in with_id for node in census.waiting):
-        return census.waiting
-    now = {node.uuid for node in (await take_census(bus)).waiting}
-    return [node for node in census.waiting if node.uuid not in with_id or node.uuid in now]
+    if not any(node.uuid in with_id for node in discovery.waiting):
+        return discovery.waiting
+    now = {node.uuid for node in (await discover_nodes(bus)).waiting}
+    return [node for node in discovery.waiting if node.uuid not in with_id or node.uuid in now]
 
 
 async def probe(bus: BusTalk, nodeids: Iterable[int]) -> set[int]:
@@ -193,14 +193,14 @@ async def probe(bus: BusTalk, nodeids: Iterable[int]) -> set[int]:
     return answered & wanted
 
 
-async def _interview_all(bus: BusTalk, nodeids: list[int]) -> list[Facts | CanductorError]:
+async def _read_all_node_info(bus: BusTalk, nodeids: list[int]) -> list[NodeInfo | CanductorError]:
     """Ask them all, a few at a time, beside a host one at a time; what went wrong with one is its result."""
-    room = asyncio.Semaphore(1 if bus.hosted else INTERVIEWS_AT_ONCE)
+    room = asyncio.Semaphore(1 if bus.hosted else READ_AT_ONCE)
 
-    async def one(nodeid: int) -> Facts | CanductorError:
+    async def one(nodeid: int) -> NodeInfo | CanductorError:
         async with room:
             try:
-                return await interview(bus, nodeid)
+                return await read_node_info(bus, nodeid)
             except CanductorError as error:
                 return error
 
@@ -210,20 +210,24 @@ async def _interview_all(bus: BusTalk, nodeids: list[int]) -> list[Facts | Candu
 # --------------------------------------------------------------------------------------------------- entries
 
 
-def _shared_ids(census: CensusResult) -> frozenset[int]:
+def _shared_ids(discovery: DiscoveredNodes) -> frozenset[int]:
     """Return the ids that more than one board has: their answers would be a mixture."""
-    boards = Counter(node.nodeid for node in census.here)
-    twins = {node.nodeid for node in census.here if node.twins}
+    boards = Counter(node.nodeid for node in discovery.here)
+    twins = {node.nodeid for node in discovery.here if node.twins}
     return frozenset(twins | {nodeid for nodeid, count in boards.items() if count > 1})
 
 
-def _assigned(nodeid: int, said: Facts | CanductorError, census: CensusResult, *, silent: bool) -> Entry:
-    ours = next((node for node in census.here if node.nodeid == nodeid), None)
+def _assigned(
+    nodeid: int, said: NodeInfo | CanductorError, discovery: DiscoveredNodes, *, silent: bool
+) -> InventoryEntry:
+    ours = next((node for node in discovery.here if node.nodeid == nodeid), None)
     application = Application.CANDUCTOR if ours else Application.KLIPPER
     if isinstance(said, CanductorError):
         uuid = ours.uuid if ours else None
         trouble = "it says that it is here, but does not answer on its id" if silent else str(said)
-        return Entry(nodeid=nodeid, uuid=uuid, application=application, state=State.UNCLEAR, trouble=trouble)
+        return InventoryEntry(
+            nodeid=nodeid, uuid=uuid, application=application, state=NodePresence.UNCLEAR, trouble=trouble
+        )
     uuid = said.uuid or (ours.uuid if ours else None)
     trouble = "" if said.configured is not None else "its firmware does not tell whether it is configured"
     if said.believed_nodeid not in (None, nodeid):
@@ -232,51 +236,53 @@ def _assigned(nodeid: int, said: Facts | CanductorError, census: CensusResult, *
         trouble = (
             f"two boards answer on this id: {ours.uuid} and {uuid}; power both off, and let one host assign"
         )
-    return Entry(
+    return InventoryEntry(
         nodeid=nodeid, uuid=uuid, application=application, state=_state(said), facts=said, trouble=trouble
     )
 
 
-def _state(facts: Facts) -> State:
+def _state(facts: NodeInfo) -> NodePresence:
     if facts.shut_down:
-        return State.SHUTDOWN
+        return NodePresence.SHUTDOWN
     if facts.configured is None:
-        return State.UNCLEAR
-    return State.CONFIGURED if facts.configured else State.IDLE
+        return NodePresence.UNCLEAR
+    return NodePresence.CONFIGURED if facts.configured else NodePresence.IDLE
 
 
-def _not_asked(node: NodeHere, shared: frozenset[int]) -> Entry:
+def _not_asked(node: NodeHere, shared: frozenset[int]) -> InventoryEntry:
     """Our firmware that said that it is here, and has a host or shares its id."""
     both = "more than one board has this id; switch them off and on, and let only one host assign ids"
     is_shared = node.nodeid in shared
-    return Entry(
+    return InventoryEntry(
         nodeid=node.nodeid,
         uuid=node.uuid,
         application=Application.CANDUCTOR,
-        state=State.UNCLEAR if is_shared else State.IN_USE,
+        state=NodePresence.UNCLEAR if is_shared else NodePresence.IN_USE,
         twins=node.twins,
         trouble=both if is_shared else "",
     )
 
 
-def _hosted(nodeid: int, *, answers: bool) -> Entry:
+def _hosted(nodeid: int, *, answers: bool) -> InventoryEntry:
     """Return what is known of a node by its traffic alone. A host that could be asked would know more."""
     silent = "another program sends to this id, and nobody answers"
-    return Entry(
+    return InventoryEntry(
         nodeid=nodeid,
         uuid=None,
         application=Application.KLIPPER if answers else Application.UNKNOWN,
-        state=State.IN_USE if answers else State.UNCLEAR,
+        state=NodePresence.IN_USE if answers else NodePresence.UNCLEAR,
         trouble="" if answers else silent,
     )
 
 
-def _waiting(node: WaitingNode) -> Entry:
-    state = State.BOOTLOADER if node.application is Application.KATAPULT else State.WAITING
-    return Entry(nodeid=None, uuid=node.uuid, application=node.application, state=state, twins=node.twins)
+def _waiting(node: WaitingNode) -> InventoryEntry:
+    state = NodePresence.BOOTLOADER if node.application is Application.KATAPULT else NodePresence.WAITING
+    return InventoryEntry(
+        nodeid=None, uuid=node.uuid, application=node.application, state=state, twins=node.twins
+    )
 
 
-def _mark_twins(entries: list[Entry]) -> tuple[Entry, ...]:
+def _mark_twins(entries: list[InventoryEntry]) -> tuple[InventoryEntry, ...]:
     boards = Counter(entry.uuid for entry in entries if entry.uuid is not None)
     return tuple(
         replace(entry, twins=entry.twins or (entry.uuid is not None and boards[entry.uuid] > 1))

@@ -83,7 +83,7 @@ class NodeHere:
 
 
 @dataclass(frozen=True, slots=True)
-class CensusResult:
+class DiscoveredNodes:
     """Who answered, in the order of uuids and ids, and what else was heard."""
 
     waiting: tuple[WaitingNode, ...]
@@ -119,7 +119,7 @@ class _Heard:
         self.last = what
 
 
-class Census:
+class NodeDiscovery:
     """Asks ROUNDS times or more. Times are nanoseconds of any one clock.
 
     Call ``start``, then ``frame`` for what arrives and ``timer`` when ``deadline_ns`` has come; send what
@@ -178,7 +178,7 @@ class Census:
         else:
             self._next_round(now_ns)
 
-    def result(self) -> CensusResult:
+    def result(self) -> DiscoveredNodes:
         """Return what is known so far."""
         # A board that was given its id meanwhile, or lost it, is what it said last; of twins all is told.
         waiting = [
@@ -192,7 +192,7 @@ class Census:
             for nodeid, answers in heard.here.items()
             if heard.last == NODE_IS_HERE or self._has_twin(heard)
         ]
-        return CensusResult(
+        return DiscoveredNodes(
             waiting=tuple(sorted(waiting, key=lambda node: node.uuid.raw)),
             here=tuple(sorted(here, key=lambda node: (node.nodeid, node.uuid.raw))),
             rounds=self._rounds,

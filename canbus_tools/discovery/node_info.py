@@ -72,7 +72,7 @@ class CanStatus:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Facts:
+class NodeInfo:
     """What a node said. None: its firmware does not know the question."""
 
     firmware: Firmware
@@ -85,18 +85,18 @@ class Facts:
     can: CanStatus | None = None
 
 
-async def interview(bus: BusTalk, nodeid: int) -> Facts:
+async def read_node_info(bus: BusTalk, nodeid: int) -> NodeInfo:
     """Ask node NODEID, to whom nobody else talks; raises CanductorError."""
     async with bus.node(nodeid) as talk:
         said = [await _said(talk, command, response) for command, response in _QUESTIONS]
-        return facts_of((talk.dictionary,), {message.name: message for message in said if message})
+        return node_info_of((talk.dictionary,), {message.name: message for message in said if message})
 
 
-def facts_of(alike: Sequence[Dictionary], said: Mapping[str, Message]) -> Facts:
+def node_info_of(alike: Sequence[Dictionary], said: Mapping[str, Message]) -> NodeInfo:
     """Return what a node SAID, by name; of several dictionaries that it may have what all of them say."""
     firmware = Firmware.common(alike)
     board, config = said.get("canbus_id"), said.get("config")
-    return Facts(
+    return NodeInfo(
         firmware=firmware,
         uuid=_uuid(board),
         believed_nodeid=_integer(board, "canbus_nodeid"),

@@ -1,11 +1,11 @@
-"""What is known of nodes in use without asking them: their own words to their host, overheard.
+"""What is known of nodes in use without asking them: their own words to their host, observed.
 
 Hosts ask their nodes for clocks, and those on CAN for their error counters, about once a second.
 """
 
 from typing import Final
 
-from canbus_tools.discovery.node_info import Facts, facts_of
+from canbus_tools.discovery.node_info import NodeInfo, node_info_of
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.dictionaries import DictionarySource
 from canbus_tools.protocol.frame import Frame as BusFrame
@@ -18,7 +18,7 @@ _ANSWERS: Final = {"canbus_id", "config", "uptime", "canbus_status"}
 ID_MAX: Final = 0x7FF
 
 
-class Overhearing:
+class PassiveDiscovery:
     """Listens along on one bus."""
 
     def __init__(self, cache: DictionaryCache) -> None:
@@ -39,10 +39,10 @@ class Overhearing:
         """Tell whether listening on may make NODEID's dictionary known."""
         return self._source.is_open(nodeid)
 
-    def facts(self, nodeid: int) -> Facts | None:
+    def facts(self, nodeid: int) -> NodeInfo | None:
         """Return what is known of a node; None: its dictionary is not."""
         dictionary = self._source.known.get(nodeid)
         if dictionary is None:
             return None
         alike = self._source.fitting.get(nodeid, (dictionary,))
-        return facts_of(alike, self._said.get(nodeid, {}))
+        return node_info_of(alike, self._said.get(nodeid, {}))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from canbus_tools.bus.bus_load import BusLoad
 from canbus_tools.bus.link_facts import LinkFacts
-from canbus_tools.discovery.inventory import SurveyResult
+from canbus_tools.discovery.inventory import Inventory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,8 +32,8 @@ class InterfaceFacts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WayFacts:
-    """What was overheard of one node; blocks are the protocol's."""
+class DirectionFacts:
+    """What was observed of one node; blocks are the protocol's."""
 
     nodeid: int
     from_blocks: int
@@ -60,7 +60,7 @@ class TrafficFacts:
     error_reports: int = 0
     errors: Mapping[str, int] = field(default_factory=dict)
     """Error reports by what they say: ack, form, stuff, bit, overflow, bus off, other."""
-    nodes: tuple[WayFacts, ...] = ()
+    nodes: tuple[DirectionFacts, ...] = ()
     send_queue_full: bool = False
     """A few short frames did not fit into the send queue (ENOBUFS)."""
     before: LinkFacts | None = None
@@ -86,7 +86,7 @@ class PingFacts:
 class NodeFacts:
     """Who is there."""
 
-    survey: SurveyResult
+    inventory: Inventory
     pings: tuple[PingFacts, ...] = ()
     silenced: Mapping[int, str] = field(default_factory=dict)
     """Nodes that said what they are and then answered no more: what went wrong, in a sentence."""
@@ -95,7 +95,7 @@ class NodeFacts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Place:
+class BusAddress:
     """Which bus, for the commands that the doctor names."""
 
     name: str

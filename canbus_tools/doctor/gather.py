@@ -16,14 +16,14 @@ from canbus_tools.bus.computer import Computer, now_s
 from canbus_tools.bus.link_facts import LinkFacts, NoInterface, read_link
 from canbus_tools.bus.open_bus import BusOptions, open_bus
 from canbus_tools.bus.talk import BusTalk
-from canbus_tools.discovery.inventory import PROBED, State, SurveyResult, survey
+from canbus_tools.discovery.inventory import PROBED, Inventory, NodePresence, take_inventory
 from canbus_tools.doctor.facts import (
     AdapterFacts,
+    DirectionFacts,
     InterfaceFacts,
     NodeFacts,
     PingFacts,
     TrafficFacts,
-    WayFacts,
 )
 from canbus_tools.protocol.decoder import BusDecoder
 from canbus_tools.protocol.flow import RoundTrips
@@ -94,7 +94,7 @@ class BusListener:
         self._meter = None if bitrate is None else LoadMeter(bitrate)
         self._decoder = BusDecoder()
         self._frames = 0
-        self._calm: tuple[BusLoad | None, int, tuple[WayFacts, ...]] | None = None
+        self._calm: tuple[BusLoad | None, int, tuple[DirectionFacts, ...]] | None = None
         self._errors: Counter[str] = Counter()
         self._started_s = self._ended_s = 0.0
 
@@ -128,7 +128,7 @@ class BusListener:
         self._bus.only(ADMIN_RESPONSE_ID)
         self._calm = self._figures()
 
-    def _figures(self) -> tuple[BusLoad | None, int, tuple[WayFacts, ...]]:
+    def _figures(self) -> tuple[BusLoad | None, int, tuple[DirectionFacts, ...]]:
         self._ended_s = now_s(self._computer)
         if self._meter is not None:
             self._meter.advance(self._ended_s)
@@ -167,12 +167,12 @@ class BusListener:
             after=after,
         )
 
-    def _ways(self) -> list[WayFacts]:
+    def _ways(self) -> list[DirectionFacts]:
         found = []
         for nodeid, node in sorted(self._decoder.nodes.items()):
             trips = node.flow.round_trips
             found.append(
-                WayFacts(
+                DirectionFacts(
                     nodeid=nodeid,
                     from_blocks=node.from_node.blocks,
                     to_blocks=node.to_node.blocks,
@@ -224,7 +224,7 @@ def fill_queue(options: BusOptions) -> bool:
 async def ask_nodes(computer: Computer, options: BusOptions, probed: range = PROBED) -> NodeFacts:
     """Find all nodes, and put questions to those to whom nobody else talks; raises CanductorError."""
     async with BusTalk.open(computer, options) as bus:
-        found = await survey(bus, probed=probed)
+        found = await take_inventory(bus, probed=probed)
         pings: list[PingFacts] = []
         silenced: dict[int, str] = {}
         for nodeid in _askable(found):
@@ -234,11 +234,11 @@ async def ask_nodes(computer: Computer, options: BusOptions, probed: range = PRO
                 if bus.closed_because is not None:
                     raise
                 silenced[nodeid] = str(error)
-    return NodeFacts(survey=found, pings=tuple(pings), silenced=silenced)
+    return NodeFacts(inventory=found, pings=tuple(pings), silenced=silenced)
 
 
-def _askable(found: SurveyResult) -> list[int]:
-    calm = (State.IDLE, State.CONFIGURED, State.SHUTDOWN)
+def _askable(found: Inventory) -> list[int]:
+    calm = (NodePresence.IDLE, NodePresence.CONFIGURED, NodePresence.SHUTDOWN)
     return [entry.nodeid for entry in found.entries if entry.nodeid is not None and entry.state in calm]
 
 

@@ -4,8 +4,8 @@ from collections import defaultdict
 from collections.abc import Iterator
 from typing import Final
 
-from canbus_tools.discovery.inventory import Entry, State
-from canbus_tools.doctor.facts import NodeFacts, PingFacts, Place
+from canbus_tools.discovery.inventory import InventoryEntry, NodePresence
+from canbus_tools.doctor.facts import BusAddress, NodeFacts, PingFacts
 from canbus_tools.doctor.finding import Finding, note, problem, warning
 from canbus_tools.doctor.traffic import RTT_SPREAD_S, slow
 from nodes.support.can_protocol import FIRST_NODEID, LAST_NODEID
@@ -16,9 +16,9 @@ NODE_ERRORS: Final = 96
 """Of a node's error counters: from here on a controller warns."""
 
 
-def check_nodes(facts: NodeFacts, place: Place) -> Iterator[Finding]:
+def check_nodes(facts: NodeFacts, place: BusAddress) -> Iterator[Finding]:
     """Judge who is there, and how they are."""
-    entries = facts.survey.entries
+    entries = facts.inventory.entries
     if not entries:
         yield _nobody(facts, place)
     yield from _twins(entries)
@@ -32,7 +32,7 @@ def check_nodes(facts: NodeFacts, place: Place) -> Iterator[Finding]:
         yield from _ping(ping, place)
 
 
-def _nobody(facts: NodeFacts, place: Place) -> Finding:
+def _nobody(facts: NodeFacts, place: BusAddress) -> Finding:
     best = max(facts.heard_at.items(), key=lambda item: item[1], default=(0, 0))
     if best[1]:
         return problem(
@@ -60,7 +60,7 @@ def _nobody(facts: NodeFacts, place: Place) -> Finding:
     )
 
 
-def _twins(entries: tuple[Entry, ...]) -> Iterator[Finding]:
+def _twins(entries: tuple[InventoryEntry, ...]) -> Iterator[Finding]:
     uuids = dict.fromkeys(entry.uuid for entry in entries if entry.twins and entry.uuid is not None)
     for uuid in uuids:
         yield problem(
@@ -73,9 +73,9 @@ def _twins(entries: tuple[Entry, ...]) -> Iterator[Finding]:
         )
 
 
-def _shared_ids(facts: NodeFacts, entries: tuple[Entry, ...]) -> Iterator[Finding]:
+def _shared_ids(facts: NodeFacts, entries: tuple[InventoryEntry, ...]) -> Iterator[Finding]:
     boards: dict[int, set[str]] = defaultdict(set)
-    for node in facts.survey.census.here:
+    for node in facts.inventory.discovery.here:
         boards[node.nodeid].add(str(node.uuid))
     for entry in entries:
         if entry.nodeid is not None and entry.uuid is not None:
@@ -94,11 +94,11 @@ def _shared_ids(facts: NodeFacts, entries: tuple[Entry, ...]) -> Iterator[Findin
 
 
 def _free_id(facts: NodeFacts) -> int:
-    taken = {entry.nodeid for entry in facts.survey.entries}
+    taken = {entry.nodeid for entry in facts.inventory.entries}
     return next(nodeid for nodeid in range(FIRST_NODEID, LAST_NODEID + 2) if nodeid not in taken)
 
 
-def _went_silent(nodeid: int, said: str, place: Place) -> Finding:
+def _went_silent(nodeid: int, said: str, place: BusAddress) -> Finding:
     return problem(
         "node-went-silent",
         f"node {nodeid} said what it is, and then answered no more: {said}",
@@ -109,9 +109,9 @@ def _went_silent(nodeid: int, said: str, place: Place) -> Finding:
     )
 
 
-def _node(entry: Entry, place: Place, free: int) -> Iterator[Finding]:
+def _node(entry: InventoryEntry, place: BusAddress, free: int) -> Iterator[Finding]:
     name = _name(entry)
-    if entry.state is State.SHUTDOWN:
+    if entry.state is NodePresence.SHUTDOWN:
         yield warning(
             "node-shutdown",
             f"{name} is in shutdown",
@@ -119,14 +119,14 @@ def _node(entry: Entry, place: Place, free: int) -> Iterator[Finding]:
             f"restart its host (FIRMWARE_RESTART in Klipper), or talk to it: 'canductor console {place.words}"
             f" --node {entry.nodeid}', and there: reset",
         )
-    elif entry.state is State.BOOTLOADER:
+    elif entry.state is NodePresence.BOOTLOADER:
         yield warning(
             "node-in-bootloader",
             f"{name} is in its bootloader (Katapult)",
             "it has no firmware that runs, or somebody asked for the bootloader: no host can use it",
             f"flash it (flashtool.py -u {entry.uuid}), or press reset once",
         )
-    elif entry.state is State.WAITING and not entry.twins:
+    elif entry.state is NodePresence.WAITING and not entry.twins:
         yield note(
             "node-waits",
             f"{name} waits for an id",
@@ -134,7 +134,7 @@ def _node(entry: Entry, place: Place, free: int) -> Iterator[Finding]:
             "put its uuid into the host's configuration; to try it:"
             f" 'canductor can assign {entry.uuid} {free} {place.words}'",
         )
-    elif entry.state is State.UNCLEAR and entry.trouble and "more than one board" not in entry.trouble:
+    elif entry.state is NodePresence.UNCLEAR and entry.trouble and "more than one board" not in entry.trouble:
         yield warning(
             "node-unclear",
             f"{name}: {entry.trouble}",
@@ -155,7 +155,7 @@ def _node(entry: Entry, place: Place, free: int) -> Iterator[Finding]:
         )
 
 
-def _ping(ping: PingFacts, place: Place) -> Iterator[Finding]:
+def _ping(ping: PingFacts, place: BusAddress) -> Iterator[Finding]:
     if ping.lost or ping.invalid_bytes:
         found = problem if ping.lost > LOSS_MANY * ping.asked else warning
         yield found(
@@ -174,6 +174,6 @@ def _ping(ping: PingFacts, place: Place) -> Iterator[Finding]:
         yield slow(ping.nodeid, ping.rtt_median_s, ping.rtt_p99_s, f"{ping.asked} questions")
 
 
-def _name(entry: Entry) -> str:
+def _name(entry: InventoryEntry) -> str:
     uuid = "" if entry.uuid is None else f"{entry.uuid}"
     return f"node {entry.nodeid} ({uuid or 'uuid unknown'})" if entry.nodeid is not None else f"board {uuid}"

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Final
 
-from canbus_tools.doctor.facts import InterfaceFacts, Place, TrafficFacts, WayFacts
+from canbus_tools.doctor.facts import BusAddress, DirectionFacts, InterfaceFacts, TrafficFacts
 from canbus_tools.doctor.finding import Finding, note, problem, warning
 from canbus_tools.doctor.interface import CABLE
 from canbus_tools.doctor.known_faults import CANDLELIGHT_FAULT, CANDLELIGHT_USB
@@ -17,8 +17,10 @@ RTT_SPREAD_S: Final = 0.02
 WIRE_ERRORS: Final = ("form", "stuff", "bit")
 
 
-def check_traffic(facts: TrafficFacts, interface: InterfaceFacts | None, place: Place) -> Iterator[Finding]:
-    """Judge what was overheard."""
+def check_traffic(
+    facts: TrafficFacts, interface: InterfaceFacts | None, place: BusAddress
+) -> Iterator[Finding]:
+    """Judge what was observed."""
     yield from _load(facts, place)
     yield from _errors(facts)
     yield from _lost(facts, place)
@@ -33,7 +35,7 @@ def check_traffic(facts: TrafficFacts, interface: InterfaceFacts | None, place: 
         )
 
 
-def _load(facts: TrafficFacts, place: Place) -> Iterator[Finding]:
+def _load(facts: TrafficFacts, place: BusAddress) -> Iterator[Finding]:
     if facts.load is None or facts.load.mean < LOAD_HIGH:
         return
     load = facts.load
@@ -92,7 +94,7 @@ def _errors(facts: TrafficFacts) -> Iterator[Finding]:
             )
 
 
-def _lost(facts: TrafficFacts, place: Place) -> Iterator[Finding]:
+def _lost(facts: TrafficFacts, place: BusAddress) -> Iterator[Finding]:
     if facts.send_queue_full:
         yield problem(
             "send-queue-full",
@@ -132,7 +134,7 @@ def _lost(facts: TrafficFacts, place: Place) -> Iterator[Finding]:
         )
 
 
-def _node(way: WayFacts, interface: InterfaceFacts | None) -> Iterator[Finding]:
+def _node(way: DirectionFacts, interface: InterfaceFacts | None) -> Iterator[Finding]:
     if way.invalid_bytes:
         yield warning(
             "bytes-invalid",

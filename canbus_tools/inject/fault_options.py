@@ -11,19 +11,19 @@ from typing import Any, Final
 
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, number, share, whole
-from nodes.virtual.faults import CLIENTS, ID_MAX, TIME_S_MAX, Fault, FaultKind
+from nodes.virtual.faults import CLIENTS, ID_MAX, TIME_S_MAX, BusFault, BusFaultKind
 
 _KINDS: Final = {
     "loss": (
-        FaultKind.LOSE,
+        BusFaultKind.LOSE,
         "SHARE",
         "frames reach nobody, or not the receiver, and the sender believes they did",
     ),
-    "corrupt": (FaultKind.CORRUPT, "SHARE", "receivers get frames with one bit of their data changed"),
-    "duplicate": (FaultKind.DUPLICATE, "SHARE", "frames come twice, as when an acknowledgement is lost"),
-    "error": (FaultKind.ERROR, "SHARE", "frames are destroyed by an error frame and sent again"),
-    "delay": (FaultKind.DELAY, "TIME", "frames come later, the order of each sender's kept"),
-    "bus-off": (FaultKind.BUS_OFF, "TIME", "a client is off the bus for so long: at a time, or by share"),
+    "corrupt": (BusFaultKind.CORRUPT, "SHARE", "receivers get frames with one bit of their data changed"),
+    "duplicate": (BusFaultKind.DUPLICATE, "SHARE", "frames come twice, as when an acknowledgement is lost"),
+    "error": (BusFaultKind.ERROR, "SHARE", "frames are destroyed by an error frame and sent again"),
+    "delay": (BusFaultKind.DELAY, "TIME", "frames come later, the order of each sender's kept"),
+    "bus-off": (BusFaultKind.BUS_OFF, "TIME", "a client is off the bus for so long: at a time, or by share"),
 }
 UNITS_S: Final = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0}
 EXPLAINED: Final = """faults:
@@ -51,7 +51,7 @@ def declare_faults(command: argparse.ArgumentParser) -> None:
     command.epilog = EXPLAINED
 
 
-def read_faults(given: argparse.Namespace, names: Mapping[str, int]) -> list[tuple[str, Fault]]:
+def read_faults(given: argparse.Namespace, names: Mapping[str, int]) -> list[tuple[str, BusFault]]:
     """Return the faults with the words that asked for them; NAMES: places of clients. Raises UsageError."""
     return [
         (f"{name} {text}", read_fault(name, text, names))
@@ -60,7 +60,7 @@ def read_faults(given: argparse.Namespace, names: Mapping[str, int]) -> list[tup
     ]
 
 
-def read_fault(name: str, text: str, names: Mapping[str, int]) -> Fault:
+def read_fault(name: str, text: str, names: Mapping[str, int]) -> BusFault:
     """Read what stands behind --NAME; raises UsageError."""
     option = f"--{name}"
     first, *rest = text.split(",")
@@ -85,9 +85,9 @@ class _Reader:
         self.fields: dict[str, Any] = {}
         self._names = names
 
-    def fault(self, kind: FaultKind, first: str) -> Fault:
+    def fault(self, kind: BusFaultKind, first: str) -> BusFault:
         """Put the fault together."""
-        timed = kind in (FaultKind.DELAY, FaultKind.BUS_OFF)
+        timed = kind in (BusFaultKind.DELAY, BusFaultKind.BUS_OFF)
         self._check_keys(kind)
         if not first and (timed or "frame" not in self.fields):
             raise UsageError(
@@ -100,25 +100,25 @@ class _Reader:
         values = {_FIELDS[key]: value for key, value in self.fields.items() if key not in ("id", "at")}
         can_id, mask = self.fields.get("id", (0, 0))
         try:
-            fault = Fault(kind=kind, can_id=can_id, mask=mask, **values)
+            fault = BusFault(kind=kind, can_id=can_id, mask=mask, **values)
             if "at" in self.fields:
                 fault = replace(fault, timed=True, from_s=self.fields["at"])
         except CanductorError as error:
             raise UsageError(f"{self.option}: {error}") from error
         return fault
 
-    def _check_keys(self, kind: FaultKind) -> None:
+    def _check_keys(self, kind: BusFaultKind) -> None:
         only = {
-            "jitter": (FaultKind.DELAY,),
-            "at": (FaultKind.BUS_OFF,),
-            "share": (FaultKind.DELAY, FaultKind.BUS_OFF),
+            "jitter": (BusFaultKind.DELAY,),
+            "at": (BusFaultKind.BUS_OFF,),
+            "share": (BusFaultKind.DELAY, BusFaultKind.BUS_OFF),
         }
         for key, kinds in only.items():
             if key in self.fields and kind not in kinds:
                 raise UsageError(f"{self.option} has no {key}=")
         if "at" in self.fields and self.fields.keys() - {"at", "sender"}:
             raise UsageError(f"{self.option} with at= takes only sender= besides")
-        if kind is FaultKind.BUS_OFF and not self.fields.keys() & {"at", "share", "frame"}:
+        if kind is BusFaultKind.BUS_OFF and not self.fields.keys() & {"at", "share", "frame"}:
             raise UsageError(f"{self.option} needs at=SECONDS, share= or frame= to know when")
 
     def share(self, text: str) -> float:
@@ -184,10 +184,10 @@ _FIELDS: Final = {
     "time": "time_s",
 }
 _EXAMPLES: Final = {
-    FaultKind.LOSE: "--loss 1%,id=0x109",
-    FaultKind.CORRUPT: "--corrupt 1%",
-    FaultKind.DUPLICATE: "--duplicate 1%",
-    FaultKind.ERROR: "--error 1%",
-    FaultKind.DELAY: "--delay 5ms,jitter=2ms",
-    FaultKind.BUS_OFF: "--bus-off 2s,at=5,sender=0",
+    BusFaultKind.LOSE: "--loss 1%,id=0x109",
+    BusFaultKind.CORRUPT: "--corrupt 1%",
+    BusFaultKind.DUPLICATE: "--duplicate 1%",
+    BusFaultKind.ERROR: "--error 1%",
+    BusFaultKind.DELAY: "--delay 5ms,jitter=2ms",
+    BusFaultKind.BUS_OFF: "--bus-off 2s,at=5,sender=0",
 }

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.frame import Frame
-from canbus_tools.protocol.traffic import Way
+from canbus_tools.protocol.traffic import DirectionTraffic
 from nodes.support._wire import ffi, lib
 
 GAP_S: Final = 0.1
@@ -41,7 +41,7 @@ class BlockStream:
     ``feed`` runs for every frame of a bus: that is why it counts as well.
     """
 
-    def __init__(self, way: Way) -> None:
+    def __init__(self, way: DirectionTraffic) -> None:
         self._way = way
         self._noise = bytearray()  # not told yet
         self._held = b""

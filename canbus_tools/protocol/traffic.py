@@ -7,7 +7,7 @@ from canbus_tools.protocol.dictionaries import GUESSED, DictionarySource
 from canbus_tools.protocol.flow import Flow
 
 
-class Way:
+class DirectionTraffic:
     """Counters of one direction."""
 
     def __init__(self) -> None:
@@ -40,8 +40,8 @@ class NodeTraffic:
         self.version = ""
         self.dictionary_origin = ""
         """Empty: there is no dictionary."""
-        self.to_node = Way()
-        self.from_node = Way()
+        self.to_node = DirectionTraffic()
+        self.from_node = DirectionTraffic()
         self.flow = Flow()
         self.last_heard_s = math.nan
         """When the node's last frame came."""

@@ -29,7 +29,7 @@ from canbus_tools.tables.table_nodes import (
 from canbus_tools.tables.table_ways import Sent, send_blind
 from nodes.mt.cost import SerialCost
 from nodes.mt.device_job import DeviceJob, DeviceKind, Load
-from nodes.mt.download import Outcome, Place, Report, download
+from nodes.mt.download import DownloadOutcome, DownloadReport, DownloadTarget, download
 from nodes.mt.mt import WORD_BYTES
 from nodes.mt.table import AxleTable
 from nodes.support.errors import CanductorError
@@ -46,7 +46,7 @@ class DeviceReport:
     job: DeviceJob
     sent: tuple[Sent, ...]
     """Where nobody confirms, and through registers."""
-    downloads: tuple[tuple[Load, Report], ...]
+    downloads: tuple[tuple[Load, DownloadReport], ...]
     """To nodes, by broadcast or link."""
     said: tuple[Said, ...]
     """By axle and node; empty where nobody confirms."""
@@ -61,13 +61,13 @@ class DeviceReport:
         """Whether every axle has its table; None: nobody can tell."""
         return self.ok if self.said else None
 
-    def _bound_s(self, report: Report) -> float:
+    def _bound_s(self, report: DownloadReport) -> float:
         return self._serial(report).bound_s if self.job.link else report.bound_s
 
-    def _serial(self, report: Report) -> SerialCost:
+    def _serial(self, report: DownloadReport) -> SerialCost:
         return SerialCost(report.words * WORD_BYTES, self.job.baud)
 
-    def _line_text(self, report: Report) -> str:
+    def _line_text(self, report: DownloadReport) -> str:
         if not self.job.link:
             return ""
         return f"; the words alone take {self._serial(report).text()}"
@@ -213,10 +213,12 @@ async def _ask(job: DeviceJob, places: _Tables) -> DeviceReport:
 
 
 async def _download(job: DeviceJob, places: _Tables, bus: TalkBus | None) -> DeviceReport:
-    downloads: list[tuple[Load, Report]] = []
+    downloads: list[tuple[Load, DownloadReport]] = []
     said: list[Said] = []
     for load in job.loads:
-        meant = [Place(t, node, bus) for node, tables in places for t in tables if t.axle in load.axles]
+        meant = [
+            DownloadTarget(t, node, bus) for node, tables in places for t in tables if t.axle in load.axles
+        ]
         said += _missing(load, (place.table.axle for place in meant))
         if meant:
             report = await download(load.pairs, meant, now_ns=loop_ns, share=job.share)
@@ -225,7 +227,7 @@ async def _download(job: DeviceJob, places: _Tables, bus: TalkBus | None) -> Dev
     return DeviceReport(job, (), tuple(downloads), tuple(said))
 
 
-def _of(outcome: Outcome) -> Said:
+def _of(outcome: DownloadOutcome) -> Said:
     place = outcome.place
     return Said(place.table.axle, place.node.name, outcome.state, outcome.problem)
 

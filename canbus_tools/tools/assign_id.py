@@ -8,9 +8,9 @@ from typing import Final
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import LISTEN_S, BusTalk
-from canbus_tools.discovery.ask_bus import declare_listen, listen_option, take_census, where
-from canbus_tools.discovery.inventory import PROBED, State, SurveyResult, survey
-from canbus_tools.discovery.node_info import Facts, interview
+from canbus_tools.discovery.ask_bus import declare_listen, discover_nodes, listen_option, where
+from canbus_tools.discovery.inventory import PROBED, Inventory, NodePresence, take_inventory
+from canbus_tools.discovery.node_info import NodeInfo, read_node_info
 from nodes.bus.assign import AssignError, Uuid
 from nodes.support.can_protocol import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID
 from nodes.support.option_values import UsageError, whole
@@ -68,7 +68,7 @@ class AssignReport:
     bus: BusOptions
     uuid: Uuid
     nodeid: int
-    facts: Facts
+    facts: NodeInfo
     had_it: bool
     ok: bool = True
 
@@ -90,14 +90,14 @@ class AssignReport:
 
 
 async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int, listen_s: float) -> AssignReport:
-    # Of a node that has an id, only the survey learns the uuid; a second board with this one would take the
-    # id as well.
-    found = await survey(bus, probed={*PROBED, nodeid}, listen_s=listen_s)
+    # Only the inventory learns the uuid of a node that has an id; a second board with this uuid would take
+    # the id as well.
+    found = await take_inventory(bus, probed={*PROBED, nodeid}, listen_s=listen_s)
     had_it = _check_node(bus, uuid, nodeid, found)
     if not had_it:
         _check_id(bus, nodeid, found)
         await _tell(bus, uuid, nodeid)
-    facts = await interview(bus, nodeid)
+    facts = await read_node_info(bus, nodeid)
     if facts.uuid not in (None, uuid):
         raise AssignError(
             f"{uuid} was given id {nodeid}, but {facts.uuid} answers on it; switch both off and on"
@@ -105,11 +105,11 @@ async def _assign(bus: BusTalk, uuid: Uuid, nodeid: int, listen_s: float) -> Ass
     return AssignReport(bus=bus.options, uuid=uuid, nodeid=nodeid, facts=facts, had_it=had_it)
 
 
-def _check_node(bus: BusTalk, uuid: Uuid, nodeid: int, found: SurveyResult) -> bool:
+def _check_node(bus: BusTalk, uuid: Uuid, nodeid: int, found: Inventory) -> bool:
     """Return whether UUID has the id already; raise AssignError unless it can be given it."""
     boards = found.by_uuid(uuid)
     if not boards:
-        waiting = ", ".join(str(node.uuid) for node in found.census.waiting) or "none"
+        waiting = ", ".join(str(node.uuid) for node in found.discovery.waiting) or "none"
         raise AssignError(
             f"node {uuid} does not wait for an id on {bus.name} (those that do: {waiting}), nor has one that "
             "answered; compare the uuid, and check the node's power, cable and bit rate: "
@@ -121,7 +121,7 @@ def _check_node(bus: BusTalk, uuid: Uuid, nodeid: int, found: SurveyResult) -> b
             f"two boards on {bus.name} have the uuid {uuid} (cloned chips?), and both would take the id; "
             "take one of them off the bus"
         )
-    if board.state is State.BOOTLOADER:
+    if board.state is NodePresence.BOOTLOADER:
         raise AssignError(
             f"node {uuid} is in its bootloader (Katapult) and runs no firmware that could take an id; flash "
             "it, or reset it to start the firmware that it has"
@@ -131,12 +131,12 @@ def _check_node(bus: BusTalk, uuid: Uuid, nodeid: int, found: SurveyResult) -> b
             f"node {uuid} has id {board.nodeid} already; 'canductor can release {board.nodeid} "
             f"{where(bus.options)}' makes it wait for another"
         )
-    if board.state is State.IN_USE:
+    if board.state is NodePresence.IN_USE:
         raise AssignError(f"node {uuid} on {bus.name} has id {nodeid} already, and another program uses it")
     return board.nodeid == nodeid
 
 
-def _check_id(bus: BusTalk, nodeid: int, found: SurveyResult) -> None:
+def _check_id(bus: BusTalk, nodeid: int, found: Inventory) -> None:
     """Raise AssignError when another node has the id: it would shut down."""
     owners = {entry.nodeid: entry.uuid for entry in found.entries if entry.nodeid is not None}
     taken = set(owners) | bus.hosted | bus.talking
@@ -152,7 +152,7 @@ async def _tell(bus: BusTalk, uuid: Uuid, nodeid: int) -> None:
     """Tell the node its id until it waits no more."""
     for _ in range(TRIES):
         bus.send_frame(ADMIN_ID, bytes((SET_NODEID, *uuid.raw, nodeid)))
-        found = await take_census(bus, rounds=2)
+        found = await discover_nodes(bus, rounds=2)
         if all(node.uuid != uuid for node in found.waiting):
             return
     raise AssignError(

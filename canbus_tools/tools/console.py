@@ -15,7 +15,7 @@ from canbus_tools.bus.talk import BusTalk, NodeTalk, TalkError, refuse_if_in_use
 from canbus_tools.bus.uart_talk import open_uart_talk
 from canbus_tools.console.prompt import prompt
 from canbus_tools.console.session import Quit, Session
-from canbus_tools.discovery.inventory import survey
+from canbus_tools.discovery.inventory import take_inventory
 from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, existing_file, whole
@@ -192,7 +192,7 @@ async def _nodeid(bus: BusTalk, node: str) -> int:
     if not _UUID.match(node):
         return int(node)
     uuid = Uuid.parse(node.lower())
-    found = (await survey(bus)).by_uuid(uuid)
+    found = (await take_inventory(bus)).by_uuid(uuid)
     if len(found) > 1:
         raise TalkError(
             f"{len(found)} boards on bus {bus.name} have the uuid {uuid} (cloned chips?); name one by its id"

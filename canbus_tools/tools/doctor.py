@@ -9,7 +9,7 @@ from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.link_facts import LinkFacts, read_link
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.discovery.ask_bus import where
-from canbus_tools.doctor.facts import InterfaceFacts, NodeFacts, Place, TrafficFacts
+from canbus_tools.doctor.facts import BusAddress, InterfaceFacts, NodeFacts, TrafficFacts
 from canbus_tools.doctor.finding import Finding, Severity, note, problem
 from canbus_tools.doctor.gather import BusListener, ask_nodes, fill_queue, read_interface, try_bitrates
 from canbus_tools.doctor.interface import check_link, check_presence
@@ -57,12 +57,12 @@ def examine(
     interface: InterfaceFacts | None = None
     findings: list[Finding] = []
     done: list[str] = []
-    place = Place(name=options.name, words=where(options), socketcan=False, bitrate=options.bitrate)
+    place = BusAddress(name=options.name, words=where(options), socketcan=False, bitrate=options.bitrate)
     if options.interface == "socketcan":
         interface = read_interface(options.channel)
         findings = list(check_presence(interface))
         bitrate = options.bitrate or (None if interface.link is None else interface.link.bitrate)
-        place = Place(name=options.name, words=where(options), socketcan=True, bitrate=bitrate)
+        place = BusAddress(name=options.name, words=where(options), socketcan=True, bitrate=bitrate)
         done.append("interface")
         if findings:
             return Diagnosis(place.name, tuple(findings), tuple(done))
@@ -77,7 +77,7 @@ def examine(
     if nodes is not None:
         done.append("nodes")
         findings += check_nodes(nodes, place)
-        if try_others and place.socketcan and not nodes.survey.entries:
+        if try_others and place.socketcan and not nodes.inventory.entries:
             findings.append(_try_by_hand(place.name))
     if place.bitrate is None:
         findings.append(
@@ -94,7 +94,7 @@ def examine(
 def _use_bus(
     computer: Computer,
     options: BusOptions,
-    place: Place,
+    place: BusAddress,
     listen_s: float,
     *,
     quiet: bool,
@@ -116,8 +116,8 @@ def _use_bus(
     if not place.socketcan and not quiet:
         nodes = computer.run(ask_nodes(computer, opened))
     traffic = listener.facts(before, _counters(options), queue_full=queue_full)
-    if nodes is not None and not nodes.survey.entries and try_others and not place.socketcan:
-        nodes = NodeFacts(survey=nodes.survey, heard_at=try_bitrates(computer, options, listen_s))
+    if nodes is not None and not nodes.inventory.entries and try_others and not place.socketcan:
+        nodes = NodeFacts(inventory=nodes.inventory, heard_at=try_bitrates(computer, options, listen_s))
     return traffic, nodes
 
 
@@ -137,7 +137,7 @@ def _try_by_hand(name: str) -> Finding:
     )
 
 
-def _unusable(said: str, place: Place) -> Finding:
+def _unusable(said: str, place: BusAddress) -> Finding:
     if "ermission denied" in said or "not permitted" in said:
         return problem(
             "no-permission",
@@ -192,7 +192,7 @@ class Diagnosis:
                 for finding in self.sorted
             ],
             "load": load,
-            "nodes": None if self.nodes is None else len(self.nodes.survey.entries),
+            "nodes": None if self.nodes is None else len(self.nodes.inventory.entries),
             "pings": [
                 {
                     "nodeid": ping.nodeid,

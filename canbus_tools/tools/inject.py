@@ -23,7 +23,7 @@ from canbus_tools.inject.fault_options import declare_faults, read_faults
 from canbus_tools.inject.inject_report import InjectReport, StatusLine
 from canbus_tools.inject.socketcand_server import PORT, SocketcandServer
 from nodes.support.option_values import UsageError, number, whole
-from nodes.virtual.faults import Fault
+from nodes.virtual.faults import BusFault
 from nodes.virtual.hub import BITRATE_MAX, BusStats, VirtualBus
 from nodes.virtual.processes import Flavour, NodeProcess
 
@@ -43,7 +43,7 @@ class InjectOptions:
     bitrate: int = 1_000_000
     """Bit/s; 0: frames take no time."""
     seed: int = 0
-    faults: tuple[tuple[str, Fault], ...] = ()
+    faults: tuple[tuple[str, BusFault], ...] = ()
     """With the words that asked for each."""
     nodes: Mapping[str, Flavour] = field(default_factory=dict)
     """Firmware processes by name, in the order in which they connect."""

@@ -13,7 +13,7 @@ from canbus_tools.bus.computer import Computer, Listener, now_s
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import BusTalk, refuse_if_in_use
 from canbus_tools.bus.until_stopped import StopFlag, stop_flag
-from canbus_tools.discovery.inventory import survey
+from canbus_tools.discovery.inventory import take_inventory
 from canbus_tools.monitor.bus_watch import BusWatch
 from canbus_tools.monitor.options import MonitorOptions
 from canbus_tools.monitor.screen import MonitorScreen
@@ -110,7 +110,7 @@ async def fetch(computer: Computer, options: BusOptions, nodes: tuple[str, ...])
     found: dict[int, Dictionary] = {}
     async with BusTalk.open(computer, options) as bus:
         if EVERY_NODE in nodes:
-            entries = (await survey(bus)).entries
+            entries = (await take_inventory(bus)).entries
             wanted = [e.nodeid for e in entries if e.facts is not None and e.nodeid is not None]
             for entry in entries:
                 if entry.facts is None and entry.nodeid is not None:

@@ -9,7 +9,13 @@ from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import LISTEN_S, BusTalk
 from canbus_tools.discovery.ask_bus import declare_listen, listen_option, where
-from canbus_tools.discovery.inventory import PROBED, Entry, State, SurveyResult, survey_all
+from canbus_tools.discovery.inventory import (
+    PROBED,
+    Inventory,
+    InventoryEntry,
+    NodePresence,
+    take_full_inventory,
+)
 from canbus_tools.discovery.node_discovery import Application
 from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.can_protocol import LAST_NODEID
@@ -34,14 +40,14 @@ NAMES: Final[Mapping[Application, str]] = {
     Application.KATAPULT: "Katapult",
     Application.UNKNOWN: "unknown",
 }
-STATES: Final[Mapping[State, str]] = {
-    State.WAITING: "waits for an id",
-    State.BOOTLOADER: "in its bootloader",
-    State.IN_USE: "in use by a host",
-    State.IDLE: "idle",
-    State.CONFIGURED: "configured",
-    State.SHUTDOWN: "SHUT DOWN",
-    State.UNCLEAR: "unclear",
+STATES: Final[Mapping[NodePresence, str]] = {
+    NodePresence.WAITING: "waits for an id",
+    NodePresence.BOOTLOADER: "in its bootloader",
+    NodePresence.IN_USE: "in use by a host",
+    NodePresence.IDLE: "idle",
+    NodePresence.CONFIGURED: "configured",
+    NodePresence.SHUTDOWN: "SHUT DOWN",
+    NodePresence.UNCLEAR: "unclear",
 }
 
 
@@ -83,9 +89,9 @@ def list_nodes(
 ) -> "NodesReport":
     """Find all nodes and ask those to whom nobody talks who they are. Raises CanductorError."""
 
-    async def find() -> SurveyResult:
+    async def find() -> Inventory:
         async with BusTalk.open(computer, options) as bus:
-            return await survey_all(bus, options, probed=probed, listen_s=listen_s)
+            return await take_full_inventory(bus, options, probed=probed, listen_s=listen_s)
 
     return NodesReport(options, computer.run(find()))
 
@@ -95,7 +101,7 @@ class NodesReport:
     """Every node."""
 
     bus: BusOptions
-    found: SurveyResult
+    found: Inventory
     ok: bool = True
 
     def to_json(self) -> Mapping[str, object]:
@@ -105,7 +111,7 @@ class NodesReport:
             "nodes": [entry_json(entry) for entry in self.found.entries],
             "duplicate_uuids": sorted({str(entry.uuid) for entry in self.found.entries if entry.twins}),
             "probed": list(self.found.probed),
-            "foreign_frames": self.found.census.foreign_frames,
+            "foreign_frames": self.found.discovery.foreign_frames,
         }
 
     def to_text(self) -> str:
@@ -119,9 +125,9 @@ class NodesReport:
         return "\n".join(lines + [line for note in notes for line in paragraph(note)]).rstrip()
 
 
-def entry_json(entry: Entry) -> dict[str, object]:
+def entry_json(entry: InventoryEntry) -> dict[str, object]:
     """Return one node with all that it said."""
-    facts = entry.facts or entry.told or entry.overheard
+    facts = entry.facts or entry.told or entry.passive
     return {
         "nodeid": entry.nodeid,
         "uuid": None if entry.uuid is None else str(entry.uuid),
@@ -130,7 +136,7 @@ def entry_json(entry: Entry) -> dict[str, object]:
         "several_boards": entry.twins,
         "trouble": entry.trouble or None,
         "told_by_host": entry.told is not None,
-        "guessed": entry.overheard is not None,
+        "guessed": entry.passive is not None,
         "firmware": None if facts is None else asdict(facts.firmware),
         "uptime_s": None if facts is None else facts.uptime_s,
         "configured": None if facts is None else facts.configured,
@@ -139,20 +145,20 @@ def entry_json(entry: Entry) -> dict[str, object]:
     }
 
 
-def _row(entry: Entry) -> list[str]:
+def _row(entry: InventoryEntry) -> list[str]:
     row = [
         "-" if entry.nodeid is None else str(entry.nodeid),
         "?" if entry.uuid is None else str(entry.uuid),
         NAMES[entry.application],
         STATES[entry.state] + (", two boards!" if entry.twins else ""),
     ]
-    facts = entry.facts or entry.told or entry.overheard
+    facts = entry.facts or entry.told or entry.passive
     if facts is None:
         return row + [""] * (len(HEADINGS) - len(row))
     firmware, can = facts.firmware, facts.can
     return [
         *row,
-        firmware.mcu + (" ?" if entry.overheard else ""),
+        firmware.mcu + (" ?" if entry.passive else ""),
         "" if firmware.clock_hz is None else f"{firmware.clock_hz / 1e6:g} MHz",
         " ".join(filter(None, (firmware.app, firmware.version))),
         duration(facts.uptime_s),
@@ -173,7 +179,7 @@ def duration(seconds: float | None) -> str:
     return f"{seconds / 3600:.1f} h" if seconds < 48 * 3600 else f"{seconds / 86400:.1f} d"
 
 
-def _notes(found: SurveyResult, bus: BusOptions) -> list[str]:
+def _notes(found: Inventory, bus: BusOptions) -> list[str]:
     entries = found.entries
     notes = [f"Node {_name(entry)}: {entry.trouble}." for entry in entries if entry.trouble]
     if twins := sorted({str(entry.uuid) for entry in entries if entry.twins}):
@@ -182,24 +188,24 @@ def _notes(found: SurveyResult, bus: BusOptions) -> list[str]:
             "Take one of them off."
         )
     for entry in entries:
-        if entry.state is State.SHUTDOWN:
+        if entry.state is NodePresence.SHUTDOWN:
             notes.append(
                 f"Node {_name(entry)} has shut down and does nothing until its host restarts it; "
                 f"'canductor can release {entry.nodeid} {where(bus)}' resets it."
             )
-        if entry.state is State.BOOTLOADER:
+        if entry.state is NodePresence.BOOTLOADER:
             notes.append(f"Node {_name(entry)} runs no firmware: flash it, or reset it.")
-    if any(entry.state is State.IN_USE for entry in entries):
+    if any(entry.state is NodePresence.IN_USE for entry in entries):
         notes.append(
             "Nodes in use were not asked, so as not to disturb their host. The coordinator that drives them "
             "tells what they are; of nodes of other hosts a uuid is known when their firmware is canductor's."
         )
-    if any(entry.overheard for entry in entries):
+    if any(entry.passive for entry in entries):
         notes.append(
             "What stands in a row with '?' was guessed: a dictionary in the cache explains what the node and "
             "its host were heard to say."
         )
-    elif any(entry.state is State.IN_USE for entry in entries):
+    elif any(entry.state is NodePresence.IN_USE for entry in entries):
         notes.append(
             "Their traffic tells what they are when their dictionary is in the cache: run this once while "
             "their host is stopped."
@@ -207,19 +213,19 @@ def _notes(found: SurveyResult, bus: BusOptions) -> list[str]:
     return notes
 
 
-def _name(entry: Entry) -> str:
+def _name(entry: InventoryEntry) -> str:
     return str(entry.uuid) if entry.nodeid is None else str(entry.nodeid)
 
 
-def _nobody(bus: BusOptions, found: SurveyResult) -> list[str]:
+def _nobody(bus: BusOptions, found: Inventory) -> list[str]:
     tried = f"ids {found.probed[0]} to {found.probed[-1]}" if found.probed else "no ids (--probe none)"
     lines = paragraph(
         f"Nobody waits for an id, nobody says that it has one, no host was heard that talks to one, and of "
         f"{tried} none answered."
     )
-    if found.census.foreign_frames:
+    if found.discovery.foreign_frames:
         lines += paragraph(
-            f"The bus works: {count(found.census.foreign_frames, 'frame')} of other protocols came by."
+            f"The bus works: {count(found.discovery.foreign_frames, 'frame')} of other protocols came by."
         )
     return lines + paragraph(
         f"'canductor can query {where(bus)}' says what to check; 'canductor can doctor {where(bus)}' checks."

@@ -8,8 +8,8 @@ from typing import Final
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import BusTalk
-from canbus_tools.discovery.ask_bus import take_census, where
-from canbus_tools.discovery.node_discovery import ROUNDS, Application, CensusResult, WaitingNode
+from canbus_tools.discovery.ask_bus import discover_nodes, where
+from canbus_tools.discovery.node_discovery import ROUNDS, Application, DiscoveredNodes, WaitingNode
 from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.option_values import whole
 
@@ -44,9 +44,9 @@ def query(computer: Computer, options: BusOptions, rounds: int = ROUNDS) -> "Que
     """Ask who waits; changes nothing in any node. Raises CanductorError."""
     started_ns = computer.monotonic_ns()
 
-    async def ask() -> CensusResult:
+    async def ask() -> DiscoveredNodes:
         async with BusTalk.open(computer, options) as bus:
-            return await take_census(bus, rounds)
+            return await discover_nodes(bus, rounds)
 
     found = computer.run(ask())
     return QueryReport(options, found, (computer.monotonic_ns() - started_ns) * 1e-9)
@@ -57,7 +57,7 @@ class QueryReport:
     """Who waits."""
 
     bus: BusOptions
-    found: CensusResult
+    found: DiscoveredNodes
     took_s: float
     ok: bool = True
 
@@ -111,12 +111,12 @@ def application_name(node: WaitingNode) -> str:
     return NAMES[node.application]
 
 
-def assigned_ids(found: CensusResult) -> list[int]:
+def assigned_ids(found: DiscoveredNodes) -> list[int]:
     """Return the node ids that were seen in use."""
     return sorted({node.nodeid for node in found.here} | found.hosted | found.talking)
 
 
-def twin_note(found: CensusResult) -> str:
+def twin_note(found: DiscoveredNodes) -> str:
     """Return what two boards with one uuid mean."""
     uuids = ", ".join(str(uuid) for uuid in found.twins)
     return (
@@ -125,7 +125,7 @@ def twin_note(found: CensusResult) -> str:
     )
 
 
-def _notes(found: CensusResult) -> list[str]:
+def _notes(found: DiscoveredNodes) -> list[str]:
     notes: list[str] = []
     if found.twins:
         notes.append(twin_note(found))
@@ -144,7 +144,7 @@ def _notes(found: CensusResult) -> list[str]:
     return [line for note in notes for line in paragraph(note)]
 
 
-def _why_nobody(found: CensusResult, bus: BusOptions) -> list[str]:
+def _why_nobody(found: DiscoveredNodes, bus: BusOptions) -> list[str]:
     """Explain an empty answer: most often it is no fault at all."""
     ids = assigned_ids(found)
     lines = []

@@ -10,9 +10,9 @@ from typing import Final
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError, in_use, refuse_if_in_use
-from canbus_tools.discovery.ask_bus import declare_listen, listen_option, take_census, where
-from canbus_tools.discovery.inventory import State, survey
-from canbus_tools.discovery.node_discovery import Application, CensusResult, WaitingNode
+from canbus_tools.discovery.ask_bus import declare_listen, discover_nodes, listen_option, where
+from canbus_tools.discovery.inventory import NodePresence, take_inventory
+from canbus_tools.discovery.node_discovery import Application, DiscoveredNodes, WaitingNode
 from canbus_tools.tools.assign_id import uuid_option
 from canbus_tools.tools.query import application_name
 from nodes.bus.assign import AssignError, Uuid
@@ -98,7 +98,7 @@ async def release_on(
     bus: BusTalk, node: Uuid | int, *, force: bool = False, listen_s: float = LISTEN_S
 ) -> ReleaseReport:
     """Reset NODE on an open bus, as ``release`` does."""
-    before = await take_census(bus)
+    before = await discover_nodes(bus)
     if isinstance(node, int):
         nodeid = node
         if not force:
@@ -125,17 +125,19 @@ def _report(bus: BusTalk, node: WaitingNode, nodeid: int | None) -> ReleaseRepor
     )
 
 
-def _waiting(census: CensusResult, uuid: Uuid) -> WaitingNode | None:
-    return next((node for node in census.waiting if node.uuid == uuid), None)
+def _waiting(discovery: DiscoveredNodes, uuid: Uuid) -> WaitingNode | None:
+    return next((node for node in discovery.waiting if node.uuid == uuid), None)
 
 
-async def _find(bus: BusTalk, uuid: Uuid, census: CensusResult, *, force: bool, listen_s: float) -> int:
+async def _find(bus: BusTalk, uuid: Uuid, discovery: DiscoveredNodes, *, force: bool, listen_s: float) -> int:
     """Return the id that UUID has, and that nobody else uses; raises CanductorError."""
-    ours = {node.nodeid for node in census.here if node.uuid == uuid}
+    ours = {node.nodeid for node in discovery.here if node.uuid == uuid}
     if force and len(ours) == 1:
         return ours.pop()
     found = [
-        entry for entry in (await survey(bus, listen_s=listen_s)).by_uuid(uuid) if entry.nodeid is not None
+        entry
+        for entry in (await take_inventory(bus, listen_s=listen_s)).by_uuid(uuid)
+        if entry.nodeid is not None
     ]
     if len(found) > 1 or any(entry.twins for entry in found):
         raise AssignError(
@@ -148,7 +150,7 @@ async def _find(bus: BusTalk, uuid: Uuid, census: CensusResult, *, force: bool, 
             f"'canductor can nodes {where(bus.options)}' lists them, and a node that another program talks "
             "to can be named by its id"
         )
-    if found[0].state is State.IN_USE:
+    if found[0].state is NodePresence.IN_USE:
         raise TalkError(in_use(bus.name, found[0].nodeid))
     return found[0].nodeid
 
@@ -171,13 +173,13 @@ async def _reset(bus: BusTalk, nodeid: int) -> Uuid | None:
         return uuid
 
 
-async def _returned(bus: BusTalk, nodeid: int, uuid: Uuid | None, before: CensusResult) -> WaitingNode:
+async def _returned(bus: BusTalk, nodeid: int, uuid: Uuid | None, before: DiscoveredNodes) -> WaitingNode:
     """Wait until the node asks for an id; one whose uuid is not known is whoever did not wait before."""
     known = {node.uuid for node in before.waiting}
     loop = asyncio.get_running_loop()
     deadline_s = loop.time() + RETURN_S
     while loop.time() < deadline_s:
-        found = await take_census(bus, rounds=1)
+        found = await discover_nodes(bus, rounds=1)
         for node in found.waiting:
             if node.uuid == uuid or (uuid is None and node.uuid not in known):
                 return node

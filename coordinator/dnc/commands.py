@@ -13,7 +13,7 @@ from coordinator.cli.commands.front_ends import send as send_to_machine
 from coordinator.cli.commands.front_ends import tls_of
 from coordinator.dnc.blocks import INPUT, OUTPUT, Header
 from coordinator.dnc.driver import Driver, Line
-from coordinator.dnc.endpoint import Desk, FileSource, Library, Outcome, Sink, Source, Take
+from coordinator.dnc.endpoint import Endpoint, FileSource, Library, Outcome, Sink, Source, Take
 from coordinator.dnc.engine import Engine
 from coordinator.dnc.feeds import SlowSource
 from coordinator.dnc.files import Check, Entry, Folder, check_lines, check_name
@@ -115,22 +115,22 @@ def _line(job: DncJob, around: Surroundings) -> Iterator[Driver]:
         port.close()
 
 
-def _play(driver: Driver, desk: Desk, around: Surroundings) -> Outcome:
+def _play(driver: Driver, endpoint: Endpoint, around: Surroundings) -> Outcome:
     """Go on until a transfer has ended, well or not."""
     try:
         while True:
-            until_s = around.now_s() + NOT_YET_S if desk.looks else None
+            until_s = around.now_s() + NOT_YET_S if endpoint.looks else None
             for event in driver.wait(until_s):
-                if (outcome := desk.handle(event)) is not None:
+                if (outcome := endpoint.handle(event)) is not None:
                     driver.flush()
                     return outcome
-            if desk.looks:
-                desk.go_on()
+            if endpoint.looks:
+                endpoint.go_on()
     except CanductorError as error:
-        desk.close(str(error))
+        endpoint.close(str(error))
         raise
     except BaseException:
-        desk.close("canductor dnc was stopped")
+        endpoint.close("canductor dnc was stopped")
         raise
 
 
@@ -158,17 +158,17 @@ def receive(job: DncJob, check: Check = check_table, around: Surroundings = HERE
         driver = stack.enter_context(_line(job, around))
         twice = stack.enter_context(contextlib.closing(Twice(folder, job.options.block_max)))
         take = numbered(twice.take if job.verify else folder_take(folder), even=job.numbered)
-        desk = Desk(driver.engine, take=take)
+        endpoint = Endpoint(driver.engine, take=take)
         if job.peripheral:
             _say(job, around, f"waiting for a control at {job.port} to send a file into {folder.path}")
-        outcome = _receive(job, driver, desk, around)
+        outcome = _receive(job, driver, endpoint, around)
         while outcome.ok and (name := twice.waits_for) is not None:
             if job.peripheral:
                 _say(job, around, _once(outcome))
             else:
                 _say(job, around, f"{name} came; asking for it again, to compare")
                 driver.wait(around.now_s() + BETWEEN * job.options.character_s)
-            outcome = _receive(job, driver, desk, around)
+            outcome = _receive(job, driver, endpoint, around)
     same = ", the same twice" if job.verify else ""
     text = f"{outcome.name}: {outcome.lines} lines are in {job.folder}{same}"
     report = _report(outcome, text)
@@ -186,11 +186,11 @@ def folder_take(folder: Folder) -> Take:
     return lambda header: folder.take(header.code, header.name)
 
 
-def _receive(job: DncJob, driver: Driver, desk: Desk, around: Surroundings) -> Outcome:
+def _receive(job: DncJob, driver: Driver, endpoint: Endpoint, around: Surroundings) -> Outcome:
     """Take a file once."""
     if not job.peripheral:
-        desk.begin(Header(job.code, job.name, INPUT))
-    return _play(driver, desk, around)
+        endpoint.begin(Header(job.code, job.name, INPUT))
+    return _play(driver, endpoint, around)
 
 
 def send(job: DncJob, around: Surroundings = HERE) -> DncReport:
@@ -202,12 +202,12 @@ def send(job: DncJob, around: Surroundings = HERE) -> DncReport:
         line_max = job.options.block_max - 2
         check_lines(content, job.file.name, line_max, job.options.frame.data_bits)
         driver = stack.enter_context(_line(job, around))
-        desk = Desk(driver.engine, give=lambda _: (job.name, FileSource(content, line_max)))
+        endpoint = Endpoint(driver.engine, give=lambda _: (job.name, FileSource(content, line_max)))
         if job.peripheral:
             _say(job, around, f"waiting for a control at {job.port} to ask for a file; it gets {job.file}")
         else:
-            desk.begin(Header(code, job.name, OUTPUT))
-        outcome = _play(driver, desk, around)
+            endpoint.begin(Header(code, job.name, OUTPUT))
+        outcome = _play(driver, endpoint, around)
         if outcome.ok and job.verify:
             _fetch_back(job, driver, Header(code, job.name, INPUT), around)
             outcome = replace(outcome, confirmed=True)
@@ -222,9 +222,9 @@ def _fetch_back(job: DncJob, driver: Driver, header: Header, around: Surrounding
     _say(job, around, f"{job.name} was sent; asking for it, to compare")
     driver.wait(around.now_s() + BETWEEN * job.options.character_s)
     same = Compare(job.name, _open(job.file), job.options.block_max, "delete it at the other side")
-    desk = Desk(driver.engine, take=lambda _: same)
-    desk.begin(header)
-    outcome = _play(driver, desk, around)
+    endpoint = Endpoint(driver.engine, take=lambda _: same)
+    endpoint.begin(header)
+    outcome = _play(driver, endpoint, around)
     if not outcome.ok:
         raise CanductorError(f"{job.name} was sent, but is not confirmed: {outcome.sentence}")
 
@@ -245,11 +245,13 @@ def serve(job: DncJob, check: Check = check_table, around: Surroundings = HERE) 
         library = Library(folder, driver.engine)
         twice = Twice(folder, job.options.block_max)
         take = numbered(twice.take if job.verify else folder_take(folder), even=job.numbered)
-        desk = Desk(driver.engine, give=library.give, take=None if job.read_only else take, folder=folder)
+        endpoint = Endpoint(
+            driver.engine, give=library.give, take=None if job.read_only else take, folder=folder
+        )
         _say(job, around, f"serving {folder.path} at {job.port}; Ctrl-C ends it")
         with contextlib.closing(twice):
             while True:
-                outcome = _play(driver, desk, around)
+                outcome = _play(driver, endpoint, around)
                 once = outcome.ok and twice.waits_for is not None and twice.waits_for == outcome.name
                 _say(job, around, _once(outcome) if once else _told(outcome))
                 if job.once and not once:
@@ -260,7 +262,7 @@ def list_files(job: DncJob, around: Surroundings = HERE) -> DncReport:
     """Ask for the directory; raises CanductorError."""
     with _line(job, around) as driver:
         driver.engine.ask_directory()
-        outcome = _play(driver, Desk(driver.engine), around)
+        outcome = _play(driver, Endpoint(driver.engine), around)
     if outcome.listing is None:
         raise CanductorError(outcome.sentence)
     lines = [f"{name:<24} {sectors:>7}" for name, sectors in outcome.listing.sectors.items()]
@@ -276,9 +278,9 @@ def drip(job: DncJob, around: Surroundings = HERE) -> DncReport:
         content = _open_stream(job.file, stack, around)
         with _line(job, around) as driver:
             source: Source = SlowSource(content, job.options.block_max - 2)
-            desk = Desk(driver.engine, give=lambda header: (header.name, source))
+            endpoint = Endpoint(driver.engine, give=lambda header: (header.name, source))
             _say(job, around, f"waiting for a control at {job.port} to ask for a program; it gets {job.file}")
-            outcome = _play(driver, desk, around)
+            outcome = _play(driver, endpoint, around)
     return _report(outcome, f"{outcome.lines} lines were fed to the control")
 
 
@@ -299,13 +301,13 @@ def _drip_to_machine(job: DncJob, around: Surroundings) -> DncReport:
             return sinks[-1]
 
         with _line(job, around) as driver:
-            desk = Desk(driver.engine, take=numbered(print_as_it_comes, even=job.numbered))
+            endpoint = Endpoint(driver.engine, take=numbered(print_as_it_comes, even=job.numbered))
             if job.peripheral:
                 waits = f"waiting for a control at {job.port} to send a program; it is printed as it comes"
                 _say(job, around, waits)
             else:
-                desk.begin(Header(job.code, job.name, INPUT))
-            outcome = _play(driver, desk, around)
+                endpoint.begin(Header(job.code, job.name, INPUT))
+            outcome = _play(driver, endpoint, around)
         report = _report(outcome, f"{outcome.name}: {outcome.lines} lines were printed as they came")
         _say(job, around, f"{outcome.name}: all {outcome.lines} lines came; waiting for the machine")
         sinks[-1].wait_until_over()

@@ -102,7 +102,7 @@ Give = Callable[[Header], tuple[str, Source]]
 """Returns the name and lines of the file that a header asks for; raises CanductorError."""
 
 
-class Desk:
+class Endpoint:
     """Acts on an engine's events; of TAKE and GIVE, what is not given is refused to the other side."""
 
     def __init__(

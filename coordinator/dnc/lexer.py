@@ -1,16 +1,16 @@
-"""Makes signs of the bytes that come over a line: blocks, answers, endings, and what is damaged.
+"""Makes tokens of the bytes that come over a line: blocks, answers, endings, and what is damaged.
 
 Everything on this half-duplex line is followed by silence: whoever sent it waits. That is the second check
 beside the block check, and the stronger one: a 7 that a flipped bit made an ETB ends a block early, but the
-block's rest then follows without a pause. So each sign counts only when the line is silent behind it:
+block's rest then follows without a pause. So each token counts only when the line is silent behind it:
 
-    sign                   silence
+    token                   silence
     block, header, ACK     1.5 characters: the next one would be there; behind a block's DC1 none at all
     NAK, EOT               NAK: ``nak_quiet_s``, since to repeat what was taken doubles a line; EOT as a block
     ETX                    ``character_s``: a damaged STX is an ETX, too, and the block's rest follows
     anything damaged       ``character_s``
 
-Sans-IO. Times are seconds of any clock that does not jump. A scanner never raises and holds one block.
+Sans-IO. Times are seconds of any clock that does not jump. A lexer never raises and holds one block.
 """
 
 import re
@@ -35,7 +35,7 @@ from coordinator.dnc.blocks import (
     is_text,
 )
 from coordinator.dnc.options import DncOptions
-from coordinator.dnc.tokens import Kind, Sign
+from coordinator.dnc.tokens import Kind, Token
 
 STARTS: Final = (SOH, STX)
 BLOCK_LIKE: Final = 16
@@ -56,7 +56,7 @@ class _State(Enum):
     JUNK = auto()
 
 
-class Scanner:
+class Lexer:
     """Reads one direction of one line."""
 
     def __init__(self, options: DncOptions) -> None:
@@ -87,7 +87,7 @@ class Scanner:
         self._etx_stands = False
         """What is junk now followed an ETX."""
         self._ends_with_eot = False
-        self._signs: list[Sign] = []
+        self._signs: list[Token] = []
         self.expects_blocks = True
         """Else it is answers that are expected, and what is like a block matters less."""
         self.answer_leads = False
@@ -101,7 +101,7 @@ class Scanner:
         self._state = _State.IDLE
         self._signs.clear()
 
-    def receive(self, data: bytes, now_s: float) -> list[Sign]:
+    def receive(self, data: bytes, now_s: float) -> list[Token]:
         """Take DATA, whose last character came at NOW_S; return what is complete."""
         first_s = now_s - len(data) * self._options.character_time_s
         self._expire(first_s)
@@ -120,7 +120,7 @@ class Scanner:
             gap, self._pause_s = False, 0.0
         return self._take()
 
-    def handle_timer(self, now_s: float) -> list[Sign]:
+    def handle_timer(self, now_s: float) -> list[Token]:
         """Return what the silence until NOW_S made complete."""
         self._expire(now_s)
         return self._take()
@@ -130,9 +130,9 @@ class Scanner:
         wait_s = self._silence_s()
         return None if wait_s is None else self._last_s + wait_s
 
-    def _take(self) -> list[Sign]:
-        signs, self._signs = self._signs, []
-        return signs
+    def _take(self) -> list[Token]:
+        tokens, self._signs = self._signs, []
+        return tokens
 
     def _text_from(self, data: bytes, at: int) -> int:
         """Return where the text ends that goes into the block as it is: most of what comes."""
@@ -383,7 +383,7 @@ class Scanner:
         if kind is Kind.NOISE:
             content = bytes((ACK,)) if self._holds_ack else b""
             self._noise(self._junk_bytes)
-        self._signs.append(Sign(kind, self._last_s, content, check, reason))
+        self._signs.append(Token(kind, self._last_s, content, check, reason))
 
 
 def _is_whole(data: bytes) -> bool:

@@ -12,7 +12,7 @@ PARITIES: Final = {"N": "none", "E": "even", "O": "odd"}
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class SerialFrame:
     """One character on the line, as in 7E1."""
 
     data_bits: int = 7
@@ -28,21 +28,21 @@ class Frame:
         return f"{self.data_bits}{self.parity}{self.stop_bits}"
 
 
-def read_frame(text: str) -> Frame:
+def read_frame(text: str) -> SerialFrame:
     """Read 7E1, 8N1 and the like; raises CanductorError."""
     word = text.strip().upper()
     if len(word) != 3 or word[0] not in "78" or word[1] not in PARITIES or word[2] not in "12":
         raise CanductorError(
             f"the character frame is '{text}', must be like 7E1 or 8N1: bits, parity, stop bits"
         )
-    return Frame(int(word[0]), word[1], int(word[2]))
+    return SerialFrame(int(word[0]), word[1], int(word[2]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DncOptions:
     """All of the protocol that can be chosen; times in seconds."""
 
-    frame: Frame = Frame()
+    frame: SerialFrame = SerialFrame()
     baud: int = 9600
     dc1: bool = True
     """Send DC1 after each check character; received, it may be there or not."""

@@ -5,7 +5,7 @@ from enum import Enum, auto
 
 
 class Kind(Enum):
-    """What a sign is."""
+    """What a token is."""
 
     BLOCK = auto()
     HEADER = auto()
@@ -31,7 +31,7 @@ class Kind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Sign:
+class Token:
     """What was on the line, and when its last character was."""
 
     kind: Kind

@@ -5,12 +5,12 @@ from functools import partial
 from typing import Final
 
 from coordinator.simulate.boards import Board
-from coordinator.simulate.faults import NS, Fault
+from coordinator.simulate.faults import NS, ScenarioFault
 from coordinator.simulate.scenario import HOST
 from coordinator.simulate.script import ScriptedWorld
 from coordinator.support.toml_values import ScenarioError
-from nodes.virtual.plant_page import Fault as State
-from nodes.virtual.plant_page import Kind
+from nodes.virtual.plant_page import PlantFault as State
+from nodes.virtual.plant_page import PlantItemKind
 from nodes.virtual.sim_plant import SimPlant
 from nodes.virtual.world import CanController, CanPort, CanWire, Uart, UartPort
 
@@ -43,7 +43,7 @@ class SimActor:
         self._wires = wires
         self._ports = ports
         self._plants = plants
-        self._acts: dict[str, Callable[[Fault, bool], None]] = {
+        self._acts: dict[str, Callable[[ScenarioFault, bool], None]] = {
             "cut": self._cut,
             "reset": self._reset,
             "power": self._power,
@@ -63,7 +63,7 @@ class SimActor:
         """Call WHAT at AT_NS, and let the host go on."""
         self._world.at(at_ns, what, wakes=True)
 
-    def act(self, fault: Fault) -> None:
+    def act(self, fault: ScenarioFault) -> None:
         """Plan FAULT: its begin, and its end."""
         act = self._acts[fault.kind]
         if fault.node and not (fault.node == HOST and fault.kind == "stall"):
@@ -75,31 +75,31 @@ class SimActor:
         self._world.at(fault.begin_ns, partial(act, fault, True))
         self._world.at(fault.end_ns, partial(act, fault, False))
 
-    def _board(self, fault: Fault) -> Board:
+    def _board(self, fault: ScenarioFault) -> Board:
         if fault.node not in self._boards:
             known = ", ".join(self._boards)
             raise ScenarioError(f"{self._name}: a fault names the node '{fault.node}'; there are {known}")
         return self._boards[fault.node]
 
-    def _cut(self, fault: Fault, begins: bool) -> None:
+    def _cut(self, fault: ScenarioFault, begins: bool) -> None:
         board = self._board(fault)
         if board.node.controller is not None:
             board.node.controller.cut(int(begins))
         elif isinstance(board.wire, Uart):
             board.wire.set_faults(loss=float(begins))
 
-    def _reset(self, fault: Fault, begins: bool) -> None:
+    def _reset(self, fault: ScenarioFault, begins: bool) -> None:
         if begins:
             self._board(fault).node.reset()
 
-    def _power(self, fault: Fault, begins: bool) -> None:
+    def _power(self, fault: ScenarioFault, begins: bool) -> None:
         node = self._board(fault).node
         if begins:
             node.power_off()
         else:
             node.power_on()
 
-    def _stall(self, fault: Fault, begins: bool) -> None:
+    def _stall(self, fault: ScenarioFault, begins: bool) -> None:
         duration_s = (fault.end_ns - fault.begin_ns) / NS
         if not begins:
             return
@@ -108,26 +108,26 @@ class SimActor:
         else:
             self._board(fault).stall(duration_s)
 
-    def _babble(self, fault: Fault, begins: bool) -> None:
+    def _babble(self, fault: ScenarioFault, begins: bool) -> None:
         controller = self._board(fault).node.controller
         if controller is None:
             raise ScenarioError(f"{self._name}: the node '{fault.node}' is on a UART and cannot babble")
         if begins:
             controller.babble(fault.can_id, BABBLE, (fault.end_ns - fault.begin_ns) / NS)
 
-    def _open_sensors(self, fault: Fault, begins: bool) -> None:
+    def _open_sensors(self, fault: ScenarioFault, begins: bool) -> None:
         if fault.node not in self._plants:
             raise ScenarioError(f"{self._name}: a fault names the node '{fault.node}', which has no sensor")
         page = self._plants[fault.node].page
-        for name in page.names(Kind.SENSOR):
-            page.set_fault(Kind.SENSOR, name, State.OPEN if begins else State.SOUND)
+        for name in page.names(PlantItemKind.SENSOR):
+            page.set_fault(PlantItemKind.SENSOR, name, State.OPEN if begins else State.SOUND)
 
-    def _disturb(self, fault: Fault, begins: bool) -> None:
+    def _disturb(self, fault: ScenarioFault, begins: bool) -> None:
         wire = self._wires[fault.bus]
         if isinstance(wire, CanWire):
             wire.set_bit_errors(bit_errors(fault.share) if begins else 0.0)
 
-    def _rate(self, fault: Fault, begins: bool) -> None:
+    def _rate(self, fault: ScenarioFault, begins: bool) -> None:
         share = fault.share if begins else 0.0
         for part in self._listeners(fault.bus):
             if fault.kind == "loss":

@@ -15,7 +15,7 @@ ISOLATING: Final = ("cut", "power", "stall", "babble", "errors", "loss")
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class ScenarioFault:
     """One thing that goes wrong once, from BEGIN_NS to END_NS of true time."""
 
     kind: str
@@ -30,7 +30,7 @@ class Fault:
 class Actor(Protocol):
     """Who makes them happen."""
 
-    def act(self, fault: Fault) -> None:
+    def act(self, fault: ScenarioFault) -> None:
         """Plan FAULT, which lies ahead."""
 
     def call(self, at_ns: int, what: Callable[[], object]) -> None:
@@ -48,10 +48,10 @@ class Faults:
         self._dice = dice
         self._actor = actor
         self._bus_of = bus_of
-        self._begun: list[Fault] = []
+        self._begun: list[ScenarioFault] = []
 
     @property
-    def begun(self) -> tuple[Fault, ...]:
+    def begun(self) -> tuple[ScenarioFault, ...]:
         """All that are planned so far."""
         return tuple(self._begun)
 
@@ -67,7 +67,7 @@ class Faults:
                     else:
                         self._actor.act(fault)
 
-    def _drawn(self, setting: FaultSetting, key: str, now_ns: int) -> list[Fault]:
+    def _drawn(self, setting: FaultSetting, key: str, now_ns: int) -> list[ScenarioFault]:
         def draw(name: str) -> float:
             return self._dice.draw(getattr(setting, name), f"{key}.{name}")
 
@@ -78,7 +78,7 @@ class Faults:
             begin_ns = now_ns + round((begin_s + n * every_s) * NS)
             end_ns = begin_ns + duration_ns
             node, bus = setting.node, setting.bus
-            faults.append(Fault(setting.kind, node, bus, begin_ns, end_ns, draw("share"), setting.id))
+            faults.append(ScenarioFault(setting.kind, node, bus, begin_ns, end_ns, draw("share"), setting.id))
         return faults
 
     # ------------------------------------------------------------------------------------------ afterwards

@@ -16,7 +16,7 @@ from coordinator.simulate import safety_real
 from coordinator.simulate.safety_rig import Found, Rig
 from coordinator.simulate.safety_row import MAX_DURATION_S, Row, table
 from nodes.support.errors import CanductorError
-from nodes.virtual.plant_page import Fault, Kind
+from nodes.virtual.plant_page import PlantFault, PlantItemKind
 
 STOP_S: Final = 0.02
 """From the host's decision to stop to the nodes' having done so."""
@@ -88,16 +88,16 @@ PRINT: Final = (
 )
 
 
-def _sensor(rig: Rig, fault: Fault) -> None:
-    rig.fault(Kind.SENSOR, fault)
+def _sensor(rig: Rig, fault: PlantFault) -> None:
+    rig.fault(PlantItemKind.SENSOR, fault)
 
 
 def _cut(rig: Rig) -> None:
     rig.cut("toolhead")
 
 
-def _heater(rig: Rig, fault: Fault) -> None:
-    rig.fault(Kind.HEATER, fault)
+def _heater(rig: Rig, fault: PlantFault) -> None:
+    rig.fault(PlantItemKind.HEATER, fault)
 
 
 def cases() -> list[Case]:
@@ -108,24 +108,24 @@ def cases() -> list[Case]:
     moving = partial(Case, lines=PRINT, moment=_printing, bounds_s=BOTH, steps_s=LEFT_ALONE_S)
     stopped = partial(Case, bounds_s=found, told="emergency stop", steps_s=STEPS_S)
     return [
-        broken("sensor open", cause=partial(_sensor, fault=Fault.OPEN), told="ADC out of range"),
-        broken("sensor shorted", cause=partial(_sensor, fault=Fault.SHORTED), told="ADC out of range"),
+        broken("sensor open", cause=partial(_sensor, fault=PlantFault.OPEN), told="ADC out of range"),
+        broken("sensor shorted", cause=partial(_sensor, fault=PlantFault.SHORTED), told="ADC out of range"),
         broken(
             "sensor open, heating up",
             moment=_warm,
             warm=False,
-            cause=partial(_sensor, fault=Fault.OPEN),
+            cause=partial(_sensor, fault=PlantFault.OPEN),
             told="ADC out of range",
         ),
-        runaway("sensor fallen out", cause=partial(_sensor, fault=Fault.FALLEN), told="does not hold"),
-        runaway("heater dead", cause=partial(_heater, fault=Fault.DEAD), told="does not hold"),
+        runaway("sensor fallen out", cause=partial(_sensor, fault=PlantFault.FALLEN), told="does not hold"),
+        runaway("heater dead", cause=partial(_heater, fault=PlantFault.DEAD), told="does not hold"),
         runaway(
             "switch stuck on while off",
             lines=("M118 cold", "G4 P600000"),
             hot=False,
             warm=False,
             moment=_idle,
-            cause=partial(_heater, fault=Fault.STUCK_ON),
+            cause=partial(_heater, fault=PlantFault.STUCK_ON),
             told="heats though it is off",
             bounds_s={"extruder": STOP_S},
         ),

@@ -21,7 +21,7 @@ from coordinator.virtual_machine.real_nodes import CONFIG, real_nodes
 from nodes.support.errors import CanductorError
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import firmware_dictionary
-from nodes.virtual.plant_page import Kind, PlantPage
+from nodes.virtual.plant_page import PlantItemKind, PlantPage
 
 PATIENCE_S: Final = 60.0
 STALL_S: Final = 2.0
@@ -102,7 +102,7 @@ def _wait_until_it_is_off(page: PlantPage) -> None:
 
     def off() -> bool:
         nonlocal given_j, since_s
-        now_j = page.item(Kind.HEATER, "extruder").extra
+        now_j = page.item(PlantItemKind.HEATER, "extruder").extra
         if now_j != given_j:
             given_j, since_s = now_j, time.monotonic()
         return time.monotonic() - since_s > STILL_S

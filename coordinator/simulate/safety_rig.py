@@ -21,7 +21,7 @@ from coordinator.streaming.job_runner import run_job
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.support.errors import CanductorError
-from nodes.virtual.plant_page import Fault, Kind
+from nodes.virtual.plant_page import PlantFault, PlantItemKind
 
 MACHINE: Final = Path(__file__).parent / "machines" / "safety.cfg"
 START: Final = (30.0, 230.0, 20.0)
@@ -150,7 +150,7 @@ class Rig:
 
     # ---------------------------------------------------------------------------------------------- causes
 
-    def fault(self, kind: Kind, fault: Fault, name: str = "extruder") -> None:
+    def fault(self, kind: PlantItemKind, fault: PlantFault, name: str = "extruder") -> None:
         """Break a sensor or a heater."""
         self.plants[HEATERS[name][0]].page.set_fault(kind, name, fault)
 

@@ -53,7 +53,7 @@ class Bus(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class DownloadTarget:
     """Where a table goes: TABLE on NODE, which is on BUS; None: on a serial line."""
 
     table: AxleTable
@@ -62,10 +62,10 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class DownloadOutcome:
     """What became of it at one place."""
 
-    place: Place
+    place: DownloadTarget
     ok: bool
     state: TableState | None
     """What the node keeps now; None when it does not answer."""
@@ -103,10 +103,10 @@ class Cast:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class DownloadReport:
     """What a download did and cost."""
 
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[DownloadOutcome, ...]
     """In the order of the places."""
     words: int
     """Of one transmission."""
@@ -140,7 +140,7 @@ class Report:
 class _Aim:
     """One place, while the table is brought to it."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: DownloadTarget) -> None:
         self.place = place
         self.state: TableState | None = None
         """What the node said last."""
@@ -169,11 +169,11 @@ class _Aim:
         self.done = fresh and state.status is MtStatus.OK and state.holds(pairs)
         self.problem = "" if self.done else _why(self.place, state, fresh=fresh)
 
-    def outcome(self) -> Outcome:
-        return Outcome(self.place, self.done, self.state, self.broadcasts, self.by_link, self.problem)
+    def outcome(self) -> DownloadOutcome:
+        return DownloadOutcome(self.place, self.done, self.state, self.broadcasts, self.by_link, self.problem)
 
 
-def _why(place: Place, state: TableState, *, fresh: bool) -> str:
+def _why(place: DownloadTarget, state: TableState, *, fresh: bool) -> str:
     table, node = place.table, place.node
     if state.status is MtStatus.LENGTH_ERROR:
         told = f"values were lost, or it has room for {table.capacity} points only"
@@ -188,12 +188,12 @@ def _why(place: Place, state: TableState, *, fresh: bool) -> str:
 
 async def download(
     pairs: Sequence[Pair],
-    places: Iterable[Place],
+    places: Iterable[DownloadTarget],
     *,
     now_ns: Callable[[], int],
     share: float = BUS_SHARE,
     broadcasts_max: int = BROADCASTS_MAX,
-) -> Report:
+) -> DownloadReport:
     """Bring PAIRS (none: remove the table) to PLACES; returns what became of it, without raising for a node.
 
     Two downloads at one time on one bus spoil each other. Raises MtError for what MT cannot carry.
@@ -214,7 +214,7 @@ async def download(
     links_begin_ns = now_ns()
     await asyncio.gather(*(_by_link(pairs, group) for group in _by_node(aims).values()))
     casts = tuple(caster.casts.values())
-    return Report(
+    return DownloadReport(
         tuple(aim.outcome() for aim in aims),
         len(words),
         casts,

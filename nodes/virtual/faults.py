@@ -18,7 +18,7 @@ TIME_S_MAX: Final = 1e8
 """Three years: far below the rollover of the bus's 64-bit nanoseconds."""
 
 
-class FaultKind(IntEnum):
+class BusFaultKind(IntEnum):
     """What happens to a frame that is hit; the numbers are those of ``enum hub_fault_kind``."""
 
     LOSE = 0
@@ -37,10 +37,10 @@ class FaultKind(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fault:
+class BusFault:
     """One rule. Times count from the moment the bus gets its rules."""
 
-    kind: FaultKind
+    kind: BusFaultKind
     share: float = 1.0
     """0..1 of the frames picked."""
     nth: int | None = None
@@ -76,11 +76,11 @@ class Fault:
             _check(name, "end", self.until_s, self.from_s, TIME_S_MAX)
         _check(name, "time", self.time_s, 0, TIME_S_MAX)
         _check(name, "jitter", self.jitter_s, 0, TIME_S_MAX)
-        if self.receiver is not None and self.kind not in (FaultKind.LOSE, FaultKind.CORRUPT):
+        if self.receiver is not None and self.kind not in (BusFaultKind.LOSE, BusFaultKind.CORRUPT):
             raise CanductorError(f"{name}: only a loss or corruption can hit a single receiver")
-        if self.kind is FaultKind.BUS_OFF and self.time_s == 0:
+        if self.kind is BusFaultKind.BUS_OFF and self.time_s == 0:
             raise CanductorError(f"{name}: needs to last for some time")
-        if self.timed and self.kind is not FaultKind.BUS_OFF:
+        if self.timed and self.kind is not BusFaultKind.BUS_OFF:
             raise CanductorError(f"{name}: only bus-off can happen without a frame")
 
     def to_c(self) -> dict[str, Any]:

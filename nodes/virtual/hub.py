@@ -24,7 +24,7 @@ from typing import Any, Self
 
 from nodes.support.errors import CanductorError
 from nodes.virtual._hub import ffi, lib
-from nodes.virtual.faults import RULES_MAX, Fault
+from nodes.virtual.faults import RULES_MAX, BusFault
 
 STUCK_LIMIT_S = 2.0
 """How long a client may stop the bus by not reading before it is disconnected."""
@@ -118,7 +118,7 @@ class VirtualBus:
         bitrate: int | None = 1_000_000,
         loss: float = 0.0,
         seed: int = 0,
-        faults: Sequence[Fault] = (),
+        faults: Sequence[BusFault] = (),
         stuck_limit_s: float = STUCK_LIMIT_S,
     ) -> None:
         """Check the arguments; raises CanductorError. Nothing happens before start()."""
@@ -154,7 +154,7 @@ class VirtualBus:
         self._final: BusStats | None = None
         self._error = 0
 
-    def _checked(self, faults: Sequence[Fault]) -> tuple[Fault, ...]:
+    def _checked(self, faults: Sequence[BusFault]) -> tuple[BusFault, ...]:
         if len(faults) > RULES_MAX:
             raise CanductorError(
                 f"virtual bus {self.path}: {len(faults)} faults are more than the {RULES_MAX} it can have"
@@ -162,11 +162,11 @@ class VirtualBus:
         return tuple(faults)
 
     @property
-    def faults(self) -> tuple[Fault, ...]:
+    def faults(self) -> tuple[BusFault, ...]:
         """The rules that hold now."""
         return self._faults
 
-    def set_faults(self, faults: Sequence[Fault]) -> None:
+    def set_faults(self, faults: Sequence[BusFault]) -> None:
         """Let these rules, and no others, hold from now on; raises CanductorError if there are too many.
 
         Their times count from now, and so do their figures.

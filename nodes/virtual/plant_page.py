@@ -37,7 +37,7 @@ _PAGE: Final = np.dtype(
 )
 
 
-class Kind(IntEnum):
+class PlantItemKind(IntEnum):
     """What an item of a plant is."""
 
     BODY = 1
@@ -49,7 +49,7 @@ class Kind(IntEnum):
     """A stepper's driver."""
 
 
-class Fault(IntEnum):
+class PlantFault(IntEnum):
     """What may be wrong with an item."""
 
     SOUND = 0
@@ -75,13 +75,20 @@ class Fault(IntEnum):
     """A driver that switched off."""
 
 
-_FAULTS: Final[Mapping[Kind, tuple[Fault, ...]]] = {
-    Kind.BODY: (),
-    Kind.HEATER: (Fault.STUCK_ON, Fault.DEAD),
-    Kind.FAN: (Fault.DEAD,),
-    Kind.SENSOR: (Fault.OPEN, Fault.SHORTED, Fault.FALLEN),
-    Kind.SWITCH: (Fault.NEVER, Fault.ALWAYS),
-    Kind.TMC: (Fault.OPEN, Fault.SHORTED, Fault.DEAD, Fault.GARBLED, Fault.WARM, Fault.OVERHEATED),
+_FAULTS: Final[Mapping[PlantItemKind, tuple[PlantFault, ...]]] = {
+    PlantItemKind.BODY: (),
+    PlantItemKind.HEATER: (PlantFault.STUCK_ON, PlantFault.DEAD),
+    PlantItemKind.FAN: (PlantFault.DEAD,),
+    PlantItemKind.SENSOR: (PlantFault.OPEN, PlantFault.SHORTED, PlantFault.FALLEN),
+    PlantItemKind.SWITCH: (PlantFault.NEVER, PlantFault.ALWAYS),
+    PlantItemKind.TMC: (
+        PlantFault.OPEN,
+        PlantFault.SHORTED,
+        PlantFault.DEAD,
+        PlantFault.GARBLED,
+        PlantFault.WARM,
+        PlantFault.OVERHEATED,
+    ),
 }
 
 
@@ -100,8 +107,8 @@ class Motor:
 class Item:
     """A part of the plant as it was last worked out."""
 
-    kind: Kind
-    fault: Fault
+    kind: PlantItemKind
+    fault: PlantFault
     value: float
     """Of a body °C; of a heater or fan its duty, 0 to 1; of a sensor its own °C; of a switch 1: pressed; of
     a driver the true time (ns) until which its DIAG is high if no step follows."""
@@ -152,26 +159,26 @@ class PlantPage:
             row["name"].decode(): Motor(int(row["count"]), int(row["head"]), int(row["lost"])) for row in rows
         }
 
-    def item(self, kind: Kind, name: str) -> Item:
+    def item(self, kind: PlantItemKind, name: str) -> Item:
         """Return the item of KIND called NAME; raises CanductorError."""
         row = self._row(kind, name)
-        return Item(kind, Fault(int(row["fault"])), float(row["value"]), float(row["extra"]))
+        return Item(kind, PlantFault(int(row["fault"])), float(row["value"]), float(row["extra"]))
 
     def temperature(self, body: str) -> float:
         """Return how warm BODY truly is, °C."""
-        return self.item(Kind.BODY, body).value
+        return self.item(PlantItemKind.BODY, body).value
 
-    def names(self, kind: Kind) -> tuple[str, ...]:
+    def names(self, kind: PlantItemKind) -> tuple[str, ...]:
         """Return the names of all items of KIND."""
         return tuple(row["name"].decode() for row in self._rows() if row["kind"] == kind)
 
-    def set_fault(self, kind: Kind, name: str, fault: Fault) -> None:
+    def set_fault(self, kind: PlantItemKind, name: str, fault: PlantFault) -> None:
         """Let FAULT be so from now on; SOUND repairs. Raises CanductorError for what cannot be.
 
         The plant takes it to heart when it is worked out next.
         """
         row = self._row(kind, name)
-        if fault is not Fault.SOUND and fault not in _FAULTS[kind]:
+        if fault is not PlantFault.SOUND and fault not in _FAULTS[kind]:
             able = ", ".join(other.name.lower() for other in _FAULTS[kind]) or "nothing"
             raise CanductorError(
                 f"{self._name}: a {kind.name.lower()} cannot be {fault.name.lower()}; it can be {able}"
@@ -181,7 +188,7 @@ class PlantPage:
     def _rows(self) -> Any:
         return self._page["items"][0, : int(self._head["items"])]
 
-    def _row(self, kind: Kind, name: str) -> Any:
+    def _row(self, kind: PlantItemKind, name: str) -> Any:
         for row in self._rows():
             if row["kind"] == kind and row["name"] == name.encode():
                 return row

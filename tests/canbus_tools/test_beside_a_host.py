@@ -3,8 +3,8 @@
 import pytest
 
 from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError
-from canbus_tools.discovery.ask_bus import take_census
-from canbus_tools.discovery.inventory import DAMAGED_BLOCK, PROBED, State, survey_all
+from canbus_tools.discovery.ask_bus import discover_nodes
+from canbus_tools.discovery.inventory import DAMAGED_BLOCK, PROBED, NodePresence, take_full_inventory
 from canbus_tools.tools.nodes import NodesReport, list_nodes
 from canbus_tools.tools.release_id import release_on
 from nodes.bus.assign import AssignError
@@ -19,16 +19,16 @@ def test_all_tools_that_ask_leave_a_host_its_nodes(six: SixNodes) -> None:
 
     async def use_tools() -> None:
         async with BusTalk.open(stage.computer, options) as bus:
-            census = await take_census(bus)
-            assert BED in {waiting.uuid for waiting in census.waiting}
-            found = await survey_all(bus, options, probed=PROBED, listen_s=LISTEN_S)
+            discovery = await discover_nodes(bus)
+            assert BED in {waiting.uuid for waiting in discovery.waiting}
+            found = await take_full_inventory(bus, options, probed=PROBED, listen_s=LISTEN_S)
             states = {entry.nodeid: entry.state for entry in found.entries if entry.nodeid}
             [main] = found.by_nodeid(MAIN_ID)
             assert main.facts is None
-            assert main.overheard is not None
-            assert main.overheard.firmware.mcu == "virtual-mainboard"
+            assert main.passive is not None
+            assert main.passive.firmware.mcu == "virtual-mainboard"
             assert "virtual-mainboard ?" in NodesReport(options, found).to_text()
-            assert states == {MAIN_ID: State.IN_USE, TOOL_ID: State.SHUTDOWN}
+            assert states == {MAIN_ID: NodePresence.IN_USE, TOOL_ID: NodePresence.SHUTDOWN}
             assert MAIN_ID not in found.probed
             for words in (MAIN, MAIN_ID):
                 with pytest.raises((TalkError, AssignError), match="in use"):

@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from canbus_tools.bus.talk import BusTalk
-from canbus_tools.discovery.ask_bus import take_census
+from canbus_tools.discovery.ask_bus import discover_nodes
 from nodes.link import Frame
 from nodes.support.can_protocol import ADMIN_ID
 from nodes.support.errors import CanductorError
@@ -36,7 +36,7 @@ def test_a_controller_that_goes_off_the_bus_ends_the_question(stage: CanStage) -
             # The simulated adapter makes no error reports: the kernel's is put where it would arrive.
             at_ns = stage.world.now_ns + 20_000_000
             stage.world.at(at_ns, lambda: bus._frame_came(Frame(BUS_OFF, bytes(8), 0)))
-            await take_census(bus)
+            await discover_nodes(bus)
 
     with pytest.raises(CanductorError, match=r"went off the bus \(bus-off\).*bit rate.*canductor can doctor"):
         stage.computer.run(ask())
@@ -46,7 +46,7 @@ def test_a_bus_that_ends_ends_the_question_in_a_sentence(stage: CanStage) -> Non
     async def ask() -> None:
         async with BusTalk.open(stage.computer, stage.options) as bus:
             stage.world.at(stage.world.now_ns + 20_000_000, lambda: stage.computer.unplug(errno.ENODEV))
-            await take_census(bus)
+            await discover_nodes(bus)
 
     with pytest.raises(CanductorError, match=r"can0: the connection ended \(No such device\)"):
         stage.computer.run(ask())

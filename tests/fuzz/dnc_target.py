@@ -54,7 +54,7 @@ def run_engine(data: bytes, choice: int) -> None:
         output = engine.take_output()
         taken += len(output)
         assert taken <= 400 + 110 * position, "more is said than is asked"
-        assert len(engine._scanner._data) <= options.block_max + 4
+        assert len(engine._lexer._data) <= options.block_max + 4
         assert len(engine._listing) <= DIRECTORY_MAX + 1
         deadline_s = engine.next_deadline()
         assert deadline_s is None or deadline_s < now_s + 700

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 
 from coordinator.simulate import scenario
-from coordinator.simulate.faults import NS, Fault, Faults
+from coordinator.simulate.faults import NS, Faults, ScenarioFault
 from coordinator.simulate.scenario import FaultSetting
 from coordinator.support.toml_values import Dice, Range
 
@@ -16,13 +16,13 @@ class Actor:
 
     def __init__(self) -> None:
         self.now = 5 * NS
-        self.acted: list[Fault] = []
+        self.acted: list[ScenarioFault] = []
         self.calls: list[int] = []
 
     def now_ns(self) -> int:
         return self.now
 
-    def act(self, fault: Fault) -> None:
+    def act(self, fault: ScenarioFault) -> None:
         self.acted.append(fault)
 
     def call(self, at_ns: int, what: Callable[[], object]) -> None:
@@ -58,7 +58,7 @@ def test_each_begins_where_it_counts_from() -> None:
 def test_a_seed_draws_the_same_again_and_others_something_else() -> None:
     setting = FaultSetting(kind="cut", node="toolhead", at_s=Range(0, 5), times=Range(1, 5))
 
-    def drawn(seed: int) -> list[Fault]:
+    def drawn(seed: int) -> list[ScenarioFault]:
         planned, actor = faults(setting, seed=seed)
         begin(planned)
         return actor.acted

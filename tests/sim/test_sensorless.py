@@ -16,7 +16,7 @@ from coordinator.streaming.move_source import Told
 from coordinator.support.toml_values import Range
 from coordinator.virtual_machine.plant import PlantSettings
 from nodes.support.errors import CanductorError
-from nodes.virtual.plant_page import Fault, Kind, PlantPage
+from nodes.virtual.plant_page import PlantFault, PlantItemKind, PlantPage
 from tests.stages.machine_stage import MachineStage
 from tests.stages.printer_text import SENSORLESS_CFG
 
@@ -61,9 +61,9 @@ class Printer(MachineStage):
     def mcu(self) -> PlantPage:
         return self.page("mcu")
 
-    def break_driver(self, fault: Fault, name: str = "stepper_x") -> None:
-        self.mcu.set_fault(Kind.TMC, name, fault)
-        assert self.mcu.item(Kind.TMC, name).fault is fault  # it is looked at: the driver knows
+    def break_driver(self, fault: PlantFault, name: str = "stepper_x") -> None:
+        self.mcu.set_fault(PlantItemKind.TMC, name, fault)
+        assert self.mcu.item(PlantItemKind.TMC, name).fault is fault  # it is looked at: the driver knows
 
 
 def test_axes_are_homed_by_what_their_drivers_feel_the_same_from_anywhere(tmp_path: Path) -> None:
@@ -115,8 +115,8 @@ def test_a_driver_is_set_anew_when_its_node_comes_back(tmp_path: Path) -> None:
     def come_back(printer: Printer, machine: Machine) -> None:
         driver = machine.modules.find("tmc2209 stepper_x", TmcDriver)
         assert driver is not None
-        printer.break_driver(Fault.DEAD)
-        printer.break_driver(Fault.SOUND)  # it has forgotten all
+        printer.break_driver(PlantFault.DEAD)
+        printer.break_driver(PlantFault.SOUND)  # it has forgotten all
         driver.started(machine.nodes["mcu"])
         asyncio.get_running_loop().call_later(1, lambda: status.append(driver.status()))
 
@@ -167,12 +167,15 @@ def test_afterwards_the_drivers_are_as_they_were(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fault", "sentence"),
     [
-        (Fault.OPEN, "does not answer; check that its motor supply is on, and uart_pin and uart_address"),
-        (Fault.GARBLED, "gives answers that are damaged; check its UART's wiring and for other drivers"),
-        (Fault.SHORTED, "reports a short circuit to ground at coil A; check motor and cable"),
+        (
+            PlantFault.OPEN,
+            "does not answer; check that its motor supply is on, and uart_pin and uart_address",
+        ),
+        (PlantFault.GARBLED, "gives answers that are damaged; check its UART's wiring and for other drivers"),
+        (PlantFault.SHORTED, "reports a short circuit to ground at coil A; check motor and cable"),
     ],
 )
-def test_a_driver_that_cannot_be_set_ends_the_start(tmp_path: Path, fault: Fault, sentence: str) -> None:
+def test_a_driver_that_cannot_be_set_ends_the_start(tmp_path: Path, fault: PlantFault, sentence: str) -> None:
     printer = Printer(tmp_path)
     printer.break_driver(fault)
     with pytest.raises(CanductorError) as error:
@@ -183,13 +186,13 @@ def test_a_driver_that_cannot_be_set_ends_the_start(tmp_path: Path, fault: Fault
 @pytest.mark.parametrize(
     ("faults", "sentence"),
     [
-        ((Fault.OVERHEATED,), "is too hot and switched itself off; lower run_current, cool it"),
-        ((Fault.GARBLED,), "gives answers that are damaged"),
-        ((Fault.DEAD, Fault.SOUND), "has lost its settings: its motor supply was off for a moment"),
+        ((PlantFault.OVERHEATED,), "is too hot and switched itself off; lower run_current, cool it"),
+        ((PlantFault.GARBLED,), "gives answers that are damaged"),
+        ((PlantFault.DEAD, PlantFault.SOUND), "has lost its settings: its motor supply was off for a moment"),
     ],
 )
 def test_a_driver_that_fails_stops_the_machine(
-    tmp_path: Path, faults: tuple[Fault, ...], sentence: str
+    tmp_path: Path, faults: tuple[PlantFault, ...], sentence: str
 ) -> None:
     def fail(printer: Printer, _: Machine) -> None:
         for number, fault in enumerate(faults):
@@ -203,7 +206,7 @@ def test_a_driver_that_fails_stops_the_machine(
 
 def test_a_driver_that_gets_warm_is_told_of_once(tmp_path: Path) -> None:
     def warm(printer: Printer, _: Machine) -> None:
-        asyncio.get_running_loop().call_later(2, printer.break_driver, Fault.WARM, "stepper_y")
+        asyncio.get_running_loop().call_later(2, printer.break_driver, PlantFault.WARM, "stepper_y")
 
     printer = Printer(tmp_path, on_ready=warm)
     printer.print("G4 P6000")
@@ -213,7 +216,7 @@ def test_a_driver_that_gets_warm_is_told_of_once(tmp_path: Path) -> None:
 
 def test_a_driver_that_falls_silent_while_an_axis_homes(tmp_path: Path) -> None:
     def cut(printer: Printer, _: Machine) -> None:
-        asyncio.get_running_loop().call_later(0.8, printer.break_driver, Fault.OPEN)
+        asyncio.get_running_loop().call_later(0.8, printer.break_driver, PlantFault.OPEN)
 
     printer = Printer(tmp_path, start=(60.0, 214.0, 20.0), on_ready=cut)
     with pytest.raises(GCodeError, match=r"^part\.gcode:1: the driver of stepper_x .* does not answer"):

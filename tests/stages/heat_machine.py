@@ -16,7 +16,7 @@ from coordinator.virtual_machine.plant import PlantSettings
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.node.config import NodeConfig
 from nodes.virtual.firmware import firmware_dictionary
-from nodes.virtual.plant_page import Fault, Kind, PlantPage
+from nodes.virtual.plant_page import PlantFault, PlantItemKind, PlantPage
 from tests.stages.machine_stage import MachineStage
 from tests.stages.printer_text import printer_section, section, stepper_section
 
@@ -151,7 +151,9 @@ class HeatMachine(MachineStage):
     def edges(self, pin: str, node: str = "toolhead") -> list[tuple[float, int]]:
         return super().edges(pin, node)
 
-    def fault(self, kind: Kind, fault: Fault, name: str = "extruder", node: str = "toolhead") -> None:
+    def fault(
+        self, kind: PlantItemKind, fault: PlantFault, name: str = "extruder", node: str = "toolhead"
+    ) -> None:
         self.page(node).set_fault(kind, name, fault)
 
     async def true_range(

@@ -12,7 +12,7 @@ from coordinator.simulate.stage import Stage
 from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.streaming.move_source import Told
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants
-from nodes.virtual.plant_page import Kind, PlantPage
+from nodes.virtual.plant_page import PlantItemKind, PlantPage
 from nodes.virtual.world import WorldNode
 
 T = TypeVar("T")
@@ -125,4 +125,4 @@ class MachineStage:
     def true_c(self, body: str) -> float:
         """Return how warm something truly is."""
         pages = (plant.page for plant in self.plants.values())
-        return next(page.temperature(body) for page in pages if body in page.names(Kind.BODY))
+        return next(page.temperature(body) for page in pages if body in page.names(PlantItemKind.BODY))

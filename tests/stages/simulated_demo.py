@@ -17,7 +17,7 @@ from coordinator.virtual_machine.plant_heat import HeatSettings
 from coordinator.virtual_machine.stage import START_MM, WARM_C
 from nodes.virtual.edge_log import Clocks, Directions, steps_of
 from nodes.virtual.plant_log import PlantEvent
-from nodes.virtual.plant_page import Kind, Motor
+from nodes.virtual.plant_page import Motor, PlantItemKind
 from nodes.virtual.world import CanWire, WorldNode
 from tests.stages.machine_stage import MachineStage
 
@@ -86,7 +86,7 @@ class SimulatedDemo(MachineStage):
         now_ns = self.stage.now_ns()
         for node, plant in self.plants.items():
             page = plant.page
-            for body in page.names(Kind.BODY):
+            for body in page.names(PlantItemKind.BODY):
                 event = PlantEvent(now_ns, "body", body, page.temperature(body))
                 self._warmth.append((node, event))
         self.stage.call_at(now_ns + round(LOOK_S * 1e9), self._look)

@@ -8,7 +8,7 @@ from coordinator.runtime.machine import Machine
 from coordinator.service.core.machine_service import MachineService
 from coordinator.support.values import Value
 from coordinator.tables.axis_table import POINTS, AxisTable, TableError, Unit
-from nodes.mt.download import Report
+from nodes.mt.download import DownloadReport
 
 _AXIS_MAX: Final = 64
 _AXIS: Final = Param("axis", Kind.STR, "x, y or z, also in capitals", high=_AXIS_MAX)
@@ -105,7 +105,7 @@ def table_methods(service: MachineService) -> Iterator[Method]:
     )
 
 
-def _downloads(reports: Sequence[Report]) -> list[dict[str, Any]]:
+def _downloads(reports: Sequence[DownloadReport]) -> list[dict[str, Any]]:
     return [
         {
             "axles": [outcome.place.table.axle for outcome in report.outcomes],

@@ -17,7 +17,7 @@ from coordinator.tables.axis_table import AxisTable, TableError, figures, notes
 from coordinator.tables.axle_map import StepperTables
 from coordinator.tables.store import TableStore
 from nodes.clock.clock import HostTime
-from nodes.mt.download import Outcome, Place, Report, download
+from nodes.mt.download import DownloadOutcome, DownloadReport, DownloadTarget, download
 from nodes.mt.mt import MtStatus, Pair
 from nodes.mt.table import ActiveTable, AxleTable, TableState
 from nodes.node.node import Node
@@ -101,7 +101,7 @@ class TableService:
 
     async def send(
         self, table: AxisTable, machine: Machine, *, stands: Callable[[], bool]
-    ) -> tuple[list[str], list[Report]]:
+    ) -> tuple[list[str], list[DownloadReport]]:
         """Accept TABLE and bring it to its nodes; returns notes, and what that cost.
 
         TableError when it cannot be accepted.
@@ -115,7 +115,9 @@ class TableService:
         await self.put_to_use(machine, stands)
         return told, reports
 
-    async def remove(self, axis: str, machine: Machine, *, stands: Callable[[], bool]) -> list[Report]:
+    async def remove(
+        self, axis: str, machine: Machine, *, stands: Callable[[], bool]
+    ) -> list[DownloadReport]:
         """Forget the table of AXIS, here and on its nodes; returns what that cost. Raises TableError."""
         self._of(machine, axis)
         if axis not in self._tables:
@@ -136,14 +138,14 @@ class TableService:
 
     # --------------------------------------------------------------------------------------------- the nodes
 
-    async def bring(self, machine: Machine, axes: Iterable[str]) -> list[Report]:
+    async def bring(self, machine: Machine, axes: Iterable[str]) -> list[DownloadReport]:
         """Make sure that the nodes of AXES keep their tables, or none; ``status`` tells what became of it.
 
         Equal tables go to all their axles in one transmission. Returns what each cost.
         """
         reports = []
         async with self._one_at_a_time:
-            missing: dict[tuple[Pair, ...], list[Place]] = {}
+            missing: dict[tuple[Pair, ...], list[DownloadTarget]] = {}
             for place, pairs in self._wanted(machine, set(axes)):
                 side = self._at.setdefault(place.table, _Side())
                 if not await side.look(place):
@@ -159,7 +161,9 @@ class TableService:
             self._show(machine)
         return reports
 
-    async def _send(self, pairs: Sequence[Pair], places: Sequence[Place], machine: Machine) -> Report | None:
+    async def _send(
+        self, pairs: Sequence[Pair], places: Sequence[DownloadTarget], machine: Machine
+    ) -> DownloadReport | None:
         try:
             report = await download(pairs, places, now_ns=machine.host.now)
         except CanductorError as error:  # kept from when there was more room
@@ -262,7 +266,7 @@ class TableService:
     def _axes(machine: Machine) -> set[str]:
         return {place.axis for place in machine.devices.tables}
 
-    def _wanted(self, machine: Machine, axes: set[str]) -> list[tuple[Place, list[Pair]]]:
+    def _wanted(self, machine: Machine, axes: set[str]) -> list[tuple[DownloadTarget, list[Pair]]]:
         """Return every place of AXES on nodes that keep tables, with what is to be there."""
         found = []
         for stepper in machine.devices.tables:
@@ -272,7 +276,7 @@ class TableService:
             table = self._tables.get(stepper.axis)
             for direction, side in stepper.sides.items():
                 pairs = [] if table is None else table.pairs(direction)
-                found.append((Place(side, node, machine.can_bus(node)), pairs))
+                found.append((DownloadTarget(side, node, machine.can_bus(node)), pairs))
         return found
 
     def _changed(self, axis: str, table: AxisTable | None) -> None:
@@ -323,7 +327,7 @@ class _Side:
         self._active: ActiveTable | None = None
         self.problem = ""
 
-    async def look(self, place: Place) -> bool:
+    async def look(self, place: DownloadTarget) -> bool:
         """Ask the node; whether it answered."""
         try:
             self._state = await place.table.state(place.node)
@@ -332,13 +336,13 @@ class _Side:
             self._state, self.problem = None, str(error)
         return self._state is not None
 
-    async def look_active(self, place: Place) -> None:
+    async def look_active(self, place: DownloadTarget) -> None:
         try:
             self._active = await place.table.active(place.node)
         except CanductorError as error:
             self.problem = str(error)
 
-    def took(self, outcome: Outcome) -> None:
+    def took(self, outcome: DownloadOutcome) -> None:
         """Take note of a download."""
         if outcome.state is not None:
             self._state = outcome.state
@@ -358,7 +362,7 @@ class _Side:
         assert self._state is not None
         return self._state.generation if self._state.length else 0
 
-    def activate(self, place: Place, at_ns: HostTime) -> None:
+    def activate(self, place: DownloadTarget, at_ns: HostTime) -> None:
         """Have it used, or no longer used, from AT_NS on."""
         assert isinstance(place.node, Node), "one of the machine's"
         try:

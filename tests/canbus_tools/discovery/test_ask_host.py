@@ -10,7 +10,7 @@ import pytest
 from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.discovery import ask_host
 from canbus_tools.discovery.ask_host import ask_hosts
-from canbus_tools.discovery.node_info import Facts
+from canbus_tools.discovery.node_info import NodeInfo
 
 NODE = {
     "bus": "can0",
@@ -22,7 +22,7 @@ NODE = {
     "firmware_version": "v1",
     "clock_freq_hz": 64_000_000,
 }
-Ask = Callable[[bytes | None], dict[int, Facts]]
+Ask = Callable[[bytes | None], dict[int, NodeInfo]]
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ask:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "canductor").mkdir()
 
-    def asked(says: bytes | None) -> dict[int, Facts]:
+    def asked(says: bytes | None) -> dict[int, NodeInfo]:
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             await reader.readline()
             if says is None:
@@ -40,7 +40,7 @@ def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ask:
                 writer.write(says)
             writer.close()
 
-        async def main() -> dict[int, Facts]:
+        async def main() -> dict[int, NodeInfo]:
             path = tmp_path / "canductor" / "one.sock"
             async with await asyncio.start_unix_server(serve, path):
                 timeout_s = ask_host.TIMEOUT_S if says is not None else 0.02

@@ -10,8 +10,8 @@ from canbus_tools.discovery.node_discovery import (
     ROUNDS,
     ROUNDS_MAX,
     Application,
-    Census,
-    CensusResult,
+    DiscoveredNodes,
+    NodeDiscovery,
 )
 from nodes.bus.assign import ANSWER_NS, Uuid
 from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, QUERY_UNASSIGNED, WHO_IS_HERE
@@ -29,31 +29,31 @@ def here(uuid: Uuid, nodeid: int) -> bytes:
     return bytes([0x21, *uuid.raw, nodeid])
 
 
-def ask(answers: Answers, rounds: int = ROUNDS) -> tuple[CensusResult, list[list[int]]]:
-    """Run a census; return its result and the questions of each round."""
-    census = Census(rounds)
-    census.start(0)
+def ask(answers: Answers, rounds: int = ROUNDS) -> tuple[DiscoveredNodes, list[list[int]]]:
+    """Run a discovery; return its result and the questions of each round."""
+    discovery = NodeDiscovery(rounds)
+    discovery.start(0)
     asked: list[list[int]] = []
-    while census.deadline_ns is not None:
-        frames = census.frames_to_send()
+    while discovery.deadline_ns is not None:
+        frames = discovery.frames_to_send()
         assert {frame.can_id for frame in frames} == {ADMIN_ID}
         asked.append([frame.data[0] for frame in frames])
         for frame in frames:
             for said in answers(len(asked), frame.data[0]):
-                census.frame(ADMIN_RESPONSE_ID, said)
-        census.timer(census.deadline_ns - 1)
-        assert census.frames_to_send() == []
-        wait(census)
-    return census.result(), asked
+                discovery.frame(ADMIN_RESPONSE_ID, said)
+        discovery.timer(discovery.deadline_ns - 1)
+        assert discovery.frames_to_send() == []
+        wait(discovery)
+    return discovery.result(), asked
 
 
-def wait(census: Census) -> int:
-    """Let the time pass until the census asks again or ends; return when (ns)."""
-    asks = census.result().rounds
+def wait(discovery: NodeDiscovery) -> int:
+    """Let the time pass until the discovery asks again or ends; return when (ns)."""
+    asks = discovery.result().rounds
     at_ns = 0
-    while census.deadline_ns is not None and census.result().rounds == asks:
-        at_ns = census.deadline_ns
-        census.timer(at_ns)
+    while discovery.deadline_ns is not None and discovery.result().rounds == asks:
+        at_ns = discovery.deadline_ns
+        discovery.timer(at_ns)
     return at_ns
 
 
@@ -84,20 +84,20 @@ def test_a_board_heard_once_in_five_rounds_is_found_and_gets_three_more_rounds_f
 
 
 def test_a_round_waits_longer_when_fewer_answer_than_before_but_not_for_ever() -> None:
-    census = Census()
-    census.start(0)
+    discovery = NodeDiscovery()
+    discovery.start(0)
     for uuid in (A, B):
-        census.frame(ADMIN_RESPONSE_ID, needs(uuid))
-    first_ns = wait(census)
-    census.frame(ADMIN_RESPONSE_ID, needs(A))
-    second_ns = wait(census)
+        discovery.frame(ADMIN_RESPONSE_ID, needs(uuid))
+    first_ns = wait(discovery)
+    discovery.frame(ADMIN_RESPONSE_ID, needs(A))
+    second_ns = wait(discovery)
     assert second_ns - first_ns == ROUND_NS + 2 * ANSWER_NS + LATE_NS
-    census.frame(ADMIN_RESPONSE_ID, needs(A))
-    assert census.deadline_ns is not None
-    census.timer(census.deadline_ns)
-    assert census.result().rounds == 3  # it waits …
-    census.frame(ADMIN_RESPONSE_ID, needs(B))
-    assert wait(census) - second_ns == 2 * ROUND_NS + 2 * ANSWER_NS  # … until all have answered
+    discovery.frame(ADMIN_RESPONSE_ID, needs(A))
+    assert discovery.deadline_ns is not None
+    discovery.timer(discovery.deadline_ns)
+    assert discovery.result().rounds == 3  # it waits …
+    discovery.frame(ADMIN_RESPONSE_ID, needs(B))
+    assert wait(discovery) - second_ns == 2 * ROUND_NS + 2 * ANSWER_NS  # … until all have answered
 
 
 def test_twins_show_by_one_answer_too_many() -> None:
@@ -133,40 +133,40 @@ def test_a_board_that_gets_its_id_meanwhile_is_no_twin() -> None:
 
 
 def test_a_host_that_asks_too_makes_no_twins() -> None:
-    census = Census()
-    census.start(0)
-    census.frame(ADMIN_ID, bytes([QUERY_UNASSIGNED]))
-    census.frame(ADMIN_ID, bytes([WHO_IS_HERE]))
-    census.frame(ADMIN_ID, b"")
+    discovery = NodeDiscovery()
+    discovery.start(0)
+    discovery.frame(ADMIN_ID, bytes([QUERY_UNASSIGNED]))
+    discovery.frame(ADMIN_ID, bytes([WHO_IS_HERE]))
+    discovery.frame(ADMIN_ID, b"")
     for said in (needs(A), here(B, 4)):
-        census.frame(ADMIN_RESPONSE_ID, said)
-        census.frame(ADMIN_RESPONSE_ID, said)
-    assert census.result().twins == ()
-    census.frame(ADMIN_RESPONSE_ID, needs(A))
-    assert census.result().twins == (A,)
+        discovery.frame(ADMIN_RESPONSE_ID, said)
+        discovery.frame(ADMIN_RESPONSE_ID, said)
+    assert discovery.result().twins == ()
+    discovery.frame(ADMIN_RESPONSE_ID, needs(A))
+    assert discovery.result().twins == (A,)
 
 
 def test_traffic_is_told_by_who_sent_it() -> None:
-    census = Census()
+    discovery = NodeDiscovery()
     for can_id in (0x108, 0x10B, 0x2FE, 0x2FF, 0x010, 0x101, 0x300, 0x7FF, 0x2000_0040):
-        census.frame(can_id, b"\x05")
-    result = census.result()
+        discovery.frame(can_id, b"\x05")
+    result = discovery.result()
     assert (set(result.hosted), set(result.talking), result.foreign_frames) == ({4, 255}, {5, 255}, 5)
 
 
 def test_garbage_is_counted_and_nothing_grows_without_end() -> None:
     source = random.Random(1)
-    census = Census()
-    census.start(0)
+    discovery = NodeDiscovery()
+    discovery.start(0)
     for size in (0, 1, 7):
-        census.frame(ADMIN_RESPONSE_ID, b"\x20" * size)
-    census.frame(ADMIN_RESPONSE_ID, b"\x22" * 8)
-    assert census.ignored == 4
+        discovery.frame(ADMIN_RESPONSE_ID, b"\x20" * size)
+    discovery.frame(ADMIN_RESPONSE_ID, b"\x22" * 8)
+    assert discovery.ignored == 4
     rounds = 1
-    while census.deadline_ns is not None:
+    while discovery.deadline_ns is not None:
         for _ in range(10):
-            census.frame(ADMIN_RESPONSE_ID, needs(Uuid(source.randbytes(6))))
-        census.timer(census.deadline_ns)
+            discovery.frame(ADMIN_RESPONSE_ID, needs(Uuid(source.randbytes(6))))
+        discovery.timer(discovery.deadline_ns)
         rounds += 1
-    assert len(census.result().waiting) == MAX_UUIDS
+    assert len(discovery.result().waiting) == MAX_UUIDS
     assert rounds < ROUNDS_MAX

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from canbus_tools.discovery import node_info as interview
+from canbus_tools.discovery import node_info
 from canbus_tools.discovery.node_info import CanStatus, Firmware
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
 from nodes.dictionary.message_format import Message, Value
@@ -29,14 +29,14 @@ def test_constants_of_a_wrong_kind_are_as_if_missing(config: dict[str, object]) 
 
 def test_a_clock_in_two_words_is_an_uptime_also_beyond_its_rollover() -> None:
     def uptime(high: int, clock: int) -> float | None:
-        return interview._uptime_s(Message("uptime", {"high": high, "clock": clock}), 1_000_000)
+        return node_info._uptime_s(Message("uptime", {"high": high, "clock": clock}), 1_000_000)
 
     assert uptime(0, 2_500_000) == 2.5
     assert uptime(0, 0xFFFFFFFF) == 4294.967295
     assert uptime(1, 0) == 4294.967296
-    assert interview._uptime_s(Message("uptime", {"high": 0}), 1_000_000) is None
-    assert interview._uptime_s(Message("uptime", {"high": 0, "clock": 1}), None) is None
-    assert interview._uptime_s(None, 1_000_000) is None
+    assert node_info._uptime_s(Message("uptime", {"high": 0}), 1_000_000) is None
+    assert node_info._uptime_s(Message("uptime", {"high": 0, "clock": 1}), None) is None
+    assert node_info._uptime_s(None, 1_000_000) is None
 
 
 @pytest.mark.parametrize(
@@ -44,13 +44,13 @@ def test_a_clock_in_two_words_is_an_uptime_also_beyond_its_rollover() -> None:
 )
 def test_the_state_of_a_controller_by_its_name(state: int, name: str) -> None:
     params: dict[str, Value] = {"rx_error": 1, "tx_error": 2, "tx_retries": 3, "canbus_bus_state": state}
-    said = interview._status(Message("canbus_status", params), WORDS)
+    said = node_info._status(Message("canbus_status", params), WORDS)
     assert said == CanStatus(rx_errors=1, tx_errors=2, tx_retries=3, state=name)
     del params["tx_error"]
-    assert interview._status(Message("canbus_status", params), WORDS) is None
+    assert node_info._status(Message("canbus_status", params), WORDS) is None
 
 
 @pytest.mark.parametrize("value", [UUID[:5], UUID + b"x", b"", 7])
 def test_a_uuid_of_a_wrong_size_is_none(value: Value) -> None:
-    assert interview._uuid(Message("canbus_id", {"canbus_uuid": value})) is None
-    assert str(interview._uuid(Message("canbus_id", {"canbus_uuid": UUID}))) == "90a4ae022dfc"
+    assert node_info._uuid(Message("canbus_id", {"canbus_uuid": value})) is None
+    assert str(node_info._uuid(Message("canbus_id", {"canbus_uuid": UUID}))) == "90a4ae022dfc"

@@ -8,17 +8,17 @@ import pytest
 
 from canbus_tools.bus.bus_load import LoadMeter
 from canbus_tools.bus.link_facts import LinkFacts, parse_link
-from canbus_tools.discovery.inventory import Entry, State, SurveyResult
-from canbus_tools.discovery.node_discovery import Application, Census
-from canbus_tools.discovery.node_info import CanStatus, Facts, Firmware
+from canbus_tools.discovery.inventory import Inventory, InventoryEntry, NodePresence
+from canbus_tools.discovery.node_discovery import Application, NodeDiscovery
+from canbus_tools.discovery.node_info import CanStatus, Firmware, NodeInfo
 from canbus_tools.doctor.facts import (
     AdapterFacts,
+    BusAddress,
+    DirectionFacts,
     InterfaceFacts,
     NodeFacts,
     PingFacts,
-    Place,
     TrafficFacts,
-    WayFacts,
 )
 from canbus_tools.doctor.finding import Finding, Severity
 from canbus_tools.doctor.gather import error_kinds, read_adapter
@@ -31,7 +31,7 @@ from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
 
 DATA = Path(__file__).parents[2] / "data" / "can"
-PLACE = Place(name="can0", words="-c can0", socketcan=True, bitrate=1_000_000)
+PLACE = BusAddress(name="can0", words="-c can0", socketcan=True, bitrate=1_000_000)
 HEALTHY = parse_link((DATA / "ip-link-healthy.json").read_text())
 GS_USB = AdapterFacts(kernel="6.8.0-45-generic", driver="gs_usb", usb_id=(0x1D50, 0x606F), usb_name="candle")
 
@@ -153,7 +153,9 @@ def test_an_adapter_is_read_from_sys(tmp_path: Path) -> None:
 
 
 def test_invalid_bytes_name_the_adapter_and_acquit_the_wiring() -> None:
-    way = WayFacts(nodeid=5, from_blocks=900, to_blocks=900, invalid_bytes=40, repeated_blocks=0, naks=0)
+    way = DirectionFacts(
+        nodeid=5, from_blocks=900, to_blocks=900, invalid_bytes=40, repeated_blocks=0, naks=0
+    )
     means = judge_traffic(TrafficFacts(listened_s=3.0, nodes=(way,)))["bytes-invalid"].means
     assert "candleLight firmware before 2.0" in means
     assert "Bad wiring does not do that" in means
@@ -164,7 +166,7 @@ def test_invalid_bytes_name_the_adapter_and_acquit_the_wiring() -> None:
 
 
 def test_repeats_and_slow_answers_of_another_host() -> None:
-    way = WayFacts(
+    way = DirectionFacts(
         nodeid=5,
         from_blocks=900,
         to_blocks=900,
@@ -244,16 +246,16 @@ def test_busy_and_too_busy(frames_per_s: int, name: str | None) -> None:
 def test_a_node_that_counts_errors() -> None:
     firmware = Firmware(mcu="x", version="", app="", build="", clock_hz=None, bitrate=None)
     status = CanStatus(rx_errors=3, tx_errors=120, tx_retries=900, state="warn")
-    entry = Entry(
+    entry = InventoryEntry(
         nodeid=5,
         uuid=Uuid.parse("90a4ae022dfc"),
         application=Application.KLIPPER,
-        state=State.IDLE,
-        facts=Facts(firmware=firmware, can=status),
+        state=NodePresence.IDLE,
+        facts=NodeInfo(firmware=firmware, can=status),
     )
-    well = replace(entry, facts=Facts(firmware=firmware, can=replace(status, tx_errors=0, state="active")))
-    survey = SurveyResult((entry, well), Census().result(), ())
-    (finding,) = check_nodes(NodeFacts(survey=survey), PLACE)
+    well = replace(entry, facts=NodeInfo(firmware=firmware, can=replace(status, tx_errors=0, state="active")))
+    inventory = Inventory((entry, well), NodeDiscovery().result(), ())
+    (finding,) = check_nodes(NodeFacts(inventory=inventory), PLACE)
     assert finding.name == "node-can-errors"
     assert "120 sending, 900 retries, bus state warn" in finding.seen
 
@@ -263,10 +265,10 @@ def test_lost_frames_by_their_number(lost: int, severity: Severity) -> None:
     ping = PingFacts(
         nodeid=4, asked=100, repeats=9, lost=lost, invalid_bytes=0, rtt_median_s=0.001, rtt_p99_s=0.002
     )
-    anyone = Entry(nodeid=4, uuid=None, application=Application.KLIPPER, state=State.IDLE)
-    survey = SurveyResult((anyone,), Census().result(), ())
-    (finding,) = check_nodes(NodeFacts(survey=survey, pings=(ping,)), PLACE)
+    anyone = InventoryEntry(nodeid=4, uuid=None, application=Application.KLIPPER, state=NodePresence.IDLE)
+    inventory = Inventory((anyone,), NodeDiscovery().result(), ())
+    (finding,) = check_nodes(NodeFacts(inventory=inventory, pings=(ping,)), PLACE)
     assert (finding.name, finding.severity) == ("frames-lost", severity)
     slow = replace(ping, lost=0, rtt_p99_s=0.03)
-    (finding,) = check_nodes(NodeFacts(survey=survey, pings=(slow,)), PLACE)
+    (finding,) = check_nodes(NodeFacts(inventory=inventory, pings=(slow,)), PLACE)
     assert finding.name == "round-trip-spread"

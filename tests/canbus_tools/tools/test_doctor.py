@@ -5,10 +5,10 @@ from functools import partial
 
 import pytest
 
-from canbus_tools.discovery.inventory import SurveyResult
-from canbus_tools.discovery.node_discovery import Census
+from canbus_tools.discovery.inventory import Inventory
+from canbus_tools.discovery.node_discovery import NodeDiscovery
+from canbus_tools.doctor.facts import BusAddress as Bus
 from canbus_tools.doctor.facts import NodeFacts
-from canbus_tools.doctor.facts import Place as Bus
 from canbus_tools.doctor.gather import ASKED
 from canbus_tools.doctor.population import check_nodes
 from nodes.transport import CanFrame
@@ -141,14 +141,14 @@ def test_other_bit_rates_are_listened_to(capsys: pytest.CaptureFixture[str]) -> 
     ("socketcan", "do"), [(True, "type can bitrate 250000 restart-ms 100"), (False, "--bitrate 250000")]
 )
 def test_nodes_at_another_bit_rate(socketcan: bool, do: str) -> None:
-    nobody = SurveyResult((), Census().result(), ())
-    facts = NodeFacts(survey=nobody, heard_at={1_000_000: 0, 250_000: 37})
+    nobody = Inventory((), NodeDiscovery().result(), ())
+    facts = NodeFacts(inventory=nobody, heard_at={1_000_000: 0, 250_000: 37})
     bus = Bus(name="can0", words="-c can0", socketcan=socketcan, bitrate=1_000_000)
     (finding,) = check_nodes(facts, bus)
     assert finding.name == "other-bitrate"
     assert "37 frames were heard at 250000 bit/s" in finding.seen
     assert do in finding.do
-    (finding,) = check_nodes(NodeFacts(survey=nobody, heard_at={1_000_000: 0, 250_000: 0}), bus)
+    (finding,) = check_nodes(NodeFacts(inventory=nobody, heard_at={1_000_000: 0, 250_000: 0}), bus)
     assert finding.name == "no-nodes"
     assert "nothing heard at 1000000, 250000 either" in finding.seen
 

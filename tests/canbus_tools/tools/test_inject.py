@@ -18,7 +18,7 @@ from canbus_tools.inject.inject_report import status
 from coordinator.cli import main as cli
 from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, NEED_NODEID, QUERY_UNASSIGNED
 from nodes.support.option_values import UsageError
-from nodes.virtual.faults import Fault, FaultKind
+from nodes.virtual.faults import BusFault, BusFaultKind
 from nodes.virtual.hub import VirtualBus
 
 WAIT_S = 30.0
@@ -185,26 +185,26 @@ def test_the_same_seed_gives_the_same_faults_in_another_process(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("name", "text", "expected"),
     [
-        ("loss", "1%", Fault(kind=FaultKind.LOSE, share=0.01)),
-        ("loss", "0.5,id=0x109", Fault(kind=FaultKind.LOSE, share=0.5, can_id=0x109, mask=0x7FF)),
+        ("loss", "1%", BusFault(kind=BusFaultKind.LOSE, share=0.01)),
+        ("loss", "0.5,id=0x109", BusFault(kind=BusFaultKind.LOSE, share=0.5, can_id=0x109, mask=0x7FF)),
         (
             "corrupt",
             "1,id=257/0x701,receiver=2,from=1.5,until=2",
-            Fault(kind=FaultKind.CORRUPT, can_id=0x101, mask=0x701, receiver=2, from_s=1.5, until_s=2),
+            BusFault(kind=BusFaultKind.CORRUPT, can_id=0x101, mask=0x701, receiver=2, from_s=1.5, until_s=2),
         ),
-        ("duplicate", "frame=7,sender=toolhead", Fault(kind=FaultKind.DUPLICATE, nth=7, sender=1)),
-        ("error", "10%", Fault(kind=FaultKind.ERROR, share=0.1)),
-        ("delay", "300us", Fault(kind=FaultKind.DELAY, time_s=300e-6)),
+        ("duplicate", "frame=7,sender=toolhead", BusFault(kind=BusFaultKind.DUPLICATE, nth=7, sender=1)),
+        ("error", "10%", BusFault(kind=BusFaultKind.ERROR, share=0.1)),
+        ("delay", "300us", BusFault(kind=BusFaultKind.DELAY, time_s=300e-6)),
         (
             "delay",
             "0,jitter=5ms,share=20%",
-            Fault(kind=FaultKind.DELAY, jitter_s=0.005, share=0.2),
+            BusFault(kind=BusFaultKind.DELAY, jitter_s=0.005, share=0.2),
         ),
-        ("bus-off", "2s,at=5", Fault(kind=FaultKind.BUS_OFF, time_s=2, timed=True, from_s=5)),
-        ("bus-off", "2,share=0.1%", Fault(kind=FaultKind.BUS_OFF, time_s=2, share=0.001)),
+        ("bus-off", "2s,at=5", BusFault(kind=BusFaultKind.BUS_OFF, time_s=2, timed=True, from_s=5)),
+        ("bus-off", "2,share=0.1%", BusFault(kind=BusFaultKind.BUS_OFF, time_s=2, share=0.001)),
     ],
 )
-def test_faults_are_read(name: str, text: str, expected: Fault) -> None:
+def test_faults_are_read(name: str, text: str, expected: BusFault) -> None:
     assert read_fault(name, text, {"mainboard": 0, "toolhead": 1}) == expected
 
 
@@ -270,7 +270,7 @@ def test_a_path_or_address_that_cannot_be_had_is_told(
 
 
 def test_the_status_line_tells_rates_and_damage(tmp_path: Path) -> None:
-    with VirtualBus(tmp_path / "bus", faults=[Fault(kind=FaultKind.LOSE)]) as bus:
+    with VirtualBus(tmp_path / "bus", faults=[BusFault(kind=BusFaultKind.LOSE)]) as bus:
         before = bus.stats
         with can.Bus(interface="canductor", channel=str(bus.path)) as sender:
             for _ in range(10):

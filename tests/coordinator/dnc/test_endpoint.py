@@ -8,7 +8,7 @@ import pytest
 from coordinator.dnc import events
 from coordinator.dnc.blocks import ACK, DIRECTORY_REQUEST, EOT, SOH, write_block
 from coordinator.dnc.commands import _sentence
-from coordinator.dnc.endpoint import Desk, Library, Outcome
+from coordinator.dnc.endpoint import Endpoint, Library, Outcome
 from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.files import Folder
 from coordinator.dnc.listing import read_listing
@@ -26,7 +26,7 @@ class Server:
         self.engine = Engine(OPTIONS, 0.0, peripheral=True)
         folder = Folder(path, check=check_table)
         library = Library(folder, self.engine)
-        self.desk = Desk(
+        self.endpoint = Endpoint(
             self.engine, give=library.give, take=lambda h: folder.take(h.code, h.name), folder=folder
         )
         self.outcomes: list[Outcome] = []
@@ -42,7 +42,7 @@ class Server:
     def look(self, now_s: float) -> None:
         while happened := self.engine.take_events():
             for event in happened:
-                if (outcome := self.desk.handle(event)) is not None:
+                if (outcome := self.endpoint.handle(event)) is not None:
                     self.outcomes.append(outcome)
 
 

@@ -18,7 +18,7 @@ from coordinator.dnc.blocks import (
     write_block,
 )
 from coordinator.dnc.engine import State
-from coordinator.dnc.options import DncOptions, Frame
+from coordinator.dnc.options import DncOptions, SerialFrame
 from nodes.support.errors import CanductorError
 from tests.coordinator.dnc.bench import Bench, block, receiving, sending, take
 
@@ -319,4 +319,4 @@ def test_patience_is_longer_than_silence() -> None:
 
 
 def test_frames_have_their_times() -> None:
-    assert [Frame(*f).bits for f in ((7, "E", 1), (8, "N", 1), (8, "E", 2))] == [10, 10, 12]
+    assert [SerialFrame(*f).bits for f in ((7, "E", 1), (8, "N", 1), (8, "E", 2))] == [10, 10, 12]

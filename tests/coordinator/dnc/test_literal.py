@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from coordinator.dnc import events
 from coordinator.dnc.blocks import SOH, STX, Header, block_check, write_block
 from coordinator.dnc.engine import Engine
-from coordinator.dnc.lexer import Scanner
+from coordinator.dnc.lexer import Lexer
 from coordinator.dnc.options import DncOptions, read_frame
 from coordinator.dnc.tokens import Kind
 from tests.coordinator.dnc import literal
@@ -61,9 +61,9 @@ def test_blocks_are_the_same(first: int, text: bytes, dc1: bool) -> None:
     ours = write_block(first, text, dc1=dc1)
     assert ours == literal.block(first, text, dc1=dc1)
     assert block_check(text) == literal.bcc(text)
-    scanner = Scanner(DncOptions())
-    signs = scanner.receive(ours, 1.0) + scanner.handle_timer(2.0)
-    assert [(s.kind, s.content) for s in signs] == [(Kind.HEADER if first == SOH else Kind.BLOCK, text)]
+    lexer = Lexer(DncOptions())
+    tokens = lexer.receive(ours, 1.0) + lexer.handle_timer(2.0)
+    assert [(s.kind, s.content) for s in tokens] == [(Kind.HEADER if first == SOH else Kind.BLOCK, text)]
 
 
 @quick

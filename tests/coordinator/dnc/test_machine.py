@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from coordinator.dnc.blocks import SOH, STX, write_block
-from coordinator.dnc.endpoint import Desk
+from coordinator.dnc.endpoint import Endpoint
 from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.files import FileRefused
 from coordinator.dnc.machine import LINES_MAX, MachineSink
@@ -220,7 +220,7 @@ def test_a_sink_tells_why_no_more_comes() -> None:
 def test_a_job_that_is_cancelled_ends_the_transfer_while_nothing_comes() -> None:
     machine, now_s = Machine(), 0.0
     engine = Engine(DncOptions(answer_s=600.0), now_s, peripheral=True)
-    desk = Desk(engine, take=lambda header: MachineSink(machine, header.name))
+    endpoint = Endpoint(engine, take=lambda header: MachineSink(machine, header.name))
 
     def come(data: bytes) -> bytes:
         nonlocal now_s
@@ -229,20 +229,20 @@ def test_a_job_that_is_cancelled_ends_the_transfer_while_nothing_comes() -> None
         now_s += 0.5
         engine.handle_timer(now_s)
         for event in engine.take_events():
-            assert desk.handle(event) is None
+            assert endpoint.handle(event) is None
         return engine.take_output()
 
     assert come(write_block(SOH, b"DJOBA")) == b"\x06"
     assert come(write_block(STX, b"G28\r\n")) == b"\x06"
-    assert desk.looks
+    assert endpoint.looks
     machine.calls[0][2].set_result({"state": "cancelled", "message": ""})
     machine.answer()
-    desk.go_on()
+    endpoint.go_on()
     assert engine.take_output() == write_block(SOH, b"NOT PRINTED", dc1=True)
     assert engine.state is State.ERROR_SENT
     engine.receive(b"\x06\x04", now_s + 1)
     engine.handle_timer(now_s + 2)
     (event,) = engine.take_events()
-    outcome = desk.handle(event)
+    outcome = endpoint.handle(event)
     assert outcome is not None
     assert outcome.sentence == "JOB was cancelled at the machine"

@@ -15,7 +15,7 @@ from coordinator.virtual_machine.plant import START_MM, PlantSettings, machine_p
 from coordinator.virtual_machine.plant_heat import HeatSettings, steinhart, table_of
 from coordinator.virtual_machine.stage import Stage
 from nodes.virtual.plant import Axis, Beta, NodePlant, Rtd, Steinhart
-from nodes.virtual.plant_page import Fault, Kind
+from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from nodes.virtual.sim import SimNode
 from nodes.virtual.sim_plant import SimPlant, connect_plants
 from tests.stages.printer_text import printer_section, section, stepper_section
@@ -175,7 +175,7 @@ def test_nodes_that_need_each_other_live_together(plants: dict[str, NodePlant]) 
     nodes = {name: SimNode() for name in plants}
     started = {name: nodes[name].start_plant(plants[name]) for name in plants}
     connect_plants(started)
-    begun_c = started["mcu"].page.item(Kind.SENSOR, "extruder").value
+    begun_c = started["mcu"].page.item(PlantItemKind.SENSOR, "extruder").value
     assert begun_c == pytest.approx(20.0)
 
     def run(seconds: float) -> None:
@@ -187,11 +187,11 @@ def test_nodes_that_need_each_other_live_together(plants: dict[str, NodePlant]) 
     run(1.0)
     assert started["tool"].page.temperature("extruder") == pytest.approx(20.0)
     hot = started["tool"].page
-    hot.set_fault(Kind.HEATER, "extruder", Fault.STUCK_ON)
+    hot.set_fault(PlantItemKind.HEATER, "extruder", PlantFault.STUCK_ON)
     run(20.0)
     true_c = started["tool"].page.temperature("extruder")
     assert 120 < true_c < 300
-    read_c = started["mcu"].page.item(Kind.SENSOR, "extruder").value
+    read_c = started["mcu"].page.item(PlantItemKind.SENSOR, "extruder").value
     assert true_c - 10 < read_c < true_c  # it follows
 
 

@@ -10,7 +10,7 @@ from nodes.devices.tmcuart import BAUD, BAUD_SLOW, IFCNT, TmcError, TmcUart
 from nodes.dictionary.dictionary import Dictionary
 from nodes.node.config import NodeConfig
 from nodes.virtual.plant import NodePlant, Stepper, Tmc
-from nodes.virtual.plant_page import Fault, Kind
+from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests import real_dictionaries
 from tests.nodes.devices.machine import DeviceMachine
 
@@ -50,8 +50,8 @@ class Rig:
         self.machine = DeviceMachine(self.uart, rolls_over_s=2.52)
         self.plant: SimPlant = self.machine.board.start_plant(PLANT)
 
-    def fail(self, fault: Fault) -> None:
-        self.plant.page.set_fault(Kind.TMC, "a", fault)
+    def fail(self, fault: PlantFault) -> None:
+        self.plant.page.set_fault(PlantItemKind.TMC, "a", fault)
 
 
 def test_two_drivers_on_a_wire_are_talked_to_at_once() -> None:
@@ -77,8 +77,8 @@ def test_what_was_not_understood_is_written_again() -> None:
 
     async def main() -> None:
         loop = asyncio.get_running_loop()
-        loop.call_later(0.020, rig.fail, Fault.OPEN)
-        loop.call_later(0.024, rig.fail, Fault.SOUND)
+        loop.call_later(0.020, rig.fail, PlantFault.OPEN)
+        loop.call_later(0.024, rig.fail, PlantFault.SOUND)
         await rig.uart.write(rig.machine.node, 0, [(CHOPCONF, number) for number in range(20)])
         written.append(await rig.uart.read(rig.machine.node, 0, CHOPCONF))
         written.append(await rig.uart.read(rig.machine.node, 0, IFCNT))
@@ -91,9 +91,9 @@ def test_what_was_not_understood_is_written_again() -> None:
 
 @pytest.mark.parametrize(
     ("fault", "sentence"),
-    [(Fault.OPEN, "does not answer"), (Fault.GARBLED, "gives answers that are damaged")],
+    [(PlantFault.OPEN, "does not answer"), (PlantFault.GARBLED, "gives answers that are damaged")],
 )
-def test_one_that_does_not_answer_is_told_of(fault: Fault, sentence: str) -> None:
+def test_one_that_does_not_answer_is_told_of(fault: PlantFault, sentence: str) -> None:
     rig = Rig()
 
     async def main() -> None:

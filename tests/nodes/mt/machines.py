@@ -9,7 +9,7 @@ from nodes.bus.assign import Uuid
 from nodes.bus.bus import UartBus
 from nodes.bus.can_bus import CanBus
 from nodes.dictionary.dictionary import Dictionary
-from nodes.mt.download import Place
+from nodes.mt.download import DownloadTarget
 from nodes.mt.mt import Pair
 from nodes.mt.table import AxleTable
 from nodes.node.config import NodeConfig
@@ -77,14 +77,15 @@ class TableMachine:
             for n in range(1, nodes + 1)
         ]
         self.places = [
-            Place(table, self.nodes[index % nodes], self.bus) for index, table in enumerate(self.tables)
+            DownloadTarget(table, self.nodes[index % nodes], self.bus)
+            for index, table in enumerate(self.tables)
         ]
 
-    def node(self, place: Place) -> "Node":
+    def node(self, place: DownloadTarget) -> "Node":
         """Return the node of a place."""
         return next(node for node in self.nodes if node is place.node)
 
-    def board(self, place: Place) -> WorldNode:
+    def board(self, place: DownloadTarget) -> WorldNode:
         """Return the board of a place."""
         return self.boards[self.nodes.index(self.node(place))]
 
@@ -131,7 +132,7 @@ class UartTableMachine:
         self.bus = UartBus("uart", start_io(self.port))
         self.tables = [AxleTable(f"axle {k}", k, capacity) for k in range(1, axles + 1)]
         self.node = self.bus.add_node("n1", _config(self.tables))
-        self.places = [Place(table, self.node, None) for table in self.tables]
+        self.places = [DownloadTarget(table, self.node, None) for table in self.tables]
 
     def now_ns(self) -> int:
         """Return true time."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from nodes.clock.clock import HostTime
-from nodes.mt.download import BUS_SHARE, Outcome, Place, download
+from nodes.mt.download import BUS_SHARE, DownloadOutcome, DownloadTarget, download
 from nodes.mt.mt import MtError, MtStatus, Pair, to_frames, transmission
 from nodes.mt.table import Activation, AxleTable
 from nodes.node.config import NodeConfigError
@@ -31,7 +31,7 @@ def perform(
     run(machine.world, main(), limit_s=limit_s)
 
 
-async def kept(place: Place) -> list[Pair]:
+async def kept(place: DownloadTarget) -> list[Pair]:
     """Read the table that the node of PLACE keeps, pair by pair."""
     length = (await place.table.state(place.node)).length
     answers = [
@@ -41,7 +41,7 @@ async def kept(place: Place) -> list[Pair]:
     return [(answer.integer("x"), answer.integer("y")) for answer in answers]
 
 
-def told(outcomes: Sequence[Outcome]) -> list[str]:
+def told(outcomes: Sequence[DownloadOutcome]) -> list[str]:
     return [outcome.problem for outcome in outcomes if not outcome.ok]
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from nodes.support.errors import CanductorError
 from nodes.transport.frame import RECORD_SIZE, CanFrame
-from nodes.virtual.faults import RULES_MAX, Fault, FaultKind
+from nodes.virtual.faults import RULES_MAX, BusFault, BusFaultKind
 from nodes.virtual.hub import FaultStats, VirtualBus
 
 WAIT_S = 20.0
@@ -46,7 +46,7 @@ def yield_until(condition: Callable[[], object]) -> None:
         os.sched_yield()
 
 
-def heard(folder: Path, seed: int, faults: list[Fault]) -> list[bytes]:
+def heard(folder: Path, seed: int, faults: list[BusFault]) -> list[bytes]:
     with (
         VirtualBus(folder / "bus", bitrate=None, seed=seed, faults=faults) as bus,
         client(bus) as sender,
@@ -58,9 +58,9 @@ def heard(folder: Path, seed: int, faults: list[Fault]) -> list[bytes]:
 
 def test_the_same_seed_hits_the_same_frames(tmp_path: Path) -> None:
     faults = [
-        Fault(kind=FaultKind.LOSE, share=0.1, can_id=0x123, mask=0x7FF),
-        Fault(kind=FaultKind.CORRUPT, share=0.1),
-        Fault(kind=FaultKind.DUPLICATE, share=0.1),
+        BusFault(kind=BusFaultKind.LOSE, share=0.1, can_id=0x123, mask=0x7FF),
+        BusFault(kind=BusFaultKind.CORRUPT, share=0.1),
+        BusFault(kind=BusFaultKind.DUPLICATE, share=0.1),
     ]
     first = heard(tmp_path, 1, faults)
     assert heard(tmp_path, 1, faults) == first
@@ -74,7 +74,7 @@ def test_rules_can_change_while_the_bus_runs_and_count_for_themselves(tmp_path: 
         sender.sendall(numbered(1, 1) + END)
         assert read_to_end(listener) == [numbered(1, 1)]
         assert not bus.stats.faults
-        bus.set_faults([Fault(kind=FaultKind.LOSE, can_id=1, mask=0x7FF)])
+        bus.set_faults([BusFault(kind=BusFaultKind.LOSE, can_id=1, mask=0x7FF)])
         sender.sendall(numbered(1, 2) + numbered(2, 3) + END)
         assert read_to_end(listener) == [numbered(2, 3)]
         assert bus.stats.faults == (FaultStats(picked=1, hits=1),)
@@ -89,7 +89,7 @@ def test_bus_off_begins_without_any_traffic(tmp_path: Path) -> None:
     with VirtualBus(tmp_path / "bus", bitrate=None) as bus, client(bus) as sender, client(bus) as listener:
         sender.sendall(END)
         assert read_to_end(listener) == []
-        off = Fault(kind=FaultKind.BUS_OFF, timed=True, sender=0, time_s=1000.0)
+        off = BusFault(kind=BusFaultKind.BUS_OFF, timed=True, sender=0, time_s=1000.0)
         bus.set_faults([off])
         yield_until(lambda: bus.stats.bus_offs)
         sender.sendall(numbered(1, 1))
@@ -102,24 +102,24 @@ def test_bus_off_begins_without_any_traffic(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"kind": FaultKind.LOSE, "share": 1.5}, "fault lose: share 1.5 is not between 0 and 1"),
-        ({"kind": FaultKind.LOSE, "can_id": 0x800}, "fault lose: id 2048 is not between 0 and 2047"),
-        ({"kind": FaultKind.LOSE, "nth": 0}, "fault lose: frame 0 is not between 1"),
-        ({"kind": FaultKind.LOSE, "sender": 64}, "fault lose: sender 64 is not between 0 and 63"),
-        ({"kind": FaultKind.LOSE, "from_s": 2, "until_s": 1}, "fault lose: end 1 is not between 2"),
-        ({"kind": FaultKind.DELAY, "time_s": -1}, "fault delay: time -1 is not between 0"),
-        ({"kind": FaultKind.DELAY, "receiver": 1}, "only a loss or corruption can hit a single receiver"),
-        ({"kind": FaultKind.BUS_OFF}, "fault bus_off: needs to last for some time"),
-        ({"kind": FaultKind.LOSE, "timed": True}, "only bus-off can happen without a frame"),
+        ({"kind": BusFaultKind.LOSE, "share": 1.5}, "fault lose: share 1.5 is not between 0 and 1"),
+        ({"kind": BusFaultKind.LOSE, "can_id": 0x800}, "fault lose: id 2048 is not between 0 and 2047"),
+        ({"kind": BusFaultKind.LOSE, "nth": 0}, "fault lose: frame 0 is not between 1"),
+        ({"kind": BusFaultKind.LOSE, "sender": 64}, "fault lose: sender 64 is not between 0 and 63"),
+        ({"kind": BusFaultKind.LOSE, "from_s": 2, "until_s": 1}, "fault lose: end 1 is not between 2"),
+        ({"kind": BusFaultKind.DELAY, "time_s": -1}, "fault delay: time -1 is not between 0"),
+        ({"kind": BusFaultKind.DELAY, "receiver": 1}, "only a loss or corruption can hit a single receiver"),
+        ({"kind": BusFaultKind.BUS_OFF}, "fault bus_off: needs to last for some time"),
+        ({"kind": BusFaultKind.LOSE, "timed": True}, "only bus-off can happen without a frame"),
     ],
 )
 def test_impossible_faults_are_refused(fields: dict[str, object], said: str) -> None:
     with pytest.raises(CanductorError, match=said):
-        Fault(**fields)  # type: ignore[arg-type]
+        BusFault(**fields)  # type: ignore[arg-type]
 
 
 def test_too_many_faults_are_refused(tmp_path: Path) -> None:
-    bus = VirtualBus(tmp_path / "bus", faults=[Fault(kind=FaultKind.LOSE)] * RULES_MAX)
+    bus = VirtualBus(tmp_path / "bus", faults=[BusFault(kind=BusFaultKind.LOSE)] * RULES_MAX)
     with pytest.raises(CanductorError, match="33 faults are more than the 32 it can have"):
-        bus.set_faults([Fault(kind=FaultKind.LOSE)] * (RULES_MAX + 1))
+        bus.set_faults([BusFault(kind=BusFaultKind.LOSE)] * (RULES_MAX + 1))
     assert len(bus.faults) == RULES_MAX

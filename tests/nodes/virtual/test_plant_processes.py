@@ -16,7 +16,7 @@ from nodes.support.errors import CanductorError
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.plant import Axis, NodePlant, Stepper, Switch, Term
 from nodes.virtual.plant_log import plant_log
-from nodes.virtual.plant_page import Fault, Kind, PlantPage
+from nodes.virtual.plant_page import PlantFault, PlantItemKind, PlantPage
 from nodes.virtual.processes import NodeProcess
 from tests.firmware.board_process import EXPIRED, ROLLOVER, BoardProcess
 from tests.nodes.virtual.plants import HOT
@@ -50,7 +50,7 @@ def test_what_happens_is_in_its_log_at_the_times_of_its_pins(start: Start, tmp_p
     node.send("finalize_config crc=1")
     node.send("update_digital_out oid=0 value=1")
     node.read_answer("shutdown")  # its host said nothing more: the heater ended by itself
-    page.set_fault(Kind.SENSOR, "block", Fault.FALLEN)
+    page.set_fault(PlantItemKind.SENSOR, "block", PlantFault.FALLEN)
     node.end()
     ((clocks, _, levels),) = EdgeLog(node.edge_log).edges(PA0)
     assert levels.tolist() == [1, 0]
@@ -61,8 +61,8 @@ def test_what_happens_is_in_its_log_at_the_times_of_its_pins(start: Start, tmp_p
     off_ns = int(EdgeLog(node.edge_log).ticks_to_monotonic_ns(int(clocks[1])))
     assert power[0].at_ns < power[1].at_ns == pytest.approx(off_ns, abs=2)
     energy_J = 90.0 * (power[1].at_ns - power[0].at_ns) * 1e-9  # noqa: N806 - the unit's letter
-    assert page.item(Kind.HEATER, "block").extra == pytest.approx(energy_J, rel=1e-6)
-    assert [int(event.value) for event in events if event.kind == "fault"] == [int(Fault.FALLEN)]
+    assert page.item(PlantItemKind.HEATER, "block").extra == pytest.approx(energy_J, rel=1e-6)
+    assert [int(event.value) for event in events if event.kind == "fault"] == [int(PlantFault.FALLEN)]
     bodies = [event.value for event in events if event.kind == "body"]
     assert bodies[0] == pytest.approx(20.0, abs=0.1)
     assert bodies[-1] > 20.5, "the last entry is written at the end"
@@ -139,7 +139,7 @@ def test_an_endstop_switches_by_the_motors_of_two_other_nodes_however_late_it_ru
     # The first look behind the step that closed it, though all looks came later than all steps.
     assert int(own.ticks_to_monotonic_ns(triggered)) == int(looks_ns[np.searchsorted(looks_ns, closed_ns)])
     assert statistics["plant_misses"] == 0
-    assert PlantPage.at(tmp_path, "stop").item(Kind.SWITCH, "x").value == 1
+    assert PlantPage.at(tmp_path, "stop").item(PlantItemKind.SWITCH, "x").value == 1
 
 
 def test_a_motors_node_that_stands_still_is_waited_for_and_then_given_up(start: Start) -> None:

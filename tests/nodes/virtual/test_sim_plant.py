@@ -17,7 +17,7 @@ from nodes.virtual.plant import (
     Switch,
     Term,
 )
-from nodes.virtual.plant_page import Fault, Kind
+from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from nodes.virtual.sim import SimNode
 from nodes.virtual.sim_plant import connect_plants
 from nodes.virtual.world import NodeSettings, World
@@ -59,14 +59,14 @@ def test_in_a_world_time_is_true_whatever_the_nodes_crystal() -> None:
     world.run_for(20.0)
     assert plant.page.updated_ns == world.now_ns
     assert plant.page.temperature("tank") == pytest.approx(cooled(20.0), abs=1e-6)
-    plant.page.set_fault(Kind.HEATER, "tank", Fault.STUCK_ON)
-    assert plant.page.item(Kind.HEATER, "tank").value == 1
+    plant.page.set_fault(PlantItemKind.HEATER, "tank", PlantFault.STUCK_ON)
+    assert plant.page.item(PlantItemKind.HEATER, "tank").value == 1
     world.run_for(10.0)
     warm_c = 220.0 + (cooled(20.0) - 220.0) * np.exp(-10.0 / TAU_S)
     assert plant.page.temperature("tank") == pytest.approx(warm_c, abs=1e-6)
     node.power_off()  # the world goes on without it
-    plant.page.set_fault(Kind.HEATER, "tank", Fault.SOUND)
-    assert plant.page.item(Kind.HEATER, "tank").value == 0
+    plant.page.set_fault(PlantItemKind.HEATER, "tank", PlantFault.SOUND)
+    assert plant.page.item(PlantItemKind.HEATER, "tank").value == 0
     world.run_for(10.0)
     cold_c = 20.0 + (warm_c - 20.0) * np.exp(-10.0 / TAU_S)
     assert plant.page.temperature("tank") == pytest.approx(cold_c, abs=1e-6)
@@ -163,11 +163,11 @@ def test_without_its_host_a_heater_ends_by_itself() -> None:
     host.send(f"queue_digital_out oid=0 clock={on} on_ticks=1")
     # And now nobody says anything any more.
     host.run(freq // 10)
-    assert plant.page.item(Kind.HEATER, "block").value == 1
+    assert plant.page.item(PlantItemKind.HEATER, "block").value == 1
     assert "Missed scheduling" in host.dies(run=freq)
     assert host.steps(0).tolist() == [on, on + freq // 4]
-    assert plant.page.item(Kind.HEATER, "block").value == 0
-    assert plant.page.item(Kind.HEATER, "block").extra == pytest.approx(22.5, rel=1e-6)
+    assert plant.page.item(PlantItemKind.HEATER, "block").value == 0
+    assert plant.page.item(PlantItemKind.HEATER, "block").extra == pytest.approx(22.5, rel=1e-6)
 
 
 def test_what_breaks_at_run_time() -> None:
@@ -178,23 +178,23 @@ def test_what_breaks_at_run_time() -> None:
         "config_analog_in oid=1 pin=16",
     )
 
-    def set_fault(kind: Kind, fault: Fault) -> None:
+    def set_fault(kind: PlantItemKind, fault: PlantFault) -> None:
         plant.page.set_fault(kind, "block", fault)
         assert plant.page.item(kind, "block").fault is fault  # the plant has seen it now
 
     host.run(freq)
     assert plant.page.temperature("block") > 50
-    set_fault(Kind.HEATER, Fault.DEAD)
+    set_fault(PlantItemKind.HEATER, PlantFault.DEAD)
     host.run(freq // 10)
-    assert plant.page.item(Kind.HEATER, "block").value == 0
-    set_fault(Kind.HEATER, Fault.STUCK_ON)
+    assert plant.page.item(PlantItemKind.HEATER, "block").value == 0
+    set_fault(PlantItemKind.HEATER, PlantFault.STUCK_ON)
     host.send("update_digital_out oid=0 value=0")
     warm_c = plant.page.temperature("block")
     host.run(freq)
     assert plant.page.temperature("block") > warm_c + 10
-    set_fault(Kind.SENSOR, Fault.FALLEN)
+    set_fault(PlantItemKind.SENSOR, PlantFault.FALLEN)
     host.run(3 * freq)
-    assert plant.page.item(Kind.SENSOR, "block").value < 21
+    assert plant.page.item(PlantItemKind.SENSOR, "block").value < 21
     assert plant.page.temperature("block") > 40
     # A broken wire is out of the range a host allows: the firmware shuts down.
     host.send(
@@ -202,13 +202,13 @@ def test_what_breaks_at_run_time() -> None:
         f"rest_ticks={freq // 50} bytes_per_report=2 min_value=800 max_value=32700 range_check_count=4"
     )
     assert host.run(freq // 10)[0].name == "analog_in_state"
-    set_fault(Kind.SENSOR, Fault.OPEN)
+    set_fault(PlantItemKind.SENSOR, PlantFault.OPEN)
     assert host.dies(run=freq) == "ADC out of range"
-    assert plant.page.item(Kind.SENSOR, "block").extra == 4095
+    assert plant.page.item(PlantItemKind.SENSOR, "block").extra == 4095
     with pytest.raises(CanductorError, match="a sensor cannot be stuck_on; it can be open, shorted, fallen"):
-        plant.page.set_fault(Kind.SENSOR, "block", Fault.STUCK_ON)
+        plant.page.set_fault(PlantItemKind.SENSOR, "block", PlantFault.STUCK_ON)
     with pytest.raises(CanductorError, match="there is no fan 'fan'; there is part"):
-        plant.page.item(Kind.FAN, "fan")
+        plant.page.item(PlantItemKind.FAN, "fan")
 
 
 def test_a_motor_that_is_off_moves_nothing() -> None:

@@ -8,7 +8,7 @@ import pytest
 from coordinator.modules.fans.temperature_fan import TemperatureFan
 from coordinator.modules.heaters.heater import LOOK_S, SILENT_LOOKS
 from coordinator.modules.sensors.temperature_input import TemperatureInput
-from nodes.virtual.plant_page import Fault, Kind
+from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests.coordinator.modules.heaters.broken_sensor import Sensor
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 
@@ -27,15 +27,15 @@ def stage(tmp_path: Path) -> HeatMachine:
     return HeatMachine(tmp_path, HOTEND_PID + FAN + HOTEND_FAN)
 
 
-@pytest.mark.parametrize("fault", [Fault.OPEN, Fault.SHORTED])
-def test_a_bad_measurement_is_neither_hot_nor_cold(stage: HeatMachine, fault: Fault) -> None:
+@pytest.mark.parametrize("fault", [PlantFault.OPEN, PlantFault.SHORTED])
+def test_a_bad_measurement_is_neither_hot_nor_cold(stage: HeatMachine, fault: PlantFault) -> None:
     async def main() -> None:
         await asyncio.sleep(1.0)
         assert stage.status(SIDE)["speed"] == 0.2
-        stage.fault(Kind.SENSOR, fault, SENSOR, "mcu")
+        stage.fault(PlantItemKind.SENSOR, fault, SENSOR, "mcu")
         await asyncio.sleep(0.4)
         assert stage.status(SIDE)["speed"] == 0.9
-        stage.fault(Kind.SENSOR, Fault.SOUND, SENSOR, "mcu")
+        stage.fault(PlantItemKind.SENSOR, PlantFault.SOUND, SENSOR, "mcu")
         await asyncio.sleep(0.4)
         assert stage.status(SIDE)["speed"] == 0.2
         assert stage.machine.stopped is None

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.parser import WordError
-from nodes.virtual.plant_page import Fault, Kind
+from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests.stages.heat_machine import BASE, BED, FAN, HeatMachine
 
 PID = "control: pid\npid_kp: 10\npid_ki: 1\npid_kd: 15\n"
@@ -70,7 +70,7 @@ def test_a_tachometer_tells_a_fan_that_fails(tmp_path: Path) -> None:
         await asyncio.sleep(6)
         turns = stage.status("fan")["rpm"]
         assert turns == pytest.approx(6000, rel=0.03)
-        stage.fault(Kind.FAN, Fault.DEAD, "fan")
+        stage.fault(PlantItemKind.FAN, PlantFault.DEAD, "fan")
         await asyncio.sleep(6)
         status = stage.status("fan")
         assert (status["speed"], status["rpm"]) == (1.0, 0.0)
@@ -87,9 +87,9 @@ def test_a_heater_goes_on_when_the_part_fan_fails_and_comes_back(tmp_path: Path)
         for _ in range(2):
             await stage.do("M106")
             await asyncio.sleep(5)
-            stage.fault(Kind.FAN, Fault.DEAD, "fan")
+            stage.fault(PlantItemKind.FAN, PlantFault.DEAD, "fan")
             await asyncio.sleep(5)
-            stage.fault(Kind.FAN, Fault.SOUND, "fan")
+            stage.fault(PlantItemKind.FAN, PlantFault.SOUND, "fan")
         assert stage.machine.stopped is None
         assert 170 < stage.true_c() < 190
 
@@ -175,14 +175,18 @@ def test_a_fan_by_its_name_and_by_hardware(tmp_path: Path) -> None:
         await stage.do("SET_FAN_SPEED FAN=chamber SPEED=0.4")
         await asyncio.sleep(1)
         assert stage.status("fan_generic Chamber")["speed"] == 0.4
-        assert stage.page("mcu").item(Kind.FAN, "fan_generic_Chamber").value == pytest.approx(0.4, abs=0.01)
+        assert stage.page("mcu").item(PlantItemKind.FAN, "fan_generic_Chamber").value == pytest.approx(
+            0.4, abs=0.01
+        )
         with pytest.raises(WordError, match="there is no 'Chmber'"):
             stage.read("SET_FAN_SPEED FAN=Chmber SPEED=1")
         with pytest.raises(WordError, match="must be 0 to 1"):
             stage.read("SET_FAN_SPEED FAN=Chamber SPEED=2")
         stage.machine.stop("for the test")
         await asyncio.sleep(1)
-        assert stage.page("mcu").item(Kind.FAN, "fan_generic_Chamber").value == pytest.approx(0.3, abs=0.01)
+        assert stage.page("mcu").item(PlantItemKind.FAN, "fan_generic_Chamber").value == pytest.approx(
+            0.3, abs=0.01
+        )
 
     stage.connected(main)
 

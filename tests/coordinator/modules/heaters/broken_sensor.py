@@ -2,7 +2,7 @@
 
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.sensors.temperature_input import TemperatureInput
-from nodes.virtual.plant_page import Fault, Kind
+from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests.stages.heat_machine import HeatMachine
 
 
@@ -17,15 +17,15 @@ class Sensor:
 
     async def good(self, measurements: int) -> None:
         """Let so many sound measurements come."""
-        self._stage.fault(Kind.SENSOR, Fault.SOUND)
+        self._stage.fault(PlantItemKind.SENSOR, PlantFault.SOUND)
         for _ in range(measurements):
             await self.unit.input.next()
         assert self.unit.input.celsius is not None
         assert self.unit.input.min_c <= self.unit.input.celsius <= self.unit.input.max_c
 
-    async def bad(self, measurements: int, fault: Fault = Fault.OPEN) -> None:
+    async def bad(self, measurements: int, fault: PlantFault = PlantFault.OPEN) -> None:
         """Let so many come that cannot be."""
-        self._stage.fault(Kind.SENSOR, fault)
+        self._stage.fault(PlantItemKind.SENSOR, fault)
         for _ in range(measurements):
             await self.unit.input.next()
             assert self.unit.input.celsius is not None

@@ -11,7 +11,7 @@ from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
 from coordinator.modules.sensors.temperature_source import BAD_IN_A_ROW
 from nodes.devices.analog_in import RANGE_CHECKS
 from nodes.support.errors import CanductorError
-from nodes.virtual.plant_page import Fault
+from nodes.virtual.plant_page import PlantFault
 from tests.coordinator.modules.heaters.broken_sensor import Sensor
 from tests.stages.heat_machine import HOTEND_PID, HeatMachine
 
@@ -37,7 +37,7 @@ def test_one_bad_measurement_ends_the_heat_until_the_next_good_one(tmp_path: Pat
         await stage.do("M104 S250")
         sensor = Sensor(stage)
         await sensor.good(5)
-        for fault in (Fault.OPEN, Fault.SHORTED):
+        for fault in (PlantFault.OPEN, PlantFault.SHORTED):
             since_s = stage.now_s()
             await sensor.bad(1, fault)
             bad_s = stage.now_s() - since_s
@@ -78,7 +78,7 @@ def test_a_bad_measurement_ends_no_wait_and_allows_no_filament(tmp_path: Path, c
         lines = ("M109 S200", "TEMPERATURE_WAIT SENSOR=extruder MINIMUM=200")
         waiting = [asyncio.ensure_future(stage.do(line)) for line in lines]
         await sensor.good(3)
-        await sensor.bad(2, Fault.SHORTED)
+        await sensor.bad(2, PlantFault.SHORTED)
         await asyncio.sleep(0)
         assert not stage.status("extruder")["can_extrude"]
         assert not any(wait.done() for wait in waiting)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from nodes.node.states import NodeState
-from nodes.virtual.plant_page import Fault, Kind
+from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests.stages.heat_machine import BED, HeatMachine
 
 PID = "control: pid\npid_kp: 10\npid_ki: 1\npid_kd: 15\n"
@@ -27,9 +27,9 @@ async def hold(stage: HeatMachine, celsius: float = 150) -> None:
     assert stage.machine.stopped is None
 
 
-@pytest.mark.parametrize("fault", [Fault.OPEN, Fault.SHORTED])
+@pytest.mark.parametrize("fault", [PlantFault.OPEN, PlantFault.SHORTED])
 @pytest.mark.parametrize("hot", [True, False])
-def test_a_sensor_whose_wire_is_broken(tmp_path: Path, fault: Fault, hot: bool) -> None:
+def test_a_sensor_whose_wire_is_broken(tmp_path: Path, fault: PlantFault, hot: bool) -> None:
     stage = heating(tmp_path, hurry=5)
 
     async def main() -> None:
@@ -39,7 +39,7 @@ def test_a_sensor_whose_wire_is_broken(tmp_path: Path, fault: Fault, hot: bool) 
             await stage.do("M104 S200")
             await asyncio.sleep(2)
         broken_s = stage.now_s()
-        stage.fault(Kind.SENSOR, fault)
+        stage.fault(PlantItemKind.SENSOR, fault)
         text = await stage.stopped()
         assert "node toolhead shut down: ADC out of range" in text
         await asyncio.sleep(1)
@@ -55,7 +55,7 @@ def test_a_sensor_that_fell_out(tmp_path: Path) -> None:
 
     async def main() -> None:
         await hold(stage)
-        stage.fault(Kind.SENSOR, Fault.FALLEN)
+        stage.fault(PlantItemKind.SENSOR, PlantFault.FALLEN)
         text = await stage.stopped()
         assert "heater extruder does not hold 150 °C" in text
         told_s = stage.now_s()
@@ -70,7 +70,7 @@ def test_a_heater_that_does_nothing(tmp_path: Path) -> None:
     stage = heating(tmp_path)
 
     async def main() -> None:
-        stage.fault(Kind.HEATER, Fault.DEAD)
+        stage.fault(PlantItemKind.HEATER, PlantFault.DEAD)
         await stage.do("M104 S200")
         text = await stage.stopped()
         assert "heater extruder is at 25" in text
@@ -87,7 +87,7 @@ def test_a_switch_that_is_stuck_on_while_it_is_off(tmp_path: Path) -> None:
 
     async def main() -> None:
         await asyncio.sleep(35)
-        stage.fault(Kind.HEATER, Fault.STUCK_ON)
+        stage.fault(PlantItemKind.HEATER, PlantFault.STUCK_ON)
         text = await stage.stopped()
         assert "heats though it is off" in text
         assert stage.true_c() < 100, "long before the node would stop at max_temp"
@@ -100,7 +100,7 @@ def test_a_switch_that_is_stuck_on_while_it_holds_ends_at_the_nodes_own_limit(tm
 
     async def main() -> None:
         await hold(stage, 200)
-        stage.fault(Kind.HEATER, Fault.STUCK_ON)
+        stage.fault(PlantItemKind.HEATER, PlantFault.STUCK_ON)
         text = await stage.stopped()
         assert "heats though it is off" in text or "ADC out of range" in text
         assert stage.true_c() < 320
@@ -206,7 +206,7 @@ def test_who_waits_for_a_temperature_learns_that_it_will_not_come(tmp_path: Path
     stage = heating(tmp_path)
 
     async def main() -> None:
-        stage.fault(Kind.HEATER, Fault.DEAD)
+        stage.fault(PlantItemKind.HEATER, PlantFault.DEAD)
         waiting = asyncio.ensure_future(stage.do("M109 S200"))
         await stage.stopped()
         await asyncio.wait((waiting,), timeout=10)
