@@ -111,7 +111,7 @@ async def take_inventory(
     answering = await probe(bus, candidates)
     hosted = frozenset(bus.hosted)
     shared = _shared_ids(discovery)
-    # A node that answered WHO_IS_HERE is asked even when no probe was answered: reading repeats each question.
+    # A node that answered WHO_IS_HERE is read even when no probe was answered: reading repeats questions.
     asked = sorted((answering | here) - hosted - shared)
     facts = dict(zip(asked, await _read_all_node_info(bus, asked), strict=True))
     silent = {n for n in here - answering if isinstance(facts.get(n), CanductorError)}
