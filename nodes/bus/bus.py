@@ -24,6 +24,7 @@ class BusBase:
 
     START_IO opens the transport; it is called again when a bus that closed is to come back. Nodes share
     CACHE, their dictionaries. ON_NOTICE gets sentences about what the user should put right.
+    A node that acknowledges nothing for LOST_AFTER_S is lost.
     """
 
     def __init__(
@@ -33,6 +34,7 @@ class BusBase:
         *,
         cache: DictionaryCache | None = None,
         on_notice: Callable[[str], None] = ignore,
+        lost_after_s: float = LOST_AFTER_S,
     ) -> None:
         self.name = name
         self.nodes: list[Node] = []
@@ -40,6 +42,7 @@ class BusBase:
         self._start_io = start_io
         self._cache = cache if cache is not None else DictionaryCache()
         self._on_notice = on_notice
+        self.lost_after_s = lost_after_s
         self._may_be_absent: set[Node] = set()
         self._io: LinkIOLike | None = None
 
@@ -174,7 +177,7 @@ class _UartConnector:
 
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
         return self._bus.io.open_link(
-            LinkSettings(None, lost_after_s=LOST_AFTER_S), on_responses=on_responses, on_lost=on_lost
+            LinkSettings(None, lost_after_s=self._bus.lost_after_s), on_responses=on_responses, on_lost=on_lost
         )
 
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:  # noqa: ARG002

@@ -38,8 +38,9 @@ class CanBus(BusBase):
         *,
         cache: DictionaryCache | None = None,
         on_notice: Callable[[str], None] = ignore,
+        lost_after_s: float = LOST_AFTER_S,
     ) -> None:
-        super().__init__(name, start_io, cache=cache, on_notice=on_notice)
+        super().__init__(name, start_io, cache=cache, on_notice=on_notice, lost_after_s=lost_after_s)
         self._nodeids: dict[Uuid, int] = {}
         self._by_uuid: dict[Uuid, Node] = {}
         self._connectors: list[_CanConnector] = []
@@ -222,7 +223,7 @@ class _CanConnector:
         if self.assignment is None:
             self.assignment = await self._bus.assign([self._uuid])
         self.assignment.check_node(self._uuid, self._bus.name)
-        settings = LinkSettings(self._bus.nodeid(self._uuid), lost_after_s=LOST_AFTER_S)
+        settings = LinkSettings(self._bus.nodeid(self._uuid), lost_after_s=self._bus.lost_after_s)
         return self._bus.io.open_link(settings, on_responses=on_responses, on_lost=on_lost)
 
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
