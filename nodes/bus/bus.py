@@ -177,7 +177,9 @@ class _UartConnector:
 
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
         return self._bus.io.open_link(
-            LinkSettings(None, lost_after_s=self._bus.lost_after_s), on_responses=on_responses, on_lost=on_lost
+            LinkSettings(None, lost_after_s=self._bus.lost_after_s),
+            on_responses=on_responses,
+            on_lost=on_lost,
         )
 
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:  # noqa: ARG002
