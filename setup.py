@@ -14,7 +14,7 @@ from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).parent
 PACKAGES = ("nodes", "coordinator", "canbus_tools")
-BUILD_MODULES = {("nodes", "native_build"), ("nodes", "link_sources")}
+BUILD_MODULES = {("nodes.support", "native_build"), ("nodes.link", "sources")}
 """Modules that only the build scripts import."""
 EXAMPLE_MACHINES = ("coordinator", "example_machines")
 """Where an installation has the files of config/."""

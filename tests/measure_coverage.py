@@ -68,8 +68,6 @@ exclude_also =
     class .*\\(Protocol.*\\):
     @overload
 """
-DISTURBED: Final = ("tests/coordinator/planning/test_plan.py::test_planning_imports_nothing_slow",)
-"""Tests of what a process imports: coverage.py is among that."""
 # gcov's files are many; a command line takes this many of them.
 BATCH: Final = 200
 
@@ -155,7 +153,7 @@ def measure(groups: Iterable[list[str]]) -> list[str]:
         else:
             pytest = [sys.executable, "-m", "pytest", "-q", "--timeout=900", "-p", "no:cacheprovider"]
             words, with_variables = (
-                [*pytest, *(f"--deselect={test}" for test in DISTURBED), *group],
+                [*pytest, *group],
                 variables,
             )
         if _start(words, with_variables):

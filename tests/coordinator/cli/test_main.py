@@ -282,24 +282,6 @@ def test_a_closed_reader_is_no_error(tmp_path: Path) -> None:
     assert done.returncode == cli.EXIT_BROKEN_PIPE
 
 
-def test_starting_imports_nothing_slow() -> None:
-    script = "import sys, coordinator.cli.main; print(*sys.modules)"
-    out = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
-    ).stdout
-    slow = {
-        "numpy",
-        "typer",
-        "can",
-        "serial",
-        "rich",
-        "asyncio",
-        "importlib.metadata",
-        "coordinator.config.options",
-    }
-    assert not slow & set(out.split())
-
-
 @pytest.mark.parametrize(
     ("words", "told"),
     [
