@@ -1,0 +1,54 @@
+"""Names that were replaced by the field's usual words do not come back (docs/glossary.md)."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+RETIRED = {
+    "Vigil": "NodeWatchdog",
+    "LinkLike": "Link",
+    "LinkIOLike": "LinkIO",
+    "Census": "NodeDiscovery",
+    "CensusResult": "DiscoveredNodes",
+    "Overhearing": "PassiveDiscovery",
+    "interview": "node_info",
+    "survey": "inventory",
+    "AtOnce": "Immediate",
+    "InTime": "Synchronized",
+    "AtRest": "AtStandstill",
+    "NotYetActing": "Unsupported",
+    "LATER_SECTIONS": "UNSUPPORTED_SECTIONS",
+    "RestTask": "StandstillTask",
+    "Resting": "StandstillAction",
+    "WayHome": "ResumeHomingPlan",
+    "way_home": "resume_homing",
+    "RailPlaces": "StepperPositions",
+    "Door": "TcpListener",
+    "no_answer": "connect_errors",
+    "Answered": "ParserExit",
+    "write_whole": "atomic_write",
+    "Desk": "Endpoint",
+    "Reactions": "Engine",
+    "Scanner": "Lexer",
+}
+"""By the name that is refused: what to write instead."""
+SEARCHED = ("coordinator", "nodes", "canbus_tools", "tests", "bench", "docs", "README.md", "CONTRIBUTING.md")
+
+
+def test_retired_names_are_not_used() -> None:
+    command = ["git", "ls-files", "-z", *SEARCHED]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a checkout of git")
+    names = re.compile(rf"(?<![\w.-])({'|'.join(RETIRED)})(?![\w-])")
+    found = [
+        f"{path}:{number}: write {RETIRED[match[1]]} instead of {match[1]}"
+        for path in listed.stdout.split("\0")
+        if path.endswith((".py", ".md")) and path != "tests/test_language.py" and "adr/" not in path
+        for number, line in enumerate((ROOT / path).read_text(encoding="utf-8").splitlines(), 1)
+        for match in names.finditer(line)
+    ]
+    assert not found, "\n".join(found)
