@@ -30,7 +30,7 @@ from nodes.bus.can_bus import CanBus
 from nodes.clock.clock import HostTime, Ticks
 from nodes.dictionary.dictionary import Dictionary
 from nodes.link import LinkIO
-from nodes.link.interfaces import LinkIOLike, OnFrame, OnLost
+from nodes.link.interfaces import LinkIoInterface, OnFrame, OnLost
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
 from nodes.virtual.world import CanPort, World, WorldNode, run
@@ -133,7 +133,7 @@ class Machine:
             board.controller.set_faults(loss=setting.loss)
         self.sender = self.world.add_node(wire, "0000000000ff").controller if setting.load else None
 
-    def _start_io(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike:
+    def _start_io(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface:
         port: CanPort = self.port
         return LinkIO.driven_by(port.open(), on_frame=on_frame, on_closed=on_closed)
 

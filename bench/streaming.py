@@ -160,7 +160,7 @@ def host(config: Path, gcode: Path) -> None:
     watch = LeadWatch()
     with Program.open(gcode) as program:
         job = run_job(
-            load_machine(str(config)), program, watch.look, on_told=lambda _: None, on_ready=watch.note
+            load_machine(str(config)), program, watch.look, on_output=lambda _: None, on_ready=watch.note
         )
         outcome = asyncio.run(job)
     assert outcome.positions == outcome.issued, "the nodes counted other steps than were sent"
@@ -219,7 +219,7 @@ def first_motion(config: Path) -> None:
         with virtual_machine(config, folder, edges=True) as played:
             description = load_machine(str(played))
             with Program(typed, "typed") as program:
-                job = run_job(description, program, lambda _: None, on_told=lambda _: None)
+                job = run_job(description, program, lambda _: None, on_output=lambda _: None)
                 asyncio.run(job)
         log = EdgeLog(folder / f"{description.nodes[0].name}.edges")
         first_ns = int(log.ticks_to_monotonic_ns(first_step(description, log)))

@@ -19,10 +19,10 @@ from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
 from nodes.dictionary.parts import DictionaryError
 from nodes.link import Frame, LinkIO, LinkSettings, LinkStats, Response
-from nodes.link.interfaces import LinkLike
+from nodes.link.interfaces import LinkInterface
 from nodes.node.errors import NodeLost
 from nodes.node.identify import identify
-from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, Conversation
+from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Answer, RequestReply
 from nodes.support.errors import CanductorError
 
 LISTEN_S: Final = 1.2
@@ -189,7 +189,7 @@ class NodeTalk:
         self.bus = bus
         self.nodeid = nodeid
         self.name = f"on {bus.name}" if nodeid is None else f"{nodeid} on {bus.name}"
-        self._talk = Conversation(self.name)
+        self._talk = RequestReply(self.name)
         self._observers: list[MessageCallback] = []
         self._lost: str | None = None
 
@@ -220,7 +220,7 @@ class NodeTalk:
         return self._talk.dictionary
 
     @property
-    def link(self) -> LinkLike:
+    def link(self) -> LinkInterface:
         """The way to the node, for what is encoded already."""
         return self._talk.link
 
@@ -252,7 +252,7 @@ class NodeTalk:
         timeout_s: float = QUERY_TIMEOUT_S,
         tries: int = ASK_TRIES,
     ) -> Answer:
-        """Send a command until its RESPONSE comes (``Conversation.ask``); raises CanductorError."""
+        """Send a command until its RESPONSE comes (``RequestReply.ask``); raises CanductorError."""
         return await self._talk.ask(
             name, response, args, timeout_s=timeout_s, tries=tries, survives_shutdown=True
         )
@@ -274,7 +274,7 @@ class NodeTalk:
 
     def be_gentle(self) -> None:
         """Leave the bus to others for most of the time; before ``connect``."""
-        self._talk = _GentleConversation(self.name)
+        self._talk = _GentleRequestReply(self.name)
 
     def connect(self, io: LinkIO) -> None:
         """Open the link."""
@@ -324,7 +324,7 @@ class NodeTalk:
         )
 
 
-class _GentleConversation(Conversation):
+class _GentleRequestReply(RequestReply):
     """Pauses between questions."""
 
     def __init__(self, name: str) -> None:

@@ -14,7 +14,7 @@ from canbus_tools.bus.talk import BusTalk, NodeTalk, TalkError
 from canbus_tools.tables.table_ways import Sent, register_cost
 from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
-from nodes.link.interfaces import LinkLike
+from nodes.link.interfaces import LinkInterface
 from nodes.mt.device_job import Load
 from nodes.mt.download import SLOW_BITRATE
 from nodes.mt.mt import MtStatus, transmission
@@ -55,7 +55,7 @@ class TableTalk:
         return self._talk.dictionary
 
     @property
-    def link(self) -> LinkLike:
+    def link(self) -> LinkInterface:
         """The way to it."""
         return self._talk.link
 

@@ -67,7 +67,7 @@ def print_and_prove(
             program,
             on_progress,
             record=record,
-            on_told=lambda event: told.append(event.text),
+            on_output=lambda event: told.append(event.text),
             on_ready=ready,
             host=host,
         ),
@@ -168,7 +168,7 @@ class Prover:
         )
 
     def _expected(self, stepper: StepperDescription) -> Iterator[ExpectedSteps]:
-        legs = program_legs(self._spec(stepper), self._record.stretches())
+        legs = program_legs(self._spec(stepper), self._record.segments())
         if not all(leg.is_plain and leg.spec.weights == legs[0].spec.weights for leg in legs):
             yield from expected_curved(legs, self._outcome.maps[stepper.node].clock_freq)
             return

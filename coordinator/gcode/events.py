@@ -13,8 +13,8 @@ WeightsChange,  generation what changed; the machine has been at rest for longer
 SmoothTime-     smoothing window is wide
 Change
 Timed           calls ACT with the print time at which the next move begins; goes on meanwhile
-Resting         takes all trapezoids; in real time, waits until PRINT_TIME_S has been executed, has it
-                performed and keeps what came of it in the event
+Standstill-     takes all trapezoids; in real time, waits until PRINT_TIME_S has been executed, has it
+Action          performed and keeps the result in the event
 Reply, Notice   shows the text
 Emergency       stops the machine at once; the job is over
 End             takes all trapezoids; the job is over
@@ -116,7 +116,7 @@ class Timed:
 
 
 @dataclass(eq=False, slots=True)
-class Resting:
+class StandstillAction:
     """Something that is done while the machine stands, from PRINT_TIME_S on; the program waits for it.
 
     A driver that performs it fills in what came of it; one that only plans leaves ``done`` as it is.
@@ -178,7 +178,7 @@ Event = (
     | PositionSet
     | MachineChange
     | Timed
-    | Resting
+    | StandstillAction
     | Reply
     | Notice
     | Emergency

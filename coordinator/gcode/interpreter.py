@@ -35,7 +35,7 @@ from coordinator.gcode.events import (
     PositionSet,
     Progress,
     Reply,
-    Resting,
+    StandstillAction,
     Timed,
 )
 from coordinator.gcode.machine_state import MachineState
@@ -128,7 +128,7 @@ class Job:
         """By command name."""
         self._events: deque[Event] = deque()
         self._inner: list[_Inner] = []
-        self._resting: Resting | None = None
+        self._resting: StandstillAction | None = None
         self._over: Event | GCodeError | None = None
         self._told: set[str] = set()
         planner.forget_line()
@@ -350,7 +350,7 @@ class Job:
                 if not machine_commands.come_to_rest(self):
                     return False
                 end_s = self.planner.print_time_end_s
-                self._resting = Resting(self.line, end_s, reading.perform, reading.planned)
+                self._resting = StandstillAction(self.line, end_s, reading.perform, reading.planned)
                 self._events.append(self._resting)
             case Lines():
                 if len(self._inner) >= MAX_DEPTH:
@@ -364,7 +364,7 @@ class Job:
                 return self._act_built_in(command.called(reading.name))
         return True
 
-    def _rested(self, event: Resting) -> None:
+    def _rested(self, event: StandstillAction) -> None:
         self._resting = None
         if event.moved and event.done is None:
             self.planner.homed = ""

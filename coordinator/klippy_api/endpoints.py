@@ -22,7 +22,7 @@ from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.service.api.motion import RESTARTS, run_script
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.work import LINES_MAX
-from coordinator.streaming.move_source import Told
+from coordinator.streaming.move_source import ProgramOutput
 from nodes.support.errors import CanductorError
 
 Result = Mapping[str, Any]
@@ -213,7 +213,7 @@ class Endpoints:
         return {}
 
 
-def kind_of(told: Told) -> ReplyKind:
+def kind_of(told: ProgramOutput) -> ReplyKind:
     """Return how TOLD reads: notices are information."""
     kind = getattr(told, "kind", ReplyKind.INFORMATION)
     assert isinstance(kind, ReplyKind)

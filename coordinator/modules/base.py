@@ -24,7 +24,7 @@ from coordinator.config.options import BadValue, ListOption, Option, SectionRead
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
 from coordinator.gcode.commands import GCodeCommand
 from coordinator.motion.planner.planner import Planner
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest, shown
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
@@ -92,7 +92,7 @@ class Module:
     def link(self, modules: Modules) -> None:
         """Find other modules; raises ConfigError."""
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to act; raises CanductorError when the hardware does not allow it."""
 
     def ready(self) -> None:

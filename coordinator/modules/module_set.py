@@ -27,7 +27,7 @@ from coordinator.modules.registry import module_for, modules_beside
 from coordinator.modules.status.console import Console
 from coordinator.modules.status.positions import Positions
 from coordinator.motion.planner.planner import Planner
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
@@ -143,7 +143,7 @@ class ModuleSet:
         """Sentences about what is no mistake."""
         self.left_out: dict[str, LeftOut] = {}
         """Sections whose module does not act, as something that it depends on does not act yet."""
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         self._homing = self.shared(Homing)
         self._motors = self.shared(MotorPower)
         self.shared(ManualProbe)
@@ -365,7 +365,7 @@ class ModuleSet:
         for device in self._devices.get(node.name, ()):
             device.started(node)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Let all begin to act, then tell them that the machine is ready; raises CanductorError."""
         self._live = live
         for module in self._modules:

@@ -23,7 +23,7 @@ LOSSY: Final = 0.15
 
 
 @dataclass(slots=True)
-class LoadWatch:
+class BusOverloadDetector:
     """Watches the forecasts of the bus called NAME."""
 
     name: str

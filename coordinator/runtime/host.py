@@ -12,7 +12,7 @@ from typing import Protocol
 from coordinator.config.model import CanConnection, UartConnection
 from nodes.clock.clock import HostTime
 from nodes.link import LinkIO
-from nodes.link.interfaces import IoFactory, LinkIOLike, OnFrame, OnLost
+from nodes.link.interfaces import IoFactory, LinkIoInterface, OnFrame, OnLost
 from nodes.transport import ByteTransport, CanTransport, open_can, open_uart
 
 
@@ -72,7 +72,7 @@ class LinuxHost:
 
 
 def _port(transport: CanTransport | ByteTransport) -> Port:
-    def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike:
+    def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface:
         return LinkIO(transport, asyncio.get_running_loop(), on_frame=on_frame, on_closed=on_closed)
 
     return Port(transport.name, start, transport.close)

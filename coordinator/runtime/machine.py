@@ -16,15 +16,15 @@ from coordinator.config.model import (
 from coordinator.config.saved import PendingConfig
 from coordinator.config.sections.nodes import check_distinct
 from coordinator.motion.specs import NodeStreamSpec
-from coordinator.runtime.bus_overload import LoadWatch
+from coordinator.runtime.bus_overload import BusOverloadDetector
 from coordinator.runtime.devices import MachineDevices, stream_specs
 from coordinator.runtime.filament_forecast import FilamentForecast
 from coordinator.runtime.host import Host
 from coordinator.runtime.machine_modules import MachineModules
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.module_runner import Runner
-from coordinator.runtime.node_recovery import JobGate, NodeCare
-from coordinator.runtime.stepper_positions import RailPlaces
+from coordinator.runtime.node_recovery import NodeRecovery, PausableJob
+from coordinator.runtime.stepper_positions import StepperPositions
 from coordinator.runtime.timebase import ClockMap, TimeBase
 from coordinator.runtime.wire import Wire
 from nodes.bus.assign import Uuid
@@ -51,7 +51,7 @@ CONFIRM_STOP_S = 0.5
 class _OpenBus:
     bus: CanBus | UartBus
     wire: Wire
-    watch: LoadWatch
+    watch: BusOverloadDetector
 
 
 def _ignore(_: str) -> None:
@@ -63,11 +63,12 @@ class Machine:
 
     It lives on one event loop.
 
-    ``start``, then ``close`` whatever happened. When a node is lost or shuts down whose policy is fatal, all
-    others are stopped at once and ``stopped`` tells why; others are brought back (NodeCare). ON_NOTICE gets
-    sentences for the user; dictionaries are kept in CACHE. RESET_NODES: nodes that are configured as they
-    should be are reset, too. PREPARE_RESTART returns what begins anew (with nodes reset if True), or raises
-    CanductorError when that is not possible; None: nobody begins it anew.
+    Call ``start``, then ``close`` whatever happened. When a node with the policy fatal is lost or shuts down,
+    all others are stopped at once and ``stopped`` has the cause; nodes with another policy are brought back
+    (NodeRecovery). ON_NOTICE gets sentences for the user; CACHE keeps dictionaries. RESET_NODES: also reset
+    nodes that are configured correctly. PREPARE_RESTART returns a function that restarts the machine (and
+    resets nodes if called with True), or raises CanductorError when that is not possible; None: the machine
+    cannot be restarted.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class Machine:
         self.policies = {node.name: node.policy for node in description.nodes}
         self.modules = modules
         self.devices = MachineDevices(description, self.modules)
-        self.rails = RailPlaces(description)
+        self.stepper_positions = StepperPositions(description)
         self.nodes: dict[str, Node] = {}
         self.stopped: MachineStopped | None = None
         self.runner: Runner | None = None
@@ -100,10 +101,10 @@ class Machine:
         self._cache = cache if cache is not None else DictionaryCache()
         self._open: list[_OpenBus] = []
         self._bus_of: dict[Node, CanBus | UartBus] = {}
-        self._care = NodeCare(
+        self._recovery = NodeRecovery(
             self.policies, bring_back=self._bring_back, on_notice=on_notice, now_s=lambda: host.now() * 1e-9
         )
-        self._job: JobGate | None = None
+        self._job: PausableJob | None = None
         self._waking: set[Node] = set()
         self._failed = asyncio.Event()
         self._stopped_at_ns = 0
@@ -142,13 +143,13 @@ class Machine:
             self._check_gone(node)  # one may have failed while others still started
         if self.stopped is not None:
             raise self.stopped
-        await self.modules.connect(Live(self, self._on_notice))
+        await self.modules.connect(ModuleContext(self, self._on_notice))
 
     async def close(self) -> None:
         """Leave the nodes as they are and release everything."""
         self._ready = False
         self.modules.close()
-        await self._care.close()
+        await self._recovery.close()
         for opened in self._open:
             await opened.bus.close()
             opened.wire.close()
@@ -160,7 +161,7 @@ class Machine:
             return
         self.stopped = MachineStopped(cause)
         self._stopped_at_ns = self.host.now()
-        self._care.halt()
+        self._recovery.halt()
         for opened in self._open:
             opened.bus.emergency_stop()
         self._failed.set()
@@ -179,7 +180,7 @@ class Machine:
                 )
             if node in self.moving:
                 raise CanductorError(f"node {name} cannot sleep while a job runs: it carries steppers")
-        await self._care.dismiss(name)
+        await self._recovery.dismiss(name)
         await node.sleep()
 
     async def wake(self, name: str) -> None:
@@ -203,15 +204,15 @@ class Machine:
         return self.nodes[name]
 
     @contextlib.contextmanager
-    def job(self, gate: JobGate) -> Iterator[None]:
+    def job(self, gate: PausableJob) -> Iterator[None]:
         """Run a job inside: GATE is held while a node is out whose policy is pause."""
         self._job = gate
-        self._care.begin_job(gate)
+        self._recovery.begin_job(gate)
         try:
             yield
         finally:
             self._job = None
-            self._care.end_job()
+            self._recovery.end_job()
 
     async def wait_stopped(self) -> MachineStopped:
         """Wait until the machine is stopped; return why."""
@@ -285,7 +286,7 @@ class Machine:
         """Tell whether a bus has carried more than LOAD lately, a share of its time."""
         return any(o.bus.closed_because is None and o.bus.io.load().total > load for o in self._open)
 
-    async def stepper_positions(self) -> dict[str, int]:
+    async def query_stepper_counts(self) -> dict[str, int]:
         """Ask every node where its steppers stand: steps from where they began, positive as motion counts."""
         return {
             stepper.name: (-1 if stepper.dir_pin.invert else 1)
@@ -320,13 +321,13 @@ class Machine:
     def _add_can(self, connection: CanConnection) -> CanBus:
         wire = Wire(lambda: self.host.open_can(connection))
         bus = CanBus(connection.interface, wire.start_io, cache=self._cache, on_notice=self._on_notice)
-        self._open.append(_OpenBus(bus, wire, LoadWatch(bus.name)))
+        self._open.append(_OpenBus(bus, wire, BusOverloadDetector(bus.name)))
         return bus
 
     def _add_uart(self, node: NodeDescription, connection: UartConnection) -> None:
         wire = Wire(lambda: self.host.open_uart(connection))
         bus = UartBus(connection.path, wire.start_io, cache=self._cache, on_notice=self._on_notice)
-        self._open.append(_OpenBus(bus, wire, LoadWatch(bus.name)))
+        self._open.append(_OpenBus(bus, wire, BusOverloadDetector(bus.name)))
         self._add(
             bus,
             bus.add_node(
@@ -359,7 +360,7 @@ class Machine:
         if not self._ready or not gone or node in self._waking:
             return
         if self.policies[node.name] is not NodePolicy.FATAL and self.stopped is None:
-            self._care.take_on(node)
+            self._recovery.take_on(node)
             return
         self.stop(f"{node.failure}; all other nodes were stopped")
         if node.state is NodeState.SHUTDOWN:

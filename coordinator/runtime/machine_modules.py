@@ -5,7 +5,7 @@ from typing import Any, Protocol, TypeVar
 
 from coordinator.config.pins import PinRegistry
 from coordinator.gcode.commands import Vocabulary
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
@@ -30,7 +30,7 @@ class MachineModules(Protocol):
     def helps(self) -> Mapping[str, str]: ...  # noqa: D102
     def configure(self, config: NodeConfig) -> None: ...  # noqa: D102
     def node_started(self, node: Node) -> None: ...  # noqa: D102
-    async def connect(self, live: "Live") -> None: ...  # noqa: D102
+    async def connect(self, live: "ModuleContext") -> None: ...  # noqa: D102
     def before_motion(self, steppers: Collection[str]) -> None: ...  # noqa: D102
     def job_begins(self) -> None: ...  # noqa: D102
     def stopped(self, cause: str) -> None: ...  # noqa: D102

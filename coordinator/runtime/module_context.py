@@ -15,7 +15,7 @@ AHEAD_S: Final = 0.1
 """What is to happen as soon as possible happens so far ahead of now: commands need their time to the node."""
 
 
-class Live:
+class ModuleContext:
     """MACHINE, connected. SAY shows a sentence to the user. Everything on the control loop."""
 
     def __init__(self, machine: "Machine", say: Callable[[str], None]) -> None:

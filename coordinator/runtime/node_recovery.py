@@ -15,7 +15,7 @@ FIRST_TRY_S: Final = 0.5
 LAST_TRY_S: Final = 10.0
 
 
-class JobGate(Protocol):
+class PausableJob(Protocol):
     """A job that can be made to wait."""
 
     def hold(self, cause: str) -> None:
@@ -25,7 +25,7 @@ class JobGate(Protocol):
         """Let the job go on; without effect on one that is not held."""
 
 
-class NodeCare:
+class NodeRecovery:
     """Brings nodes of POLICIES other than fatal back, quietly and for ever.
 
     BRING_BACK restarts a node once (CanductorError: not yet), ON_NOTICE gets a sentence when a node is gone
@@ -45,7 +45,7 @@ class NodeCare:
         self._on_notice = on_notice
         self._now_s = now_s
         self._out: dict[str, asyncio.Task[None]] = {}
-        self._gate: JobGate | None = None
+        self._gate: PausableJob | None = None
         self._halted = False
 
     @property
@@ -53,7 +53,7 @@ class NodeCare:
         """Names of the nodes that are being brought back."""
         return tuple(self._out)
 
-    def begin_job(self, gate: JobGate) -> None:
+    def begin_job(self, gate: PausableJob) -> None:
         """Have GATE held whenever a node with policy pause is out."""
         self._gate = gate
         for name in self._out:

@@ -19,7 +19,7 @@ from coordinator.motion.specs import StepKinematics
 _XYZ: Final = 3
 
 
-class RailPlaces:
+class StepperPositions:
     """The places of the machine's motors in mm (rad where they turn something); unknown until declared."""
 
     def __init__(self, described: MachineDescription) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from coordinator.runtime.host import Port
-from nodes.link.interfaces import LinkIOLike, OnFrame, OnLost
+from nodes.link.interfaces import LinkIoInterface, OnFrame, OnLost
 
 
 class Wire:
@@ -13,7 +13,7 @@ class Wire:
         self._open_port = open_port
         self._port: Port | None = None
 
-    def start_io(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike:
+    def start_io(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface:
         """Open the port and start its I/O; an earlier one has ended. Raises CanductorError."""
         self.close()
         self._port = self._open_port()

@@ -100,7 +100,7 @@ class _Run:
                 program,
                 lambda _: None,
                 record=self.record,
-                on_told=lambda _: None,
+                on_output=lambda _: None,
                 on_ready=self._ready,
                 host=self.stage.host,
             )

@@ -121,7 +121,7 @@ class Rig:
             self.stage.description,
             program,
             lambda _: None,
-            on_told=lambda told: self._told_ns.update({told.text: self.stage.now_ns()}),
+            on_output=lambda told: self._told_ns.update({told.text: self.stage.now_ns()}),
             on_ready=ready,
             host=self.stage.host,
         )

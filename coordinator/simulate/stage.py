@@ -22,7 +22,7 @@ from coordinator.verification.expected import Floats, Ints
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from nodes.clock.clock import HostTime
 from nodes.link import LinkIO
-from nodes.link.interfaces import LinkIOLike, OnFrame, OnLost
+from nodes.link.interfaces import LinkIoInterface, OnFrame, OnLost
 from nodes.virtual._sim import lib
 from nodes.virtual.plant import NodePlant
 from nodes.virtual.sim_plant import SimPlant, connect_plants
@@ -355,7 +355,7 @@ class SimHost:
         return self._open(self._ports[connection.path])
 
     def _open(self, port: CanPort | UartPort) -> HostPort:
-        def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike:
+        def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface:
             return LinkIO.driven_by(port.open(), on_frame=on_frame, on_closed=on_closed)
 
         return HostPort(port.name, start, lambda: None)

@@ -14,7 +14,7 @@ from coordinator.runtime.host import Host, LinuxHost
 from coordinator.runtime.machine import Machine, MachineStopped, link_of
 from coordinator.runtime.timebase import ClockMap
 from coordinator.streaming.compensation import Compensation
-from coordinator.streaming.move_source import JobState, Told
+from coordinator.streaming.move_source import JobState, ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.program_machine import machine_state
 from coordinator.streaming.streamer import Streamer
@@ -62,7 +62,7 @@ async def run_job(
     on_progress: OnProgress,
     *,
     record: PlanRecord | None = None,
-    on_told: Callable[[Told], None],
+    on_output: Callable[[ProgramOutput], None],
     on_ready: Callable[[Machine], None] | None = None,
     host: Host | None = None,
     cache: DictionaryCache | None = None,
@@ -80,14 +80,16 @@ async def run_job(
         description,
         host or LinuxHost(),
         build_modules(description),
-        on_notice=lambda text: on_told(Notice(0, text)),
+        on_notice=lambda text: on_output(Notice(0, text)),
         cache=cache,
     )
     await machine.start()
     if on_ready is not None:
         on_ready(machine)
     try:
-        return await _print(machine, program, on_progress, record, on_told=on_told, compensation=compensation)
+        return await _print(
+            machine, program, on_progress, record, on_output=on_output, compensation=compensation
+        )
     except GCodeError:
         raise
     except BaseException as error:
@@ -112,7 +114,7 @@ async def _print(
     on_progress: OnProgress,
     record: PlanRecord | None,
     *,
-    on_told: Callable[[Told], None],
+    on_output: Callable[[ProgramOutput], None],
     compensation: "Compensation | None",
 ) -> Outcome:
     began_ns = machine.host.now()
@@ -137,16 +139,16 @@ async def _print(
         machine.modules.vocabulary,
     )
     streamer = Streamer(
-        machine, job, record=record, compensation=compensation, on_told=on_told, on_state=show
+        machine, job, record=record, compensation=compensation, on_output=on_output, on_state=show
     )
-    streamer.worker.began_at = await machine.stepper_positions()
+    streamer.worker.began_at = await machine.query_stepper_counts()
     await streamer.run()
     return await outcome_of(machine, streamer)
 
 
 async def outcome_of(machine: Machine, streamer: Streamer) -> Outcome:
     """Return what became of STREAMER's job, which has ended."""
-    ended_at = await machine.stepper_positions()
+    ended_at = await machine.query_stepper_counts()
     stats = streamer.worker.steps.stats()
     return Outcome(
         moves=streamer.worker.pipeline.moves,

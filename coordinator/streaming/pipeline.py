@@ -40,7 +40,7 @@ BATCH_ROOM = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class Acting:
+class MotionSettings:
     """What acts between trapezoids and steppers."""
 
     shapers: Mapping[str, Shaper]
@@ -52,7 +52,7 @@ class Acting:
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
+class Segment:
     """Trapezoids between which nothing is declared or changed."""
 
     start: Position
@@ -60,7 +60,7 @@ class Stretch:
     declared: bool
     """Whether they were declared to stand there; else they came there, and every stepper goes on as it is."""
     moves: "NDArray[np.void]"
-    acting: Acting
+    settings: MotionSettings
 
 
 @dataclass(slots=True)
@@ -72,14 +72,14 @@ class PlanRecord:
     declared: list[tuple[int, Position]] = field(default_factory=list)
     """Before trapezoid number N the machine was declared to stand at a position."""
     count: int = 0
-    acting: list[tuple[int, Acting]] = field(default_factory=list)
+    settings: list[tuple[int, MotionSettings]] = field(default_factory=list)
     """What acts from trapezoid number N on."""
 
     def restart(self) -> None:
         """Forget all: something else has moved the machine."""
         self.pieces.clear()
         self.declared.clear()
-        self.acting.clear()
+        self.settings.clear()
         self.count = 0
 
     def add(self, trapezoids: "NDArray[np.void]") -> None:
@@ -92,25 +92,25 @@ class PlanRecord:
         return np.concatenate(self.pieces) if self.pieces else np.empty(0, TRAPEZOID)
 
     def epochs(self) -> "list[tuple[Position, NDArray[np.void]]]":
-        """Return the stretches between declarations: where each begins, and its trapezoids."""
+        """Return the segments between declarations: where each begins, and its trapezoids."""
         every = self.every()
         cuts = [(0, self.start), *self.declared]
         ends = [at for at, _ in cuts[1:]] + [len(every)]
         return [(position, every[at:end]) for (at, position), end in zip(cuts, ends, strict=True)]
 
-    def stretches(self) -> list[Stretch]:
-        """Return the stretches between declarations and changes, those with trapezoids, in order."""
-        found: list[Stretch] = []
-        at, changes = 0, [*self.acting]
-        acting = Acting({}, {}, {})
+    def segments(self) -> list[Segment]:
+        """Return the segments between declarations and changes, those with trapezoids, in order."""
+        found: list[Segment] = []
+        at, changes = 0, [*self.settings]
+        settings = MotionSettings({}, {}, {})
         for position, moves in self.epochs():
             begin, epoch_end = at, at + len(moves)
             while at < epoch_end:
                 while changes and changes[0][0] <= at:
-                    acting = changes.pop(0)[1]
+                    settings = changes.pop(0)[1]
                 end = min([epoch_end, *(n for n, _ in changes[:1])])
                 start = _four(moves[at - begin]["start"].tolist()) if at > begin else position
-                found.append(Stretch(start, at == begin, moves[at - begin : end - begin], acting))
+                found.append(Segment(start, at == begin, moves[at - begin : end - begin], settings))
                 at = end
         return found
 
@@ -181,7 +181,7 @@ class Pipeline:
                 self._smooth()
             case SmoothTimeChange():
                 self._smooth()
-        self._note_acting()
+        self._note_settings()
         self.planner.begin_at(self.steps.next_move_s)
 
     def _begin(self) -> None:
@@ -195,16 +195,16 @@ class Pipeline:
             self._follow(machine.carriages.weights(machine.carriage_state))
         self._follow(machine.follows)
         self._smooth()
-        self._note_acting()
+        self._note_settings()
         self.planner.begin_at(self.steps.next_move_s)
 
-    def _note_acting(self) -> None:
+    def _note_settings(self) -> None:
         """Record what acts from here on."""
         if self._record is None:
             return
         shapers = {axis: shaper for axis, shaper in self._shapers.items() if shaper.frequency_hz}
-        acting = Acting(shapers, dict(self._weights), dict(self._windows_s))
-        self._record.acting.append((self._record.count, acting))
+        settings = MotionSettings(shapers, dict(self._weights), dict(self._windows_s))
+        self._record.settings.append((self._record.count, settings))
 
     def _shape(self, axis: str, shaper: Shaper) -> None:
         self._shapers[axis] = shaper

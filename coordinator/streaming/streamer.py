@@ -10,12 +10,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
 from coordinator.gcode.errors import GCodeError
-from coordinator.gcode.events import Emergency, End, Event, Notice, Resting
+from coordinator.gcode.events import Emergency, End, Event, Notice, StandstillAction
 from coordinator.runtime.machine import Machine, MachineStopped, link_of
 from coordinator.streaming.compensation import Compensation
-from coordinator.streaming.move_source import JobState, MoveSource, Planned, Told, Witness
+from coordinator.streaming.move_source import JobState, MoveSource, Planned, ProgramOutput, Witness
 from coordinator.streaming.pipeline import PlanRecord
-from coordinator.streaming.standstill_task import RestTask
+from coordinator.streaming.standstill import StandstillTask
 from coordinator.streaming.timed_events import Due, DueEvents
 from coordinator.streaming.worker import START_LEAD_S, Cycle, MotionWorker
 from nodes.support.errors import CanductorError
@@ -45,7 +45,7 @@ class Streamer:
         record: PlanRecord | None = None,
         witness: Witness | None = None,
         compensation: "Compensation | None" = None,
-        on_told: Callable[[Told], None],
+        on_output: Callable[[ProgramOutput], None],
         on_state: Callable[[JobState], None],
         on_cycle: Callable[[], None] = lambda: None,
     ) -> None:
@@ -53,7 +53,7 @@ class Streamer:
         self.worker = MotionWorker(machine, job, record=record, witness=witness, compensation=compensation)
         """For others to look at from the control loop, not to call."""
         self._job = job
-        self._on_told = on_told
+        self._on_output = on_output
         self._on_state = on_state
         self._on_cycle = on_cycle
         self._witness = witness
@@ -62,7 +62,7 @@ class Streamer:
         self.began_s = 0.0
         """Print time at which the job began, or went on after something else had moved the machine."""
         self.ended_s = 0.0
-        self._resting: RestTask | None = None
+        self._standstill: StandstillTask | None = None
 
     def print_time_now(self) -> float:
         """Return the present print time."""
@@ -109,8 +109,8 @@ class Streamer:
             for task in (work, watch):
                 task.cancel()
             await asyncio.gather(work, watch, return_exceptions=True)
-            if self._resting is not None:
-                await self._resting.close()
+            if self._standstill is not None:
+                await self._standstill.close()
 
     async def _stop_after(self, error: BaseException | None, watch: asyncio.Future[MachineStopped]) -> None:
         """Stop the machine after ERROR of the stream, unless it is that of a program and all stands still."""
@@ -137,7 +137,7 @@ class Streamer:
                     return
                 await self._tell_on(cycle)
                 self._hand_over(cycle)  # last: links and buses begin to work then, and the loop rests
-                if isinstance(event, Resting):
+                if isinstance(event, StandstillAction):
                     await self._attend(event)
                 if event is not None or self.held is not None:
                     await asyncio.sleep(CYCLE_S)
@@ -146,20 +146,20 @@ class Streamer:
         if self.worker.failure is not None:
             raise self.worker.failure
 
-    async def _attend(self, event: Resting) -> None:
+    async def _attend(self, event: StandstillAction) -> None:
         """Have EVENT performed once all moves before it are executed."""
-        if self._resting is None:
+        if self._standstill is None:
             if self.print_time_now() < event.print_time_s + self.worker.steps.lag_s + SETTLE_S:
                 return
-            self._resting = RestTask(event)
-        if self._resting.look():
-            self._resting = None
+            self._standstill = StandstillTask(event)
+        if self._standstill.look():
+            self._standstill = None
             if event.moved:
                 await self._begin_again()
 
     async def _begin_again(self) -> None:
         """Go on where something else has left the steppers."""
-        began_at = await self._machine.stepper_positions()
+        began_at = await self._machine.query_stepper_counts()
         self._look_at_load()
         self.began_s = self.worker.begin_again(began_at)
 
@@ -176,7 +176,7 @@ class Streamer:
 
     def _tell(self, cycle: Cycle) -> None:
         for told in cycle.told:
-            self._on_told(told)
+            self._on_output(told)
         self._act(self._due.take(self.print_time_now(), cycle.due))
 
     async def _tell_on(self, cycle: Cycle) -> None:
@@ -194,7 +194,7 @@ class Streamer:
             try:
                 timed.act(print_time_s)
             except CanductorError as error:  # such as the loss of a node that may be missing
-                self._on_told(Notice(timed.line, f"{self._job.name}:{timed.line}: {error}"))
+                self._on_output(Notice(timed.line, f"{self._job.name}:{timed.line}: {error}"))
 
     def _look_at_load(self) -> None:
         busy = self._machine.is_busy(BUSY_LOAD)

@@ -4,28 +4,28 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from coordinator.motion.specs import StepperSpec
-from coordinator.streaming.pipeline import Acting, Stretch
+from coordinator.streaming.pipeline import MotionSettings, Segment
 from coordinator.verification.exact_path import Leg, Setting
 from coordinator.verification.exact_shapers import impulses
 
 
-def program_legs(spec: StepperSpec, stretches: Sequence[Stretch]) -> list[Leg]:
+def program_legs(spec: StepperSpec, segments: Sequence[Segment]) -> list[Leg]:
     """Return the legs of the stepper SPEC, whose weights hold as long as STRETCHES tell no others."""
     return [
         Leg(
-            replace(spec, weights=stretch.acting.weights.get(spec.name, spec.weights)),
-            stretch.start,
-            stretch.moves,
-            _setting(stretch.acting, spec.name),
-            declared=stretch.declared,
+            replace(spec, weights=segment.settings.weights.get(spec.name, spec.weights)),
+            segment.start,
+            segment.moves,
+            _setting(segment.settings, spec.name),
+            declared=segment.declared,
         )
-        for stretch in stretches
+        for segment in segments
     ]
 
 
-def _setting(acting: Acting, stepper: str) -> Setting:
+def _setting(settings: MotionSettings, stepper: str) -> Setting:
     shapers = {
         axis: impulses(shaper.kind, shaper.frequency_hz, shaper.damping_ratio)
-        for axis, shaper in acting.shapers.items()
+        for axis, shaper in settings.shapers.items()
     }
-    return Setting(shapers, acting.windows_s.get(stepper, 0.0))
+    return Setting(shapers, settings.windows_s.get(stepper, 0.0))

@@ -6,7 +6,7 @@ from typing import Final
 
 from nodes.dictionary.cache import DictionaryCache
 from nodes.link import LinkSettings
-from nodes.link.interfaces import FrameLike, IoFactory, LinkIOLike, LinkLike, OnLost, OnResponses
+from nodes.link.interfaces import FrameLike, IoFactory, LinkInterface, LinkIoInterface, OnLost, OnResponses
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeLost
 from nodes.node.node import Node, OnClock, OnState
@@ -44,10 +44,10 @@ class BusBase:
         self._on_notice = on_notice
         self.lost_after_s = lost_after_s
         self._may_be_absent: set[Node] = set()
-        self._io: LinkIOLike | None = None
+        self._io: LinkIoInterface | None = None
 
     @property
-    def io(self) -> LinkIOLike:
+    def io(self) -> LinkIoInterface:
         """The I/O of the bus; NodeLost when it is not open."""
         if self._io is None or self.closed_because is not None:
             cause = self.closed_because or "it is not open"
@@ -175,7 +175,7 @@ class _UartConnector:
     def __init__(self, bus: UartBus) -> None:
         self._bus = bus
 
-    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
+    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
         return self._bus.io.open_link(
             LinkSettings(None, lost_after_s=self._bus.lost_after_s),
             on_responses=on_responses,

@@ -13,7 +13,7 @@ from nodes.clock.wire_time import can_wire_ns
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
 from nodes.link import LinkSettings
-from nodes.link.interfaces import FrameLike, IoFactory, LinkLike, OnLost, OnResponses
+from nodes.link.interfaces import FrameLike, IoFactory, LinkInterface, OnLost, OnResponses
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeError, NodeLost
 from nodes.node.node import Node, OnClock, OnState
@@ -219,7 +219,7 @@ class _CanConnector:
         self._uuid = uuid
         self.assignment: Assignment | None = None
 
-    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
+    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
         if self.assignment is None:
             self.assignment = await self._bus.assign([self._uuid])
         self.assignment.check_node(self._uuid, self._bus.name)

@@ -34,7 +34,7 @@ OnLost = Callable[[str], None]
 OnFrame = Callable[[FrameLike], None]
 
 
-class LinkLike(Protocol):
+class LinkInterface(Protocol):
     """The reliable way to one node. Callbacks run on the control loop."""
 
     def send(  # noqa: D102
@@ -50,12 +50,12 @@ class LinkLike(Protocol):
     def close(self) -> None: ...  # noqa: D102
 
 
-class LinkIOLike(Protocol):
+class LinkIoInterface(Protocol):
     """All links over one transport."""
 
     def open_link(  # noqa: D102
         self, settings: LinkSettings, *, on_responses: OnResponses, on_lost: OnLost
-    ) -> LinkLike: ...
+    ) -> LinkInterface: ...
     def send_frame(self, can_id: int, data: bytes) -> None: ...  # noqa: D102
     def learn_bitrate(self, bitrate: int) -> None: ...  # noqa: D102
     def forecast(self) -> Forecast: ...  # noqa: D102
@@ -67,4 +67,4 @@ class LinkIOLike(Protocol):
 class IoFactory(Protocol):
     """Starts the I/O of a bus; on_frame is None on a UART."""
 
-    def __call__(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike: ...  # noqa: D102
+    def __call__(self, *, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface: ...  # noqa: D102

@@ -8,7 +8,7 @@ from typing import Final, Protocol
 from nodes.devices.stepper import Stepper
 from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
-from nodes.link.interfaces import LinkLike
+from nodes.link.interfaces import LinkInterface
 from nodes.mt.mt import AXLES, MtStatus, Pair, checksum, digest
 from nodes.node.config import NodeConfig, NodeConfigError
 from nodes.node.errors import NodeError
@@ -30,7 +30,7 @@ class TableNode(Protocol):
     @property
     def dictionary(self) -> "Dictionary": ...  # noqa: D102
     @property
-    def link(self) -> "LinkLike": ...  # noqa: D102
+    def link(self) -> "LinkInterface": ...  # noqa: D102
     async def query(  # noqa: D102
         self,
         name: str,

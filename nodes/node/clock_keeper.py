@@ -7,7 +7,7 @@ from typing import Final
 from nodes.clock.clock import ClockEstimate, ClockEstimator
 from nodes.clock.wire_time import narrow
 from nodes.node.connector import Connector
-from nodes.node.request_reply import Answer, Conversation, QueryTimeout
+from nodes.node.request_reply import Answer, QueryTimeout, RequestReply
 from nodes.support.errors import CanductorError
 
 SILENCE_S: Final = 0.25
@@ -23,7 +23,7 @@ class ClockKeeper:
 
     def __init__(
         self,
-        talk: Conversation,
+        talk: RequestReply,
         connector: Connector,
         *,
         on_estimate: Callable[[ClockEstimate], None],

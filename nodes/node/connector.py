@@ -4,14 +4,14 @@ from collections.abc import Callable
 from typing import Protocol
 
 from nodes.dictionary.dictionary import Dictionary
-from nodes.link.interfaces import LinkLike, OnLost, OnResponses
+from nodes.link.interfaces import LinkInterface, OnLost, OnResponses
 from nodes.node.config import NodeConfig
 
 
 class Connector(Protocol):
     """How a node gets its link; the bus provides it."""
 
-    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
+    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
         """Open a link, giving the node its id first where it needs one."""
 
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:

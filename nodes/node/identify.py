@@ -15,7 +15,7 @@ from nodes.dictionary.cache import CachedDictionary, DictionaryCache
 from nodes.dictionary.dictionary import MAX_COMPRESSED_BYTES, Dictionary
 from nodes.dictionary.parts import DictionaryError
 from nodes.node.errors import NodeLost
-from nodes.node.request_reply import Conversation, QueryTimeout
+from nodes.node.request_reply import QueryTimeout, RequestReply
 
 IDENTIFY_PIECE: Final = 40
 PIECE_TRIES: Final = 16
@@ -26,12 +26,12 @@ MAX_CANDIDATES: Final = 4
 
 
 async def identify(
-    talk: Conversation, cache: DictionaryCache, why_silent: Callable[[], Exception | None]
+    talk: RequestReply, cache: DictionaryCache, why_silent: Callable[[], Exception | None]
 ) -> Dictionary:
     """Return the dictionary of the node that TALK talks with.
 
     Raises DictionaryError when it cannot be used, what WHY_SILENT knows when the node never answered, and
-    what Conversation.ask raises.
+    what RequestReply.ask raises.
     """
     try:
         beginning = await _piece(talk, 0)
@@ -59,7 +59,7 @@ async def identify(
         return dictionary
 
 
-async def _recognised(talk: Conversation, cache: DictionaryCache, beginning: bytes) -> Dictionary | None:
+async def _recognised(talk: RequestReply, cache: DictionaryCache, beginning: bytes) -> Dictionary | None:
     for cached in cache.candidates(beginning)[:MAX_CANDIDATES]:
         if await _has(talk, cached, len(beginning)):
             cache.used(cached)
@@ -67,7 +67,7 @@ async def _recognised(talk: Conversation, cache: DictionaryCache, beginning: byt
     return None
 
 
-async def _has(talk: Conversation, cached: CachedDictionary, piece_size: int) -> bool:
+async def _has(talk: RequestReply, cached: CachedDictionary, piece_size: int) -> bool:
     """Tell whether the node's dictionary ends as this one does, and there."""
     size = len(cached.compressed)
     tail_at = max(0, size - piece_size)
@@ -76,7 +76,7 @@ async def _has(talk: Conversation, cached: CachedDictionary, piece_size: int) ->
     return await _piece(talk, size) == b""
 
 
-async def _download(talk: Conversation, beginning: bytes) -> bytes:
+async def _download(talk: RequestReply, beginning: bytes) -> bytes:
     data = bytearray(beginning)
     while piece := await _piece(talk, len(data)):
         data += piece
@@ -85,7 +85,7 @@ async def _download(talk: Conversation, beginning: bytes) -> bytes:
     return bytes(data)
 
 
-async def _piece(talk: Conversation, offset: int) -> bytes:
+async def _piece(talk: RequestReply, offset: int) -> bytes:
     answer = await talk.ask(
         "identify",
         "identify_response",

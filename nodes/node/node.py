@@ -13,7 +13,7 @@ from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
 from nodes.dictionary.parts import DictionaryError
 from nodes.dictionary.vocabulary import carries_identity, check_vocabulary
-from nodes.link.interfaces import LinkLike
+from nodes.link.interfaces import LinkInterface
 from nodes.node.clock_keeper import ClockKeeper
 from nodes.node.config import NodeConfig
 from nodes.node.connector import BuildConfig, Connector
@@ -21,9 +21,9 @@ from nodes.node.errors import NodeError, NodeLost, NodeShutdown, shutdown_senten
 from nodes.node.identify import identify
 from nodes.node.load import NodeLoad, load_of
 from nodes.node.queue_slots import share_slots
-from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, Conversation
+from nodes.node.request_reply import QUERY_TIMEOUT_S, QUERY_TRIES, Callback, RequestReply
 from nodes.node.states import NodeEvent, NodeState, following
-from nodes.node.watchdog import Vigil, get_config, restarted
+from nodes.node.watchdog import NodeWatchdog, get_config, restarted
 from nodes.support.errors import CanductorError
 
 MAX_STARTS: Final = 3
@@ -83,9 +83,9 @@ class Node:
         self._on_state = on_state
         self._on_clock = on_clock
         self._cache = cache
-        self._talk = Conversation(name)
+        self._talk = RequestReply(name)
         self._keeper: ClockKeeper | None = None
-        self._vigil = Vigil(self._talk, 0)
+        self._watchdog = NodeWatchdog(self._talk, 0)
         self._starting_over = True  # until an old configuration is judged, old news mean nothing
         self._generation = 0
         for response, handler in (
@@ -146,7 +146,7 @@ class Node:
         return self.dictionary.clock_freq_hz
 
     @property
-    def link(self) -> LinkLike:
+    def link(self) -> LinkInterface:
         """The link, for batches of commands; NodeError unless the node can be talked to."""
         self._check_usable()
         return self._talk.link
@@ -331,7 +331,7 @@ class Node:
         self._check_configured(found, wanted)
         self.move_count = found.integer("move_count")
         self.step_slots, self.output_slots = share_slots(self.move_count, wanted.timed_outputs)
-        self._vigil = Vigil(self._talk, wanted.crc)
+        self._watchdog = NodeWatchdog(self._talk, wanted.crc)
         for command in wanted.init_commands:
             self._talk.send_text(command)
         return True
@@ -389,7 +389,7 @@ class Node:
 
     async def _look(self) -> None:
         """Notice what the node said only once, should that have been lost."""
-        trouble = await self._vigil.look() if self.state is NodeState.READY else None
+        trouble = await self._watchdog.look() if self.state is NodeState.READY else None
         if trouble is not None:
             shutdown = isinstance(trouble, NodeShutdown)
             self._fail(NodeEvent.SHUTDOWN if shutdown else NodeEvent.RESTARTED, trouble)

@@ -10,7 +10,7 @@ from typing import Final
 
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
 from nodes.dictionary.message_format import Message, MessageError, Value
-from nodes.link.interfaces import LinkLike, ResponseLike
+from nodes.link.interfaces import LinkInterface, ResponseLike
 from nodes.support.errors import CanductorError
 
 QUERY_TIMEOUT_S: Final = 0.25
@@ -52,7 +52,7 @@ class _Waiter:
 Callback = Callable[[Message], None]
 
 
-class Conversation:
+class RequestReply:
     """The messages to and from node NAME over the link it is given by ``attach``."""
 
     def __init__(self, name: str) -> None:
@@ -62,18 +62,18 @@ class Conversation:
         """Responses that no format of the dictionary fits: damaged, or from other firmware."""
         self.heard = 0
         """Responses received, whatever they were."""
-        self._link: LinkLike | None = None
+        self._link: LinkInterface | None = None
         self._waiters: list[_Waiter] = []
         self._listeners: dict[tuple[str, int | None], list[Callback]] = {}
 
     # ------------------------------------------------------------------------------------------------ link
 
-    def attach(self, link: LinkLike) -> None:
+    def attach(self, link: LinkInterface) -> None:
         """Talk over LINK from now on, with nothing known of the node but how to identify it."""
         self._link = link
         self.dictionary = BOOTSTRAP
 
-    def detach(self) -> LinkLike | None:
+    def detach(self) -> LinkInterface | None:
         """Stop talking; returns the link, which the caller closes."""
         link, self._link = self._link, None
         return link
@@ -84,7 +84,7 @@ class Conversation:
         return self._link is not None
 
     @property
-    def link(self) -> LinkLike:
+    def link(self) -> LinkInterface:
         """The link; QueryTimeout when there is none."""
         if self._link is None:
             raise QueryTimeout(f"node {self.name} has no connection")

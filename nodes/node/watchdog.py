@@ -5,7 +5,7 @@ from typing import Final
 
 from nodes.dictionary.message_format import Message
 from nodes.node.errors import NodeError, NodeRestarted, NodeShutdown, shutdown_sentence
-from nodes.node.request_reply import QUERY_TRIES, Conversation
+from nodes.node.request_reply import QUERY_TRIES, RequestReply
 
 SHUTDOWN_GRACE_S: Final = 0.05
 """For a node that is seen to be shut down to say why."""
@@ -16,15 +16,15 @@ def restarted(node: str, how: str) -> NodeRestarted:
     return NodeRestarted(f"node {node} restarted by itself ({how}); check its power supply")
 
 
-async def get_config(talk: Conversation, tries: int = QUERY_TRIES) -> Message:
+async def get_config(talk: RequestReply, tries: int = QUERY_TRIES) -> Message:
     """Ask for the node's configuration state."""
     return (await talk.ask("get_config", "config", tries=tries, survives_shutdown=True)).message
 
 
-class Vigil:
+class NodeWatchdog:
     """Watches the node that TALK talks with, since it took the configuration with CRC."""
 
-    def __init__(self, talk: Conversation, crc: int) -> None:
+    def __init__(self, talk: RequestReply, crc: int) -> None:
         self._talk = talk
         self._crc = crc
         self._uptime_ticks = 0

@@ -29,7 +29,7 @@ def print_on(stage: Stage, cut_at_s: float | None = None) -> Outcome:
         Program.from_lines(GCODE.splitlines(keepends=True)) as program,
         asyncio.Runner(loop_factory=stage.make_loop) as runner,
     ):
-        job = run_job(stage.description, program, see, on_told=lambda _: None, host=stage.host)
+        job = run_job(stage.description, program, see, on_output=lambda _: None, host=stage.host)
         return runner.run(job)
 
 

@@ -59,7 +59,7 @@ class Loaded:
             self.stage.description,
             program,
             lambda _: None,
-            on_told=lambda _: None,
+            on_output=lambda _: None,
             on_ready=self._ready,
             host=self.stage.host,
         )

@@ -48,7 +48,7 @@ def first_step_s(folder: Path, load: float) -> float:
             stage.description,
             Program(typed, "typed"),
             lambda _: None,
-            on_told=lambda _: None,
+            on_output=lambda _: None,
             host=stage.host,
         )
         runner.run(job)

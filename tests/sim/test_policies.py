@@ -78,7 +78,7 @@ def test_a_job_that_is_held_reads_no_further_until_it_is_released(tmp_path: Path
         try:
             with Program.open(gcode) as program:
                 job = Job(program, Planner(real.description.limits), real.description.homed_position)
-                streamer = Streamer(real, job, on_told=lambda _: None, on_state=look)
+                streamer = Streamer(real, job, on_output=lambda _: None, on_state=look)
                 streamer.hold("a node is away")
                 await streamer.run()
             assert held_cycles == 10

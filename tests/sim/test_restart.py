@@ -9,7 +9,7 @@ import pytest
 from coordinator.assembly.load import load_machine
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.save_config import SaveConfig
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.simulate.scenario import load
 from coordinator.simulate.stage import Stage
 from tests.stages.served import Served, running
@@ -46,7 +46,7 @@ async def counts(stage: Served) -> dict[str, int]:
     return steps
 
 
-def live(stage: Served) -> Live:
+def live(stage: Served) -> ModuleContext:
     assert stage.service.machine is not None
     (module,) = stage.service.machine.modules.of(SaveConfig)
     assert module._live is not None

@@ -211,7 +211,7 @@ async def motor_mm(served: Served) -> float:
     assert machine is not None
     await served.until(lambda: motion.standing, "standstill")
     (stepper,) = [s for s in machine.description.steppers if s.name == "stepper_x"]
-    at: int = (await machine.stepper_positions())["stepper_x"]
+    at: int = (await machine.query_stepper_counts())["stepper_x"]
     return at * stepper.step_distance
 
 

@@ -68,7 +68,7 @@ class TypedRun:
                 machine.description,
                 Program(self._input, "standard input"),
                 lambda _: None,
-                on_told=lambda told: self.told.append(told.text),
+                on_output=lambda told: self.told.append(told.text),
                 host=machine.host,
             )
         )

@@ -110,7 +110,7 @@ class HeatMachine(MachineStage):
 
     def print(self, *lines: str, ready: Callable[[Machine], None] | None = None) -> None:
         """Run a program to its end, as a job; READY gets the machine when it begins."""
-        self.print_lines(lines, on_told=lambda told: self.notices.append(str(told)), on_ready=ready)
+        self.print_lines(lines, on_output=lambda told: self.notices.append(str(told)), on_ready=ready)
 
     # ------------------------------------------------------------------------------------------ commands
 

@@ -9,7 +9,7 @@ import pytest
 from coordinator.assembly.load import load_machine
 from coordinator.gcode.commands import Done
 from coordinator.gcode.errors import GCodeError
-from coordinator.gcode.events import End, Event, Full, Notice, Progress, Reply, Resting
+from coordinator.gcode.events import End, Event, Full, Notice, Progress, Reply, StandstillAction
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.modules.module_set import build_modules
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def events_of(
-    job: Job, drain: Callable[[], object], perform: Callable[[Resting], None] | None = None
+    job: Job, drain: Callable[[], object], perform: Callable[[StandstillAction], None] | None = None
 ) -> list[Event]:
     """Run JOB to its end, with DRAIN after each step; return its events but for progress.
 
@@ -33,7 +33,7 @@ def events_of(
     while not (found and isinstance(found[-1], End)):
         event = job.step()
         drain()
-        if isinstance(event, Resting):
+        if isinstance(event, StandstillAction):
             assert job.planner.at_standstill
             if perform is not None:
                 perform(event)
@@ -66,7 +66,7 @@ class ProgramStage:
             self.modules.vocabulary,
         )
 
-    def events(self, *lines: str, perform: Callable[[Resting], None] | None = None) -> list[Event]:
+    def events(self, *lines: str, perform: Callable[[StandstillAction], None] | None = None) -> list[Event]:
         """Run a program to its end; what is done at rest succeeds unless PERFORM says what comes of it."""
         job = self.job(*lines)
         return events_of(job, self._drain, perform)

@@ -111,7 +111,7 @@ def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
                 description,
                 program,
                 show,
-                on_told=lambda told: _say(told.text),
+                on_output=lambda told: _say(told.text),
                 cache=DictionaryCache.of_user(),
                 compensation=compensation,
                 host=host,

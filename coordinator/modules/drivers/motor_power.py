@@ -12,7 +12,7 @@ from coordinator.config.pins import PinDescription
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
 from nodes.node.node import Node
@@ -52,7 +52,7 @@ class MotorPower(Module):
                 line.steppers.append(stepper.name)
         self._lines = tuple(lines.values())
         self._motors = build.machine.motors
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         for line in self._lines:
             build.add_device(line.node, line)
         for name in ("M84", "M18"):
@@ -66,7 +66,7 @@ class MotorPower(Module):
             )
         )
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take over the machine."""
         self._live = live
 

@@ -8,7 +8,7 @@ from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.single import Ramp, SingleMove
 
 TIMES: Final = 10
@@ -27,12 +27,12 @@ class StepperBuzz(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._steppers = {stepper.name: stepper for stepper in build.machine.steppers}
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         build.add_command(
             GCodeCommand("STEPPER_BUZZ", "Move the motor STEPPER to and fro ten times, by 1 mm", self._read)
         )
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take over the machine."""
         self._live = live
 

@@ -27,7 +27,7 @@ from coordinator.modules.drivers.tmc_options import (
     driver_spec,
 )
 from coordinator.modules.homing.virtual_endstop import StallEndstop
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest, shown
 from coordinator.support.values import Value
 from nodes.devices.tmcuart import TmcError
@@ -68,7 +68,7 @@ class TmcDriver(StallEndstop):
         """What has to be in its registers."""
         self.run_a, self.hold_a = self.settings.run_a, self.settings.hold_a
         self._drv_status: Mapping[str, int] = {}
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         self._watch: asyncio.Task[None] | None = None
         self._is_new: asyncio.Event | None = None
         self._warned = False
@@ -87,7 +87,7 @@ class TmcDriver(StallEndstop):
 
     # -------------------------------------------------------------------------------------------- life
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Set the driver; raises CanductorError when it cannot be."""
         self._live = live
         self._is_new = asyncio.Event()

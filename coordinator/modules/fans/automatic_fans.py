@@ -15,7 +15,7 @@ from coordinator.modules.fans.fan_unit import (
 )
 from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.heaters.heaters import Heaters
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest, shown
 
 LOOK_S: Final = 1.0
@@ -106,7 +106,7 @@ class HeaterFan(FanModule):
         """Find its heaters."""
         self._heaters = self._names.find(modules)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to look."""
         await super().connect(live)
         live.every(LOOK_S, self._look)
@@ -148,7 +148,7 @@ class ControllerFan(FanModule):
         self._idle_speed = self._speed if idle is None else idle
         self._idle_s = build.get(IDLE_TIMEOUT)
         self._heaters: list[HeaterUnit] = []
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         self._worked_s: float | None = None
 
     @staticmethod
@@ -168,7 +168,7 @@ class ControllerFan(FanModule):
         """Find its heaters."""
         self._heaters = self._names.find(modules)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to look."""
         await super().connect(live)
         self._live = live
@@ -185,6 +185,6 @@ class ControllerFan(FanModule):
         else:
             self.unit.set_speed(0.0)
 
-    def _moves(self, live: "Live") -> bool:
+    def _moves(self, live: "ModuleContext") -> bool:
         on = self._power.are_on()
         return any(on.get(name, live.machine.busy) for name in self._steppers)

@@ -7,7 +7,7 @@ from coordinator.config.options import BoolOption, FloatOption, IntOption, Optio
 from coordinator.config.pins import PinOption
 from coordinator.modules.base import Build, Module
 from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.counter import Counter
 from nodes.devices.digital_out import DigitalOut
@@ -126,7 +126,7 @@ class FanUnit:
             self._enable_node = enable.node
             add_pinned(build, self._enable, enable)
         self._add_tachometer(build)
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
 
     def _add_tachometer(self, build: Build) -> None:
         tachometer = build.find_pin(TACHOMETER_PIN)
@@ -151,7 +151,7 @@ class FanUnit:
         del node
         self.speed = 0.0
 
-    def connect(self, live: "Live") -> None:
+    def connect(self, live: "ModuleContext") -> None:
         """Begin to act; the fan stands still."""
         self._live = live
 
@@ -175,7 +175,7 @@ class FanUnit:
             self.speed = 0.0
             live.say(f"[{self.name}] cannot be set: {error}")
 
-    def _drive(self, live: "Live", at_s: float, speed: float, before: float) -> None:
+    def _drive(self, live: "ModuleContext", at_s: float, speed: float, before: float) -> None:
         node = live.node(self.node)
         if self._enable is not None and self._enable_node is not None and (speed > 0) != (before > 0):
             clock = live.ticks_at(self._enable_node, at_s)
@@ -196,7 +196,7 @@ class FanModule(Module):
 
     unit: FanUnit
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to act."""
         self.unit.connect(live)
 

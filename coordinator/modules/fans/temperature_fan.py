@@ -31,7 +31,7 @@ from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.modules.words import one, parameters, value
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
 FULL: Final = shutdown_speed(1.0)
@@ -137,7 +137,7 @@ class TemperatureFan(FanModule):
         """Find the sensor."""
         self.input.link(modules)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to act."""
         await super().connect(live)
         await self.input.connect(live)
@@ -164,7 +164,7 @@ class TemperatureFan(FanModule):
         wanted = self._controller.power(at_s, MIRROR_C - celsius, MIRROR_C - self.target_c)
         self.unit.set_speed(min(max(wanted, self.min_speed), self.max_speed))
 
-    def _look(self, live: "Live") -> None:
+    def _look(self, live: "ModuleContext") -> None:
         """Notice that there are no measurements any more."""
         if self.input.missed() <= SILENT_LOOKS:
             return

@@ -28,7 +28,7 @@ from coordinator.modules.heaters.control import ControlSettings
 from coordinator.modules.heaters.verify_heater import VerifyHeater, usual
 from coordinator.modules.pinned import AHEAD_S, add_pinned
 from coordinator.modules.sensors.temperature_input import SensorModule, TemperatureInput
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.analog_in import RANGE_CHECKS
 from nodes.devices.pwm_out import PwmOut
@@ -98,7 +98,7 @@ class HeaterUnit:
         """Called at the end of each steady state."""
         self._tuning: Tuning | None = None
         self._tuning_failure: CanductorError | None = None
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         self._on = False
         self._applied_s = 0.0
         """When power was applied last, host's time."""
@@ -121,7 +121,7 @@ class HeaterUnit:
         if self._find_ambient is not None:
             self._ambient = self._find_ambient(modules)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to act."""
         self._live = live
         if self.settings.kind == "mpc":
@@ -252,7 +252,7 @@ class HeaterUnit:
         if held is not None and self.on_held is not None:
             self.on_held(held)
 
-    def _out_of_range(self, live: "Live", celsius: float) -> None:
+    def _out_of_range(self, live: "ModuleContext", celsius: float) -> None:
         """Heat no more while what is measured cannot be; its node stops by itself a moment later."""
         self._bad += 1
         self._apply(0.0)

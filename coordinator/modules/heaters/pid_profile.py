@@ -13,7 +13,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import HeaterUnit
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.words import one, parameters, value
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest, shown
 from coordinator.support.values import Value
 
@@ -43,7 +43,7 @@ class PidProfiles(Module):
         self._heaters = build.shared(Heaters)
         self._of: dict[str, dict[str, PidGains]] = {}
         self._loaded: dict[str, str] = {}
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         build.add_command(
             GCodeCommand(
                 "PID_PROFILE",
@@ -61,7 +61,7 @@ class PidProfiles(Module):
         units = self._heaters.units.values()
         return next((unit for unit in units if name in (unit.key, unit.name)), None)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to act."""
         self._live = live
 

@@ -19,7 +19,7 @@ from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.heaters.pid_profile import PidProfiles
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.modules.words import numbers
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
 
@@ -37,7 +37,7 @@ class HeaterModule(Module):
         """Find what belongs to the heater."""
         self.unit.link(modules)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to act."""
         await self.unit.connect(live)
 
@@ -152,7 +152,7 @@ class ExtruderHeater(Module):
         if self.unit is not None:
             self.unit.link(modules)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to act."""
         if self.unit is not None:
             await self.unit.connect(live)

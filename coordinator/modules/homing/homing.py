@@ -21,7 +21,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing_plan import AXES, Approach, approaches, landed, second_landed
 from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
 from coordinator.runtime.machine import Machine
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.homing import HomingMove, HomingResult
 from coordinator.runtime.moves.single import Ramp, SingleMove
 from coordinator.runtime.moves.straight import move_by
@@ -50,7 +50,7 @@ class Homing(Module):
         self._described = build.machine
         self._last_query: dict[str, bool] = {}
         self._approaches = approaches(build.machine)
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         self._feelers: dict[str, StallEndstop] = {}
         """By virtual endstop."""
         self.instead: Callable[[Call, str], Reading] | None = None
@@ -89,7 +89,7 @@ class Homing(Module):
             if found is not None:
                 self._feelers[virtual] = found
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take over the machine."""
         self._live = live
 

@@ -10,7 +10,7 @@ from coordinator.gcode.commands import AtRest, Call, Done, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import STRAIGHT, Homing
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.straight import move_by
 from nodes.support.errors import CanductorError
 
@@ -75,7 +75,7 @@ class SafeZHome(Module):
         self._speed, self._hop_speed = build.get(SPEED), build.get(Z_HOP_SPEED)
         self._hop_mm, self._back = build.get(Z_HOP), build.get(BACK)
         self._limits = build.machine.limits
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         kinematics = build.machine.kinematics.name
         if kinematics not in STRAIGHT:
             raise ConfigError(
@@ -96,7 +96,7 @@ class SafeZHome(Module):
                 return f"{x:g}, {y:g}, but {'XY'[axis]} goes from {low:g} to {high:g} mm"
         return ""
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take over the machine."""
         self._live = live
 

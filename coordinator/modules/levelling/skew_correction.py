@@ -20,7 +20,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.words import flag, one, parameters, value
 from coordinator.motion.specs import StepKinematics
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
 SKEW_MAX: Final = 0.2
@@ -107,7 +107,7 @@ class Skews(Module):
         """What holds for the lines to come."""
         self._profile = ""
         self._profiles: dict[str, Skew] = {}
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         build.shared(Homing).corrected = self.home
         for name, help_, read in (
             ("SET_SKEW", "Correct what was measured: XY=AC,BD,AD XZ= YZ=, or CLEAR=1", self._set),
@@ -126,7 +126,7 @@ class Skews(Module):
             if found.profile:
                 self._profiles[found.profile] = found.skew
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take over the machine."""
         self._live = live
 
@@ -237,7 +237,7 @@ class Skews(Module):
             live.soon_on_loop(lambda: _keep(live, name, skew))
 
 
-def _keep(live: "Live", name: str, skew: Skew) -> None:
+def _keep(live: "ModuleContext", name: str, skew: Skew) -> None:
     for plane, option in OPTIONS.items():
         live.save(f"skew_correction {name}", option.name, f"{getattr(skew, plane.lower()):.6f}")
 

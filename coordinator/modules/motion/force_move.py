@@ -11,7 +11,7 @@ from coordinator.config.options import BoolOption, SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.single import Ramp, SingleMove
 
 ENABLE: Final = BoolOption(
@@ -33,7 +33,7 @@ class ForceMove(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._machine = build.machine
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         if not build.get(ENABLE):
             return
         build.add_command(
@@ -51,7 +51,7 @@ class ForceMove(Module):
             )
         )
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take over the machine."""
         self._live = live
 

@@ -10,7 +10,7 @@ from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
 from coordinator.modules.words import one, parameters, value
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
@@ -116,7 +116,7 @@ class OutputPin(Module):
             )
         add_pinned(build, self._output, pin)
         build.add_device(pin.node, self)
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         build.shared(OutputPins).by_name[build.instance] = self
 
     def _share(self, build: Build, option: FloatOption) -> float:
@@ -145,7 +145,7 @@ class OutputPin(Module):
         if self._live is not None and self._begins_late:
             self.set(self._begin * self._scale)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to act."""
         self._live = live
         if self._begins_late:

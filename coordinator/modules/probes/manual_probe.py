@@ -14,7 +14,7 @@ from coordinator.gcode.events import Reply
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
 SPEED: Final = 5.0
@@ -34,7 +34,7 @@ class ManualProbe(Module):
         super().__init__(build)
         self.name = "manual_probe"
         self._machine = build.machine
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         self._accepted: Callable[[float], tuple[str, ...]] | None = None
         """What a height that is accepted leads to; None: nothing is looked for."""
         self._speed = SPEED
@@ -57,7 +57,7 @@ class ManualProbe(Module):
         ):
             build.add_command(GCodeCommand(name, text, read))
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take over the machine."""
         self._live = live
 

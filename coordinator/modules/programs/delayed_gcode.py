@@ -9,7 +9,7 @@ from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, needed, parameters
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest
 from coordinator.support.values import Value
 
@@ -39,11 +39,11 @@ class DelayedGCode(Module):
         self.id = build.instance
         self.template = GCodeTemplate(build, GCODE)
         self._initial_s = build.get(INITIAL)
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         self._call_off: Callable[[], None] | None = None
         build.shared(DelayedGCodes)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take the clock."""
         self._live = live
 

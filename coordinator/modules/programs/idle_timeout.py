@@ -11,7 +11,7 @@ from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Readin
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, parameters
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
 TIMEOUT = FloatOption(
@@ -41,7 +41,7 @@ class IdleTimeout(Module):
         self._configured_s = self._timeout_s = build.get(TIMEOUT)
         self._template = GCodeTemplate(build, GCODE) if build.find(GCODE) is not None else None
         self._default: tuple[str, ...] = ()
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         self._state = "Idle"
         self._since_s = 0.0
         self._busy_since_s: float | None = None
@@ -56,7 +56,7 @@ class IdleTimeout(Module):
         """Find what there is to switch off."""
         self._default = tuple(name for name in OFF if modules.knows(name))
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to watch."""
         self._live = live
         self._since_s = live.now_s()

@@ -5,7 +5,7 @@ import asyncio
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
@@ -18,7 +18,7 @@ class SaveConfig(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "configfile"
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         for name, text, read in (
             (
                 "SAVE_CONFIG",
@@ -38,7 +38,7 @@ class SaveConfig(Module):
         ):
             build.add_command(GCodeCommand(name, text, read))
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take over the machine."""
         self._live = live
 

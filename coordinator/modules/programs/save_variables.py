@@ -17,7 +17,7 @@ from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
 from coordinator.modules.words import needed, parameters
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.atomic_file import write_whole
 from coordinator.support.quoting import shown_path
 from coordinator.support.values import Value
@@ -52,7 +52,7 @@ class SaveVariables(Module):
         except CanductorError as error:
             raise ConfigError(self._place, str(error)) from None
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Write the file from now on."""
         self._writer = _Writer(self.path, live.say)
 

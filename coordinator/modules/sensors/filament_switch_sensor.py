@@ -11,7 +11,7 @@ from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.modules.words import flag, needed, one, parameters
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.button import Button
 
@@ -72,7 +72,7 @@ class FilamentSwitchSensor(Module):
         self._stats = build.shared(PrintStats)
         self._can_pause = False
         self._quiet_until_s = 0.0
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         pin = build.pin(PIN)
         self.switch = Button(self.name, pin=pin.name, pull=pin.pull, invert=pin.invert)
         self.switch.on_change = self._changed
@@ -83,7 +83,7 @@ class FilamentSwitchSensor(Module):
         """See whether there is PAUSE."""
         self._can_pause = modules.knows("PAUSE")
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Act from now on."""
         self._live = live
         self._quiet_until_s = live.now_s() + self._delay_s

@@ -25,7 +25,7 @@ from coordinator.modules.base import Build, Modules
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from coordinator.modules.sensors.temperature_source import TemperatureSource
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest, shown
 from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.node.config import NodeConfig, NodeConfigError
@@ -86,7 +86,7 @@ class ChipTemperature(TemperatureSource):
         """The node it is on."""
         return self._node
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to tell; ask the chip for what its factory measured."""
         await super().connect(live)
         node = live.node(self._node)
@@ -137,7 +137,7 @@ class HostTemperature(TemperatureSource):
         super().__init__(build.name, min_c, max_c)
         self._path = Path(build.get(SENSOR_PATH))
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to look; CanductorError when there is nothing to see."""
         await super().connect(live)
         self._look()
@@ -199,7 +199,7 @@ class CombinedTemperature(TemperatureSource):
                 )
             self._sources.append(source)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to look."""
         await super().connect(live)
         live.every(COMBINED_S, self._look)

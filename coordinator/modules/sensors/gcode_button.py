@@ -10,7 +10,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import flag, one, parameters
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.button import Button
 
@@ -35,11 +35,11 @@ class GCodeButton(Module):
         pin = build.pin(PIN)
         self._button = Button(self.name, pin=pin.name, pull=pin.pull, invert=pin.invert)
         self._button.on_change = self._changed
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         add_pinned(build, self._button, pin)
         build.shared(GCodeButtons)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Act from now on."""
         self._live = live
 

@@ -30,7 +30,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.modules.sensors.thermistor import KINDS, Circuit, CustomSensor
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest, shown
 from nodes.devices.analog_in import AnalogIn, AnalogValue
 from nodes.node.states import NodeState
@@ -108,7 +108,7 @@ class TemperatureInput(TemperatureSource):
 
     # ---------------------------------------------------------------------------------------------- live
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to tell what is measured; waits for the first time, unless its node is away."""
         await super().connect(live)
         if self.celsius is None and live.node(self._pin.node).state is NodeState.READY:

@@ -13,7 +13,7 @@ from coordinator.modules.base import Build, Modules
 from coordinator.modules.heaters.heaters import Heaters
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_input import SensorModule
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
 GCODE_ID: Final = TextOption(
@@ -45,7 +45,7 @@ class TemperatureSensor(SensorModule):
         """Find the sensor."""
         self.input.link(modules)
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to measure."""
         await self.input.connect(live)
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Final
 
 from coordinator.modules.base import Modules
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from nodes.support.errors import CanductorError
 
 SILENT_S: Final = 10.0
@@ -39,7 +39,7 @@ class TemperatureSource:
         self.on_measured: OnMeasured = _ignore
         self.ratio: float | None = None
         """What its converter read last, 0 to 1; None: nothing yet, or there is none."""
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         self._looks = 0
         self._bad = 0
         self._waiting: list[asyncio.Future[None]] = []
@@ -48,7 +48,7 @@ class TemperatureSource:
     def link(self, modules: Modules) -> None:
         """Find what belongs to it; raises ConfigError."""
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Begin to tell what is measured."""
         self._live = live
 
@@ -93,7 +93,7 @@ class TemperatureSource:
         if self._over is not None:
             raise CanductorError(self._over)
 
-    def _take(self, celsius: float, at_s: Callable[["Live"], float]) -> None:
+    def _take(self, celsius: float, at_s: Callable[["ModuleContext"], float]) -> None:
         """Take a measurement; AT_S tells its print time on a machine that lives."""
         self.celsius = celsius
         if self.min_c <= celsius <= self.max_c:
@@ -103,7 +103,7 @@ class TemperatureSource:
             self.on_measured(at_s(self._live), celsius)
         self.wake()
 
-    def _watch(self, live: "Live", celsius: float) -> None:
+    def _watch(self, live: "ModuleContext", celsius: float) -> None:
         """Stop the machine when CELSIUS stays outside the limits: for sensors that no node watches."""
         self._bad = 0 if self.min_c <= celsius <= self.max_c else self._bad + 1
         if self._bad == BAD_IN_A_ROW:

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.modules.base import Modules
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 from nodes.node.node import Node
 from nodes.support.errors import CanductorError
 
 _MEMORY: Final = Path("/proc/meminfo")
 
 
-def machine_view(live: "Live | None") -> Mapping[str, Mapping[str, object]]:
+def machine_view(live: "ModuleContext | None") -> Mapping[str, Mapping[str, object]]:
     """Return it by name; on the control loop. Without LIVE nothing is connected: a program is planned."""
     nodes = {} if live is None else live.machine.nodes
     stopped = None if live is None else live.machine.stopped

@@ -4,7 +4,7 @@ from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
 from coordinator.gcode.status import frames
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 
 
 class Positions(Module):
@@ -14,7 +14,7 @@ class Positions(Module):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         build.add_command(
             GCodeCommand(
                 "GET_POSITION",
@@ -24,7 +24,7 @@ class Positions(Module):
             )
         )
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take over the machine."""
         self._live = live
 
@@ -38,9 +38,9 @@ class Positions(Module):
         """Answer with what the nodes count, what follows from that, and what the program was TOLD."""
         assert self._live is not None
         machine = self._live.machine
-        counts = await machine.stepper_positions()
-        places = machine.rails.places(counts)
-        head = machine.rails.head(places)
+        counts = await machine.query_stepper_counts()
+        places = machine.stepper_positions.places(counts)
+        head = machine.stepper_positions.head(places)
         mcu = " ".join(f"{name}:{count}" for name, count in counts.items())
         stepper = " ".join(f"{name}:{place:.6f}" for name, place in places.items())
         unknown = "unknown; home the machine with G28"

@@ -19,7 +19,7 @@ from coordinator.modules.status.absent_status import absent_statuses
 from coordinator.modules.status.config_view import ConfigView
 from coordinator.modules.status.machine_view import Commands, machine_view
 from coordinator.modules.status.print_stats import PrintStats
-from coordinator.runtime.module_context import Live
+from coordinator.runtime.module_context import ModuleContext
 
 PATIENCE_S: Final = 0.2
 Shown = Mapping[str, Mapping[str, object]]
@@ -37,13 +37,13 @@ class PrinterStatus(Module):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._loop_thread = 0
         self._last: Shown = {}
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
 
     def link(self, modules: Modules) -> None:
         """Remember who there is."""
         self._modules = modules
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Ask the loop from now on."""
         self._live = live
         self._loop, self._loop_thread = asyncio.get_running_loop(), threading.get_ident()

@@ -153,7 +153,7 @@ class HomingMove:
 
     async def run(self) -> tuple[HomingResult, ...]:
         """Move until every endstop switched; raises HomingError with everything stopped."""
-        first = await self._machine.stepper_positions()
+        first = await self._machine.query_stepper_counts()
         for lead_s in LEADS_S[:-1]:
             with contextlib.suppress(_LateError):
                 return await self._run(lead_s, first)
@@ -169,7 +169,7 @@ class HomingMove:
                     f"the endstop of axis {rail.axis} is pressed before the move towards it; move the axis "
                     "away by hand, or check the endstop's wiring and whether its pin has to be inverted"
                 )
-        began_at = await self._machine.stepper_positions()
+        began_at = await self._machine.query_stepper_counts()
         move = SingleMove(self._machine, self._ramp, self._ratio, ways=self._ways, lead_s=lead_s)
         legs = [self._leg(slot, rail, move) for slot, rail in enumerate(self._rails)]
         ends: list[Callable[[], None]] = []
@@ -193,7 +193,7 @@ class HomingMove:
             raise late
         for leg, found in zip(legs, states, strict=True):
             self._check(leg, found)
-        ended_at = await self._machine.stepper_positions()
+        ended_at = await self._machine.query_stepper_counts()
         before = {s.name: began_at[s.name] - first[s.name] for s in move.steppers}
         moved = {s.name: ended_at[s.name] - first[s.name] for s in move.steppers}
         return tuple([await self._result(leg, move, before, moved) for leg in legs])

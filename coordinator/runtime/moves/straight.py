@@ -21,10 +21,10 @@ async def move_by(machine: Machine, way: Way, speed: float, accel: float) -> Way
     length = math.dist(way, (0.0, 0.0, 0.0))
     if length < SHORTEST_MM:
         return (0.0, 0.0, 0.0)
-    began_at = await machine.stepper_positions()
+    began_at = await machine.query_stepper_counts()
     x, y, z = (value / length for value in way)
     await SingleMove(machine, Ramp(length, speed, accel), (x, y, z, 0.0)).run()
-    ended_at = await machine.stepper_positions()
+    ended_at = await machine.query_stepper_counts()
     motors = machine.description.motors
     made = [(ended_at[motor.name] - began_at[motor.name]) * motor.step_distance for motor in motors]
     solved = np.linalg.lstsq(np.array([motor.weights[:3] for motor in motors]), np.array(made), rcond=None)[0]

@@ -12,7 +12,7 @@ from coordinator.gcode.errors import GCodeError
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
 from coordinator.modules.module_set import INTERRUPTING
 from coordinator.runtime.machine import Machine
-from coordinator.service.core.feeder import FeederFull, Ticket
+from coordinator.service.core.feeder import FeederFull, QueuedWork
 from coordinator.service.core.machine_service import MachineService, ServiceState
 from coordinator.service.core.motion import Motion, MotionOver, texts
 from coordinator.service.core.work import (
@@ -27,7 +27,7 @@ from coordinator.service.core.work import (
     commands_in,
 )
 from coordinator.service.state.figures import axes, position_figures
-from coordinator.streaming.move_source import Told
+from coordinator.streaming.move_source import ProgramOutput
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
@@ -66,7 +66,7 @@ _TOLD: Final = (
 class ScriptOutcome:
     """What lines of a client answered."""
 
-    told: Sequence[Told] = ()
+    told: Sequence[ProgramOutput] = ()
     logged: bool = True
     """Whether the log has it already: not what is answered beside a job."""
 
@@ -202,25 +202,25 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
 # ------------------------------------------------------------------------------------------------ doing
 
 
-async def _done(service: MachineService, motion: Motion, work: Work, *, aside: bool = False) -> Ticket:
+async def _done(service: MachineService, motion: Motion, work: Work, *, aside: bool = False) -> QueuedWork:
     """Have WORK done; raises ApiError where it was not, for whatever reason."""
     try:
         if aside and isinstance(work, LinesWork):
-            ticket = await motion.do_aside(work)
+            queued = await motion.do_interjection(work)
         else:
-            ticket = await motion.do(work)
+            queued = await motion.do(work)
     except FeederFull as error:
         raise ApiError("busy", str(error)) from None
     except MotionOver:
         raise ApiError("stopped", f"the machine stopped: {service.cause or 'it begins anew'}") from None
-    if isinstance(ticket.error, GCodeError | WorkError):
-        raise ApiError("bad_gcode" if isinstance(ticket.error, GCodeError) else "bad_move", str(ticket.error))
-    if ticket.error is not None:
-        raise ticket.error
-    return ticket
+    if isinstance(queued.error, GCodeError | WorkError):
+        raise ApiError("bad_gcode" if isinstance(queued.error, GCodeError) else "bad_move", str(queued.error))
+    if queued.error is not None:
+        raise queued.error
+    return queued
 
 
-def _answer(told: Sequence[Told]) -> Value:
+def _answer(told: Sequence[ProgramOutput]) -> Value:
     replies, notices = texts(told)
     return {"replies": list(replies), "notices": list(notices)}
 
@@ -308,8 +308,8 @@ def _stepper_figures(machine: Machine, motion: Motion) -> Value:
 
 def _node_figures(machine: Machine, steps: dict[str, int]) -> dict[str, Value]:
     """Return what follows from the STEPS that the nodes count."""
-    places = machine.rails.places(steps)
-    head = machine.rails.head(places)
+    places = machine.stepper_positions.places(steps)
+    head = machine.stepper_positions.head(places)
     return {
         "nodes_steps": dict(steps),
         "rails": {name: round(place, 6) for name, place in places.items()},
@@ -339,7 +339,7 @@ class _StepsOfNodes:
 
     async def _ask(self) -> dict[str, int]:
         try:
-            found = dict(await self._service.up_machine().stepper_positions())
+            found = dict(await self._service.up_machine().query_stepper_counts())
         except ApiError:
             raise
         except CanductorError as error:

@@ -23,7 +23,7 @@ from coordinator.gcode.events import (
     Notice,
     Progress,
     Reply,
-    Resting,
+    StandstillAction,
     Timed,
 )
 from coordinator.gcode.interpreter import Job
@@ -37,7 +37,7 @@ from nodes.support.errors import CanductorError
 
 WAITING_MAX: Final = 64
 """Works that may wait; more are refused."""
-ASIDES_MAX: Final = 16
+INTERJECTIONS_MAX: Final = 16
 COME_BACK_MM_S: Final = 50.0
 """At which a job goes back to where it was paused."""
 TOLD_MAX: Final = 1000
@@ -49,7 +49,7 @@ class FeederFull(CanductorError):  # noqa: N818
 
 
 @dataclass(eq=False)
-class Ticket:
+class QueuedWork:
     """A work on its way."""
 
     work: Work
@@ -68,7 +68,7 @@ class Ticket:
     """Print time at which its last move ends, once it is known; 0: there is nothing to wait for."""
     done: bool = False
     """Whether that has passed."""
-    resting: Resting | None = None
+    standstill: StandstillAction | None = None
     """What it waits for while the machine stands."""
 
 
@@ -85,13 +85,13 @@ class Feeder:
         self.planner = planner
         self.machine = machine
         self._setting = Setting(planner, machine, dict(homed_position), vocabulary, self)
-        self._waiting: deque[Ticket] = deque()
-        self._asides: deque[Ticket] = deque()
-        self._aside: Ticket | None = None
+        self._waiting: deque[QueuedWork] = deque()
+        self._interjections: deque[QueuedWork] = deque()
+        self._interjection: QueuedWork | None = None
         """That is being done, and has to wait for room."""
-        self._aside_events: deque[Event] = deque()
-        self._now: Ticket | None = None
-        self._held: tuple[Ticket, Aside] | None = None
+        self._interjection_events: deque[Event] = deque()
+        self._now: QueuedWork | None = None
+        self._held: tuple[QueuedWork, Aside] | None = None
         """A paused job that others have come between."""
         self._come_back: SavedState | None = None
         """Where the paused job has to go on, if something may have moved since."""
@@ -103,8 +103,8 @@ class Feeder:
         """For the control loop to take: a program wants the interrupted job to go on."""
         self.to_print: deque[str] = deque(maxlen=WAITING_MAX)
         """For the control loop to take: files that programs want to have printed."""
-        self.finished: deque[Ticket] = deque(maxlen=WAITING_MAX + ASIDES_MAX + 1)
-        """For the control loop to take: tickets of which everything is read, oldest first."""
+        self.finished: deque[QueuedWork] = deque(maxlen=WAITING_MAX + INTERJECTIONS_MAX + 1)
+        """For the control loop to take: works of which everything is read, oldest first."""
 
     # --------------------------------------------------------------------------- for the control loop
 
@@ -145,21 +145,21 @@ class Feeder:
         """What programs know through modules."""
         return self._setting.vocabulary
 
-    def submit(self, work: Work, *, is_job: bool = False) -> Ticket:
+    def submit(self, work: Work, *, is_job: bool = False) -> QueuedWork:
         """Have WORK done after all that was submitted before; raises FeederFull."""
         if len(self._waiting) >= WAITING_MAX:
             raise FeederFull(f"{WAITING_MAX} requests wait for the machine already; wait for their answers")
-        ticket = Ticket(work, is_job)
-        self._waiting.append(ticket)
-        return ticket
+        queued = QueuedWork(work, is_job)
+        self._waiting.append(queued)
+        return queued
 
-    def submit_aside(self, lines: LinesWork) -> Ticket:
+    def submit_interjection(self, lines: LinesWork) -> QueuedWork:
         """Have LINES, none of which moves anything, done between two lines of the work; raises FeederFull."""
-        if len(self._asides) >= ASIDES_MAX:
-            raise FeederFull(f"{ASIDES_MAX} requests wait already; wait for their answers")
-        ticket = Ticket(lines)
-        self._asides.append(ticket)
-        return ticket
+        if len(self._interjections) >= INTERJECTIONS_MAX:
+            raise FeederFull(f"{INTERJECTIONS_MAX} requests wait already; wait for their answers")
+        queued = QueuedWork(lines)
+        self._interjections.append(queued)
+        return queued
 
     def pause(self) -> None:
         """Read no further: what is planned is carried out, to a standstill between two moves."""
@@ -169,17 +169,17 @@ class Feeder:
         """Go on with the next line."""
         self._paused = False
 
-    def cancel(self, ticket: Ticket) -> None:
-        """End TICKET before its next line, also while it waits; what is planned of it is carried out."""
-        ticket.cancelled = True
-        if (resting := ticket.resting) is not None:
-            resting.cancelled = True
+    def cancel(self, queued: QueuedWork) -> None:
+        """End QUEUED before its next line, also while it waits; what is planned of it is carried out."""
+        queued.cancelled = True
+        if (standstill := queued.standstill) is not None:
+            standstill.cancelled = True
 
     def cancel_all(self) -> None:
         """End what is being done and what waits, each before its next line."""
         now = self._now
-        for ticket in (*self._waiting, *([now] if now is not None else [])):
-            self.cancel(ticket)
+        for queued in (*self._waiting, *([now] if now is not None else [])):
+            self.cancel(queued)
 
     def close(self) -> None:
         """End: ``step`` answers End once all is planned."""
@@ -190,39 +190,39 @@ class Feeder:
         left = [*self._waiting, *([self._now] if self._now is not None else [])]
         left += [self._held[0]] if self._held is not None else []
         self._waiting.clear()
-        self._asides.clear()
+        self._interjections.clear()
         self._now = self._held = None
-        for ticket in left:
-            ticket.work.close()
+        for queued in left:
+            queued.work.close()
 
     # ------------------------------------------------------------------------- for the worker's thread
 
     def step(self) -> Event:
         """Go on with the work at hand, or the next one."""
-        if (event := self._do_asides()) is not None:
+        if (event := self._do_interjections()) is not None:
             return event
         if self._now is None and (event := self._take_next()) is not None:
             return event
-        ticket = self._now
-        assert ticket is not None
-        if ticket.read or ticket.cancelled:
-            return self._finish(ticket)
-        if self._gives_way(ticket):
-            self._held = (ticket, self.planner.put_aside())
+        queued = self._now
+        assert queued is not None
+        if queued.read or queued.cancelled:
+            return self._finish(queued)
+        if self._gives_way(queued):
+            self._held = (queued, self.planner.put_aside())
             self._now = None
-            return ticket.progress
+            return queued.progress
         try:
-            event = self._step_job(ticket) if ticket.is_job else self._begin_or_step(ticket)
+            event = self._step_job(queued) if queued.is_job else self._begin_or_step(queued)
         except CanductorError as error:
-            ticket.error = error
-            ticket.read = True
-            return self._finish(ticket)
-        return self._pass_on(ticket, event)
+            queued.error = error
+            queued.read = True
+            return self._finish(queued)
+        return self._pass_on(queued, event)
 
     def attend_others(self) -> Event | None:
         """Act on lines of clients while the work at hand waits for something that is done at rest."""
         until_s, self.planner.plan_until_s = self.planner.plan_until_s, float("-inf")
-        event = self._do_asides()
+        event = self._do_interjections()
         self.planner.plan_until_s = until_s
         return None if isinstance(event, Full) else event
 
@@ -238,21 +238,21 @@ class Feeder:
             return Idle()
         return None
 
-    def _gives_way(self, ticket: Ticket) -> bool:
-        """Whether TICKET is a paused job that others may come between now; remember where it stands."""
-        if not (self._paused and ticket.is_job and self._waiting) or not ticket.work.settled:
+    def _gives_way(self, queued: QueuedWork) -> bool:
+        """Whether QUEUED is a paused job that others may come between now; remember where it stands."""
+        if not (self._paused and queued.is_job and self._waiting) or not queued.work.settled:
             return False
-        if self._come_back is None and ticket.begun_at_s is not None:
+        if self._come_back is None and queued.begun_at_s is not None:
             self._come_back = present_state(self.planner)
         return True
 
-    def _step_job(self, ticket: Ticket) -> Event:
+    def _step_job(self, queued: QueuedWork) -> Event:
         """Go on with a job, unless it is paused; raises CanductorError."""
         if not self._paused:
             if self._come_back is not None and (event := self._go_back(self._come_back)) is not None:
                 return event
-            return self._begin_or_step(ticket)
-        if ticket.begun_at_s is not None and (event := ticket.work.pending()) is not None:
+            return self._begin_or_step(queued)
+        if queued.begun_at_s is not None and (event := queued.work.pending()) is not None:
             return event
         return Idle()
 
@@ -276,79 +276,79 @@ class Feeder:
         self._come_back = None
         return None
 
-    def _begin_or_step(self, ticket: Ticket) -> Event:
-        if ticket.begun_at_s is None:
-            ticket.begun_at_s = self.planner.print_time_end_s
-            ticket.work.begin(self._setting)
-        ticket.resting = None
-        return ticket.work.step()
+    def _begin_or_step(self, queued: QueuedWork) -> Event:
+        if queued.begun_at_s is None:
+            queued.begun_at_s = self.planner.print_time_end_s
+            queued.work.begin(self._setting)
+        queued.standstill = None
+        return queued.work.step()
 
-    def _pass_on(self, ticket: Ticket, event: Event) -> Event:
+    def _pass_on(self, queued: QueuedWork, event: Event) -> Event:
         """Keep what is the client's, hand on what is the streamer's."""
         if isinstance(event, End):
-            ticket.read = True
-            return self._finish(ticket)
-        ticket.progress = ticket.work.progress()
-        if ticket.is_job and ticket.work.at_line:
+            queued.read = True
+            return self._finish(queued)
+        queued.progress = queued.work.progress()
+        if queued.is_job and queued.work.at_line:
             self._paused, self._pause_wanted = self._paused or self._pause_wanted, False
-            ticket.cancelled, self._cancel_wanted = ticket.cancelled or self._cancel_wanted, False
-        if isinstance(event, Resting):
-            ticket.resting = event
-            event.cancelled = ticket.cancelled  # since the last look
+            queued.cancelled, self._cancel_wanted = queued.cancelled or self._cancel_wanted, False
+        if isinstance(event, StandstillAction):
+            queued.standstill = event
+            event.cancelled = queued.cancelled  # since the last look
         if isinstance(event, Reply | Notice):
-            _keep(ticket, event)
+            _keep(queued, event)
         return event
 
-    def _finish(self, ticket: Ticket) -> Event:
-        """Let TICKET go once its moves are planned as far as they have to be."""
-        early = ticket.cancelled or ticket.error is not None
-        if ticket.resting is not None and ticket.resting.moved:
+    def _finish(self, queued: QueuedWork) -> Event:
+        """Let QUEUED go once its moves are planned as far as they have to be."""
+        early = queued.cancelled or queued.error is not None
+        if queued.standstill is not None and queued.standstill.moved:
             self.planner.homed = ""  # nobody takes over any more where that left the machine
-        if (early or ticket.work.rest is Rest.STANDSTILL) and not self.planner.flush():
+        if (early or queued.work.rest is Rest.STANDSTILL) and not self.planner.flush():
             return Full()
-        ticket.read = True
+        queued.read = True
         end_s = self.planner.print_time_end_s
-        at_once = end_s == ticket.begun_at_s or (ticket.work.rest is Rest.OPEN and not early)
-        ticket.ends_at_s = 0.0 if at_once else end_s
-        ticket.work.close()
+        at_once = end_s == queued.begun_at_s or (queued.work.rest is Rest.OPEN and not early)
+        queued.ends_at_s = 0.0 if at_once else end_s
+        queued.work.close()
         self._now = None
-        if ticket.is_job:
+        if queued.is_job:
             self._come_back, self._pause_wanted, self._cancel_wanted = None, False, False
-        self.finished.append(ticket)
-        return ticket.progress
+        self.finished.append(queued)
+        return queued.progress
 
-    def _do_asides(self) -> Event | None:
+    def _do_interjections(self) -> Event | None:
         """Act on all lines that neither move nor wait, and tell what comes of it; Full: one needs room."""
-        while self._aside is not None or self._asides:
-            ticket = self._aside = self._aside or self._asides.popleft()
+        while self._interjection is not None or self._interjections:
+            queued = self._interjection = self._interjection or self._interjections.popleft()
             aside = self.planner.put_aside(moving=False)
-            done = self._do_aside(ticket)
+            done = self._do_interjection(queued)
             self.planner.take_up(aside)
             if not done:
                 return Full()
-            self._aside = None
-        return self._aside_events.popleft() if self._aside_events else None
+            self._interjection = None
+        return self._interjection_events.popleft() if self._interjection_events else None
 
-    def _do_aside(self, ticket: Ticket) -> bool:
+    def _do_interjection(self, queued: QueuedWork) -> bool:
         """Go on with lines of a client; False: there is no room."""
         try:
-            if ticket.begun_at_s is None:
-                ticket.begun_at_s = self.planner.print_time_end_s
-                ticket.work.begin(self._setting)
-            while not isinstance(event := ticket.work.step(), End | Emergency):
+            if queued.begun_at_s is None:
+                queued.begun_at_s = self.planner.print_time_end_s
+                queued.work.begin(self._setting)
+            while not isinstance(event := queued.work.step(), End | Emergency):
                 if isinstance(event, Full):
                     return False
                 if isinstance(event, Reply | Notice):
-                    _keep(ticket, event)
+                    _keep(queued, event)
                 elif isinstance(event, Timed):  # it does not belong to any place among the work's moves
-                    self._aside_events.append(replace(event, after_moves=AS_SOON_AS_POSSIBLE))
+                    self._interjection_events.append(replace(event, after_moves=AS_SOON_AS_POSSIBLE))
             if isinstance(event, Emergency):
-                self._aside_events.appendleft(event)
+                self._interjection_events.appendleft(event)
         except CanductorError as error:
-            ticket.error = error
-        ticket.read = True
-        ticket.ends_at_s = 0.0
-        self.finished.append(ticket)
+            queued.error = error
+        queued.read = True
+        queued.ends_at_s = 0.0
+        self.finished.append(queued)
         return True
 
     # ------------------------------------------------- for programs (coordinator/gcode/print_control.py)
@@ -356,8 +356,8 @@ class Feeder:
     @property
     def job_is_active(self) -> bool:
         """Whether there is a job that is neither done nor cancelled."""
-        tickets = (self._now, self._held[0] if self._held is not None else None)
-        return any(ticket is not None and ticket.is_job and not ticket.cancelled for ticket in tickets)
+        found = (self._now, self._held[0] if self._held is not None else None)
+        return any(queued is not None and queued.is_job and not queued.cancelled for queued in found)
 
     def pause_job(self, program: Job) -> None:
         """Let the job read no further, by a line of PROGRAM."""
@@ -399,9 +399,9 @@ class Feeder:
 
     def _is_job(self, program: Job) -> bool:
         now = self._now
-        return now is not None and now.is_job and not program.beside and self._aside is None
+        return now is not None and now.is_job and not program.beside and self._interjection is None
 
 
-def _keep(ticket: Ticket, event: Reply | Notice) -> None:
-    if len(ticket.told) < TOLD_MAX:
-        ticket.told.append(event)
+def _keep(queued: QueuedWork, event: Reply | Notice) -> None:
+    if len(queued.told) < TOLD_MAX:
+        queued.told.append(event)

@@ -127,18 +127,18 @@ class Programs:
         try:
             if job is not None and not job.gives_way:
                 work.beside = True
-                ticket = await motion.do_aside(work)
-                for told in ticket.told:
+                queued = await motion.do_interjection(work)
+                for told in queued.told:
                     self._service.tell(told)
             else:
-                ticket = await motion.do(work)
+                queued = await motion.do(work)
         except FeederFull as error:
             log.add("notice", f"{work.name} was left out: {error}", ReplyKind.ERROR)
         except MotionOver:
             return
         else:
-            if ticket.error is not None:
-                log.add("notice", str(ticket.error), ReplyKind.ERROR)
+            if queued.error is not None:
+                log.add("notice", str(queued.error), ReplyKind.ERROR)
 
     # ------------------------------------------------------------------------------------ for the job
 

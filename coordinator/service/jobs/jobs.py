@@ -4,7 +4,7 @@ from collections import deque
 from enum import StrEnum
 from typing import Final
 
-from coordinator.service.core.feeder import Feeder, Ticket
+from coordinator.service.core.feeder import Feeder, QueuedWork
 from coordinator.service.core.motion import Motion
 from coordinator.service.core.work import FileWork
 
@@ -58,7 +58,7 @@ class JobRun:
         self._looked_s = now_s
         self._began_e = motion.moment().position[3]
         self._motion = motion
-        self._ticket: Ticket = motion.feeder.submit(work, is_job=True)
+        self._queued: QueuedWork = motion.feeder.submit(work, is_job=True)
 
     @property
     def active(self) -> bool:
@@ -73,12 +73,12 @@ class JobRun:
     @property
     def lines_read(self) -> int:
         """Lines read; they are carried out seconds later."""
-        return self._ticket.progress.line
+        return self._queued.progress.line
 
     @property
     def read_bytes(self) -> int:
         """Bytes read."""
-        return self.size_bytes if self.phase is JobPhase.DONE else self._ticket.progress.done_bytes
+        return self.size_bytes if self.phase is JobPhase.DONE else self._queued.progress.done_bytes
 
     @property
     def done_bytes(self) -> int:
@@ -106,7 +106,7 @@ class JobRun:
 
     def cancel(self) -> None:
         """End early: what is planned is carried out."""
-        self._feeder.cancel(self._ticket)
+        self._feeder.cancel(self._queued)
         self._feeder.resume()
         self.phase = JobPhase.CANCELLING
 
@@ -121,7 +121,7 @@ class JobRun:
             return
         self._follow_programs()
         moment = self._motion.moment()
-        began_s = self._ticket.begun_at_s
+        began_s = self._queued.begun_at_s
         self.filament_mm = moment.position[3] - self._began_e
         self._extruded = self._extruded or self.filament_mm > 0
         if self.phase is not JobPhase.PAUSED and not self._motion.paused:
@@ -131,31 +131,31 @@ class JobRun:
         self._looked_s = now_s
         if moment.moving and moment.line and began_s is not None and self._motion.now_s >= began_s:
             self.line = max(self.line, moment.line)  # others that come between count from 1
-        ticket = self._ticket
-        self._trail.look(ticket.progress.line, ticket.progress.done_bytes, self.line)
-        if ticket.done:
-            self._ended(ticket, now_s)
+        queued = self._queued
+        self._trail.look(queued.progress.line, queued.progress.done_bytes, self.line)
+        if queued.done:
+            self._ended(queued, now_s)
         elif self.phase is JobPhase.PAUSING and self._motion.paused:
             self.phase = JobPhase.PAUSED
 
     def _follow_programs(self) -> None:
         """Take note of what a program has asked for: to pause, to go on, to cancel."""
-        if self._ticket.cancelled:
+        if self._queued.cancelled:
             self.phase = JobPhase.CANCELLING
         elif self._feeder.paused and self.phase is JobPhase.PRINTING:
             self.phase = JobPhase.PAUSING
         elif not self._feeder.paused and self.phase in (JobPhase.PAUSING, JobPhase.PAUSED):
             self.phase = JobPhase.PRINTING
 
-    def _ended(self, ticket: Ticket, now_s: float) -> None:
+    def _ended(self, queued: QueuedWork, now_s: float) -> None:
         self._feeder.resume()  # a pause that came too late must not hold what comes next
-        if ticket.error is not None:
-            self._end(JobPhase.FAILED, str(ticket.error), now_s)
-        elif ticket.cancelled:
+        if queued.error is not None:
+            self._end(JobPhase.FAILED, str(queued.error), now_s)
+        elif queued.cancelled:
             self._end(JobPhase.CANCELLED, "", now_s)
         else:
-            self.size_bytes = self.size_bytes or ticket.progress.done_bytes
-            self.line = ticket.progress.line
+            self.size_bytes = self.size_bytes or queued.progress.done_bytes
+            self.line = queued.progress.line
             self._end(JobPhase.DONE, "", now_s)
 
     def _end(self, phase: JobPhase, message: str, now_s: float) -> None:

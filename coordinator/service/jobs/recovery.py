@@ -28,10 +28,10 @@ from coordinator.service.jobs.journal import ENTRY_S, NAME, Interrupted, Journal
 from coordinator.service.jobs.resume_homing import (
     LIFT_MM,
     LIFT_MM_S,
+    ResumeHomingPlan,
     TakeHeight,
-    WayHome,
+    plan_resume_homing,
     sure_height,
-    way_home,
 )
 from nodes.support.errors import CanductorError
 
@@ -194,7 +194,7 @@ class Recovery:
         with contextlib.ExitStack() as unless_done:
             unless_done.callback(work.program.close)
             assert work.reached is not None
-            way = self._way_home(how, found, motion, work.reached.part_mm)
+            way = self._homing_plan(how, found, motion, work.reached.part_mm)
             await self._do(found, LinesWork(hot or ["M400"], name="recover"))
             if way.z_mm is not None:
                 await self._do(found, TakeHeight((), "recover", z_mm=way.z_mm))
@@ -210,9 +210,9 @@ class Recovery:
         return job
 
     async def _do(self, found: Interrupted, work: Work) -> None:
-        ticket = await self._service.ready_motion().do(work)
-        if ticket.error is not None:
-            raise ApiError("failed", f"{found.file} cannot go on: {ticket.error}")
+        queued = await self._service.ready_motion().do(work)
+        if queued.error is not None:
+            raise ApiError("failed", f"{found.file} cannot go on: {queued.error}")
 
     def _ready(self, how: Recovering) -> tuple[Interrupted, Motion]:
         """Return what is to go on, and what moves it; raises ApiError."""
@@ -241,11 +241,13 @@ class Recovery:
             )
         return found, motion
 
-    def _way_home(self, how: Recovering, found: Interrupted, motion: Motion, part_mm: float) -> WayHome:
+    def _homing_plan(
+        self, how: Recovering, found: Interrupted, motion: Motion, part_mm: float
+    ) -> ResumeHomingPlan:
         z_mm = sure_height(found.held.get("z")) if how.z_mm is None else how.z_mm
         machine = self._service.up_machine()
         homed, part_mm = motion.planned.homed, max(part_mm, z_mm or 0.0)
-        return way_home(machine.description, machine.modules, homed, part_mm=part_mm, z_mm=z_mm)
+        return plan_resume_homing(machine.description, machine.modules, homed, part_mm=part_mm, z_mm=z_mm)
 
     def _heating(self, found: Interrupted) -> tuple[list[str], list[str]]:
         """Return the lines that make hot what was hot, extruders last, and those of fans; raises ApiError."""

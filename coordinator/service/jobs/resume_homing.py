@@ -31,7 +31,7 @@ _STRAIGHT: Final = frozenset(
 
 
 @dataclass(frozen=True, slots=True)
-class WayHome:
+class ResumeHomingPlan:
     """What is done."""
 
     z_mm: float | None = None
@@ -42,33 +42,33 @@ class WayHome:
     """Lines that home."""
 
 
-def way_home(
+def plan_resume_homing(
     described: "MachineDescription",
     modules: "MachineModules",
     homed: str,
     *,
     part_mm: float,
     z_mm: float | None,
-) -> WayHome:
+) -> ResumeHomingPlan:
     """Return how the axes become known that are not among HOMED (letters).
 
     PART_MM: how high the part is. Z_MM: where the head stands; None: it is not known. Raises ApiError.
     """
     missing = [axis for axis in described.homed_position if axis in "XYZ" and axis not in homed]
     if not missing:
-        return WayHome()
+        return ResumeHomingPlan()
     home = f"home {' '.join(missing)} where the part is not in the way, then try again"
     homing = next(modules.of(Homing))
     if homing.instead is not None or "G28" in modules.vocabulary.commands:
         raise ApiError("not_ready", f"a section of this machine says what G28 does, maybe in Z: {home}")
     name = described.kinematics.name
     if name in _UPWARDS:
-        return WayHome(homing=("G28",))
+        return ResumeHomingPlan(homing=("G28",))
     if name not in _STRAIGHT:
         raise ApiError("not_ready", f"homing a {name} machine moves the head past the part: {home}")
     around = tuple(f"G28 {axis}" for axis in missing if axis != "Z")
     if "Z" in missing and _homes_upwards(described):
-        return WayHome(homing=("G28 Z", *around))
+        return ResumeHomingPlan(homing=("G28 Z", *around))
     if "Z" in missing and z_mm is None:
         raise ApiError(
             "not_ready",
@@ -76,7 +76,7 @@ def way_home(
             " where the head stands",
         )
     up_mm = min(part_mm + LIFT_MM, described.limits.position_max[2])
-    return WayHome(z_mm if "Z" in missing else None, up_mm, around)
+    return ResumeHomingPlan(z_mm if "Z" in missing else None, up_mm, around)
 
 
 def _homes_upwards(described: "MachineDescription") -> bool:

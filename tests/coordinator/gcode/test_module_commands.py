@@ -16,7 +16,17 @@ from coordinator.gcode.commands import (
     Vocabulary,
 )
 from coordinator.gcode.errors import GCodeError
-from coordinator.gcode.events import End, Event, Full, Notice, PositionSet, Progress, Reply, Resting, Timed
+from coordinator.gcode.events import (
+    End,
+    Event,
+    Full,
+    Notice,
+    PositionSet,
+    Progress,
+    Reply,
+    StandstillAction,
+    Timed,
+)
 from coordinator.gcode.interpreter import MAX_DEPTH, Job
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.program import Program
@@ -42,12 +52,12 @@ def job(*lines: str, home: Callable[[Call, str], Reading] | None = None, **read:
     )
 
 
-def events(work: Job, perform: Callable[[Resting], None] = lambda _: None) -> list[Event]:
+def events(work: Job, perform: Callable[[StandstillAction], None] = lambda _: None) -> list[Event]:
     found: list[Event] = []
     while not (found and isinstance(found[-1], End)):
         event = work.step()
         drain(work.planner)
-        if isinstance(event, Resting):
+        if isinstance(event, StandstillAction):
             assert work.planner.at_standstill
             perform(event)
         if not isinstance(event, Progress | Full | Notice):
@@ -73,7 +83,7 @@ def test_what_is_done_in_time_knows_its_place_among_the_moves() -> None:
 
 
 def test_what_is_done_at_rest_comes_to_rest_first_and_hands_back_where_the_machine_stands() -> None:
-    def probed(event: Resting) -> None:
+    def probed(event: StandstillAction) -> None:
         event.done, event.over = Done(("at 1.5",), position=(10.0, 0.0, 1.5, 0.0), homed="Z"), True
 
     work = job("G28", "G92 Z7", "G1 X10 F6000", "PROBE", "M114", PROBE=AtRest(nothing))
@@ -92,7 +102,7 @@ def test_a_plan_takes_what_the_command_says_for_granted() -> None:
 
 
 def test_what_failed_on_its_way_leaves_nothing_homed_and_ends_the_program() -> None:
-    def lost(event: Resting) -> None:
+    def lost(event: StandstillAction) -> None:
         event.done, event.over, event.moved, event.failure = None, True, True, "the probe did not switch"
 
     work = job("G28", "PROBE", "G1 X10 F6000", PROBE=AtRest(nothing))
@@ -102,7 +112,7 @@ def test_what_failed_on_its_way_leaves_nothing_homed_and_ends_the_program() -> N
 
 
 def test_axes_can_be_forgotten() -> None:
-    def off(event: Resting) -> None:
+    def off(event: StandstillAction) -> None:
         event.done, event.over = Done(unhomed="XY"), True
 
     work = job("G28", "OFF", OFF=AtRest(nothing))
@@ -167,7 +177,7 @@ def test_homing_is_the_modules_business_and_a_plan_knows_where_it_ends() -> None
         asked.append(axes)
         return AtRest(nothing)
 
-    def found(event: Resting) -> None:
+    def found(event: StandstillAction) -> None:
         event.done, event.over = Done(position=(0.0, 0.0, 0.25, 0.0), homed="Z"), True
 
     planned = job("G28 Z", "M114", home=home)

@@ -42,7 +42,7 @@ class Planned:
 
     def prove(self, windows: list[tuple[float, float]] | None = None) -> list[Verdict]:
         """Compare every stepper's steps with its exact motion, in WINDOWS of print time or everywhere."""
-        stretches, streams = self.record.stretches(), self.streams()
+        stretches, streams = self.record.segments(), self.streams()
         verdicts = []
         for spec in self.steppers:
             freq = self.nodes[spec.node].clock_freq

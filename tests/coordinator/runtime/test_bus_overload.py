@@ -2,7 +2,7 @@
 
 import pytest
 
-from coordinator.runtime.bus_overload import PERSISTS_S, URGENT_S, BusOverload, LoadWatch
+from coordinator.runtime.bus_overload import PERSISTS_S, URGENT_S, BusOverload, BusOverloadDetector
 from nodes.clock.clock import HostTime
 from nodes.link import Forecast
 
@@ -13,12 +13,12 @@ def forecast(now_s: float, late_in_s: float | None, ratio: float = 1.3) -> Forec
     return Forecast(now_ns, ratio, now_ns, late_ns, 350_000.0, 10_000)
 
 
-def look(watch: LoadWatch, now_s: float, late_in_s: float | None, repeated: float = 0.01) -> None:
+def look(watch: BusOverloadDetector, now_s: float, late_in_s: float | None, repeated: float = 0.01) -> None:
     watch.look(forecast(now_s, late_in_s), HostTime(round(now_s * 1e9)), lambda: repeated)
 
 
 def test_a_passing_doubt_is_no_overload() -> None:
-    watch = LoadWatch("can0")
+    watch = BusOverloadDetector("can0")
     look(watch, 1.0, 1.0)
     look(watch, 1.0 + PERSISTS_S / 2, 1.0)
     look(watch, 1.0 + PERSISTS_S * 0.9, None)
@@ -27,7 +27,7 @@ def test_a_passing_doubt_is_no_overload() -> None:
 
 
 def test_a_lasting_one_is_said_long_before_the_first_late_step() -> None:
-    watch = LoadWatch("can0")
+    watch = BusOverloadDetector("can0")
     look(watch, 1.0, 1.0)
     with pytest.raises(BusOverload) as caught:
         look(watch, 1.0 + PERSISTS_S * 1.01, 0.8)
@@ -40,9 +40,9 @@ def test_a_lasting_one_is_said_long_before_the_first_late_step() -> None:
 
 def test_losses_are_named_as_what_they_are() -> None:
     with pytest.raises(BusOverload, match="bus can0 loses too much: 23% of the blocks"):
-        look(LoadWatch("can0"), 1.0, 0.1, repeated=0.23)
+        look(BusOverloadDetector("can0"), 1.0, 0.1, repeated=0.23)
 
 
 def test_what_is_near_is_said_at_once() -> None:
     with pytest.raises(BusOverload):
-        look(LoadWatch("can0"), 1.0, URGENT_S / 2)
+        look(BusOverloadDetector("can0"), 1.0, URGENT_S / 2)

@@ -14,7 +14,7 @@ from coordinator.runtime.host import Port
 from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.runtime.node_recovery import LAST_TRY_S
 from nodes.clock.clock import HostTime
-from nodes.link.interfaces import LinkIOLike, OnFrame, OnLost
+from nodes.link.interfaces import LinkIoInterface, OnFrame, OnLost
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
 from tests.nodes import virtual_time
@@ -68,7 +68,7 @@ class TwinHost:
     def _port(self, name: str, io: TwinIO) -> Port:
         self.open_ports += 1
 
-        def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike:
+        def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface:
             return io(on_frame=on_frame, on_closed=on_closed)
 
         def close() -> None:

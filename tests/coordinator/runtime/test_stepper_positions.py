@@ -8,7 +8,7 @@ from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
 from coordinator.kinematics.dual_carriage import CarriageMode
 from coordinator.motion.planner.planner import Position
-from coordinator.runtime.stepper_positions import RailPlaces
+from coordinator.runtime.stepper_positions import StepperPositions
 from coordinator.support.command_options import EXAMPLES
 from coordinator.virtual_machine.plant import start_point
 
@@ -31,7 +31,7 @@ def test_counts_tell_where_the_head_is(path: Path) -> None:
     machine = load_machine(str(path))
     first = (*start_point(machine, 20.0), 1.0)
     later = (*start_point(machine, 43.0), 4.0)
-    rails = RailPlaces(machine)
+    rails = StepperPositions(machine)
     assert rails.places({}) == {}
     assert rails.head({}) is None
     state = None if machine.dual_carriage is None else machine.dual_carriage.carriages.home
@@ -47,7 +47,7 @@ def test_the_head_is_where_the_carriage_is_that_prints() -> None:
     machine = load_machine(str(EXAMPLES / "idex.cfg"))
     assert machine.dual_carriage is not None
     dual = machine.dual_carriage.carriages
-    rails, zeros = RailPlaces(machine), {stepper.name: 0 for stepper in machine.steppers}
+    rails, zeros = StepperPositions(machine), {stepper.name: 0 for stepper in machine.steppers}
     rails.declare((-50.0, 0.0, 0.0, 0.0), zeros, dual.home)
     per_mm = round(1 / next(s for s in machine.steppers if s.name == "stepper_x").step_distance)
     counts = zeros | {"stepper_x": 100 * per_mm, "dual_carriage": -60 * per_mm}

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.commands import AtRest, Done, GCodeCommand, Vocabulary
-from coordinator.gcode.events import End, Event, Full, Idle, Notice, Reply, Resting
+from coordinator.gcode.events import End, Event, Full, Idle, Notice, Reply, StandstillAction
 from coordinator.gcode.program import Program
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.modules.status.print_stats import PrintStats
-from coordinator.service.core.feeder import Feeder, Ticket
+from coordinator.service.core.feeder import Feeder, QueuedWork
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork
 from tests.stages.program_stage import ProgramStage
 
@@ -61,13 +61,13 @@ class Fed:
         )
         self.told: list[str] = []
 
-    def job(self, *lines: str) -> Ticket:
+    def job(self, *lines: str) -> QueuedWork:
         work = FileWork(Program.from_lines(["\n".join(lines) + "\n"], "job.gcode"))
         return self.feeder.submit(work, is_job=True)
 
-    def lines(self, *lines: str, beside: bool = False) -> Ticket:
+    def lines(self, *lines: str, beside: bool = False) -> QueuedWork:
         work = LinesWork(lines, beside=beside)
-        return self.feeder.submit_aside(work) if beside else self.feeder.submit(work)
+        return self.feeder.submit_interjection(work) if beside else self.feeder.submit(work)
 
     def step(self, *, room: bool = True) -> Event:
         event = self.feeder.step()
@@ -283,7 +283,7 @@ def test_a_pause_takes_over_what_was_done_at_rest_before_others_move(tmp_path: P
     fed = finding(tmp_path)
     done = Done(("found",), position=(10.0, 20.0, 30.0, 0.0), homed="XYZ")
     job = fed.job("FIND", "G1 X50 F6000")
-    event = next(event for event in (fed.step() for _ in range(99)) if isinstance(event, Resting))
+    event = next(event for event in (fed.step() for _ in range(99)) if isinstance(event, StandstillAction))
     fed.feeder.pause()
     event.done, event.over = done, True
     fed.feeder.submit(MoveWork({"X": 1.0}, 50.0, relative=True))
@@ -324,7 +324,7 @@ def test_clients_are_answered_while_a_job_waits_at_rest_but_nothing_is_planned(t
     fed.job(
         *BEGIN, "EXCLUDE_OBJECT_START NAME=a", "EXCLUDE_OBJECT NAME=a", "G1 E0.1 F600", "FIND", "G1 X70 E0.3"
     )  # fmt: skip
-    event = next(event for event in (fed.step() for _ in range(99)) if isinstance(event, Resting))
+    event = next(event for event in (fed.step() for _ in range(99)) if isinstance(event, StandstillAction))
     asked = fed.lines("M114", "M220 S50", "HELLO NAME=you", beside=True)
     back = fed.lines("EXCLUDE_OBJECT RESET=1", beside=True)
     moves = fed.planner.moves

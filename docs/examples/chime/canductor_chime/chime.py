@@ -11,7 +11,7 @@ from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
 
 if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
+    from coordinator.runtime.module_context import ModuleContext
 
 LENGTH_MAX_S: Final = 5.0
 PIN: Final = PinOption(name="pin", help="the bell's output; ! when low means ringing")
@@ -39,12 +39,12 @@ class Chime(Module):
         self._bell = DigitalOut(
             f"[{build.name}]", pin=pin.name, invert=pin.invert, max_duration_s=LENGTH_MAX_S + 1
         )
-        self._live: Live | None = None
+        self._live: ModuleContext | None = None
         self._rung = 0
         build.add_device(self._node, self._bell)
         build.add_command(GCodeCommand("CHIME", "Ring the bell for LENGTH seconds", self._read))
 
-    async def connect(self, live: "Live") -> None:
+    async def connect(self, live: "ModuleContext") -> None:
         """Take over the machine."""
         self._live = live
 

@@ -53,7 +53,7 @@ def ring(folder: Path, *lines: str) -> list[tuple[float, int]]:
 
     async def go() -> None:
         program = Program.from_lines(lines, "part.gcode")
-        await run_job(stage.description, program, lambda _: None, on_told=lambda _: None, host=stage.host)
+        await run_job(stage.description, program, lambda _: None, on_output=lambda _: None, host=stage.host)
 
     with asyncio.Runner(loop_factory=stage.make_loop) as runner:
         runner.run(go())

@@ -29,7 +29,7 @@ def job(stage: HeatMachine, vocabulary: Vocabulary, *lines: str) -> Job:
 
 async def play(stage: HeatMachine, *lines: str) -> None:
     work = job(stage, stage.machine.modules.vocabulary, *lines)
-    await Streamer(stage.machine, work, on_told=lambda _: None, on_state=lambda _: None).run()
+    await Streamer(stage.machine, work, on_output=lambda _: None, on_state=lambda _: None).run()
 
 
 @pytest.mark.parametrize("line", ["G1 E1 F300", "G1 X10 E0.5 F3000", "G1 E-1 F300"])

@@ -17,7 +17,7 @@ from nodes.virtual.world import VirtualLoop, World
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from coordinator.runtime.module_context import Live
+    from coordinator.runtime.module_context import ModuleContext
 
 
 class Stops:
@@ -30,8 +30,8 @@ class Stops:
         self.causes.append(cause)
 
     @property
-    def live(self) -> "Live":
-        return cast("Live", self)
+    def live(self) -> "ModuleContext":
+        return cast("ModuleContext", self)
 
 
 class Source(TemperatureSource):

@@ -7,7 +7,7 @@ from coordinator.gcode.events import Emergency, End, Event, Full, Idle, Position
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
 from coordinator.motion.planner.planner import Planner
-from coordinator.service.core.feeder import ASIDES_MAX, WAITING_MAX, Feeder, FeederFull, Ticket
+from coordinator.service.core.feeder import INTERJECTIONS_MAX, WAITING_MAX, Feeder, FeederFull, QueuedWork
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Rest, WorkError, commands_in
 from coordinator.support.command_options import DEMO_MACHINE
 
@@ -32,10 +32,10 @@ def drive(feeder: Feeder, most: int = 1000) -> list[Event]:
     raise AssertionError("the feeder does not come to an end")
 
 
-def finished(feeder: Feeder) -> list[Ticket]:
-    tickets = list(feeder.finished)
+def finished(feeder: Feeder) -> list[QueuedWork]:
+    found = list(feeder.finished)
     feeder.finished.clear()
-    return tickets
+    return found
 
 
 def file_of(*lines: str) -> FileWork:
@@ -59,9 +59,9 @@ def test_works_are_done_in_order_and_replies_kept_apart(feeder: Feeder) -> None:
 
 
 def test_what_moves_nothing_is_done_at_once(feeder: Feeder) -> None:
-    ticket = feeder.submit(LinesWork(["M114"]))
+    queued = feeder.submit(LinesWork(["M114"]))
     drive(feeder)
-    assert ticket.ends_at_s == 0.0
+    assert queued.ends_at_s == 0.0
 
 
 def test_an_open_end_leaves_the_moves_to_be_joined(feeder: Feeder) -> None:
@@ -100,7 +100,7 @@ def test_pause_reads_no_line_and_resume_the_next_one(feeder: Feeder) -> None:
     feeder.pause()
     read = feeder.planner.moves
     assert isinstance(feeder.step(), Idle)
-    feeder.submit_aside(LinesWork(["M114", "M220 S50"]))
+    feeder.submit_interjection(LinesWork(["M114", "M220 S50"]))
     lines = feeder.planner.lines
     assert isinstance(feeder.step(), Idle)
     (aside,) = finished(feeder)
@@ -172,10 +172,10 @@ def test_queues_are_bounded(feeder: Feeder) -> None:
         feeder.submit(LinesWork(["M114"]))
     with pytest.raises(FeederFull):
         feeder.submit(LinesWork(["M114"]))
-    for _ in range(ASIDES_MAX):
-        feeder.submit_aside(LinesWork(["M114"]))
+    for _ in range(INTERJECTIONS_MAX):
+        feeder.submit_interjection(LinesWork(["M114"]))
     with pytest.raises(FeederFull):
-        feeder.submit_aside(LinesWork(["M114"]))
+        feeder.submit_interjection(LinesWork(["M114"]))
 
 
 def test_close_ends_at_rest(feeder: Feeder) -> None:

@@ -7,14 +7,14 @@ import pytest
 from coordinator.assembly.load import load_machine
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.module_set import build_modules
-from coordinator.service.jobs.resume_homing import WayHome, sure_height, way_home
+from coordinator.service.jobs.resume_homing import ResumeHomingPlan, plan_resume_homing, sure_height
 
 CONFIG = Path("config")
 
 
-def way(path: Path, homed: str = "", *, z_mm: float | None = 12.0, part_mm: float = 12.0) -> WayHome:
+def way(path: Path, homed: str = "", *, z_mm: float | None = 12.0, part_mm: float = 12.0) -> ResumeHomingPlan:
     described = load_machine(str(path))
-    return way_home(described, build_modules(described), homed, part_mm=part_mm, z_mm=z_mm)
+    return plan_resume_homing(described, build_modules(described), homed, part_mm=part_mm, z_mm=z_mm)
 
 
 def with_text(folder: Path, before: str, after: str) -> Path:
@@ -28,10 +28,10 @@ def with_text(folder: Path, before: str, after: str) -> Path:
 @pytest.mark.parametrize("name", ["corexy_toolhead", "cartesian", "corexz"])
 def test_x_and_y_are_homed_above_the_part(name: str) -> None:
     path = CONFIG / f"{name}.cfg"
-    assert way(path) == WayHome(12.0, 17.0, ("G28 X", "G28 Y"))
-    assert way(path, "Z", z_mm=None) == WayHome(None, 17.0, ("G28 X", "G28 Y"))
-    assert way(path, "XY") == WayHome(12.0, 17.0, ())
-    assert way(path, "XYZ", z_mm=None) == WayHome()
+    assert way(path) == ResumeHomingPlan(12.0, 17.0, ("G28 X", "G28 Y"))
+    assert way(path, "Z", z_mm=None) == ResumeHomingPlan(None, 17.0, ("G28 X", "G28 Y"))
+    assert way(path, "XY") == ResumeHomingPlan(12.0, 17.0, ())
+    assert way(path, "XYZ", z_mm=None) == ResumeHomingPlan()
     assert way(path, part_mm=249).up_mm == load_machine(str(path)).limits.position_max[2]
     with pytest.raises(ApiError, match="so Z is not known: home Y Z where the part is not in the way"):
         way(path, "X", z_mm=None)
@@ -40,11 +40,11 @@ def test_x_and_y_are_homed_above_the_part(name: str) -> None:
 def test_a_z_that_homes_away_from_the_part_is_homed(tmp_path: Path) -> None:
     before = "endstop_pin: ^PC2\nposition_endstop: 0"
     path = with_text(tmp_path, before, before.replace("p: 0", "p: 250"))
-    assert way(path, z_mm=None) == WayHome(homing=("G28 Z", "G28 X", "G28 Y"))
+    assert way(path, z_mm=None) == ResumeHomingPlan(homing=("G28 Z", "G28 X", "G28 Y"))
 
 
 def test_towers_go_up() -> None:
-    assert way(CONFIG / "delta.cfg", z_mm=None) == WayHome(homing=("G28",))
+    assert way(CONFIG / "delta.cfg", z_mm=None) == ResumeHomingPlan(homing=("G28",))
 
 
 @pytest.mark.parametrize(

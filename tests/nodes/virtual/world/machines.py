@@ -7,7 +7,7 @@ from nodes.bus.assign import Uuid
 from nodes.bus.bus import UartBus
 from nodes.bus.can_bus import CanBus
 from nodes.link import LinkIO
-from nodes.link.interfaces import IoFactory, LinkIOLike, OnFrame, OnLost
+from nodes.link.interfaces import IoFactory, LinkIoInterface, OnFrame, OnLost
 from nodes.node.states import NodeState
 from nodes.virtual.world import CanPort, CanWire, Port, UartSettings, World, WorldNode, run
 from tests.nodes.machine import make_config, stepper_x
@@ -21,7 +21,7 @@ def uuid(number: int) -> str:
 
 
 def start_io(port: Port) -> IoFactory:
-    def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIOLike:
+    def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface:
         return LinkIO.driven_by(port.open(), on_frame=on_frame, on_closed=on_closed)
 
     return start

@@ -4,15 +4,15 @@ import asyncio
 import contextlib
 
 from coordinator.gcode.commands import Done
-from coordinator.gcode.events import Resting
+from coordinator.gcode.events import StandstillAction
 from coordinator.runtime.machine import MachineStopped
 from nodes.support.errors import CanductorError
 
 
-class RestTask:
+class StandstillTask:
     """EVENT being performed on the running loop; ``look`` until it is over."""
 
-    def __init__(self, event: Resting) -> None:
+    def __init__(self, event: StandstillAction) -> None:
         self._event = event
         self._has_begun = self._is_ending = False
         self._task = asyncio.ensure_future(self._perform())

@@ -5,12 +5,12 @@ import asyncio
 import pytest
 
 from coordinator.gcode.commands import Done
-from coordinator.gcode.events import Resting
-from coordinator.streaming.standstill_task import RestTask
+from coordinator.gcode.events import StandstillAction
+from coordinator.streaming.standstill import StandstillTask
 from nodes.support.errors import CanductorError
 
 
-async def look_until_over(task: RestTask) -> None:
+async def look_until_over(task: StandstillTask) -> None:
     for _ in range(100):
         if task.look():
             return
@@ -30,9 +30,9 @@ def test_what_is_ended_tidies_up_though_it_is_looked_at_meanwhile() -> None:
                 steps.append(step)
         raise AssertionError
 
-    async def go() -> Resting:
-        event = Resting(1, 0.0, perform, Done(("planned",)))
-        task = RestTask(event)
+    async def go() -> StandstillAction:
+        event = StandstillAction(1, 0.0, perform, Done(("planned",)))
+        task = StandstillTask(event)
         await asyncio.sleep(0)
         event.cancelled = True
         await look_until_over(task)
@@ -47,9 +47,9 @@ def test_what_fails_is_told_and_may_have_moved() -> None:
     async def perform() -> Done:
         raise CanductorError("no switch")
 
-    async def go() -> Resting:
-        event = Resting(1, 0.0, perform, None)
-        await look_until_over(RestTask(event))
+    async def go() -> StandstillAction:
+        event = StandstillAction(1, 0.0, perform, None)
+        await look_until_over(StandstillTask(event))
         return event
 
     event = asyncio.run(go())
@@ -61,9 +61,9 @@ def test_what_is_done_is_kept(done: Done | None) -> None:
     async def perform() -> Done | None:
         return done
 
-    async def go() -> Resting:
-        event = Resting(1, 0.0, perform, None)
-        await look_until_over(RestTask(event))
+    async def go() -> StandstillAction:
+        event = StandstillAction(1, 0.0, perform, None)
+        await look_until_over(StandstillTask(event))
         return event
 
     event = asyncio.run(go())
