@@ -101,7 +101,7 @@ static int flush(struct io_thread *thread, uint64_t now) {
 static uint64_t queued(const struct io_thread *thread) {
     if (!io_bounds_queue(thread->bus))
         return IO_QUEUED_UNKNOWN;
-    int bytes = 0;
+    int bytes;
     if (thread->kind == IO_BYTES)
         return ioctl(thread->fd, TIOCOUTQ, &bytes) == 0 ? (uint64_t)bytes : IO_QUEUED_UNKNOWN;
     uint32_t memory[SK_MEMINFO_VARS];
