@@ -132,18 +132,28 @@ def test_a_filter_is_what_matrices_and_integrals_make_of_the_bounds(delays: Dela
         check_filters(one, other)
 
 
-def test_a_way_that_is_slower_from_the_first_exchange_on_is_noticed_as_soon_as_later() -> None:
+@pytest.mark.parametrize("way", [0, 1])
+def test_a_way_that_turns_slower_twice_is_noticed_after_16_exchanges_each_time(way: int) -> None:
+    """... from the very first one on."""
     one, other = both_filters()
-    for exchange in exchanges(lambda _, rng: (BASE_S + 8 * MEAN_S, ordinary(0, rng)[1]), 18.0):
+    rng = random.Random(8)
+    for count in range(36):
+        delays = [BASE_S + rng.expovariate(1 / MEAN_S) for _ in range(2)]
+        delays[way] = BASE_S + (8 if count < 16 else 20) * MEAN_S
+        exchange = 0.9 * (count + 1), (delays[0] - delays[1]) / 2, sum(delays)
         one.add(*exchange)
         other.add(*exchange)
         check_filters(one, other)
-    one, other = both_filters()
-    for exchange in exchanges(lambda _, rng: (ordinary(0, rng)[0], BASE_S + 8 * MEAN_S), 18.0):
-        one.add(*exchange)
-        other.add(*exchange)
+    assert all(len(gaps) < 16 for gaps in other.nearest.values())
+
+
+def test_what_lies_within_the_noise_of_reading_is_no_reason_to_doubt() -> None:
+    one = Filter([0.0, 0.0, 0.0, BASE_S], np.diag([1e-18, 1e-18, 1e-18, 1e-18]).tolist(), 0.0, MEAN_S)
+    other = FilterByMatrices(np.array([0, 0, 0, BASE_S, 0]), np.diag([1e-18] * 4 + [0]), 0.0, MEAN_S)
+    for _ in range(4):
+        one.add(0.0, -0.3e-6, 2 * BASE_S)
+        other.add(0.0, -0.3e-6, 2 * BASE_S)
         check_filters(one, other)
-    assert len(other.nearest[-1]) < 16
 
 
 def test_a_filter_without_any_jitter_trusts_no_bound_better_than_a_tenth_of_a_microsecond() -> None:
