@@ -91,13 +91,13 @@ class ClockEstimator:
     def __init__(self, nominal_freq_hz: int) -> None:
         self._freq_hz = nominal_freq_hz
         self._round_trips_s: deque[float] = deque(maxlen=REMEMBERED)
-        self._zero_ns = 0
-        self._zero_ticks = 0
-        self._last_ns = -1
-        self._contradictions = 0
-        self._start = Start()
-        self._filter: Blend | None = None
         self._estimate: ClockEstimate | None = None
+        # The first sample sets these, in _restart():
+        self._zero_ns: int
+        self._zero_ticks: int
+        self._start: Start
+        self._filter: Blend | None
+        self._contradictions: int
         self.accepted = 0
         self.unusable = 0
         """Answers whose times are not known (a repeated block) or make no sense."""
@@ -114,9 +114,6 @@ class ClockEstimator:
 
     def begin(self, sent_ns: int, received_ns: int, high: int, clock32: int) -> bool:
         """Start, or start anew, with an answer to get_uptime. Returns whether it was usable."""
-        self._round_trips_s.clear()
-        self._last_ns = -1
-        self._contradictions = 0
         self._estimate = None
         self.accepted = 0
         return self._take(sent_ns, received_ns, Ticks(high * _WHOLE + clock32 % _WHOLE))
@@ -149,40 +146,41 @@ class ClockEstimator:
     # ------------------------------------------------------------------------------------------------- fit
 
     def _take(self, sent_ns: int, received_ns: int, ticks: Ticks) -> bool:
-        middle_ns = (sent_ns + received_ns) // 2
-        if sent_ns <= 0 or received_ns <= sent_ns or middle_ns <= self._last_ns:
+        middle_ns = HostTime((sent_ns + received_ns) // 2)
+        last = self._estimate
+        if sent_ns <= 0 or received_ns <= sent_ns or (last is not None and middle_ns <= last.at_ns):
             self.unusable += 1
             return False
         round_trip_s = (received_ns - sent_ns) * 1e-9
         if (
-            self._last_ns < 0
-            or middle_ns - self._last_ns > GAP_NS
-            or self._impossible(middle_ns, ticks, round_trip_s)
+            last is None
+            or middle_ns - last.at_ns > GAP_NS
+            or self._impossible(last, middle_ns, ticks, round_trip_s)
         ):
             self._restart(middle_ns, ticks)
-        self._last_ns = middle_ns
         self._round_trips_s.append(round_trip_s)
         self.accepted += 1
         self._fit(middle_ns, ticks, round_trip_s)
         return True
 
-    def _restart(self, middle_ns: int, ticks: Ticks) -> None:
+    def _restart(self, middle_ns: HostTime, ticks: Ticks) -> None:
         """Measure from here on, as if nothing were known."""
         self._zero_ns, self._zero_ticks = middle_ns, ticks
         self._start, self._filter = Start(), None
         self._round_trips_s.clear()
         self._contradictions = 0
 
-    def _impossible(self, middle_ns: int, ticks: Ticks, round_trip_s: float) -> bool:
+    def _impossible(
+        self, last: ClockEstimate, middle_ns: HostTime, ticks: Ticks, round_trip_s: float
+    ) -> bool:
         """Whether this reading, like the ones before it, was not taken between question and answer."""
-        estimate = self.estimate()
-        off_s = abs(ticks - estimate.ticks_at(HostTime(middle_ns))) / self._freq_hz
-        age_s = (middle_ns - estimate.at_ns) * 1e-9
-        allowed_s = round_trip_s / 2 + estimate.error_s * (1 + age_s / AHEAD_S)
+        off_s = abs(ticks - last.ticks_at(middle_ns)) / self._freq_hz
+        age_s = (middle_ns - last.at_ns) * 1e-9
+        allowed_s = round_trip_s / 2 + last.error_s * (1 + age_s / AHEAD_S)
         self._contradictions = self._contradictions + 1 if off_s > allowed_s else 0
         return self._contradictions >= CONTRADICTIONS
 
-    def _fit(self, middle_ns: int, ticks: Ticks, round_trip_s: float) -> None:
+    def _fit(self, middle_ns: HostTime, ticks: Ticks, round_trip_s: float) -> None:
         faded_s = 0.0
         at_s = (middle_ns - self._zero_ns) * 1e-9
         lead_s = (ticks - self._zero_ticks) / self._freq_hz - at_s
@@ -197,7 +195,7 @@ class ClockEstimator:
         variance = covariance[0][0] + 2 * AHEAD_S * covariance[0][1] + AHEAD_S**2 * covariance[1][1]
         self._estimate = ClockEstimate(
             self._freq_hz * (1 + state[1]),
-            HostTime(middle_ns),
+            middle_ns,
             Ticks(self._zero_ticks + round((at_s + state[0]) * self._freq_hz)),
             CONFIDENCE * math.sqrt(max(covariance[0][0], variance, 0.0)) + faded_s + 1e-6,
             self.round_trip_s / 2,

@@ -31,8 +31,6 @@ MEMORY: Final = 256.0
 LATE: Final = 16
 """So many exchanges later than believable, in one direction, mean that the way has become slower."""
 LEAST_SPREAD_S: Final = 1e-7
-
-
 OUTLIERS: Final = 1e-4
 """Density of an exchange that no bound explains, against the mean delay: what one may count as evidence."""
 
@@ -40,9 +38,10 @@ OUTLIERS: Final = 1e-4
 def hazard(k: float) -> float:
     """Return φ(k)/Φ(k) of the normal distribution, for any K without underflow."""
     if k < -25.0:
-        return -k - 1 / k
-    if k > 37.0:
-        return 0.0
+        x = (
+            1 / k
+        )  # so many terms that of r * (k + r), which is 1 - x**2 and some more, the difference to 1 is right
+        return -k - x + 2 * x**3 - 10 * x**5
     return math.exp(-k * k / 2) * 0.3989422804014327 / (0.5 * math.erfc(-k * 0.7071067811865476))
 
 

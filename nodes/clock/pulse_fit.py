@@ -90,7 +90,7 @@ class PulseFit:
         self._reference_hz = reference_hz
         self._freq_hz = freq_hz
         self._pairs: deque[tuple[Ticks, Ticks]] = deque(maxlen=PAIRS_MAX)
-        self._off_s = np.zeros(0)
+        self._off_s: NDArray[np.float64]
         """How far the pairs lie off the newest fit."""
         self.line: PulseLine | None = None
         """The newest fit; None before the first pair."""

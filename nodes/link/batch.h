@@ -13,7 +13,7 @@
 #include <stdint.h>
 #include <string.h>
 
-enum { BATCH_HEADER = 17 };
+enum { BATCH_REQ_CLOCK = 8, BATCH_SIZE = 16, BATCH_HEADER = 17 }; // where they begin; the payload behind
 
 struct batch_record {
     uint64_t min_clock, req_clock;
@@ -24,11 +24,11 @@ struct batch_record {
 // Reads the record at AT, which has ROOM bytes behind it. Returns its whole length, or 0 when it is cut
 // short.
 static inline size_t batch_read(const uint8_t *at, size_t room, struct batch_record *out) {
-    if (room < BATCH_HEADER || room - BATCH_HEADER < at[16])
+    if (room < BATCH_HEADER || room - BATCH_HEADER < at[BATCH_SIZE])
         return 0;
-    memcpy(&out->min_clock, at, 8);
-    memcpy(&out->req_clock, at + 8, 8);
-    out->size = at[16];
+    memcpy(&out->min_clock, at, sizeof out->min_clock);
+    memcpy(&out->req_clock, at + BATCH_REQ_CLOCK, sizeof out->req_clock);
+    out->size = at[BATCH_SIZE];
     out->payload = at + BATCH_HEADER;
     return (size_t)BATCH_HEADER + out->size;
 }
@@ -36,9 +36,9 @@ static inline size_t batch_read(const uint8_t *at, size_t room, struct batch_rec
 // Writes a record whose PAYLOAD is SIZE bytes; the caller saw to the room. Returns its whole length.
 static inline size_t batch_write(uint8_t *at, uint64_t min_clock, uint64_t req_clock, const uint8_t *payload,
                                  uint8_t size) {
-    memcpy(at, &min_clock, 8);
-    memcpy(at + 8, &req_clock, 8);
-    at[16] = size;
+    memcpy(at, &min_clock, sizeof min_clock);
+    memcpy(at + BATCH_REQ_CLOCK, &req_clock, sizeof req_clock);
+    at[BATCH_SIZE] = size;
     memcpy(at + BATCH_HEADER, payload, size);
     return (size_t)BATCH_HEADER + size;
 }

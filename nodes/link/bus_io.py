@@ -91,7 +91,8 @@ class LinkIO:
         a transport that has ended.
         """
         where = f"{self.name}: node {settings.nodeid}"
-        if self._serial != (settings.nodeid is None) or not 1 <= (settings.nodeid or 1) <= 255:
+        nodeid = settings.nodeid
+        if not (nodeid is None if self._serial else 1 <= (nodeid or 0) <= 255):
             raise LinkError(f"{where}: a link needs a node id of 1..255 on CAN and none on a serial line")
         if settings.receive_window < self._lib.LINK_WINDOW_MIN:
             raise LinkError(
@@ -103,7 +104,7 @@ class LinkIO:
         lost_after_ns = round(settings.lost_after_s * 1e9)
         c_settings = self._ffi.new("struct link_settings *", (settings.receive_window, lost_after_ns))
         number = self._ffi.new("uint32_t *")
-        status = self._lib.io_open_link(self._bus.live(), settings.nodeid or 0, c_settings, number)
+        status = self._lib.io_open_link(self._bus.live(), nodeid or 0, c_settings, number)
         if status == self._lib.IO_TAKEN:
             raise LinkError(
                 f"{where}: there is a link with this id already, or {self._lib.IO_LINKS_MAX} links"
@@ -121,8 +122,8 @@ class LinkIO:
         return link
 
     def learn_bitrate(self, bitrate: int) -> None:
-        """Take BITRATE (bit/s) for what the bus carries, unless that is known already."""
-        if self.stats().bitrate == 0 < bitrate:
+        """Take BITRATE (bit/s, 0: unknown) for what the bus carries, unless that is known already."""
+        if self.stats().bitrate == 0:
             self._lib.io_set_bitrate(self._bus.live(), bitrate)
 
     def send_frame(self, can_id: int, data: bytes) -> None:

@@ -21,7 +21,6 @@ struct io_bus *io_new(enum io_kind kind, const struct io_settings *settings, con
         return NULL;
     bus->kind = kind;
     bus->driver = *driver;
-    bus->allowed = LINK_ALL;
     bus->hold_ns = UINT64_MAX;
     bus->context = context;
     bus->settings = *settings;
@@ -93,10 +92,10 @@ void io_count_wakeup(struct io_bus *bus) {
 void io_handle_time(struct io_bus *bus, uint64_t now) {
     for (size_t i = 0; i < bus->link_count && !bus->ended; i++) {
         struct io_link *node = bus->links[i];
-        uint64_t before = node->link.stats.timeouts + node->link.state;
+        uint64_t timeouts = node->link.stats.timeouts;
         io_deliver(bus, node, NULL, 0, now);
         link_handle_timer(&node->link, now);
-        node->changed |= node->link.stats.timeouts + node->link.state != before;
+        node->changed |= node->link.stats.timeouts != timeouts;
     }
     if (bus->hold_ns <= now) // io_next() follows, or the driver waits for something else
         bus->hold_ns = UINT64_MAX;
@@ -159,28 +158,26 @@ static size_t take_ring(struct io_ring *ring, struct io_event *out, size_t room)
     return taken;
 }
 
-// Moves one flag out as an event; returns whether it did.
-static int take_flag(uint8_t *flag, struct io_event *out, struct io_event event) {
-    if (!*flag)
+// Moves what is pending out as an event, if there is room; returns how many events that makes.
+static size_t take_notice(uint8_t *pending, struct io_event *out, size_t room, struct io_event event) {
+    if (!*pending || room == 0)
         return 0;
-    *flag = 0;
+    *pending = 0;
     *out = event;
     return 1;
 }
 
 static size_t take_notices(struct io_bus *bus, struct io_event *out, size_t room) {
     size_t taken = 0;
-    for (size_t i = 0; i < bus->link_count && room - taken >= 2; i++) {
+    for (size_t i = 0; i < bus->link_count; i++) {
         struct io_link *node = bus->links[i];
         struct io_event drained = {.notice = IO_DRAINED, .link = node->number};
         struct io_event lost = {.notice = IO_LOST, .link = node->number, .value = (int32_t)node->link.cause};
-        taken += (size_t)take_flag(&node->drained_pending, out + taken, drained);
-        taken += (size_t)take_flag(&node->lost_pending, out + taken, lost);
+        taken += take_notice(&node->drained_pending, out + taken, room - taken, drained);
+        taken += take_notice(&node->lost_pending, out + taken, room - taken, lost);
     }
     struct io_event ended = {.notice = IO_ENDED, .value = bus->ended_errno};
-    if (taken < room)
-        taken += (size_t)take_flag(&bus->ended_pending, out + taken, ended);
-    return taken;
+    return taken + take_notice(&bus->ended_pending, out + taken, room - taken, ended);
 }
 
 size_t io_take(struct io_bus *bus, struct io_event *out, size_t room) {

@@ -15,6 +15,11 @@ static int has_room(const struct outlet *outlet) {
     return outlet->room - outlet->size >= IO_FRAME_SIZE && outlet->left > 0;
 }
 
+static void spend(struct io_bus *bus, enum link_class kind, uint32_t bits) {
+    schedule_sent(&bus->schedule, kind, bits);
+    bus->allowed = schedule_allowed(&bus->schedule);
+}
+
 static uint32_t put_frame(struct io_bus *bus, struct outlet *outlet, enum link_class kind, uint32_t can_id,
                           const uint8_t *data, size_t size) {
     struct can_frame frame = {.can_id = can_id, .can_dlc = (uint8_t)size};
@@ -24,7 +29,7 @@ static uint32_t put_frame(struct io_bus *bus, struct outlet *outlet, enum link_c
     outlet->left--;
     uint32_t bits = io_frame_bits(bus, can_id, data, size);
     bus->stats.frames_sent++;
-    schedule_sent(&bus->schedule, kind, bits);
+    spend(bus, kind, bits);
     return bits;
 }
 
@@ -46,13 +51,11 @@ static void count_sent(struct io_bus *bus, struct io_link *node, uint64_t frames
         bus->motion_bits += bits;
 }
 
-// The next block of NODE, as it was offered, at OUT; returns its size, 0: it has none.
+// The next block of NODE, which was offered, at OUT; returns its size.
 static size_t take_block(struct io_bus *bus, struct io_link *node, const struct link_offer *offer,
                          uint64_t now, uint8_t *out) {
     uint64_t content = node->link.motion_content;
     size_t size = link_next_block(&node->link, now, bus->allowed, out);
-    if (!size)
-        return 0;
     node->changed = 1;
     node->cut_offer = *offer;
     node->flows[offer->kind].blocks++;
@@ -65,15 +68,13 @@ static size_t take_block(struct io_bus *bus, struct io_link *node, const struct 
 // node is due earlier.
 static int append_block(struct io_bus *bus, struct io_link *node, uint64_t now) {
     struct link_offer offer;
-    bus->allowed = schedule_allowed(&bus->schedule);
     if (io_next_link(bus, now, bus->allowed, node, &offer) != node)
         return 0;
     size_t left = node->cut_size - node->cut_at;
     memmove(node->cut, node->cut + node->cut_at, left);
-    size_t size = take_block(bus, node, &offer, now, node->cut + left);
+    node->cut_size = left + take_block(bus, node, &offer, now, node->cut + left);
     node->cut_at = 0;
-    node->cut_size = left + size;
-    return size > 0;
+    return 1;
 }
 
 // Cuts blocks of one link into frames while no other link is due earlier. A frame holds the end of one block
@@ -84,7 +85,6 @@ static void send_from(struct io_bus *bus, struct io_link *node, struct outlet *o
         size_t left = node->cut_size - node->cut_at;
         if (left < IO_DATA_MAX && append_block(bus, node, now))
             continue;
-        left = node->cut_size - node->cut_at;
         size_t size = left < IO_DATA_MAX ? left : IO_DATA_MAX;
         if (size) {
             uint32_t bits = put_frame(bus, outlet, (enum link_class)node->cut_offer.kind, can_id,
@@ -101,7 +101,6 @@ static void send_frames(struct io_bus *bus, struct outlet *outlet, uint64_t now)
     struct link_offer offer;
     send_admin(bus, outlet);
     while (has_room(outlet)) {
-        bus->allowed = schedule_allowed(&bus->schedule);
         struct io_link *node = io_next_link(bus, now, bus->allowed, NULL, &offer);
         if (!node)
             return;
@@ -112,7 +111,6 @@ static void send_frames(struct io_bus *bus, struct outlet *outlet, uint64_t now)
 static void send_bytes(struct io_bus *bus, struct outlet *outlet, uint64_t now) {
     struct io_link *node = bus->link_count ? bus->links[0] : NULL;
     while (node && outlet->left && outlet->room - outlet->size >= LINK_WIRE_MAX) {
-        bus->allowed = schedule_allowed(&bus->schedule);
         struct link_offer offer;
         if (!link_next_offer(&node->link, now, bus->allowed, &offer))
             return;
@@ -120,7 +118,7 @@ static void send_bytes(struct io_bus *bus, struct outlet *outlet, uint64_t now) 
         outlet->size += size;
         outlet->left -= size < outlet->left ? size : outlet->left;
         uint32_t bits = io_serial_bits(bus, size);
-        schedule_sent(&bus->schedule, (enum link_class)node->cut_offer.kind, bits);
+        spend(bus, (enum link_class)node->cut_offer.kind, bits);
         count_sent(bus, node, 0, bits);
     }
 }
@@ -134,7 +132,6 @@ static void note_holds(struct io_bus *bus, const struct outlet *outlet, uint64_t
         bus->hold_ns = schedule_room_at(&bus->schedule);
         bus->stats.queue_waits++;
     }
-    bus->allowed = schedule_allowed(&bus->schedule);
     if (bus->allowed == LINK_ALL || !io_next_link(bus, now, LINK_ALL, NULL, &offer))
         return;
     for (int kind = LINK_MOTION; kind < LINK_CLASSES; kind++) {
@@ -161,6 +158,7 @@ size_t io_next(struct io_bus *bus, uint64_t now, uint64_t queued, uint8_t *out, 
     if (bus->ended)
         return 0;
     schedule_advance(&bus->schedule, now);
+    bus->allowed = schedule_allowed(&bus->schedule);
     struct outlet outlet = {.out = out, .room = room, .left = schedule_room(&bus->schedule, queued)};
     if (schedule_breathe(&bus->schedule, unanswered_since(bus)))
         outlet.left = 0;

@@ -31,7 +31,7 @@ struct io_thread {
     pthread_t thread;
     pthread_mutex_t mutex;
     uint8_t stopping;
-    uint8_t sleeping;        // the thread sleeps, or is about to
+    uint8_t sleeping;        // the thread sleeps, or is about to, and nobody has woken it
     uint8_t kernel_full;     // wait until the descriptor is writable
     uint64_t retry_ns;       // the kernel has no buffers; try again then. 0: it has
     uint64_t sleep_until_ns; // when the sleeping thread wakes by itself
@@ -62,7 +62,7 @@ static void read_all(struct io_thread *thread, uint64_t now) {
                 return; // a stream gave less than there was room for: it is empty
         } else if (size == 0) {
             io_end(thread->bus, 0);
-        } else if (errno == EAGAIN || errno == EWOULDBLOCK) {
+        } else if (errno == EAGAIN) {
             return;
         } else if (errno != EINTR) {
             io_end(thread->bus, errno);
@@ -84,7 +84,7 @@ static int flush(struct io_thread *thread, uint64_t now) {
             continue;
         if (done < 0 && errno == ENOBUFS)
             thread->retry_ns = now + NO_BUFFERS_NS;
-        else if (done == 0 || errno == EAGAIN || errno == EWOULDBLOCK)
+        else if (done == 0 || errno == EAGAIN)
             thread->kernel_full = 1;
         else
             io_end(thread->bus, errno);
@@ -100,8 +100,8 @@ static int flush(struct io_thread *thread, uint64_t now) {
 // the core estimates that from the bit rate, so the greater of the two counts.
 static uint64_t queued(const struct io_thread *thread) {
     if (!io_bounds_queue(thread->bus))
-        return 0;
-    int bytes = 0;
+        return IO_QUEUED_UNKNOWN;
+    int bytes;
     if (thread->kind == IO_BYTES)
         return ioctl(thread->fd, TIOCOUTQ, &bytes) == 0 ? (uint64_t)bytes : IO_QUEUED_UNKNOWN;
     uint32_t memory[SK_MEMINFO_VARS];
@@ -110,7 +110,7 @@ static uint64_t queued(const struct io_thread *thread) {
         return IO_QUEUED_UNKNOWN;
     uint64_t frames = 0;
     unsigned buffers = memory[SK_MEMINFO_WMEM_ALLOC] / SKB_BYTES;
-    for (unsigned i = 1; i <= buffers && i <= WRITES && i <= thread->writes; i++)
+    for (unsigned i = 1; i <= buffers && i <= WRITES; i++) // a write that never was has no frames
         frames += thread->write_frames[(thread->writes - i) % WRITES];
     return frames;
 }
@@ -134,6 +134,13 @@ static uint64_t next_deadline(const struct io_thread *thread, uint64_t now) {
     return thread->retry_ns && !io_ended(thread->bus) && thread->retry_ns < at_ns ? thread->retry_ns : at_ns;
 }
 
+// Makes an eventfd unreadable; nobody else reads it.
+static void drain(int fd) {
+    uint64_t count;
+    ssize_t done = read(fd, &count, sizeof count);
+    (void)done;
+}
+
 // Sleeps until the descriptor, a caller or time asks for work; returns what poll saw on the descriptor.
 static short sleep_unlocked(struct io_thread *thread, uint64_t now) {
     struct pollfd fds[2] = {{.fd = io_ended(thread->bus) ? -1 : thread->fd, .events = POLLIN},
@@ -145,18 +152,17 @@ static short sleep_unlocked(struct io_thread *thread, uint64_t now) {
     struct timespec wait = {.tv_sec = (time_t)(wait_ns / NS_PER_S), .tv_nsec = (long)(wait_ns % NS_PER_S)};
     thread->sleeping = 1;
     pthread_mutex_unlock(&thread->mutex);
-    int ready = ppoll(fds, 2, thread->sleep_until_ns == UINT64_MAX ? NULL : &wait, NULL);
-    uint64_t count;
-    if (ready > 0 && (fds[1].revents & POLLIN) && read(thread->wake_fd, &count, sizeof count) < 0)
-        ready = 0; // cannot happen: the eventfd was readable and this thread alone reads it
+    ppoll(fds, 2, thread->sleep_until_ns == UINT64_MAX ? NULL : &wait, NULL); // fails: nothing was seen
+    if (fds[1].revents & POLLIN)
+        drain(thread->wake_fd);
     pthread_mutex_lock(&thread->mutex);
-    thread->sleeping = 0;
     io_count_wakeup(thread->bus);
-    return (short)(ready > 0 ? fds[0].revents : 0);
+    return fds[0].revents;
 }
 
+// In the first 2 ms of a computer's uptime the answer is yes, which costs a needless read.
 static int overslept(const struct io_thread *thread, uint64_t now) {
-    return now > thread->sleep_until_ns && now - thread->sleep_until_ns > OVERSLEPT_NS;
+    return now - OVERSLEPT_NS > thread->sleep_until_ns;
 }
 
 static void *run(void *argument) {
@@ -212,7 +218,7 @@ static void kick(void *context) {
         wake(thread);
 }
 
-// An eventfd holds 2^64-2 such ones, and nobody else reads it: neither call can fail.
+// An eventfd holds 2^64-2 such ones.
 static void notify(void *context) {
     uint64_t one = 1;
     ssize_t done = write(((struct io_thread *)context)->notice_fd, &one, sizeof one);
@@ -220,9 +226,7 @@ static void notify(void *context) {
 }
 
 static void quiet(void *context) {
-    uint64_t count;
-    ssize_t done = read(((struct io_thread *)context)->notice_fd, &count, sizeof count);
-    (void)done;
+    drain(((struct io_thread *)context)->notice_fd);
 }
 
 // ------------------------------------------------------------------------------------------- start and end
@@ -243,7 +247,7 @@ static void forget(struct io_thread *thread) {
 // bytes for a frame (or for a short run of them on a stream) and doubles the figure it is given. No socket:
 // no such buffer.
 static void bound_kernel_queue(int fd) {
-    int bytes = KERNEL_FRAMES * 768 / 2;
+    int bytes = KERNEL_FRAMES * SKB_BYTES / 2;
     setsockopt(fd, SOL_SOCKET, SO_SNDBUF, &bytes, sizeof bytes);
 }
 

@@ -11,7 +11,7 @@ AREAS: Final[dict[str, tuple[str, ...]]] = {
     "objects": ("firmware/objects/*.[ch]",),
     "net": ("firmware/net/*.[ch]",),
     "link": ("nodes/link/*.c", "nodes/link/*.h", "nodes/link/*.py"),
-    "clock": ("nodes/clock/*.py",),
+    "clock": ("nodes/clock/*.py", "nodes/node/clock_keeper.py"),
     "homing": (
         "coordinator/runtime/moves/homing.py",
         "coordinator/modules/homing/homing.py",

@@ -1,5 +1,7 @@
 """The states of a link: the table, its page, and that the link goes by it."""
 
+import runpy
+import warnings
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,13 @@ LOST_AFTER_NS = 1000 * MS
 
 def test_the_diagram_of_the_states_is_not_stale() -> None:
     assert (ROOT / "docs" / "link-states.md").read_text() == page()
+
+
+def test_the_page_is_written_by_the_module(capsys: pytest.CaptureFixture[str]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # it is imported here, too
+        runpy.run_module("nodes.link.states", run_name="__main__")
+    assert capsys.readouterr().out == page()
 
 
 def test_the_words_cover_the_tables_states_and_events() -> None:
