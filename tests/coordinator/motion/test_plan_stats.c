@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // sources: coordinator/motion/stats/plan_stats.c nodes/support/can_bits.c firmware/wire/vlq.c
-// sources: firmware/wire/block.c Plan statistics: peaks, bins and their merging, frames and their bits.
+// sources: firmware/wire/block.c
+// Plan statistics: peaks, bins and their merging, frames and their bits.
 #include "coordinator/motion/stats/plan_stats.h"
 #include "nodes/link/batch.h"
 #include "nodes/support/can_bits.h"

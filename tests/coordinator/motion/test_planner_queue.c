@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // sources: coordinator/motion/planner/planner_*.c coordinator/motion/planner/gcode_lines.c
-// sources: coordinator/motion/planner/gcode_arcs.c The hot path and the look-ahead under the sanitizers: random text,
+// sources: coordinator/motion/planner/gcode_arcs.c
+// The hot path and the look-ahead under the sanitizers: random text,
 // random moves, every ring and queue edge.
 #include "coordinator/motion/planner/gcode_lines.h"
 #include "tests/check.h"
