@@ -120,6 +120,10 @@ static void a_start_that_fails_leaves_nothing_behind(void) {
         CHECK_EQUAL(kernel_open_fds(), 0);
         CHECK(!kernel.mutex_exists);
     }
+    kernel_reset();
+    kernel.no_memory = 1;
+    CHECK(!io_start(LINE_FD, IO_BYTES, &unknown_speed));
+    CHECK_EQUAL(kernel.event_calls, 0);
 }
 
 // ----------------------------------------------------------------------------------------------------
