@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // sources: firmware/wire/*.c nodes/link/[a-hj-z]*.c nodes/can_bits.c
 // sources: nodes/link/io_[fr]*.c nodes/link/io_s[ct]*.c nodes/link/io_send.c
-// A computer without memory: what cannot be made is refused, and nothing is left behind (the sanitizer sees it).
+// A computer without memory: what cannot be made is refused, and nothing is left behind (the sanitizer sees
+// it).
 #include <stdlib.h>
 
 #include "tests/check.h"
