@@ -238,6 +238,17 @@ def test_of_exchanges_that_are_equally_fast_the_first_one_says_where_to_look() -
         check_same(state, wanted, np.sqrt(np.diag(wanted_covariance)), 1e-4)
 
 
+def test_a_bound_that_says_all_there_is_known_is_not_taken_for_what_others_say() -> None:
+    """After a silence only one direction was quick: its factor makes up the belief but for a thousandth."""
+    one, other = Start(), StartByRows()
+    for exchange in ((0.0, 0.0, 300e-6), (100.0, -1e-3, 2.3e-3), (101.0, -1e-3, 2.3e-3)):
+        state, covariance = one.add(*exchange)
+        wanted, wanted_covariance = other.add(*exchange)
+        deviation = np.sqrt(np.diag(wanted_covariance))
+        check_same(state, wanted, deviation, 1e-3)
+        check_same(covariance, wanted_covariance, np.outer(deviation, deviation), 1e-3)
+
+
 def test_the_start_expects_some_jitter_even_where_it_saw_none() -> None:
     one, quick = Start(), Start()
     for count in range(1, 9):

@@ -9,7 +9,7 @@ import pytest
 from nodes.clock import SETTLE_SAMPLES, ClockEstimate
 from nodes.clock_keeper import ClockKeeper
 from nodes.conversation import Conversation
-from nodes.node_errors import NodeLost
+from nodes.node_errors import NodeLost, NodeShutdown
 from nodes.seams import LinkLike, OnLost, OnResponses
 from tests.nodes import virtual_time
 from tests.nodes.twin_bus import DELAY_S, TwinIO, TwinLink, TwinNode
@@ -206,6 +206,22 @@ def test_when_the_conversation_fails_keeping_the_clock_is_over() -> None:
     assert bench.run(main) == []
     assert bench.lost == ["it does not answer"]
     assert len(bench.link.sent) == 1
+
+
+def test_a_shutdown_of_the_node_is_no_reason_to_lose_its_clock() -> None:
+    bench = Bench()
+
+    async def main(_: ClockKeeper) -> None:
+        await asyncio.sleep(0.0001)  # now it is asked for its uptime
+        bench.talk.fail(NodeShutdown("it stopped"), shutdown=True)
+        await asyncio.sleep(0.0259)  # ... and now for its clock
+        bench.talk.fail(NodeShutdown("it stopped"), shutdown=True)
+        await asyncio.sleep(0.01)
+        assert bench.asked == ["get_uptime", "get_clock"]
+        assert len(bench.estimates) == 2
+
+    bench.run(main)
+    assert bench.lost == []
 
 
 def test_a_bug_is_reported_and_the_node_given_up() -> None:
