@@ -25,8 +25,8 @@ class Blend:
         self._warming = first
         self._steady = first.steady()
         self._odds = 0.0
-        self.state = [0.0, 0.0]
-        self.covariance = [[0.0, 0.0], [0.0, 0.0]]
+        self.state = first.state[:2]
+        self.covariance = [row[:2] for row in first.covariance[:2]]
 
     def add(self, at_s: float, lead_s: float, round_trip_s: float) -> None:
         """Take an exchange in whose middle, AT_S, the clock would have been ahead by LEAD_S."""
@@ -45,7 +45,7 @@ class Blend:
     def _mix(self, share: float) -> None:
         """Set state and covariance to those of both filters together, the steady one having SHARE."""
         one, two = self._warming, self._steady
-        apart = [b - a for a, b in zip(one.state[:2], two.state[:2], strict=True)]
+        apart = [two.state[i] - one.state[i] for i in (0, 1)]
         for i in (0, 1):
             self.state[i] = one.state[i] + share * apart[i]
             for j in (0, 1):

@@ -47,8 +47,8 @@ class Start:
         both = (1.0, at_s, bend, 1.0), (-1.0, -at_s, -bend, 1.0)
         self._rows = np.concatenate((self._rows, both))
         self._bounds = np.concatenate((self._bounds, (way_s + lead_s, way_s - lead_s)))
-        self._precision = np.concatenate((self._precision, (0.0, 0.0)))
-        self._shift = np.concatenate((self._shift, (0.0, 0.0)))
+        self._precision = np.concatenate((self._precision, np.zeros(2)))
+        self._shift = np.concatenate((self._shift, np.zeros(2)))
         if is_fastest:
             self._expect(lead_s, round_trip_s)
         guess = self._guess()

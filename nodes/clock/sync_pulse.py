@@ -61,9 +61,9 @@ class PulseClock:
 @dataclass(slots=True)
 class _Follower:
     fit: PulseFit
-    missed: int = 0
+    missed: int
     """Rounds in a row without a pair."""
-    settling: int = 0
+    settling: int
     """Rounds for which it may still hasten the pulses."""
 
 

@@ -161,7 +161,7 @@ class StartByRows:
         return move @ mean, move @ covariance @ move.T
 
     def _belief(self, bounds: list[tuple[Array, float]]) -> tuple[Array, Array]:
-        fastest_s, lead_s = min((trip, lead) for _, lead, trip in self.exchanges)
+        _, lead_s, fastest_s = min(self.exchanges, key=lambda exchange: exchange[2])
         sd = np.array([fastest_s, 1.5e-4, 1e-8, fastest_s / 3])
         information = np.diag(sd**-2)
         pull = np.array([lead_s, 0, 0, fastest_s / 3]) * sd**-2

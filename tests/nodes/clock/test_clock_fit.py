@@ -187,6 +187,8 @@ def test_a_steady_filter_shares_nothing_with_the_one_it_was_made_from() -> None:
 def test_a_blend_weighs_two_filters_by_what_they_foretold() -> None:
     filter_, other_filter = both_filters()
     one, other = Blend(filter_), BlendByMatrices(other_filter)
+    assert one.state == STATE[:2]
+    assert one.covariance == [row[:2] for row in COVARIANCE[:2]]
     odds: list[float] = []
     for exchange in exchanges(ordinary, 600.0, step_s=4.0, bend=1.5e-8, bends_from_s=400.0):
         one.add(*exchange)
@@ -226,6 +228,25 @@ def test_the_start_is_expectation_propagation_over_all_bounds(delays: Delays) ->
         check_same(covariance, wanted_covariance, np.outer(deviation, deviation), 1e-5)
         assert one.spread_s == pytest.approx(other.spread_s, rel=1e-6)
         assert one.samples == count
+
+
+def test_of_exchanges_that_are_equally_fast_the_first_one_says_where_to_look() -> None:
+    one, other = Start(), StartByRows()
+    for exchange in ((0.1, 40e-6, 300e-6), (0.2, -40e-6, 300e-6), (0.3, 0.0, 290e-6), (0.4, 9e-6, 290e-6)):
+        state, _ = one.add(*exchange)
+        wanted, wanted_covariance = other.add(*exchange)
+        check_same(state, wanted, np.sqrt(np.diag(wanted_covariance)), 1e-4)
+
+
+def test_a_bound_that_says_all_there_is_known_is_not_taken_for_what_others_say() -> None:
+    """After a silence only one direction was quick: its factor makes up the belief but for a thousandth."""
+    one, other = Start(), StartByRows()
+    for exchange in ((0.0, 0.0, 300e-6), (100.0, -1e-3, 2.3e-3), (101.0, -1e-3, 2.3e-3)):
+        state, covariance = one.add(*exchange)
+        wanted, wanted_covariance = other.add(*exchange)
+        deviation = np.sqrt(np.diag(wanted_covariance))
+        check_same(state, wanted, deviation, 1e-3)
+        check_same(covariance, wanted_covariance, np.outer(deviation, deviation), 1e-3)
 
 
 def test_the_start_expects_some_jitter_even_where_it_saw_none() -> None:

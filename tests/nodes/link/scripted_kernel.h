@@ -54,7 +54,8 @@ static struct kernel {
     unsigned event_calls;
     uint64_t count[EVENT_FDS];
     uint8_t is_open[EVENT_FDS];
-    // The thread, its mutex and its sleep.
+    // The thread, its mutex, its memory and its sleep.
+    uint8_t no_memory;
     int thread_error; // that pthread_create() gives
     unsigned threads, slack_ns;
     pthread_t owner;
@@ -111,6 +112,10 @@ static inline int kernel_mutex_destroy(pthread_mutex_t *mutex) {
     CHECK(kernel.mutex_exists && !kernel.held);
     kernel.mutex_exists = 0;
     return 0;
+}
+
+static inline void *kernel_calloc(size_t count, size_t size) {
+    return kernel.no_memory ? NULL : calloc(count, size);
 }
 
 // The thread runs until it sleeps.
@@ -295,6 +300,7 @@ static inline int kernel_setsockopt(int fd, int level, int option, const void *v
     return 0;
 }
 
+#define calloc kernel_calloc
 #define clock_gettime kernel_clock_gettime
 #define close kernel_close
 #define eventfd kernel_eventfd

@@ -135,11 +135,11 @@ def test_a_bit_rate_is_learned_once() -> None:
         bus.io.learn_bitrate(bitrate)
         bus.driver.receive(b"")
         assert bus.io.stats().bitrate == known
-    known = Bus(ByHand(serial=False, bitrate=1_000_000))
-    known.driver.receive(b"")
-    known.io.learn_bitrate(500_000)
-    known.driver.receive(b"")
-    assert known.io.stats().bitrate == 1_000_000
+    bus = Bus(ByHand(serial=False, bitrate=1_000_000))
+    bus.driver.receive(b"")
+    bus.io.learn_bitrate(500_000)
+    bus.driver.receive(b"")
+    assert bus.io.stats().bitrate == 1_000_000
 
 
 # --------------------------------------------------------------------------------------------- handing over

@@ -208,7 +208,7 @@ static void check_written(uint64_t *sequence, const void *copy, size_t size, uns
     written.first = copy;
     written.end = (const uint8_t *)copy + size;
     before_store = note_written;
-    io_publish(scene.bus);
+    io_handle_time(scene.bus, scene.now_ns);
     before_store = NULL;
     CHECK_EQUAL(before % 2, 0);
     CHECK_EQUAL(written.sequences, 2 * times);

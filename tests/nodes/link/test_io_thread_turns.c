@@ -120,6 +120,10 @@ static void a_start_that_fails_leaves_nothing_behind(void) {
         CHECK_EQUAL(kernel_open_fds(), 0);
         CHECK(!kernel.mutex_exists);
     }
+    kernel_reset();
+    kernel.no_memory = 1;
+    CHECK(!io_start(LINE_FD, IO_BYTES, &unknown_speed));
+    CHECK_EQUAL(kernel.event_calls, 0);
 }
 
 // ----------------------------------------------------------------------------------------------------
@@ -354,6 +358,24 @@ static void the_thread_sleeps_until_the_next_deadline(void) {
     stop(thread);
 }
 
+// A thread that is on its way finds what was queued meanwhile, and sends it together.
+static void a_thread_that_was_woken_sends_the_rest(void) {
+    struct io_thread *thread = start(IO_CAN_STREAM, &unknown_speed);
+    uint32_t link;
+    CHECK_EQUAL(io_open_link(thread->bus, NODE, &usual, &link), IO_OK);
+    CHECK_EQUAL(io_send(thread->bus, link, LINK_CONTROL, (const uint8_t *)"\5", 1, 0, 0), IO_OK);
+    CHECK(kernel_is_woken()); // there is a deadline now
+    CHECK_EQUAL(kernel.write_calls, 1);
+    for (uint8_t i = 1; i <= 3; i++)
+        CHECK_EQUAL(send_frame(thread, i), IO_OK);
+    CHECK_EQUAL(kernel.write_calls, 1);
+    kernel.sent_size = 0;
+    kernel_turn(0);
+    CHECK_EQUAL(kernel.write_calls, 1);
+    check_sent((const uint8_t[]){1, 2, 3}, 3);
+    stop(thread);
+}
+
 // Who woke much too late reads before it judges by the time: the answer may be there.
 static void a_thread_that_overslept_reads_first(void) {
     struct io_thread *thread = start(IO_BYTES, &unknown_speed);
@@ -490,6 +512,7 @@ int main(void) {
     a_kernel_without_buffers_is_asked_again_later();
     a_line_may_end_while_it_is_written();
     the_thread_sleeps_until_the_next_deadline();
+    a_thread_that_was_woken_sends_the_rest();
     a_thread_that_overslept_reads_first();
     a_sockets_buffers_are_counted_as_the_writes_they_hold();
     a_serial_lines_bytes_are_counted();

@@ -1,0 +1,244 @@
+"""Keeping the clock of one node: when it is asked, when it is suspected, and how keeping it ends."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+
+from nodes.clock import SETTLE_SAMPLES, ClockEstimate
+from nodes.clock_keeper import ClockKeeper
+from nodes.conversation import Conversation
+from nodes.node_errors import NodeLost, NodeShutdown
+from nodes.seams import LinkLike, OnLost, OnResponses
+from tests.nodes import virtual_time
+from tests.nodes.twin_bus import DELAY_S, TwinIO, TwinLink, TwinNode
+
+OUT_NS, BACK_NS = 120_000, 150_000
+
+
+class OwingLink(TwinLink):
+    """Says how many commands the node has not acknowledged."""
+
+    owed = 0
+
+    def pending(self) -> int:
+        return self.owed
+
+
+class Bench:
+    """A keeper over a real conversation with a twin node, and what it reported; it is its connector, too."""
+
+    def __init__(self) -> None:
+        self.twin = TwinNode()
+        self.io = TwinIO([self.twin])
+        self.talk = Conversation("mainboard")
+        self.link = OwingLink(self.io, self.twin, self.talk.receive, lambda _: None)
+        self.talk.attach(self.link)
+        self.talk.dictionary = self.twin.dictionary
+        self.estimates: list[ClockEstimate] = []
+        self.sampled_s: list[float] = []
+        self.suspected_s: list[float] = []
+        self.lost: list[str] = []
+        self.blocks: list[tuple[int, int, bool]] = []
+        self.on_sample: Callable[[], None] = lambda: None
+
+    # What a connector does:
+
+    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
+        raise AssertionError("it is connected")
+
+    def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
+        self.blocks.append((content_bytes, bitrate, answer))
+        return BACK_NS if answer else OUT_NS
+
+    def forget(self) -> None:
+        raise AssertionError("it was not reset")
+
+    def why_silent(self) -> Exception | None:
+        return None
+
+    def check_identity(self, found: bytes) -> None:
+        raise AssertionError("it was not asked")
+
+    def suspect(self) -> None:
+        self.suspected_s.append(asyncio.get_running_loop().time())
+
+    # ------------------------------------------------------------------------------------------------------
+
+    async def _sampled(self) -> None:
+        self.sampled_s.append(asyncio.get_running_loop().time())
+        self.on_sample()
+
+    def run(self, main: Callable[[ClockKeeper], Awaitable[None]]) -> list[dict[str, Any]]:
+        """Run MAIN beside a keeper, then close it; return what the loop was told of bugs."""
+        bugs: list[dict[str, Any]] = []
+
+        async def all_of_it() -> None:
+            asyncio.get_running_loop().set_exception_handler(lambda _, context: bugs.append(context))
+            keeper = ClockKeeper(
+                self.talk,
+                self,
+                on_estimate=self.estimates.append,
+                on_sample=self._sampled,
+                on_lost=self.lost.append,
+            )
+            await main(keeper)
+            await keeper.close()
+            await keeper.close()
+
+        virtual_time.run(all_of_it())
+        return bugs
+
+    @property
+    def asked(self) -> list[str]:
+        return [text.split()[0] for text in self.twin.executed]
+
+
+def sleeping(seconds: float) -> Callable[[ClockKeeper], Awaitable[None]]:
+    async def sleep(_: ClockKeeper) -> None:
+        await asyncio.sleep(seconds)
+
+    return sleep
+
+
+def test_a_clock_is_learned_by_asking_often_and_kept_by_asking_now_and_then() -> None:
+    bench = Bench()
+
+    async def learn(keeper: ClockKeeper) -> None:
+        await keeper.ready.wait()
+        assert keeper.estimator.accepted == SETTLE_SAMPLES == len(bench.estimates)
+        await asyncio.sleep(2.5)
+
+    assert bench.run(learn) == []
+    assert bench.asked == ["get_uptime"] + ["get_clock"] * 49
+    steps_s = [b - a for a, b in zip(bench.sampled_s[:-1], bench.sampled_s[1:], strict=True)]
+    intervals_s = [0.025] * 15 + [0.05] * 32 + [0.9843] * 2
+    assert [step_s - 2 * DELAY_S for step_s in steps_s] == pytest.approx(intervals_s, abs=1e-10)
+    assert bench.link.clocks == [(e.freq_hz, e.at_ns, e.at_ticks) for e in bench.estimates]
+    assert bench.lost == []
+    assert bench.suspected_s == []
+
+
+def test_the_time_on_the_wire_is_taken_off_the_exchange() -> None:
+    bench = Bench()
+    bench.talk.dictionary.constants["CANBUS_FREQUENCY"] = 250_000
+    bench.run(sleeping(0.1))
+    first = bench.link.sent[0][0]
+    assert bench.blocks[0] == (len(first), 250_000, False)
+    content_bytes, bitrate, is_answer = bench.blocks[1]
+    assert (bitrate, is_answer) == (250_000, True)
+    assert content_bytes > len(first)
+    trip_s = 2 * DELAY_S - (OUT_NS + BACK_NS) * 1e-9
+    assert bench.estimates[0].asymmetry_s == pytest.approx(trip_s / 2, rel=1e-6)
+    middle_s = bench.sampled_s[0] - DELAY_S + (OUT_NS - BACK_NS) * 0.5e-9
+    assert bench.estimates[0].at_ns * 1e-9 == pytest.approx(middle_s, abs=1e-8)
+
+
+def test_where_the_bit_rate_is_unknown_that_is_what_the_connector_hears() -> None:
+    bench = Bench()
+    bench.talk.dictionary.constants.pop("CANBUS_FREQUENCY", None)
+    bench.run(sleeping(0.01))
+    assert [block[1] for block in bench.blocks] == [0, 0]
+
+
+def test_a_node_that_does_not_answer_is_suspected_and_asked_again() -> None:
+    bench = Bench()
+    bench.twin.alive = False
+    bench.run(sleeping(0.85))
+    times_s = [t - virtual_time.START_S for t in bench.suspected_s]
+    assert times_s == pytest.approx([0.25, 0.525, 0.8], abs=1e-6)
+    assert bench.estimates == []
+    assert bench.lost == []
+
+
+def test_an_answer_of_unknown_times_is_not_used() -> None:
+    bench = Bench()
+
+    async def main(keeper: ClockKeeper) -> None:
+        await asyncio.sleep(0.01)
+        known = len(bench.estimates)
+        bench.twin.alive = False
+        await asyncio.sleep(0.02)
+        bench.link.say(bench.twin.response("clock", clock=5))  # a repeated block carries no time
+        await asyncio.sleep(0.01)
+        assert keeper.estimator.unusable == 1
+        assert len(bench.estimates) == known == len(bench.link.clocks)
+        assert len(bench.sampled_s) == known + 1, "it is a sign of life nevertheless"
+
+    bench.run(main)
+
+
+def test_a_node_that_owes_answers_and_says_nothing_is_suspected_every_quarter_of_a_second() -> None:
+    bench = Bench()
+
+    async def main(keeper: ClockKeeper) -> None:
+        await keeper.ready.wait()
+        sampled_s = bench.sampled_s[-1]
+        bench.link.owed = 1
+        await asyncio.sleep(0.98)
+        assert [t - sampled_s for t in bench.suspected_s] == pytest.approx([0.25, 0.5, 0.75], abs=1e-6)
+        await asyncio.sleep(0.1)
+        assert len(bench.suspected_s) == 3, "an answer to the next question"
+        await asyncio.sleep(0.25)
+        bench.link.say(bench.twin.response("clock", clock=5))  # whatever it says
+        await asyncio.sleep(0.2)
+        bench.suspected_s.clear()
+        await asyncio.sleep(0.1)
+        assert bench.suspected_s == []
+        bench.talk.detach()
+        await asyncio.sleep(0.25)
+        assert bench.suspected_s == []
+
+    bench.run(main)
+
+
+def test_when_the_conversation_fails_keeping_the_clock_is_over() -> None:
+    bench = Bench()
+    bench.twin.alive = False
+
+    async def main(keeper: ClockKeeper) -> None:
+        await asyncio.sleep(0.1)
+        bench.talk.fail(NodeLost("it does not answer"))
+        await asyncio.sleep(3)
+        assert not keeper.ready.is_set()
+
+    assert bench.run(main) == []
+    assert bench.lost == ["it does not answer"]
+    assert len(bench.link.sent) == 1
+
+
+def test_a_shutdown_of_the_node_is_no_reason_to_lose_its_clock() -> None:
+    bench = Bench()
+
+    async def main(_: ClockKeeper) -> None:
+        await asyncio.sleep(0.0001)  # now it is asked for its uptime
+        bench.talk.fail(NodeShutdown("it stopped"), shutdown=True)
+        await asyncio.sleep(0.0259)  # ... and now for its clock
+        bench.talk.fail(NodeShutdown("it stopped"), shutdown=True)
+        await asyncio.sleep(0.01)
+        assert bench.asked == ["get_uptime", "get_clock"]
+        assert len(bench.estimates) == 2
+
+    bench.run(main)
+    assert bench.lost == []
+
+
+def test_a_bug_is_reported_and_the_node_given_up() -> None:
+    bench = Bench()
+    bug = ZeroDivisionError()
+
+    def fail() -> None:
+        raise bug
+
+    bench.on_sample = fail
+    bugs = bench.run(sleeping(1.0))
+    assert [context["exception"] for context in bugs] == [bug]
+    assert [text.split(";")[0] for text in bench.lost] == ["its clock is no longer kept"]
+    assert len(bench.sampled_s) == 1
+
+
+def test_closing_is_no_loss() -> None:
+    bench = Bench()
+    assert bench.run(sleeping(0.3)) == []
+    assert bench.lost == []
