@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from nodes.clock import SETTLE_SAMPLES, ClockEstimate
-from nodes.clock_keeper import ClockKeeper
-from nodes.conversation import Conversation
-from nodes.node_errors import NodeLost, NodeShutdown
-from nodes.seams import LinkLike, OnLost, OnResponses
+from nodes.clock.clock import SETTLE_SAMPLES, ClockEstimate
+from nodes.link.interfaces import LinkLike, OnLost, OnResponses
+from nodes.node.clock_keeper import ClockKeeper
+from nodes.node.errors import NodeLost, NodeShutdown
+from nodes.node.request_reply import Conversation
 from tests.nodes import virtual_time
 from tests.nodes.twin_bus import DELAY_S, TwinIO, TwinLink, TwinNode
 
