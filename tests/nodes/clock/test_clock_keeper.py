@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from nodes.clock.clock import SETTLE_SAMPLES, ClockEstimate
-from nodes.link.interfaces import LinkLike, OnLost, OnResponses
+from nodes.link.interfaces import Link, OnLost, OnResponses
 from nodes.node.clock_keeper import ClockKeeper
 from nodes.node.errors import NodeLost, NodeShutdown
-from nodes.node.request_reply import Conversation
+from nodes.node.request_reply import RequestReply
 from tests.nodes import virtual_time
 from tests.nodes.twin_bus import DELAY_S, TwinIO, TwinLink, TwinNode
 
@@ -32,7 +32,7 @@ class Bench:
     def __init__(self) -> None:
         self.twin = TwinNode()
         self.io = TwinIO([self.twin])
-        self.talk = Conversation("mainboard")
+        self.talk = RequestReply("mainboard")
         self.link = OwingLink(self.io, self.twin, self.talk.receive, lambda _: None)
         self.talk.attach(self.link)
         self.talk.dictionary = self.twin.dictionary
@@ -45,7 +45,7 @@ class Bench:
 
     # What a connector does:
 
-    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkLike:
+    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> Link:
         raise AssertionError("it is connected")
 
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
