@@ -9,8 +9,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 RETIRED = {
     "Vigil": "NodeWatchdog",
-    "LinkLike": "Link",
-    "LinkIOLike": "LinkIO",
+    "LinkLike": "LinkInterface",
+    "LinkIOLike": "LinkIoInterface",
     "Census": "NodeDiscovery",
     "CensusResult": "DiscoveredNodes",
     "Overhearing": "PassiveDiscovery",

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from nodes.clock.clock import SETTLE_SAMPLES, ClockEstimate
-from nodes.link.interfaces import Link, OnLost, OnResponses
+from nodes.link.interfaces import LinkInterface, OnLost, OnResponses
 from nodes.node.clock_keeper import ClockKeeper
 from nodes.node.errors import NodeLost, NodeShutdown
 from nodes.node.request_reply import RequestReply
@@ -45,7 +45,7 @@ class Bench:
 
     # What a connector does:
 
-    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> Link:
+    async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
         raise AssertionError("it is connected")
 
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
