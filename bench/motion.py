@@ -29,7 +29,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from coordinator.motion.specs import NodeStreamSpec, StepKinematics, StepperSpec
+from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps.steps import StepGenerator
 from tests.coordinator.motion.exact_program import Planned, plan_program
 
@@ -186,17 +186,16 @@ def generation_cases() -> Iterator[Generation]:
     yield Generation("cartesian x and y, mzv", linear(cartesian), shaped=True)
     yield Generation("corexy, mzv", linear(corexy), shaped=True)
     yield Generation("extruder, pressure advance", extruder, advanced=True)
-    kinds = StepKinematics
     delta, winch = (260.0**2, 130.0, -75.0), (-300.0, 500.0, 900.0)
     rotary = (300.0, 700.0, 150.0, 600.0, cos(2.0), sin(2.0))
-    for kind, params in ((kinds.DELTA, delta), (kinds.WINCH, winch), (kinds.ROTARY_DELTA, rotary)):
-        distance = 1e-4 if kind == kinds.ROTARY_DELTA else 0.00625
+    for kind, params in (("delta", delta), ("winch", winch), ("rotary_delta", rotary)):
+        distance = 1e-4 if kind == "rotary_delta" else 0.00625
         specs = [curved(kind, params, distance)]
         for shaped in (False, True):
-            yield Generation(kind.name.lower() + ", mzv" * shaped, specs, MIDDLE, shaped)
-    yield Generation("deltesian", [curved(kinds.DELTESIAN, (300.0**2, -150.0), 0.00625)], MIDDLE)
-    yield Generation("polar radius", [curved(kinds.POLAR_RADIUS, (), 0.00625)], (-10.0, -10.0, 0, 0))
-    yield Generation("polar angle", [curved(kinds.POLAR_ANGLE, (), 1e-4)], (-10.0, -10.0, 0, 0))
+            yield Generation(kind + ", mzv" * shaped, specs, MIDDLE, shaped)
+    yield Generation("deltesian", [curved("deltesian", (300.0**2, -150.0), 0.00625)], MIDDLE)
+    yield Generation("polar radius", [curved("polar_radius", (), 0.00625)], (-10.0, -10.0, 0, 0))
+    yield Generation("polar angle", [curved("polar_angle", (), 1e-4)], (-10.0, -10.0, 0, 0))
 
 
 def linear(
@@ -205,7 +204,7 @@ def linear(
     return [StepperSpec(f"s{i}", 0, i, w, distance, False, 1e-7) for i, w in enumerate(weights)]
 
 
-def curved(kind: StepKinematics, params: tuple[float, ...], distance: float) -> StepperSpec:
+def curved(kind: str, params: tuple[float, ...], distance: float) -> StepperSpec:
     return StepperSpec("s", 0, 0, (0.0, 0.0, 0.0, 0.0), distance, False, 1e-7, kind, params)
 
 

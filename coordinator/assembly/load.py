@@ -19,8 +19,7 @@ from coordinator.config.sections.extruder import (
     read_extruders,
 )
 from coordinator.config.sections.kinematics.frame import Frame
-from coordinator.config.sections.kinematics.printer_options import PRINTER_SPECS
-from coordinator.config.sections.kinematics.select import read_frame
+from coordinator.config.sections.kinematics.registry import KINDS, read_frame
 from coordinator.config.sections.nodes import check_policies, make_pin_registry, read_nodes
 from coordinator.config.sections.printer import open_printer, read_printer
 from coordinator.config.sections.reading import Reading
@@ -41,8 +40,9 @@ _SINGLE_SECTIONS = (
 SHELL_COMMAND = "gcode_shell_command"
 """Programs of the host, called from macros on other hosts: said once, however many there are."""
 _NAMED_SECTIONS = ("mcu", "board_pins", "duplicate_pin_override")
+_STEPPERS = "|".join(name for kind in KINDS.values() for name in kind.steppers)
 _MOTION_SECTIONS = re.compile(
-    r"stepper_([a-z]|bed|arm|left|right)|extruder[1-9]?|extruder1[0-5]|dual_carriage"
+    rf"stepper_([a-z]|{_STEPPERS})|extruder[1-9]?|extruder1[0-5]|dual_carriage"
     r"|(stepper|carriage|extra_carriage|dual_carriage|extruder_stepper) \S+",
     re.ASCII,
 )
@@ -66,7 +66,7 @@ def describe(config: ConfigFile) -> MachineDescription:
     _check_section_names(config)
     nodes = read_nodes(config, later)
     reading = Reading(config, make_pin_registry(config, nodes), later)
-    kinematics, reader = open_printer(_required(config, "printer"), PRINTER_SPECS)
+    kinematics, reader = open_printer(_required(config, "printer"))
     printer = read_printer(reader)
     frame = with_second_endstops(reading, read_frame(reading, kinematics, reader))
     reading.finish(reader)

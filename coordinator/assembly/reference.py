@@ -15,14 +15,8 @@ from coordinator.config.sections import printer as read_printer
 from coordinator.config.sections import rails as read_rails
 from coordinator.config.sections import shaper as read_shaper
 from coordinator.config.sections import tables as read_tables
-from coordinator.config.sections.kinematics import delta as read_delta
-from coordinator.config.sections.kinematics import deltesian as read_deltesian
 from coordinator.config.sections.kinematics import dual_carriage as read_dual
-from coordinator.config.sections.kinematics import generic_cartesian as read_generic
-from coordinator.config.sections.kinematics import polar as read_polar
-from coordinator.config.sections.kinematics import rotary_delta as read_rotary_delta
-from coordinator.config.sections.kinematics import winch as read_winch
-from coordinator.config.sections.kinematics.printer_options import PRINTER_SPECS
+from coordinator.config.sections.kinematics.registry import KINDS, PRINTER_SPECS
 from coordinator.config.unsupported import LATER_SECTIONS
 from coordinator.modules.registry import own_beside, own_modules
 
@@ -34,15 +28,7 @@ SECTIONS: dict[str, SectionSpec] = {
     **{f"[printer] with kinematics {name}": spec for name, spec in PRINTER_SPECS.items()},
     "[stepper_x], [stepper_y], [stepper_z], [stepper_arm]": read_rails.RAIL,
     "[stepper_x1], [stepper_z1], [stepper_z2] …": read_rails.EXTRA_STEPPER,
-    "[stepper_a], [stepper_b], [stepper_c] of a delta": read_delta.TOWER,
-    "[stepper_left], [stepper_right] of a deltesian": read_deltesian.SIDE,
-    "[stepper_bed] of a polar machine": read_polar.BED,
-    "[stepper_a], [stepper_b], [stepper_c] of a rotary delta": read_rotary_delta.ARM,
-    "[stepper_a], [stepper_b], [stepper_c] … of winches": read_winch.WINCH,
-    "[carriage NAME]": read_generic.CARRIAGE,
-    "[stepper NAME]": read_generic.STEPPER,
-    "[extra_carriage NAME]": read_generic.EXTRA_CARRIAGE,
-    "[dual_carriage NAME]": read_generic.DUAL_CARRIAGE,
+    **{title: spec for kind in KINDS.values() for title, spec in kind.reference.items()},
     "[dual_carriage]": read_dual.DUAL_CARRIAGE,
     "[extruder], [extruder1] …": read_extruder.EXTRUDER,
     "[extruder_stepper NAME]": read_extruder.EXTRUDER_STEPPER,

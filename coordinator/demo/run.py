@@ -187,7 +187,7 @@ class Prover:
             step_distance=stepper.step_distance,
             invert_dir=stepper.dir_pin.invert,
             step_pulse_s=stepper.step_pulse_s,
-            kinematics=function.kinematics,
+            formula=function.formula,
             params=function.params,
         )
 

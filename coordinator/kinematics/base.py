@@ -5,10 +5,10 @@ what step generation divides by the way per step: mm, or rad where the rail turn
 """
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
-
-from coordinator.motion.specs import StepKinematics
+from typing import ClassVar
 
 Point = tuple[float, float, float]
 Weights = tuple[float, float, float, float]
@@ -20,17 +20,25 @@ FILAMENT: Weights = (0.0, 0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class StepFunction:
-    """How step generation gets a rail's position from the axes; see StepKinematics for the parameters."""
+    """How step generation gets a rail's position from the axes: a sum of them, or a formula in C."""
 
-    kinematics: StepKinematics = StepKinematics.LINEAR
+    formula: str | None = None
+    """Name given to STEP_FORMULA in coordinator/kinematics/*.c; None: the sum of WEIGHTS times axes."""
     weights: Weights = NO_WEIGHTS
-    """Of X Y Z E, where the kinematics is LINEAR."""
+    """Of X Y Z E, where there is no formula."""
     params: tuple[float, ...] = ()
+    """Of the formula, at most 8."""
+    axes: str = "xyz"
+    """Of a formula: the axes that move the rail."""
+    turns: bool = False
+    """Whether the position is an angle, rad."""
+    lever_mm: float = 0.0
+    """Of an angle: length of the arm that turns; 0: no arm."""
 
     @property
-    def turns(self) -> bool:
-        """Whether the position is an angle."""
-        return self.kinematics in {StepKinematics.POLAR_ANGLE, StepKinematics.ROTARY_DELTA}
+    def linear(self) -> bool:
+        """Whether the position is a sum of the axes."""
+        return self.formula is None
 
 
 def linear(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> StepFunction:
@@ -75,30 +83,74 @@ class WorkSpace:
         return any(self.cone_slope) and self.low[2] <= z <= self.cone_top - down
 
 
-class Kinematics(Protocol):
-    """Between the head and its rails. Implementations are frozen values without any state."""
+class Kinematics(ABC):
+    """Between the head and its rails. Subclasses are frozen values without any state."""
+
+    __slots__ = ()
+    name: ClassVar[str]
+    """As in the configuration."""
+    second_carriages: ClassVar[Mapping[str, StepFunction]] = {}
+    """By axis that may have a second carriage ([dual_carriage]): how that one's motor follows the axes."""
 
     @property
-    def name(self) -> str:
-        """As in the configuration."""
-
-    @property
+    @abstractmethod
     def rails(self) -> tuple[str, ...]:
         """Names of the rails, in the order in which positions are given and taken."""
 
     @property
+    @abstractmethod
     def homing_order(self) -> tuple[tuple[str, ...], ...]:
         """Rails that are homed one after the other; those of one group move together."""
 
     @property
+    @abstractmethod
     def work_space(self) -> WorkSpace:
         """Where the head may be."""
 
+    @property
+    def endstop_positions(self) -> tuple[float, ...]:
+        """Where the endstops of towers or arms are that all go up together when homed; empty: no such."""
+        return ()
+
+    @property
+    def homes_upwards(self) -> bool:
+        """Whether homing moves the head up, away from what is on the bed."""
+        return bool(self.endstop_positions)
+
+    @property
+    def straight(self) -> bool:
+        """Whether rails are sums of the axes.
+
+        Then the head may be moved before it is known where it is, and homing X and Y keeps Z.
+        """
+        return bool(self.rails) and all(function.linear for function in self.step_functions())
+
+    def homed_letters(self, group: tuple[str, ...]) -> str:
+        """Return the axes whose position is known when a group of ``homing_order`` is homed."""
+        return "XYZ" if len(group) > 1 else group[0].upper()
+
+    @abstractmethod
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return what step generation computes for each rail."""
 
+    @abstractmethod
     def inverse(self, point: Point) -> tuple[float, ...]:
         """Return the rails' positions with the head at POINT; ValueError where it cannot be."""
 
+    @abstractmethod
     def forward(self, positions: tuple[float, ...]) -> Point:
         """Return where the head is when the rails are at POSITIONS; ValueError where they cannot be."""
+
+
+@dataclass(frozen=True, slots=True)
+class AxesKinematics(Kinematics):
+    """A kinematics with one rail per axis."""
+
+    box: WorkSpace
+    rails = ("x", "y", "z")
+    homing_order = (("x",), ("y",), ("z",))
+
+    @property
+    def work_space(self) -> WorkSpace:
+        """The box that the axes span."""
+        return self.box

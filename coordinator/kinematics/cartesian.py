@@ -1,18 +1,17 @@
 """Cartesian: each rail moves one axis. Formulas: none, a rail's position is the axis' position."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
+from coordinator.kinematics.base import AxesKinematics, Point, StepFunction, linear
 
 
 @dataclass(frozen=True, slots=True)
-class Cartesian:
+class Cartesian(AxesKinematics):
     """Three axes with motors of their own."""
 
-    work_space: WorkSpace
     name = "cartesian"
-    rails = ("x", "y", "z")
-    homing_order = (("x",), ("y",), ("z",))
+    second_carriages: ClassVar = {"x": linear(x=1), "y": linear(y=1)}
 
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return the rails' functions."""

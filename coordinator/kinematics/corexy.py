@@ -7,17 +7,14 @@ that a motor alone moves its rail by the same way as on a cartesian machine.
 
 from dataclasses import dataclass
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
+from coordinator.kinematics.base import AxesKinematics, Point, StepFunction, linear
 
 
 @dataclass(frozen=True, slots=True)
-class CoreXY:
+class CoreXY(AxesKinematics):
     """Rail x has the motor that moves by x + y, rail y the one that moves by x - y."""
 
-    work_space: WorkSpace
     name = "corexy"
-    rails = ("x", "y", "z")
-    homing_order = (("x",), ("y",), ("z",))
 
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return the rails' functions."""

@@ -5,17 +5,14 @@ a = x + z, c = x - z, and so x = (a + c) / 2, z = (a - c) / 2. Source: as corexy
 
 from dataclasses import dataclass
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
+from coordinator.kinematics.base import AxesKinematics, Point, StepFunction, linear
 
 
 @dataclass(frozen=True, slots=True)
-class CoreXZ:
+class CoreXZ(AxesKinematics):
     """Rail x has the motor that moves by x + z, rail z the one that moves by x - z."""
 
-    work_space: WorkSpace
     name = "corexz"
-    rails = ("x", "y", "z")
-    homing_order = (("x",), ("y",), ("z",))
 
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return the rails' functions."""

@@ -6,15 +6,15 @@ joints (tx, ty, u) meet. Source: the Pythagorean theorem on the rod; the same in
 Rocholl (Rostock) style delta robot kinematics" (2012).
 
 ``delta_radius`` is measured from a carriage's joint to the head's joint with the head in the middle, so
-that the head counts as a point here. Step generation takes DELTA with params (A², tx, ty).
+that the head counts as a point here. Step generation takes the formula delta (delta.c) with params (A², tx,
+ty).
 """
 
 import math
 from dataclasses import dataclass
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace
+from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpace
 from coordinator.kinematics.geometry import spheres_meet
-from coordinator.motion.specs import StepKinematics
 
 USUAL_TOWER_SPEED = 3.0
 """How much faster than the head a carriage may be: where a rod lies flatter, the head is slower instead."""
@@ -36,7 +36,7 @@ class Tower:
 
 
 @dataclass(frozen=True, slots=True)
-class Delta:
+class Delta(Kinematics):
     """A linear delta."""
 
     towers: tuple[Tower, Tower, Tower]
@@ -52,8 +52,7 @@ class Delta:
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return the towers' functions."""
         return tuple(
-            StepFunction(StepKinematics.DELTA, params=(tower.rod_length**2, *self._foot(tower)))
-            for tower in self.towers
+            StepFunction("delta", params=(tower.rod_length**2, *self._foot(tower))) for tower in self.towers
         )
 
     def inverse(self, point: Point) -> tuple[float, ...]:

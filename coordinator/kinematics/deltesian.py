@@ -4,14 +4,13 @@ A tower stands at ax (left: negative), its rod is A long: u = z + √(A² - (ax 
 carriages at heights u and w: the head is the lower of the points where the circles of radius A around (ax,
 u) and (bx, w) meet. Source: delta.py in two dimensions.
 
-Step generation takes DELTESIAN with params (A², ax).
+Step generation takes the formula deltesian (deltesian.c) with params (A², ax).
 """
 
 import math
 from dataclasses import dataclass
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from coordinator.motion.specs import StepKinematics
+from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpace, linear
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +25,7 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True)
-class Deltesian:
+class Deltesian(Kinematics):
     """A deltesian."""
 
     left: Arm
@@ -43,7 +42,7 @@ class Deltesian:
 
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return the rails' functions."""
-        towers = (StepFunction(StepKinematics.DELTESIAN, params=(a.rod_length**2, a.x)) for a in self._arms)
+        towers = (StepFunction("deltesian", params=(a.rod_length**2, a.x), axes="xz") for a in self._arms)
         return (*towers, linear(y=1))
 
     def inverse(self, point: Point) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
+from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpace, linear
 from coordinator.kinematics.geometry import cross, dot, solve
 
 MIN_INDEPENDENCE = 1e-6
@@ -16,15 +16,20 @@ MIN_INDEPENDENCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class GenericCartesian:
+class GenericCartesian(Kinematics):
     """Any machine whose motors move by sums of the axes."""
 
     motors: tuple[tuple[str, Point], ...]
     """Each motor's name and its way per mm of X, Y and Z."""
-    work_space: WorkSpace
+    box: WorkSpace
     name = "generic_cartesian"
     homing_order = (("x",), ("y",), ("z",))
     """Of axes here: a motor is no rail with an endstop of its own."""
+
+    @property
+    def work_space(self) -> WorkSpace:
+        """The box that the carriages' ranges span."""
+        return self.box
 
     @property
     def rails(self) -> tuple[str, ...]:

@@ -5,18 +5,18 @@ Source: the way of a belt whose free length is x - y, as described for the Markf
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
+from coordinator.kinematics.base import AxesKinematics, Point, StepFunction, linear
 
 
 @dataclass(frozen=True, slots=True)
-class HybridCoreXY:
+class HybridCoreXY(AxesKinematics):
     """Rail x has the motor that moves by x - y; rail y moves y alone."""
 
-    work_space: WorkSpace
     name = "hybrid_corexy"
-    rails = ("x", "y", "z")
-    homing_order = (("x",), ("y",), ("z",))
+    second_carriages: ClassVar = {"x": linear(x=1, y=1)}
+    """The second belt runs the other way round."""
 
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return the rails' functions."""

@@ -4,18 +4,18 @@ a = x - z, c = z, and so x = a + c. Source: as hybrid_corexy.py, with Z for Y.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
+from coordinator.kinematics.base import AxesKinematics, Point, StepFunction, linear
 
 
 @dataclass(frozen=True, slots=True)
-class HybridCoreXZ:
+class HybridCoreXZ(AxesKinematics):
     """Rail x has the motor that moves by x - z; rail z moves z alone."""
 
-    work_space: WorkSpace
     name = "hybrid_corexz"
-    rails = ("x", "y", "z")
-    homing_order = (("x",), ("y",), ("z",))
+    second_carriages: ClassVar = {"x": linear(x=1, z=1)}
+    """The second belt runs the other way round."""
 
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return the rails' functions."""

@@ -1,18 +1,18 @@
 """A machine whose head nothing moves: heaters, fans and sensors alone, perhaps an extruder."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace
+from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpace
 
 
 @dataclass(frozen=True, slots=True)
-class NoMotion:
+class NoMotion(Kinematics):
     """No rails at all."""
 
     name = "none"
-    rails: tuple[str, ...] = ()
-    homing_order: tuple[tuple[str, ...], ...] = ()
-    work_space: WorkSpace = field(default_factory=lambda: WorkSpace((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    rails = ()
+    homing_order = ()
+    work_space = WorkSpace((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return none."""

@@ -10,12 +10,11 @@ that must not go there has an arm whose position_min is above 0.
 import math
 from dataclasses import dataclass
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace, linear
-from coordinator.motion.specs import StepKinematics
+from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpace, linear
 
 
 @dataclass(frozen=True, slots=True)
-class Polar:
+class Polar(Kinematics):
     """A polar machine."""
 
     arm_range: tuple[float, float]
@@ -25,11 +24,15 @@ class Polar:
     rails = ("bed", "arm", "z")
     homing_order = (("arm",), ("z",))
 
+    def homed_letters(self, group: tuple[str, ...]) -> str:
+        """Return X and Y for the arm: the bed's angle counts as 0 from then on."""
+        return "XY" if group == ("arm",) else Kinematics.homed_letters(self, group)
+
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return the rails' functions."""
         return (
-            StepFunction(StepKinematics.POLAR_ANGLE),
-            StepFunction(StepKinematics.POLAR_RADIUS),
+            StepFunction("polar_angle", axes="xy", turns=True),
+            StepFunction("polar_radius", axes="xy"),
             linear(z=1),
         )
 

@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 // Rotary delta: a shoulder turns the upper arm, the lower one leads from its elbow to the head.
-#include "coordinator/motion/steps/step_internal.h"
+#include "coordinator/motion/steps/step_formula.h"
 
 // Params: upper arm U, lower arm L, shoulder's radius R and height H, cosine and sine of its direction. The
 // elbow (R + U·cos θ, H + U·sin θ) is L away from the head; the speed is that equation's derivative.
-double kin_rotary_delta(const double *q, const double *p, const double *v, double *speed) {
+static double position(const double *q, double near, const double *p, const double *v, double *speed) {
+    (void)near;
     const double out = q[4] * p[0] + q[5] * p[1], beside = q[4] * p[1] - q[5] * p[0];
     const double out_v = q[4] * v[0] + q[5] * v[1], beside_v = q[4] * v[1] - q[5] * v[0];
     const double a = q[2] - out, b = q[3] - p[2], square = a * a + b * b;
@@ -14,3 +15,5 @@ double kin_rotary_delta(const double *q, const double *p, const double *v, doubl
     *speed = (x * out_v + z * v[2] - beside * beside_v) / (q[0] * (z * cos(angle) - x * sin(angle)));
     return angle;
 }
+
+STEP_FORMULA(rotary_delta, .axes = STEP_USES_X | STEP_USES_Y | STEP_USES_Z, .position = position);

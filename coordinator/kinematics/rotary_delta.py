@@ -11,15 +11,14 @@ atan2(b, a) ± acos(k / √(a² + b²)); the elbow stands outwards with the minu
 spheres of radius L around the elbows meet. Source: derived here from the closure of the two links; the
 robot is R. Clavel's (US patent 4976582).
 
-Step generation takes ROTARY_DELTA with params (U, L, R, H, cos φ, sin φ).
+Step generation takes the formula rotary_delta (rotary_delta.c) with params (U, L, R, H, cos φ, sin φ).
 """
 
 import math
 from dataclasses import dataclass
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace
+from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpace
 from coordinator.kinematics.geometry import spheres_meet
-from coordinator.motion.specs import StepKinematics
 
 MIN_LEVERAGE = 1 / 3
 """Smallest share of the lower arm that is in the elbow's direction: an elbow is at most three times as fast
@@ -40,7 +39,7 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True)
-class RotaryDelta:
+class RotaryDelta(Kinematics):
     """A rotary delta."""
 
     arms: tuple[Arm, Arm, Arm]
@@ -61,7 +60,9 @@ class RotaryDelta:
         """Return the arms' functions."""
         return tuple(
             StepFunction(
-                StepKinematics.ROTARY_DELTA,
+                "rotary_delta",
+                turns=True,
+                lever_mm=arm.upper_length,
                 params=(
                     arm.upper_length,
                     arm.lower_length,
@@ -103,16 +104,11 @@ class RotaryDelta:
         )
 
     @property
-    def endstop_angles(self) -> tuple[float, ...]:
+    def endstop_positions(self) -> tuple[float, ...]:
         """Where the endstops switch, rad."""
         return tuple(
             self.arm_angle(arm, (0.0, 0.0, z)) for arm, z in zip(self.arms, self.endstop_height, strict=True)
         )
-
-    @property
-    def endstop_positions(self) -> tuple[float, ...]:
-        """The same, by the name that towers have for it."""
-        return self.endstop_angles
 
     @property
     def widest_radius(self) -> float:
@@ -135,7 +131,7 @@ class RotaryDelta:
     def _cone_slope(self) -> float:
         """Return how steep the way down from the endstops must be so that no arm rises; see delta.py."""
         slopes = []
-        for arm, angle in zip(self.arms, self.endstop_angles, strict=True):
+        for arm, angle in zip(self.arms, self.endstop_positions, strict=True):
             outward = self.shoulder_radius + arm.upper_length * math.cos(max(0.0, -angle))
             slopes.append(outward / math.sqrt(max(arm.lower_length**2 - outward**2, 1e-6)))
         return max(slopes)
@@ -153,7 +149,7 @@ class RotaryDelta:
         the radius lets it.
         """
         tops = []
-        for arm, angle in zip(self.arms, self.endstop_angles, strict=True):
+        for arm, angle in zip(self.arms, self.endstop_positions, strict=True):
             elbow = self.shoulder_radius + arm.upper_length * math.cos(angle)
             drop = math.sqrt(arm.lower_length**2 - max(elbow - radius, 0.0) ** 2)
             tops.append(self.shoulder_height + arm.upper_length * math.sin(angle) - drop)

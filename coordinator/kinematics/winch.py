@@ -5,15 +5,14 @@ Forward: the differences of the squared lengths of four cables are linear in the
 are not in one plane. If all are, three cables leave two points, and the head hangs at the lower one. Source:
 Euclidean distance, trilateration (geometry.py).
 
-Step generation takes WINCH with params (ax, ay, az).
+Step generation takes the formula winch (winch.c) with params (ax, ay, az).
 """
 
 import math
 from dataclasses import dataclass
 
-from coordinator.kinematics.base import Point, StepFunction, WorkSpace
+from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpace
 from coordinator.kinematics.geometry import along, cross, dot, solve, spheres_meet, subtract
-from coordinator.motion.specs import StepKinematics
 
 MIN_WINCHES = 3
 _FLAT = 1e-3
@@ -23,12 +22,12 @@ _CLEARANCE = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Winch:
+class Winch(Kinematics):
     """A machine of three winches or more; the first three anchors are not on one line."""
 
     anchors: tuple[Point, ...]
     name = "winch"
-    homing_order: tuple[tuple[str, ...], ...] = ()
+    homing_order = ()
     """No cable can be homed on an endstop: the head is put where G28 shall find it."""
 
     @property
@@ -38,7 +37,7 @@ class Winch:
 
     def step_functions(self) -> tuple[StepFunction, ...]:
         """Return the cables' functions."""
-        return tuple(StepFunction(StepKinematics.WINCH, params=anchor) for anchor in self.anchors)
+        return tuple(StepFunction("winch", params=anchor) for anchor in self.anchors)
 
     def inverse(self, point: Point) -> tuple[float, ...]:
         """Return the cables' lengths."""

@@ -1,7 +1,6 @@
 """What motion is told about the machine: plain values, checked by whoever builds them."""
 
 from dataclasses import dataclass
-from enum import IntEnum
 
 AXIS_RANGE_OPTIONS = (
     "position_min and position_max of [stepper_x]",
@@ -72,25 +71,6 @@ class NodeStreamSpec:
     reset_step_clock_id: int
 
 
-class StepKinematics(IntEnum):
-    """What a stepper's position is as a function of the axes; the numbers are those of steps.h."""
-
-    LINEAR = 0
-    """Sum of weights times axes."""
-    DELTA = 1
-    """Height of a carriage; params: arm², tower x, tower y."""
-    DELTESIAN = 2
-    """Height of a carriage; params: arm², arm x."""
-    POLAR_RADIUS = 3
-    """Distance from the Z axis."""
-    POLAR_ANGLE = 4
-    """Angle around the Z axis, unwrapped, rad."""
-    ROTARY_DELTA = 5
-    """Angle of an upper arm, rad; params: see kinematics/rotary_delta.py."""
-    WINCH = 6
-    """Distance from the anchor; params: x, y, z."""
-
-
 @dataclass(frozen=True, slots=True)
 class StepperSpec:
     """One stepper."""
@@ -100,13 +80,14 @@ class StepperSpec:
     """Index into the list of NodeStreamSpec."""
     oid: int
     weights: tuple[float, float, float, float]
-    """Of a LINEAR stepper: its position in mm is the sum of weights[i] * axis[i] over X Y Z E."""
+    """Of a stepper without a formula: its position in mm is the sum of weights[i] * axis[i] over X Y Z E."""
     step_distance: float
-    """mm (POLAR_ANGLE and ROTARY_DELTA: rad) per step, > 0."""
+    """mm (of an angle: rad) per step, > 0."""
     invert_dir: bool
     """Whether set_next_step_dir takes 0 for a positive step."""
     step_pulse_s: float
     """Shortest high time of the step pin; steps are never closer than two of them. 0: both edges step."""
-    kinematics: StepKinematics = StepKinematics.LINEAR
+    formula: str | None = None
+    """Name of the C function (coordinator/kinematics/*.c) that gives its position; None: WEIGHTS do."""
     params: tuple[float, ...] = ()
-    """Of the kinematics."""
+    """Of the formula."""

@@ -117,7 +117,7 @@ class MachineDevices:
             step_distance=described.step_distance,
             invert_dir=described.dir_pin.invert,
             step_pulse_s=described.step_pulse_s,
-            kinematics=described.function.kinematics,
+            formula=described.function.formula,
             params=described.function.params,
         )
 

@@ -14,7 +14,6 @@ from coordinator.config.model import MachineDescription, StepperDescription
 from coordinator.kinematics.base import Point, Weights
 from coordinator.kinematics.dual_carriage import CarriageState
 from coordinator.motion.planner.planner import Position
-from coordinator.motion.specs import StepKinematics
 
 _XYZ: Final = 3
 
@@ -68,7 +67,7 @@ class StepperPositions:
         if not places:
             return None
         motors = self._described.motors
-        if all(motor.function.kinematics is StepKinematics.LINEAR for motor in motors):
+        if all(motor.function.linear for motor in motors):
             return self._head_of_sums(places)
         rails = {rail.axis: rail.steppers[0].name for rail in self._described.rails}
         kinematics = self._described.kinematics
@@ -81,7 +80,7 @@ class StepperPositions:
 
     def _place(self, stepper: StepperDescription, position: Position, offsets: Sequence[float]) -> float:
         function = stepper.function
-        if function.kinematics is not StepKinematics.LINEAR:
+        if not function.linear:
             rail = next(rail.axis for rail in self._described.rails if stepper in rail.steppers)
             kinematics = self._described.kinematics
             return kinematics.inverse(position[:_XYZ])[kinematics.rails.index(rail)]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from coordinator.config.model import MachineDescription
-from coordinator.motion.specs import MotionLimits, StepKinematics
+from coordinator.motion.specs import MotionLimits
 from coordinator.motion.steps.steps import TABLE_POINTS_MAX, AxisCorrection, StepGenerator
 from coordinator.tables.axis_table import AxisTable, Unit
 from coordinator.tables.store import TableStore
@@ -124,7 +124,7 @@ class Compensation:
 
 def corrected_axes(description: MachineDescription) -> str:
     """Return the letters of the axes that the coordinator can correct by tables; empty: none of this kind."""
-    linear = all(motor.function.kinematics is StepKinematics.LINEAR for motor in description.motors)
+    linear = all(motor.function.linear for motor in description.motors)
     return AXES if linear and description.dual_carriage is None else ""
 
 

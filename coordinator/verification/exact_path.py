@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.motion.specs import StepKinematics, StepperSpec
+from coordinator.motion.specs import StepperSpec
 from coordinator.verification.exact_signal import REST_S, Floats, Phases, Shaped, Signal, Smoothed
 
 Ints = NDArray[np.int64]
@@ -100,14 +100,15 @@ def _rotary_delta(params: Sequence[float], x: Floats, y: Floats, z: Floats) -> t
     return theta, (by_outward * cos - by_beside * sin, by_outward * sin + by_beside * cos, by_z)
 
 
-INVERSE: Mapping[StepKinematics, Inverse] = {
-    StepKinematics.DELTA: _delta,
-    StepKinematics.DELTESIAN: _deltesian,
-    StepKinematics.POLAR_RADIUS: _radius,
-    StepKinematics.POLAR_ANGLE: _angle,
-    StepKinematics.WINCH: _winch,
-    StepKinematics.ROTARY_DELTA: _rotary_delta,
+INVERSE: Mapping[str, Inverse] = {
+    "delta": _delta,
+    "deltesian": _deltesian,
+    "polar_radius": _radius,
+    "polar_angle": _angle,
+    "winch": _winch,
+    "rotary_delta": _rotary_delta,
 }
+"""By formula (coordinator/kinematics/*.c); the definitions again, for arrays."""
 
 
 # ---------------------------------------------------------------------------------------------- paths
@@ -122,13 +123,11 @@ class StepperPath:
         """POSITION: where the stepper stands at START, in steps."""
         self.spec = spec
         phases = Phases.of(start, moves)
-        if spec.kinematics == StepKinematics.LINEAR:
+        if spec.formula is None:
             self._axes: list[AxisSignal] = _linear(spec.weights, phases, setting)
         else:
             self._axes = [_axis(axis, 1.0, phases, setting) for axis in range(3)]
-        self.curved = spec.kinematics != StepKinematics.LINEAR or any(
-            not isinstance(axis, Signal) for axis in self._axes
-        )
+        self.curved = spec.formula is not None or any(not isinstance(axis, Signal) for axis in self._axes)
         """Not one straight move after the other: then the end of a move is no rest."""
         self._origin = 0.0
         self._origin = float(self.u(np.array([REST_S]))[0]) - position
@@ -136,12 +135,12 @@ class StepperPath:
     def u(self, t: Floats, near: Floats | None = None) -> Floats:
         """Return the place at T; of an angle the turn that is next to NEAR (steps)."""
         at = [axis.at(t) for axis in self._axes]
-        if self.spec.kinematics == StepKinematics.LINEAR:
+        if self.spec.formula is None:
             place: Floats = sum(at[1:], at[0])
         else:
-            place = INVERSE[self.spec.kinematics](self.spec.params, *at)[0]
+            place = INVERSE[self.spec.formula](self.spec.params, *at)[0]
         u = place / self.spec.step_distance - self._origin
-        if near is not None and self.spec.kinematics == StepKinematics.POLAR_ANGLE:
+        if near is not None and self.spec.formula == "polar_angle":
             turn = math.tau / self.spec.step_distance
             u += turn * np.round((near - u) / turn)
         return u
@@ -149,12 +148,10 @@ class StepperPath:
     def slope(self, t: Floats) -> Floats:
         """Return du/dt, steps/s."""
         speed = [axis.slope(t) for axis in self._axes]
-        if self.spec.kinematics == StepKinematics.LINEAR:
+        if self.spec.formula is None:
             rate: Floats = sum(speed[1:], speed[0])
         else:
-            gradient = INVERSE[self.spec.kinematics](self.spec.params, *(axis.at(t) for axis in self._axes))[
-                1
-            ]
+            gradient = INVERSE[self.spec.formula](self.spec.params, *(axis.at(t) for axis in self._axes))[1]
             rate = sum((g * v for g, v in zip(gradient, speed, strict=True)), np.zeros_like(t))
         return rate / self.spec.step_distance
 
@@ -300,7 +297,7 @@ def places(path: StepperPath) -> tuple[Floats, Floats, Floats]:
     """Return the turning points (s), u there, and how many steps are done at each."""
     t = turning_points(path)
     u = path.u(t)
-    if path.spec.kinematics == StepKinematics.POLAR_ANGLE:
+    if path.spec.formula == "polar_angle":
         u = np.unwrap(u, period=math.tau / path.spec.step_distance)
     place = np.floor(np.round(u * SNAP) / SNAP + 0.5)
     if path.curved:
@@ -323,7 +320,7 @@ class Leg:
     @property
     def is_plain(self) -> bool:
         """Whether the stepper moves as the axes do."""
-        return self.spec.kinematics is StepKinematics.LINEAR and not self.setting.acts_on(self.spec.weights)
+        return self.spec.formula is None and not self.setting.acts_on(self.spec.weights)
 
 
 def legs_of(

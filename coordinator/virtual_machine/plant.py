@@ -12,7 +12,6 @@ import numpy as np
 
 from coordinator.config.model import SECOND_CARRIAGE, MachineDescription, RailDescription, StepperDescription
 from coordinator.kinematics.base import Point
-from coordinator.motion.specs import StepKinematics
 from coordinator.virtual_machine.plant_heat import HeatSettings, machine_heat
 from coordinator.virtual_machine.plant_tmc import machine_drivers
 from nodes.support.errors import CanductorError
@@ -218,5 +217,5 @@ def _motors(description: MachineDescription) -> list[StepperDescription]:
     """Return the motors that are sums of axes, but for those of a second carriage."""
     dual = description.dual_carriage
     others = [stepper.name for stepper in dual.rails[1].steppers] if dual is not None else []
-    linear = [m for m in description.motors if m.function.kinematics is StepKinematics.LINEAR]
+    linear = [m for m in description.motors if m.function.linear]
     return [motor for motor in linear if motor.name not in others]

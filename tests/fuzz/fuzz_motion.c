@@ -93,7 +93,7 @@ static void begin(const uint8_t *options) {
         steppers[i].oid = i;
         steppers[i].weights[i] = 1;
         if (run.delta && i != AXIS_E) {
-            steppers[i].kinematics = STEP_DELTA;
+            steppers[i].formula = step_find_formula("delta");
             steppers[i].params[0] = ARM * ARM;
             tower(i, steppers[i].params + 1);
         }

@@ -6,8 +6,9 @@ from coordinator.config.errors import ConfigError
 from coordinator.config.file import RawSection
 from coordinator.config.model import ExtruderDescription, ExtruderStepperDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec, TextOption
+from coordinator.config.sections.bounds import MAX_ACCEL, MAX_SPEED
 from coordinator.config.sections.heater_options import EXTRUDER_HEATER_OPTIONS, LATER_HEATER_OPTIONS
-from coordinator.config.sections.printer import MAX_ACCEL, MAX_SPEED, PrinterSection
+from coordinator.config.sections.printer import PrinterSection
 from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_EXTRUDER_OPTIONS

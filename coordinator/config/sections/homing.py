@@ -4,8 +4,7 @@ from coordinator.config.errors import NotActing
 from coordinator.config.model import HomingDescription
 from coordinator.config.options import BoolOption, FloatOption, SectionReader
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
-from coordinator.config.sections.printer import MAX_ACCEL, MAX_SPEED
-from coordinator.config.sections.steppers import MAX_POSITION
+from coordinator.config.sections.bounds import MAX_ACCEL, MAX_POSITION, MAX_SPEED
 from coordinator.config.sections.virtual_endstops import find_diag_pin
 
 ENDSTOP_PIN = PinOption(name="endstop_pin", help="the endstop's input", pullable=True, share="endstop")

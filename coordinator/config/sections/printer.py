@@ -1,33 +1,17 @@
 """The section [printer], and how it and [extruder] limit every move."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.file import RawSection
 from coordinator.config.options import ChoiceOption, FloatOption, SectionReader, SectionSpec, one_of
-
-# Far above any machine, low enough that squares and sums stay exact and a slipped digit group is seen.
-MAX_SPEED = 100_000.0
-MAX_ACCEL = 10_000_000.0
+from coordinator.config.sections.bounds import MAX_ACCEL, MAX_SPEED
+from coordinator.config.sections.kinematics.registry import KINDS, PRINTER_SPECS
 
 KINEMATICS = ChoiceOption(
     name="kinematics",
     help="how the steppers move the head",
-    choices=(
-        "cartesian",
-        "corexy",
-        "corexz",
-        "delta",
-        "deltesian",
-        "generic_cartesian",
-        "hybrid_corexy",
-        "hybrid_corexz",
-        "none",
-        "polar",
-        "rotary_delta",
-        "winch",
-    ),
+    choices=tuple(KINDS),
 )
 MAX_VELOCITY = FloatOption(
     name="max_velocity", help="highest speed of the head", unit="mm/s", above=0, maximum=MAX_SPEED
@@ -109,12 +93,9 @@ class PrinterSection:
     minimum_cruise_ratio: float
 
 
-def open_printer(section: RawSection, specs: Mapping[str, SectionSpec]) -> tuple[str, SectionReader]:
-    """Return the kinematics, and a reader of [printer] with its options; raises ConfigError.
-
-    SPECS: what [printer] may contain besides for some kinematics.
-    """
-    names = {k: (*spec.later, *(option.name for option in spec.options)) for k, spec in specs.items()}
+def open_printer(section: RawSection) -> tuple[str, SectionReader]:
+    """Return the kinematics, and a reader of [printer] with its options; raises ConfigError."""
+    names = {k: (*spec.later, *(option.name for option in spec.options)) for k, spec in PRINTER_SPECS.items()}
     every = tuple({name: None for owned in names.values() for name in owned})
     kinematics = SectionReader(section, SectionSpec(PRINTER.help, PRINTER.options, every)).get(KINEMATICS)
     for name, option in section.options.items():
@@ -125,7 +106,7 @@ def open_printer(section: RawSection, specs: Mapping[str, SectionSpec]) -> tuple
                 f"option '{name}' of [{section.name}] belongs to kinematics {one_of(owners)}, but this"
                 f" machine is {kinematics}; remove it",
             )
-    own = specs.get(kinematics, SectionSpec("", ()))
+    own = PRINTER_SPECS.get(kinematics, SectionSpec("", ()))
     spec = SectionSpec(PRINTER.help, (*PRINTER.options, *own.options), own.later)
     reader = SectionReader(section, spec)
     reader.get(KINEMATICS)

@@ -4,16 +4,10 @@ from dataclasses import dataclass
 
 from coordinator.config.model import RailDescription, StepperDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
+from coordinator.config.sections.bounds import MAX_BELT_POSITION, MAX_POSITION
 from coordinator.config.sections.homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
 from coordinator.config.sections.reading import Reading, SecondEndstop
-from coordinator.config.sections.steppers import (
-    MAX_BELT_POSITION,
-    MAX_POSITION,
-    MOTOR,
-    TURNING_MOTOR,
-    extra_sections,
-    read_stepper,
-)
+from coordinator.config.sections.steppers import MOTOR, TURNING_MOTOR, extra_sections, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
 from coordinator.kinematics.base import StepFunction
 

@@ -1,15 +1,10 @@
 """Endstops of further steppers: where an axis has its steppers to itself, each side may have its own."""
 
 from dataclasses import replace
-from typing import Final
 
 from coordinator.config.model import NotYetActing, RailDescription
 from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.sections.reading import Reading
-from coordinator.motion.specs import StepKinematics
-
-_FLAT: Final = ((StepKinematics.POLAR_ANGLE, 2), (StepKinematics.POLAR_RADIUS, 2))
-"""Curved rails, and the axis that they do not move."""
 
 
 def with_second_endstops(reading: Reading, frame: Frame) -> Frame:
@@ -59,8 +54,8 @@ def _moves_by_itself(frame: Frame, rail: RailDescription) -> bool:
     axis = "xyz".index(rail.axis)
     for motor in frame.steppers:
         own = motor in rail.steppers
-        kind = motor.function.kinematics
-        moves = motor.weights[axis] != 0 or (kind is not StepKinematics.LINEAR and (kind, axis) not in _FLAT)
+        function = motor.function
+        moves = motor.weights[axis] != 0 if function.linear else rail.axis in function.axes
         others = any(weight for number, weight in enumerate(motor.weights) if number != axis)
         if moves != own or (own and others):
             return False

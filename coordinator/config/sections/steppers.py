@@ -12,11 +12,6 @@ from coordinator.config.pins import PinDescription, PinOption, PinRegistry
 from coordinator.config.sections.reading import Reading
 from coordinator.kinematics.base import StepFunction
 
-MAX_POSITION = 100_000.0
-"""mm: a hundred metres; positions stay exact to far below a step."""
-MAX_BELT_POSITION = 1e9
-"""mm: the end of an axis that has none, of a machine with a belt for its bed."""
-
 STEP_PIN = PinOption(name="step_pin", help="the driver's step input")
 DIR_PIN = PinOption(name="dir_pin", help="the driver's direction input; ! when high means negative")
 ENABLE_PIN = PinOption(name="enable_pin", help="the driver's enable input; may be shared", share="enable")

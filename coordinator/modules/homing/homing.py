@@ -32,10 +32,6 @@ AWAY_MM: Final = 5.0
 """How far a rail that stands on its endstop goes away first, where homing_retract_dist is 0."""
 
 
-STRAIGHT: Final = frozenset(
-    ("cartesian", "corexy", "corexz", "hybrid_corexy", "hybrid_corexz", "generic_cartesian")
-)
-"""Kinematics whose steppers' ways add up: the head may be moved before it is known where it is."""
 ReadHome = Callable[[Call, str], Reading]
 
 
@@ -174,7 +170,7 @@ class Homing(Module):
         By a step more than needed, as a way is made in whole steps. Towers and arms end within their space.
         """
         described = self._described
-        if self._live is None or not STRAIGHT & {described.kinematics.name}:
+        if self._live is None or not described.kinematics.straight:
             return place
         for axis, letter in enumerate("XYZ"):
             way_mm = self._way_within(axis, place[axis]) if letter in letters else 0.0

@@ -22,9 +22,6 @@ WAY_SHARE: Final = 1.5
 WAY_MAX_MM: Final = 150_000.0
 """And within this, of an axis that has no end: a belt."""
 AXES: Final = ("x", "y", "z")
-_TOWERS: Final = ("delta", "deltesian", "rotary_delta")
-"""Kinematics whose rails go up together."""
-_ARM: Final = "arm"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +52,11 @@ def approaches(described: "MachineDescription") -> list[Approach]:
     found = []
     for names in described.kinematics.homing_order:
         group = [rails[name] for name in names if name in rails]
-        if described.kinematics.name in _TOWERS and len(names) > 1:
-            found.append(_towers(described, group))
-        elif names == (_ARM,):
-            found.append(_alone(group[0], "XY", "x"))
+        letters = described.kinematics.homed_letters(names)
+        if len(letters) == len(AXES):
+            found.append(_together(described, group))
+        elif len(letters) > 1:
+            found.append(_alone(group[0], letters, letters[0].lower()))
         elif group and names[0] in AXES:
             found.append(_axis(described, group[0]))
             if (second := _second(described, names[0])) is not None:
@@ -74,14 +72,13 @@ def _axis(described: "MachineDescription", rail: "RailDescription") -> Approach:
     return Approach(rail.pieces, rail.axis.upper(), rail.axis, ways, most_mm)
 
 
-def _towers(described: "MachineDescription", rails: "Sequence[RailDescription]") -> Approach:
+def _together(described: "MachineDescription", rails: "Sequence[RailDescription]") -> Approach:
     space = described.kinematics.work_space
     ways, longest_mm = {}, space.high[2] - space.low[2]
     for rail in rails:
         for stepper in rail.steppers:
             ways[stepper.name] = 1.0
-            if stepper.function.turns:
-                arm_mm = stepper.function.params[0]
+            if arm_mm := stepper.function.lever_mm:
                 ways[stepper.name] = 1.0 / arm_mm
                 longest_mm = max(longest_mm, math.pi * arm_mm)
     return Approach(tuple(rails), "XYZ", "z", ways, WAY_SHARE * longest_mm)
@@ -127,7 +124,7 @@ def landed(
         return _head_of_towers(described, approach, beyond_mm, y_of_towers)
     assert rail.homing.position_endstop is not None
     at = rail.homing.position_endstop + _direction(rail) * beyond_mm[0]
-    if rail.axis == _ARM:
+    if approach.letters == "XY":  # an arm, which counts as along X
         return (at, 0.0, z)
     return (at if rail.axis == "x" else x, at if rail.axis == "y" else y, at if rail.axis == "z" else z)
 
@@ -143,9 +140,8 @@ def _head_of_towers(
     described: "MachineDescription", approach: Approach, beyond_mm: Sequence[float], y: float
 ) -> Point:
     kinematics = described.kinematics
-    ends: tuple[float, ...] = kinematics.endstop_positions  # type: ignore[attr-defined]
     places = [
         end + beyond * approach.ways[rail.steppers[0].name]
-        for end, beyond, rail in zip(ends, beyond_mm, approach.rails, strict=True)
+        for end, beyond, rail in zip(kinematics.endstop_positions, beyond_mm, approach.rails, strict=True)
     ]
     return kinematics.forward((*places, *(() if len(places) == len(kinematics.rails) else (y,))))

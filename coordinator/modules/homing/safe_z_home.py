@@ -5,11 +5,11 @@ from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
-from coordinator.config.sections.printer import MAX_SPEED
+from coordinator.config.sections.bounds import MAX_SPEED
 from coordinator.gcode.commands import AtRest, Call, Done, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
-from coordinator.modules.homing.homing import STRAIGHT, Homing
+from coordinator.modules.homing.homing import Homing
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.straight import move_by
 from nodes.support.errors import CanductorError
@@ -76,10 +76,11 @@ class SafeZHome(Module):
         self._hop_mm, self._back = build.get(Z_HOP), build.get(BACK)
         self._limits = build.machine.limits
         self._live: ModuleContext | None = None
-        kinematics = build.machine.kinematics.name
-        if kinematics not in STRAIGHT:
+        kinematics = build.machine.kinematics
+        if not kinematics.straight:
             raise ConfigError(
-                build.place, f"[{build.name}] has no use on a machine of kinematics {kinematics}; remove it"
+                build.place,
+                f"[{build.name}] has no use on a machine of kinematics {kinematics.name}; remove it",
             )
         self._outside = self._find_outside()
         if self._outside:

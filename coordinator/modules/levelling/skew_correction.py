@@ -19,7 +19,6 @@ from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.words import flag, one, parameters, value
-from coordinator.motion.specs import StepKinematics
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
@@ -82,9 +81,7 @@ class SkewCorrection(Module):
         self.profile = build.reader.section.instance
         self.skew = Skew(**{plane.lower(): build.get(option) for plane, option in OPTIONS.items()})
         motors = build.machine.motors
-        if build.machine.dual_carriage is not None or any(
-            motor.function.kinematics is not StepKinematics.LINEAR for motor in motors
-        ):
+        if build.machine.dual_carriage is not None or not all(motor.function.linear for motor in motors):
             raise ConfigError(
                 build.place,
                 f"[{build.name}] needs a machine whose motors move along X, Y and Z or sums of them, with one"

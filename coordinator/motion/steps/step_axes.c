@@ -91,14 +91,11 @@ void step_make_taps(struct step_gen *gen) {
 }
 
 static unsigned axes_used(const struct step_stepper_config *config) {
-    static const unsigned used[STEP_KINEMATICS] = {
-        [STEP_DELTA] = 7,       [STEP_DELTESIAN] = 5,    [STEP_POLAR_RADIUS] = 3,
-        [STEP_POLAR_ANGLE] = 3, [STEP_ROTARY_DELTA] = 7, [STEP_WINCH] = 7,
-    };
-    unsigned axes = used[config->kinematics];
-    if (config->kinematics == STEP_LINEAR)
-        for (int i = 0; i < AXES; i++)
-            axes |= config->weights[i] != 0 ? 1u << i : 0;
+    if (config->formula)
+        return config->formula->axes;
+    unsigned axes = 0;
+    for (int i = 0; i < AXES; i++)
+        axes |= config->weights[i] != 0 ? 1u << i : 0;
     return axes;
 }
 
@@ -108,7 +105,7 @@ void step_choose_way(struct step_gen *gen, struct stepper *s) {
     s->uses = axes_used(&s->config);
     const bool smooth = s->smooth_s > 0 && s->uses & USES_E;
     s->reach = s->lag = smooth ? s->smooth_s / 2 : 0;
-    s->curve = smooth || s->config.kinematics != STEP_LINEAR;
+    s->curve = smooth || s->config.formula;
     for (int i = 0; i < gen->tap_count; i++)
         if (gen->taps[i].axes & s->uses) {
             s->reach = fmax(s->reach, -gen->taps[i].time);

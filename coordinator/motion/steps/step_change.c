@@ -71,9 +71,9 @@ static double mix(const double *weights, const double *position) {
 double step_absolute(struct stepper *s, const double *position) {
     static const double still[AXES];
     double speed;
-    if (s->config.kinematics == STEP_LINEAR)
+    if (!s->config.formula)
         return mix(s->config.weights, position) / s->config.step_distance;
-    s->angle = step_kinematic(&s->config, s->angle, position, still, &speed);
+    s->angle = s->config.formula->position(s->config.params, s->angle, position, still, &speed);
     return s->angle / s->config.step_distance;
 }
 
@@ -90,7 +90,7 @@ static int set_motor_position(struct step_gen *gen, const double *position) {
     for (int i = 0; i < AXES; i++)
         shift[i] = position[i] - shift[i];
     for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
-        if (!settled && s->curve && s->config.kinematics != STEP_LINEAR)
+        if (!settled && s->curve && s->config.formula)
             return STEP_NOT_IDLE;
     for (struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++)
         if (!settled && s->curve)
@@ -163,7 +163,7 @@ static double possible_take_up(const struct step_gen *gen, int axis, double take
     for (const struct stepper *s = gen->steppers; s < gen->steppers + gen->stepper_count; s++) {
         const double weight = fabs(s->config.weights[axis]);
         const double fastest = s->config.step_distance / s->closest_ticks * s->clock->ticks_per_s;
-        if (s->config.kinematics == STEP_LINEAR && weight > 0)
+        if (!s->config.formula && weight > 0)
             take_up = fmin(take_up, fastest / weight / 4);
     }
     return take_up;
@@ -248,8 +248,7 @@ int step_set_shaper(struct step_gen *gen, int axis, int n, const double *amplitu
 }
 
 int step_set_weights(struct step_gen *gen, int stepper, const double *weights) {
-    if (stepper < 0 || stepper >= gen->stepper_count ||
-        gen->steppers[stepper].config.kinematics != STEP_LINEAR)
+    if (stepper < 0 || stepper >= gen->stepper_count || gen->steppers[stepper].config.formula)
         return STEP_BAD_CONFIG;
     for (int i = 0; i < AXES; i++)
         if (!(fabs(weights[i]) < LONGEST_S))

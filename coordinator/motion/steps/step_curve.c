@@ -36,7 +36,7 @@ static double evaluate(const struct stepper *s, const struct piece *p, double t,
         at[i] = p->axis[i][0] + t * (p->axis[i][1] + t * p->axis[i][2]);
         v[i] = p->axis[i][1] + 2 * t * p->axis[i][2];
     }
-    const double u = step_kinematic(&s->config, s->angle, at, v, speed);
+    const double u = s->config.formula->position(s->config.params, s->angle, at, v, speed);
     *speed /= s->config.step_distance;
     return u / s->config.step_distance - s->origin;
 }
@@ -104,7 +104,7 @@ static double add_axes(const struct step_gen *gen, struct stepper *s, struct pie
 }
 
 static void make_piece(const struct step_gen *gen, struct stepper *s, double until, struct piece *p) {
-    *p = (struct piece){.begin = s->time, .linear = s->config.kinematics == STEP_LINEAR, .still = true};
+    *p = (struct piece){.begin = s->time, .linear = !s->config.formula, .still = true};
     p->smooth = p->linear && s->smooth_s > 0 && s->uses & USES_E;
     const unsigned axes = p->smooth ? s->uses & ~(unsigned)USES_E : s->uses;
     double end = fmin(until, p->linear ? add_taps(gen, s, axes, p) : add_axes(gen, s, p));
@@ -301,7 +301,7 @@ static int play_piece(struct step_gen *gen, struct stepper *s, const struct piec
         const int status = play_span(gen, s, p, from, to);
         if (status)
             return status;
-        if (s->config.kinematics == STEP_POLAR_ANGLE)
+        if (s->config.formula && s->config.formula->unwraps)
             s->angle = (evaluate(s, p, to, &speed) + s->origin) * s->config.step_distance;
         from = to;
         s->time = s->checked = p->begin + to; // steps up to here are done, whatever comes

@@ -3,6 +3,7 @@
 #ifndef MOTION_STEP_INTERNAL_H
 #define MOTION_STEP_INTERNAL_H
 
+#include "coordinator/motion/steps/step_formula.h"
 #include "coordinator/motion/steps/step_table.h"
 #include "coordinator/motion/steps/steps.h"
 
@@ -234,19 +235,6 @@ bool step_settled(const struct step_gen *gen);
 // step_smooth.c: E of a smoothed stepper as a polynomial of the time since TIME, valid up to the result. TIME
 // is where the last polynomial still holds.
 double step_smooth(const struct step_gen *gen, struct stepper *stepper, double time, double poly[5]);
-
-// step_kinematics.c: position and speed of a stepper that is not linear, without distance and origin. ANGLE:
-// a value near by.
-double step_kinematic(const struct step_stepper_config *config, double angle, const double *position,
-                      const double *velocity, double *speed);
-
-// kin_*.c, for step_kinematics.c: the formulas, Q: the stepper's params.
-double kin_delta(const double *q, const double *p, const double *v, double *speed);
-double kin_deltesian(const double *q, const double *p, const double *v, double *speed);
-double kin_polar_radius(const double *p, const double *v, double *speed);
-double kin_polar_angle(double near, const double *p, const double *v, double *speed);
-double kin_rotary_delta(const double *q, const double *p, const double *v, double *speed);
-double kin_winch(const double *q, const double *p, const double *v, double *speed);
 
 // step_curve.c: as step_times_advance, for a stepper whose CURVE is set.
 int step_curve_advance(struct step_gen *gen, struct stepper *stepper, double until);

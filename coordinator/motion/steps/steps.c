@@ -24,7 +24,6 @@ static bool is_legal(const struct step_config *c) {
     for (int i = 0; ok && i < c->stepper_count; i++) {
         const struct step_stepper_config *s = &c->steppers[i];
         ok = s->node >= 0 && s->node < c->node_count && step_in_range(s->step_distance, 0, LONGEST_S) &&
-             s->kinematics >= 0 && s->kinematics < STEP_KINEMATICS &&
              step_in_range(s->step_pulse_s, -1e-300, 1) && s->oid >= 0 && s->oid <= UINT8_MAX;
         for (int j = 0; ok && j < AXES; j++)
             ok = fabs(s->weights[j]) < LONGEST_S;

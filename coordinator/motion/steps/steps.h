@@ -57,21 +57,12 @@ enum step_status {
     STEP_BAD_CONFIG, // see init
 };
 
-// What a stepper's position is, in units of step_distance; p = X Y Z (mm).
-enum step_kinematics {
-    STEP_LINEAR,       // Σ weights[i]·axis[i] over X Y Z E
-    STEP_DELTA,        // z + √(arm² − (tower_x − x)² − (tower_y − y)²); params: arm², tower_x, tower_y
-    STEP_DELTESIAN,    // z + √(arm² − (arm_x − x)²); params: arm², arm_x
-    STEP_POLAR_RADIUS, // √(x² + y²)
-    STEP_POLAR_ANGLE,  // atan2(y, x), unwrapped, rad
-    STEP_ROTARY_DELTA, // angle of the upper arm, rad; params: see kin_rotary_delta.c
-    STEP_WINCH,        // distance to the anchor; params: x, y, z
-    STEP_KINEMATICS,
-};
+// How a stepper that is no sum of axes follows the head: see step_formula.h.
+struct step_formula;
 
 struct step_stepper_config {
     int32_t node, oid;
-    int32_t kinematics; // enum step_kinematics
+    const struct step_formula *formula; // NULL: position = Σ weights[i]·axis[i] over X Y Z E
     double weights[4];
     double params[8];
     double step_distance; // mm (angles: rad), > 0
@@ -125,6 +116,9 @@ struct step_node_stats {
 };
 
 struct step_gen;
+
+// The formula of that name (coordinator/kinematics/NAME.c), or NULL.
+const struct step_formula *step_find_formula(const char *name);
 
 // Bytes that init needs, or 0 when CONFIG is not legal: counts within the limits above, node indices in
 // range, every length, frequency and error finite and > 0, ids in 32 bits, max_error at least one tick.

@@ -286,7 +286,10 @@ class StepGenerator:
         self._check_settled(status, f"the shaper of axis {axis}", f"impulses {list(impulses)}")
 
     def set_weights(self, stepper: int, weights: Position) -> None:
-        """Let STEPPER (LINEAR) follow other axes from now on; raises StepError unless all has settled."""
+        """Let STEPPER, which has no formula, follow other axes from now on.
+
+        Raises StepError unless all has settled.
+        """
         self._check_stepper(stepper)
         status = lib.step_set_weights(self._gen, stepper, weights)
         self._check_settled(status, f"what {self._steppers[stepper].name} follows", f"weights {weights}")
@@ -391,6 +394,19 @@ class _Config:
         self.struct, self.keep = struct, keep
 
 
+def _formula(stepper: StepperSpec) -> Any:
+    """Return the C function of STEPPER's position; raises StepError when there is none of that name."""
+    if stepper.formula is None:
+        return ffi.NULL
+    found = lib.step_find_formula(stepper.formula.encode())
+    if not found:
+        raise StepError(
+            f"{stepper.name}: coordinator/kinematics/*.c have no formula '{stepper.formula}'; add it by"
+            " STEP_FORMULA and compile again"
+        )
+    return found
+
+
 def _config(
     steppers: Sequence[StepperSpec], nodes: Sequence[NodeStreamSpec], max_error_s: float, start: Position
 ) -> _Config:
@@ -398,7 +414,7 @@ def _config(
     c_nodes = ffi.new("struct step_node_config[]", max(len(nodes), 1))
     for c, s in zip(c_steppers, steppers, strict=False):
         c.node, c.oid, c.weights, c.step_distance = s.node, s.oid, s.weights, s.step_distance
-        c.kinematics, c.params = s.kinematics, s.params
+        c.formula, c.params = _formula(s), s.params
         c.invert_dir, c.step_pulse_s = s.invert_dir, s.step_pulse_s
     for c, n in zip(c_nodes, nodes, strict=False):
         c.clock_freq, c.move_count, c.queue_step_id = n.clock_freq, n.move_count, n.queue_step_id

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from coordinator.config.model import StepperDescription
-from coordinator.motion.specs import StepKinematics, StepperSpec
+from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps.steps import StepGenerator
 from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.runtime.machine import Machine, link_of
@@ -179,4 +179,4 @@ class SingleMove:
 
 
 def _by_itself(spec: StepperSpec, way: float) -> StepperSpec:
-    return replace(spec, weights=(way, 0.0, 0.0, 0.0), kinematics=StepKinematics.LINEAR, params=())
+    return replace(spec, weights=(way, 0.0, 0.0, 0.0), formula=None, params=())

@@ -22,12 +22,6 @@ LIFT_MM: Final = 5.0
 LIFT_MM_S: Final = 5.0
 SURE_MM: Final = 0.1
 """Heights that are no further apart are one: of a part that grows all the time. The lowest counts."""
-_UPWARDS: Final = frozenset(("delta", "deltesian", "rotary_delta"))
-"""Kinematics whose rails go up when they are homed."""
-_STRAIGHT: Final = frozenset(
-    ("cartesian", "corexy", "corexz", "generic_cartesian", "hybrid_corexy", "hybrid_corexz")
-)
-"""Kinematics that home X and Y without moving the head in Z."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +55,13 @@ def plan_resume_homing(
     homing = next(modules.of(Homing))
     if homing.instead is not None or "G28" in modules.vocabulary.commands:
         raise ApiError("not_ready", f"a section of this machine says what G28 does, maybe in Z: {home}")
-    name = described.kinematics.name
-    if name in _UPWARDS:
+    kinematics = described.kinematics
+    if kinematics.homes_upwards:
         return ResumeHomingPlan(homing=("G28",))
-    if name not in _STRAIGHT:
-        raise ApiError("not_ready", f"homing a {name} machine moves the head past the part: {home}")
+    if not kinematics.straight:
+        raise ApiError(
+            "not_ready", f"homing a {kinematics.name} machine moves the head past the part: {home}"
+        )
     around = tuple(f"G28 {axis}" for axis in missing if axis != "Z")
     if "Z" in missing and _homes_upwards(described):
         return ResumeHomingPlan(homing=("G28 Z", *around))

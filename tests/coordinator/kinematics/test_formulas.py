@@ -11,7 +11,6 @@ from coordinator.kinematics.base import Kinematics, Point, StepFunction, WorkSpa
 from coordinator.kinematics.delta import Delta
 from coordinator.kinematics.deltesian import Deltesian
 from coordinator.kinematics.rotary_delta import RotaryDelta
-from coordinator.motion.specs import StepKinematics
 from tests.coordinator.kinematics.machines import MACHINES, ceiling, number, points
 
 EVERY = pytest.mark.parametrize("name", MACHINES)
@@ -72,21 +71,21 @@ def upper_arm_angle(params: tuple[float, ...], point: Point) -> float:
 
 Formula = Callable[[tuple[float, ...], Point], float]
 
-FORMULAS: dict[StepKinematics, Formula] = {
-    StepKinematics.LINEAR: lambda p, at: p[0] * at[0] + p[1] * at[1] + p[2] * at[2],
-    StepKinematics.DELTA: lambda p, at: at[2] + math.sqrt(p[0] - (p[1] - at[0]) ** 2 - (p[2] - at[1]) ** 2),
-    StepKinematics.DELTESIAN: lambda p, at: at[2] + math.sqrt(p[0] - (p[1] - at[0]) ** 2),
-    StepKinematics.POLAR_RADIUS: lambda _, at: math.hypot(at[0], at[1]),
-    StepKinematics.POLAR_ANGLE: lambda _, at: math.atan2(at[1], at[0]),
-    StepKinematics.WINCH: math.dist,
-    StepKinematics.ROTARY_DELTA: upper_arm_angle,
+FORMULAS: dict[str | None, Formula] = {
+    None: lambda p, at: p[0] * at[0] + p[1] * at[1] + p[2] * at[2],
+    "delta": lambda p, at: at[2] + math.sqrt(p[0] - (p[1] - at[0]) ** 2 - (p[2] - at[1]) ** 2),
+    "deltesian": lambda p, at: at[2] + math.sqrt(p[0] - (p[1] - at[0]) ** 2),
+    "polar_radius": lambda _, at: math.hypot(at[0], at[1]),
+    "polar_angle": lambda _, at: math.atan2(at[1], at[0]),
+    "winch": math.dist,
+    "rotary_delta": upper_arm_angle,
 }
 """A rail's position as step generation is to compute it, from the parameters (LINEAR: the weights) alone."""
 
 
 def evaluate(function: StepFunction, point: Point) -> float:
-    linear = function.kinematics is StepKinematics.LINEAR
-    return FORMULAS[function.kinematics](function.weights if linear else function.params, point)
+    linear = function.formula is None
+    return FORMULAS[function.formula](function.weights if linear else function.params, point)
 
 
 @EVERY
@@ -108,9 +107,7 @@ def test_no_rail_is_much_faster_than_the_head(name: str, data: st.DataObject) ->
     inward = [-1 if p > 0 else 1 for p in point]  # stay inside
     near = tuple(p + s * STEP * abs(d) / length for p, s, d in zip(point, inward, direction, strict=True))
     before, after = machine.inverse(point), machine.inverse((near[0], near[1], near[2]))
-    scale = [
-        f.params[0] if f.kinematics is StepKinematics.ROTARY_DELTA else 1.0 for f in machine.step_functions()
-    ]
+    scale = [f.lever_mm or 1.0 for f in machine.step_functions()]
     for a, b, mm_per_unit in zip(before, after, scale, strict=True):
         assert abs(b - a) * mm_per_unit <= STEP * (allowed.get(name, 1 + math.hypot(3, 1)) + 1e-3)
 
@@ -121,7 +118,7 @@ TOWERS = pytest.mark.parametrize("name", ["delta", "deltesian", "rotary_delta"])
 def endstops(machine: Kinematics) -> tuple[float, ...]:
     """Return where the towers' or arms' endstops are."""
     if isinstance(machine, RotaryDelta):
-        return machine.endstop_angles
+        return machine.endstop_positions
     assert isinstance(machine, Delta | Deltesian)
     return machine.endstop_positions
 

@@ -6,19 +6,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from coordinator.motion.specs import StepKinematics, StepperSpec
+from coordinator.motion.specs import StepperSpec
 from coordinator.verification.exact_path import Setting
 from coordinator.verification.exact_signal import TRAPEZOID
 from tests.coordinator.motion.steps_harness import ORIGIN, X, stepper
 from tests.coordinator.motion.steps_oracle import Move, Position, make_move
 
 PARAMS = {
-    StepKinematics.DELTA: (250.0**2, 100.0, -60.0),
-    StepKinematics.DELTESIAN: (200.0**2, -110.0),
-    StepKinematics.POLAR_RADIUS: (),
-    StepKinematics.POLAR_ANGLE: (),
-    StepKinematics.WINCH: (-300.0, 500.0, 900.0),
-    StepKinematics.ROTARY_DELTA: (120.0, 300.0, 60.0, 250.0, math.cos(2.0), math.sin(2.0)),
+    "delta": (250.0**2, 100.0, -60.0),
+    "deltesian": (200.0**2, -110.0),
+    "polar_radius": (),
+    "polar_angle": (),
+    "winch": (-300.0, 500.0, 900.0),
+    "rotary_delta": (120.0, 300.0, 60.0, 250.0, math.cos(2.0), math.sin(2.0)),
 }
 
 
@@ -36,9 +36,8 @@ LINEAR = {
 def spec_of(kind: str) -> StepperSpec:
     if kind in LINEAR:
         return stepper(0, LINEAR[kind], 0.002 if kind == "extruder" else 0.00625)
-    found = next(k for k in PARAMS if k.name == kind)
-    rad = found in {StepKinematics.POLAR_ANGLE, StepKinematics.ROTARY_DELTA}
-    return replace(stepper(0, X, 1e-4 if rad else 0.00625), kinematics=found, params=PARAMS[found])
+    rad = kind in {"polar_angle", "rotary_delta"}
+    return replace(stepper(0, X, 1e-4 if rad else 0.00625), formula=kind, params=PARAMS[kind])
 
 
 def chain(seed: int, count: int) -> list[Move]:

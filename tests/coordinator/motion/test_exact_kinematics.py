@@ -38,7 +38,7 @@ def generated(spec: StepperSpec, moves: Any, setting: Setting) -> Stream:
     return replay(bytes(batch), node, [spec])[spec.name]
 
 
-@pytest.mark.parametrize("kind", [*LINEAR, *(k.name for k in PARAMS)])
+@pytest.mark.parametrize("kind", [*LINEAR, *PARAMS])
 @pytest.mark.parametrize("setting", SETTINGS)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_every_step_is_where_the_exact_motion_has_it(kind: str, setting: str, seed: int) -> None:

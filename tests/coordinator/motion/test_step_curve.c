@@ -9,11 +9,12 @@
 
 enum { MOVES = 30000 };
 enum { SHAPED, DELTA, SMOOTHED, ANGLE, STEPPERS };
+extern const struct step_formula formula_delta, formula_polar_angle;
 static const struct step_stepper_config steppers[STEPPERS] = {
-    [SHAPED] = {0, 0, STEP_LINEAR, {1, 1, 0, 0}, {0}, 0.02, 0, 2e-6},
-    [DELTA] = {0, 1, STEP_DELTA, {0}, {62500, 90, -50}, 0.02, 0, 2e-6},
-    [SMOOTHED] = {0, 2, STEP_LINEAR, {0, 0, 0, 1}, {0}, 0.004, 0, 2e-6},
-    [ANGLE] = {0, 3, STEP_POLAR_ANGLE, {0}, {0}, 0.002, 0, 2e-6},
+    [SHAPED] = {0, 0, NULL, {1, 1, 0, 0}, {0}, 0.02, 0, 2e-6},
+    [DELTA] = {0, 1, &formula_delta, {0}, {62500, 90, -50}, 0.02, 0, 2e-6},
+    [SMOOTHED] = {0, 2, NULL, {0, 0, 0, 1}, {0}, 0.004, 0, 2e-6},
+    [ANGLE] = {0, 3, &formula_polar_angle, {0}, {0}, 0.002, 0, 2e-6},
 };
 static const struct step_node_config nodes[] = {{64e6, 4096, 11, 12, 13}};
 static const double start[AXES] = {30, 20, 5, 0};

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from coordinator.motion.specs import StepKinematics, StepperSpec
+from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps.shapers import SHAPER_KINDS, shaper_impulses
 from coordinator.motion.steps.steps import StepError
 from tests.coordinator.motion.steps_harness import MAX_ERROR_S, NOISE_S, Run, node_spec, rows, stepper
@@ -99,21 +99,21 @@ def rotary(q: Sequence[float], x: Floats, y: Floats, z: Floats) -> Floats:
 
 
 ROTARY = (80.0, 200.0, 60.0, 170.0, math.cos(0.4), math.sin(0.4))
-KINEMATICS: dict[StepKinematics, tuple[tuple[float, ...], float, Callable[..., Floats]]] = {
-    StepKinematics.DELTA: (
+KINEMATICS: dict[str, tuple[tuple[float, ...], float, Callable[..., Floats]]] = {
+    "delta": (
         (250.0**2, 90.0, -50.0),
         0.0125,
         lambda x, y, z: z + np.sqrt(250.0**2 - (90 - x) ** 2 - (-50 - y) ** 2),
     ),
-    StepKinematics.DELTESIAN: (
+    "deltesian": (
         (200.0**2, -120.0),
         0.0125,
         lambda x, _y, z: z + np.sqrt(200.0**2 - (-120 - x) ** 2),
     ),
-    StepKinematics.POLAR_RADIUS: ((), 0.0125, lambda x, y, _z: np.hypot(x, y)),
-    StepKinematics.POLAR_ANGLE: ((), 0.0005, lambda x, y, _z: np.unwrap(np.arctan2(y, x))),
-    StepKinematics.ROTARY_DELTA: (ROTARY, 0.0002, lambda x, y, z: rotary(ROTARY, x, y, z)),
-    StepKinematics.WINCH: (
+    "polar_radius": ((), 0.0125, lambda x, y, _z: np.hypot(x, y)),
+    "polar_angle": ((), 0.0005, lambda x, y, _z: np.unwrap(np.arctan2(y, x))),
+    "rotary_delta": (ROTARY, 0.0002, lambda x, y, z: rotary(ROTARY, x, y, z)),
+    "winch": (
         (5.0, 20.0, -40.0),
         0.0125,
         lambda x, y, z: np.sqrt((x - 5) ** 2 + (y - 20) ** 2 + (z + 40) ** 2),
@@ -170,10 +170,10 @@ def test_smoothed_pressure_advance(advances: Sequence[float]) -> None:
 
 @pytest.mark.parametrize("kind", list(KINEMATICS))
 @pytest.mark.parametrize("impulses", [PLAIN, shaper_impulses("ei", 50.0, 0.1)])
-def test_kinematics(kind: StepKinematics, impulses: Impulses) -> None:
+def test_kinematics(kind: str, impulses: Impulses) -> None:
     params, distance, formula = KINEMATICS[kind]
     moves = square()
-    spec: StepperSpec = replace(stepper(0, (0.0,) * 4, distance), kinematics=kind, params=params)
+    spec: StepperSpec = replace(stepper(0, (0.0,) * 4, distance), formula=kind, params=params)
     run = Run([spec], [node_spec()], start=START)
     for axis in range(3):
         run.gen.set_shaper(axis, impulses)
@@ -212,8 +212,8 @@ def test_a_move_after_a_flush_begins_late_enough_to_leave_the_past_alone() -> No
 
 
 def test_the_axes_of_a_delta_are_declared_elsewhere_without_a_step() -> None:
-    params, distance, formula = KINEMATICS[StepKinematics.DELTA]
-    spec = replace(stepper(0, (0.0,) * 4, distance), kinematics=StepKinematics.DELTA, params=params)
+    params, distance, formula = KINEMATICS["delta"]
+    spec = replace(stepper(0, (0.0,) * 4, distance), formula="delta", params=params)
     run = Run([spec], [node_spec()], start=(0.0, 0.0, 0.0, 0.0))
     run.gen.set_axis_position(START)
     play(run, square())

@@ -9,9 +9,10 @@
 #include <stdlib.h>
 #include <string.h>
 
+extern const struct step_formula formula_winch;
 static const struct step_stepper_config steppers[] = {
-    {0, 0, STEP_LINEAR, {1, 0, 0, 0}, {0}, 0.01, 0, 2e-6},
-    {1, 1, STEP_WINCH, {0, 0, 0, 0}, {-100, 0, 500}, 0.01, 0, 2e-6},
+    {0, 0, NULL, {1, 0, 0, 0}, {0}, 0.01, 0, 2e-6},
+    {1, 1, &formula_winch, {0, 0, 0, 0}, {-100, 0, 500}, 0.01, 0, 2e-6},
 };
 static const struct step_node_config nodes[] = {{168e6, 512, 11, 200, -3}, {16e6, 512, 11, 12, 13}};
 static const struct step_config config = {2, 2, steppers, nodes, 12.5e-6, {0, 0, 0, 0}};

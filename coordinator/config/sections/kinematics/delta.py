@@ -4,21 +4,36 @@ import math
 
 from coordinator.config.model import RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
+from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, read_tower_homing
-from coordinator.config.sections.kinematics.frame import Frame, tidy
-from coordinator.config.sections.kinematics.printer_options import (
-    DELTA_RADIUS,
+from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, tidy
+from coordinator.config.sections.kinematics.towers import (
     MINIMUM_Z,
-    PRINT_RADIUS,
     ROUND_RANGE_OPTIONS,
+    check_directions,
+    check_height,
 )
-from coordinator.config.sections.kinematics.tower_checks import check_directions, check_height
 from coordinator.config.sections.rails import read_extra_steppers
 from coordinator.config.sections.reading import Reading
-from coordinator.config.sections.steppers import MAX_POSITION, MOTOR, read_stepper
+from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
 from coordinator.kinematics.delta import MAX_TOWER_SPEED, Delta, Tower
 
+DELTA_RADIUS = FloatOption(
+    name="delta_radius",
+    help="from a tower's joint to the head's, measured level, with the head in the middle",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+PRINT_RADIUS = FloatOption(
+    name="print_radius",
+    help="how far from the middle the head may be; by default delta_radius, or less where rods lie too flat",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+PRINTER = SectionSpec(help="What a delta needs besides", options=(DELTA_RADIUS, PRINT_RADIUS, MINIMUM_Z))
 ARM_LENGTH = FloatOption(
     name="arm_length",
     help="length of the rods, from joint to joint; by default that of stepper_a",
@@ -95,3 +110,8 @@ def _check_radius(printer: SectionReader, first: SectionReader, delta: Delta, no
             f"{printer.place_of(PRINT_RADIUS)}: 'print_radius' of [printer] is {delta.print_radius:g} mm, but"
             f" the rods lie too flat beyond {widest:.5g} mm: moves end there"
         )
+
+
+DELTA = KinematicsKind(
+    Delta, read_delta, PRINTER, reference={"[stepper_a], [stepper_b], [stepper_c] of a delta": TOWER}
+)

@@ -4,18 +4,38 @@ import math
 
 from coordinator.config.model import RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
+from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, read_tower_homing
-from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of, tidy
-from coordinator.config.sections.kinematics.printer_options import MIN_ANGLE, MINIMUM_Z, PRINT_WIDTH
-from coordinator.config.sections.kinematics.tower_checks import check_height
+from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, axis_range, home_of, tidy
+from coordinator.config.sections.kinematics.towers import MINIMUM_Z, check_height
 from coordinator.config.sections.rails import read_extra_steppers, read_rail
 from coordinator.config.sections.reading import Reading
-from coordinator.config.sections.steppers import MAX_POSITION, MOTOR, read_stepper
+from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
 from coordinator.kinematics.base import linear
 from coordinator.kinematics.deltesian import Arm, Deltesian
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
+MIN_ANGLE = FloatOption(
+    name="min_angle",
+    help="smallest angle between a rod and the horizontal, which limits X",
+    default=5.0,
+    unit="°",
+    above=0,
+    below=90,
+)
+PRINT_WIDTH = FloatOption(
+    name="print_width",
+    help="range of X, centred; by default what min_angle allows",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+PRINTER = SectionSpec(
+    help="What a deltesian needs besides",
+    options=(MINIMUM_Z, MIN_ANGLE, PRINT_WIDTH),
+    later=("slow_ratio",),
+)
 ARM_LENGTH = FloatOption(
     name="arm_length",
     help="length of the rod, from joint to joint; by default that of stepper_left",
@@ -89,3 +109,12 @@ def _check_width(printer: SectionReader, left: SectionReader, deltesian: Deltesi
         raise printer.bad(
             PRINT_WIDTH, f"but rods would lie below min_angle; it can be at most {2 * widest:.5g} mm"
         )
+
+
+DELTESIAN = KinematicsKind(
+    Deltesian,
+    read_deltesian,
+    PRINTER,
+    steppers=("left", "right"),
+    reference={"[stepper_left], [stepper_right] of a deltesian": SIDE},
+)

@@ -1,15 +1,16 @@
 """[dual_carriage]: a second carriage on X or Y, beside the first."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import DualCarriageDescription, RailDescription, StepperDescription
 from coordinator.config.options import ChoiceOption, FloatOption, SectionReader, SectionSpec, one_of
+from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.config.sections.homing import WAITING
 from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of
 from coordinator.config.sections.rails import RAIL, read_axis
 from coordinator.config.sections.reading import Reading
-from coordinator.config.sections.steppers import MAX_POSITION
 from coordinator.kinematics.base import StepFunction
 from coordinator.kinematics.dual_carriage import Carriage, DualCarriage
 
@@ -27,32 +28,30 @@ DUAL_CARRIAGE = SectionSpec(
     options=(AXIS, SAFE_DISTANCE, *RAIL.options),
     later=RAIL.later,
 )
-_POSSIBLE = {"cartesian": "xy", "hybrid_corexy": "x", "hybrid_corexz": "x"}
-"""Axes that may have two carriages, by kinematics."""
-_BELT_CARRIED_BY = {"cartesian": None, "hybrid_corexy": 1, "hybrid_corexz": 2}
-"""The axis whose gantry carries the belt along: the second belt runs the other way round."""
 
 
-def read_dual_carriage(reading: Reading, frame: Frame) -> Frame:
-    """Return the frame with the second carriage if there is one; raises ConfigError."""
-    section = reading.config.sections.get("dual_carriage")
-    if section is None:
-        return frame
-    possible = _POSSIBLE.get(frame.kinematics.name)
-    if possible is None:
+def read_dual_carriage(reading: Reading, frame: Frame, possible: Sequence[str]) -> Frame:
+    """Return the frame with the second carriage of [dual_carriage]; raises ConfigError.
+
+    POSSIBLE: the kinematics that have a place for one, for the message.
+    """
+    kinematics = frame.kinematics
+    section = reading.config.sections["dual_carriage"]
+    if not kinematics.second_carriages:
         raise ConfigError(
             section.place,
-            f"kinematics {frame.kinematics.name} has no place for [dual_carriage]; it needs"
-            f" {one_of(tuple(_POSSIBLE))}, or generic_cartesian with [dual_carriage NAME]",
+            f"kinematics {kinematics.name} has no place for [dual_carriage]; it needs"
+            f" {one_of(tuple(possible))}, or generic_cartesian with [dual_carriage NAME]",
         )
     reading.used.add(section.name)
     reader = SectionReader(section, DUAL_CARRIAGE)
     letter = reader.get(AXIS)
-    if letter not in possible:
-        raise reader.bad(AXIS, f"but kinematics {frame.kinematics.name} can have a second carriage on x only")
+    function = kinematics.second_carriages.get(letter)
+    if function is None:
+        raise reader.bad(AXIS, f"but kinematics {kinematics.name} can have a second carriage on x only")
     axis = "xyz".index(letter)
     first = frame.rails[axis]
-    second = read_axis(reading, reader, letter, _second_function(frame.kinematics.name, axis))
+    second = read_axis(reading, reader, letter, function)
     dual = describe_dual(reader, axis, (first, first.steppers), (second, second.steppers))
     reading.finish(reader, waiting=WAITING if second.homing.waits else ())
     return park(frame, dual, second.steppers, reader.name)
@@ -103,12 +102,3 @@ def describe_dual(
 def _carriage(rail: RailDescription, steppers: tuple[StepperDescription, ...]) -> Carriage:
     low, high = axis_range(rail)
     return Carriage(low, high, home_of(rail), tuple((stepper.name, stepper.weights) for stepper in steppers))
-
-
-def _second_function(kinematics: str, axis: int) -> StepFunction:
-    weights = [0.0, 0.0, 0.0, 0.0]
-    weights[axis] = 1.0
-    carrier = _BELT_CARRIED_BY[kinematics]
-    if carrier is not None:
-        weights[carrier] = 1.0
-    return StepFunction(weights=(weights[0], weights[1], weights[2], weights[3]))

@@ -1,8 +1,11 @@
-"""What the reader of a kinematics gives."""
+"""What describes a kinematics to the configuration, and what its reader returns."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 from coordinator.config.model import DualCarriageDescription, RailDescription, StepperDescription
+from coordinator.config.options import SectionReader, SectionSpec
+from coordinator.config.sections.reading import Reading
 from coordinator.kinematics.base import Kinematics, Point, WorkSpace
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
@@ -25,6 +28,21 @@ class Frame:
     def steppers(self) -> tuple[StepperDescription, ...]:
         """All steppers, each once."""
         return self.motors or tuple(stepper for rail in self.rails for stepper in rail.steppers)
+
+
+@dataclass(frozen=True, slots=True)
+class KinematicsKind:
+    """One value of ``kinematics`` in [printer]."""
+
+    kinematics: type[Kinematics]
+    read: Callable[[Reading, SectionReader], Frame]
+    """Reads the sections and what [printer] says besides; raises ConfigError."""
+    printer: SectionSpec | None = None
+    """What [printer] may contain besides."""
+    steppers: tuple[str, ...] = ()
+    """Sections [stepper_NAME] that it has, but for those of one letter."""
+    reference: Mapping[str, SectionSpec] = field(default_factory=dict)
+    """Its own sections for docs/configuration.md, by title."""
 
 
 def axis_range(rail: RailDescription) -> tuple[float, float]:

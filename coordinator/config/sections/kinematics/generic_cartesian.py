@@ -11,7 +11,7 @@ from coordinator.config.options import BadValue, ChoiceOption, Option, SectionRe
 from coordinator.config.pins import PinDescription
 from coordinator.config.sections.homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
 from coordinator.config.sections.kinematics.dual_carriage import SAFE_DISTANCE, describe_dual, park
-from coordinator.config.sections.kinematics.frame import Frame, box_of, home_of
+from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, box_of, home_of
 from coordinator.config.sections.rails import RANGE, read_range
 from coordinator.config.sections.reading import Reading, SecondEndstop
 from coordinator.config.sections.steppers import MOTOR, read_stepper
@@ -269,3 +269,15 @@ def _without_second(reading: Reading, frame: Frame, carriages: _Carriages) -> Fr
 
 def _movers(steppers: tuple[StepperDescription, ...], axis: int) -> tuple[StepperDescription, ...]:
     return tuple(stepper for stepper in steppers if stepper.weights[axis])
+
+
+GENERIC_CARTESIAN = KinematicsKind(
+    GenericCartesian,
+    read_generic,
+    reference={
+        "[carriage NAME]": CARRIAGE,
+        "[stepper NAME]": STEPPER,
+        "[extra_carriage NAME]": EXTRA_CARRIAGE,
+        "[dual_carriage NAME]": DUAL_CARRIAGE,
+    },
+)

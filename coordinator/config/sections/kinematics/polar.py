@@ -3,7 +3,7 @@
 from coordinator.config.model import NO_ENDSTOP, RailDescription
 from coordinator.config.options import SectionReader, SectionSpec
 from coordinator.config.sections.homing import WAITING
-from coordinator.config.sections.kinematics.frame import Frame, axis_range, home_of
+from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, axis_range, home_of
 from coordinator.config.sections.rails import POSITION_MAX, read_extra_steppers, read_rail
 from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.steppers import TURNING_MOTOR, read_stepper
@@ -11,6 +11,9 @@ from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
 from coordinator.kinematics.polar import Polar
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
+PRINTER = SectionSpec(
+    help="What a polar machine may have besides", options=(), later=("max_angular_velocity",)
+)
 BED = SectionSpec(
     help="The motor that turns the bed of a polar machine", options=TURNING_MOTOR, later=LATER_STEPPER_OPTIONS
 )
@@ -33,3 +36,8 @@ def read_polar(reading: Reading, _printer: SectionReader) -> Frame:
         raise SectionReader(option, SectionSpec("", ())).bad(POSITION_MAX, "must be above 0")
     home = (home_of(arm), 0.0, home_of(z))
     return Frame(Polar((low, high), axis_range(z)), (bed, arm, z), home, range_options=RANGE_OPTIONS)
+
+
+POLAR = KinematicsKind(
+    Polar, read_polar, PRINTER, steppers=("bed", "arm"), reference={"[stepper_bed] of a polar machine": BED}
+)

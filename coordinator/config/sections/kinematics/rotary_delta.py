@@ -4,22 +4,46 @@ import math
 
 from coordinator.config.model import RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
+from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.config.sections.homing import HOMING, POSITION_ENDSTOP, WAITING, read_tower_homing
-from coordinator.config.sections.kinematics.frame import Frame, tidy
-from coordinator.config.sections.kinematics.printer_options import (
-    ARMS_PRINT_RADIUS,
+from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, tidy
+from coordinator.config.sections.kinematics.towers import (
     MINIMUM_Z,
     ROUND_RANGE_OPTIONS,
-    SHOULDER_HEIGHT,
-    SHOULDER_RADIUS,
+    check_directions,
+    check_height,
 )
-from coordinator.config.sections.kinematics.tower_checks import check_directions, check_height
 from coordinator.config.sections.rails import read_extra_steppers
 from coordinator.config.sections.reading import Reading
-from coordinator.config.sections.steppers import MAX_POSITION, TURNING_MOTOR, read_stepper
+from coordinator.config.sections.steppers import TURNING_MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
 from coordinator.kinematics.rotary_delta import Arm, RotaryDelta
 
+SHOULDER_RADIUS = FloatOption(
+    name="shoulder_radius",
+    help="radius of the shoulders' circle less that of the joints at the head",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+SHOULDER_HEIGHT = FloatOption(
+    name="shoulder_height",
+    help="height of the shoulders above the bed less that of the head's joints above the nozzle",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+PRINT_RADIUS = FloatOption(
+    name="print_radius",
+    help="how far from the middle the head may be; by default what gives the largest cylinder",
+    unit="mm",
+    above=0,
+    maximum=MAX_POSITION,
+)
+PRINTER = SectionSpec(
+    help="What a rotary delta needs besides",
+    options=(SHOULDER_RADIUS, SHOULDER_HEIGHT, PRINT_RADIUS, MINIMUM_Z),
+)
 UPPER_LENGTH = FloatOption(
     name="upper_arm_length",
     help="length of the upper arm, from shoulder to elbow; by default that of stepper_a",
@@ -54,7 +78,7 @@ _ANGLES = (30.0, 150.0, 270.0)
 def read_rotary_delta(reading: Reading, printer: SectionReader) -> Frame:
     """Return the frame of a rotary delta; raises ConfigError."""
     radius, height = printer.get(SHOULDER_RADIUS), printer.get(SHOULDER_HEIGHT)
-    min_z, print_radius = printer.get(MINIMUM_Z), printer.find(ARMS_PRINT_RADIUS)
+    min_z, print_radius = printer.get(MINIMUM_Z), printer.find(PRINT_RADIUS)
     readers = [SectionReader(reading.get(f"stepper_{name}", WHY), ARM) for name in "abc"]
     arms, ends = [], []
     for reader, default in zip(readers, _ANGLES, strict=True):
@@ -73,7 +97,7 @@ def read_rotary_delta(reading: Reading, printer: SectionReader) -> Frame:
         steppers = (first, *read_extra_steppers(reading, reader.name, function))
         reading.finish(reader, waiting=WAITING if homing.waits else ())
         rails.append(RailDescription(reader.name[-1], steppers, None, None, homing, reader.place))
-    home = tidy(machine.forward(machine.endstop_angles))
+    home = tidy(machine.forward(machine.endstop_positions))
     return Frame(machine, tuple(rails), home, range_options=ROUND_RANGE_OPTIONS)
 
 
@@ -102,6 +126,14 @@ def _check_reach(printer: SectionReader, first: SectionReader, machine: RotaryDe
         )
     if machine.print_radius is not None and machine.print_radius > widest:
         raise printer.bad(
-            ARMS_PRINT_RADIUS, f"but the arms reach only to {widest:.5g} mm from the middle; reduce it"
+            PRINT_RADIUS, f"but the arms reach only to {widest:.5g} mm from the middle; reduce it"
         )
     check_height(printer, machine.work_space.high[2], machine.min_z)
+
+
+ROTARY_DELTA = KinematicsKind(
+    RotaryDelta,
+    read_rotary_delta,
+    PRINTER,
+    reference={"[stepper_a], [stepper_b], [stepper_c] of a rotary delta": ARM},
+)

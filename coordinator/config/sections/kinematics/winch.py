@@ -5,11 +5,12 @@ import string
 
 from coordinator.config.model import NO_ENDSTOP, RailDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec
+from coordinator.config.sections.bounds import MAX_POSITION
 from coordinator.config.sections.homing import WAITING
-from coordinator.config.sections.kinematics.frame import Frame
+from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind
 from coordinator.config.sections.rails import read_extra_steppers
 from coordinator.config.sections.reading import Reading
-from coordinator.config.sections.steppers import MAX_POSITION, MOTOR, read_stepper
+from coordinator.config.sections.steppers import MOTOR, read_stepper
 from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
 from coordinator.kinematics.base import Point
 from coordinator.kinematics.geometry import cross, dot, subtract
@@ -25,7 +26,7 @@ ANCHORS = tuple(
     )
     for axis in "xyz"
 )
-WINCH = SectionSpec(
+SPEC = SectionSpec(
     help="The winch of one cable: stepper_a, stepper_b, stepper_c, up to stepper_z",
     options=(*MOTOR, *ANCHORS),
     later=LATER_STEPPER_OPTIONS,
@@ -49,7 +50,7 @@ def read_winch(reading: Reading, _printer: SectionReader) -> Frame:
         if section is None:
             reading.used.discard(f"stepper_{letter}")
             break
-        readers.append(SectionReader(section, WINCH))
+        readers.append(SectionReader(section, SPEC))
     anchors = tuple(_read_anchor(reader) for reader in readers)
     _check_anchors(readers, anchors)
     winch = Winch(anchors)
@@ -81,3 +82,8 @@ def _check_anchors(readers: list[SectionReader], anchors: tuple[Point, ...]) -> 
             ANCHORS[0],
             "the anchors of stepper_a, stepper_b and stepper_c are on one line; place one beside it",
         )
+
+
+WINCH = KinematicsKind(
+    Winch, read_winch, reference={"[stepper_a], [stepper_b], [stepper_c] … of winches": SPEC}
+)

@@ -96,7 +96,7 @@ def test_a_polar_machine() -> None:
 def test_a_rotary_delta() -> None:
     machine = example("rotary_delta")
     assert isinstance(machine.kinematics, RotaryDelta)
-    assert machine.kinematics.inverse(machine.home) == pytest.approx(machine.kinematics.endstop_angles)
+    assert machine.kinematics.inverse(machine.home) == pytest.approx(machine.kinematics.endstop_positions)
     gears = 107 / 16 * 60 / 16
     assert machine.steppers[0].step_distance == pytest.approx(math.tau / (200 * 16 * gears))
     assert machine.kinematics.work_space.max_radius > 150

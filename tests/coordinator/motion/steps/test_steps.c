@@ -10,9 +10,9 @@
 #include <string.h>
 
 static const struct step_stepper_config steppers[] = {
-    {0, 0, STEP_LINEAR, {1, 1, 0, 0}, {0}, 0.00625, 0, 2e-6},
-    {0, 1, STEP_LINEAR, {1, -1, 0, 0}, {0}, 0.00625, 1, 2e-6},
-    {1, 2, STEP_LINEAR, {0, 0, 0, 1}, {0}, 0.0014, 0, 0},
+    {0, 0, NULL, {1, 1, 0, 0}, {0}, 0.00625, 0, 2e-6},
+    {0, 1, NULL, {1, -1, 0, 0}, {0}, 0.00625, 1, 2e-6},
+    {1, 2, NULL, {0, 0, 0, 1}, {0}, 0.0014, 0, 0},
 };
 static const struct step_node_config nodes[] = {{168e6, 5, 11, 200, -3}, {16e6, 1024, 11, 12, 13}};
 

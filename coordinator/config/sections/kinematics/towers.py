@@ -1,10 +1,24 @@
-"""What towers and arms have to keep to, whatever their kinematics."""
+"""What kinematics with towers or arms around the bed share: options and checks."""
 
 import math
 
 from coordinator.config.options import FloatOption, SectionReader
-from coordinator.config.sections.kinematics.printer_options import MINIMUM_Z
+from coordinator.config.sections.bounds import MAX_POSITION
 
+MINIMUM_Z = FloatOption(
+    name="minimum_z_position",
+    help="lowest Z that the head may go to",
+    default=0.0,
+    unit="mm",
+    minimum=-MAX_POSITION,
+    maximum=MAX_POSITION,
+)
+ROUND_RANGE_OPTIONS = (
+    "print_radius of [printer]",
+    "print_radius of [printer]",
+    "minimum_z_position of [printer] and position_endstop of [stepper_a]",
+)
+"""What says how far X, Y and Z may go where carriages or arms stand around the bed."""
 _TOO_CLOSE_DEG = 30.0
 
 
