@@ -32,7 +32,7 @@ from coordinator.assembly.load import load_machine
 from coordinator.config.model import CanConnection, MachineDescription
 from coordinator.gcode.program import Program
 from coordinator.runtime.machine import Machine
-from coordinator.streaming.job_runner import run_job
+from coordinator.service.core.job_runner import run_job
 from coordinator.streaming.streamer import Streamer
 from coordinator.support.progress import Progress
 from nodes.virtual.edge_log import EdgeLog

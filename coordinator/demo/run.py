@@ -16,7 +16,8 @@ from coordinator.gcode.program import Program
 from coordinator.motion.specs import StepperSpec
 from coordinator.runtime.host import Computer, LinuxHost
 from coordinator.runtime.machine import Machine
-from coordinator.streaming.job_runner import OnProgress, Outcome, run_job
+from coordinator.service.core.job_runner import OnProgress, run_job
+from coordinator.service.jobs.outcome import Outcome
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.support.command_options import DEMO_GCODE, DemoOptions
 from coordinator.support.interrupts import run_to_end

@@ -10,13 +10,14 @@ from typing import Any, Final
 from coordinator.config.model import StepperDescription
 from coordinator.gcode.program import Program
 from coordinator.runtime.machine import Machine, link_of
+from coordinator.service.core.job_runner import run_job
+from coordinator.service.jobs.outcome import Outcome
 from coordinator.simulate import checker, truth
 from coordinator.simulate.checker import Ending, OutputTruth, QueueDepth, StepperTruth, Violation
 from coordinator.simulate.program import make_program
 from coordinator.simulate.result import Result
 from coordinator.simulate.scenario import OutputSetting, Scenario
 from coordinator.simulate.stage import Stage
-from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.support.toml_values import ScenarioError
 from nodes.link import Link

@@ -15,9 +15,9 @@ import numpy as np
 
 from coordinator.gcode.program import Program
 from coordinator.runtime.machine import Machine, MachineStopped
+from coordinator.service.core.job_runner import run_job
 from coordinator.simulate.scenario import Scenario
 from coordinator.simulate.stage import Stage
-from coordinator.streaming.job_runner import run_job
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.support.errors import CanductorError

@@ -4,16 +4,14 @@ The control loop says which tables are wanted; the motion worker takes them up w
 taken up makes no step by itself: docs/tables.md tells how it comes into effect.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 from coordinator.config.model import MachineDescription
 from coordinator.motion.specs import MotionLimits
 from coordinator.motion.steps.steps import TABLE_POINTS_MAX, AxisCorrection, StepGenerator
 from coordinator.tables.axis_table import AxisTable, Unit
-from coordinator.tables.store import TableStore
 
 AXES: Final = "xyz"
 WHICH_AXES: Final = (
@@ -140,24 +138,3 @@ def why_not_corrected(description: MachineDescription, table: AxisTable) -> str:
             f"generation has room for {TABLE_POINTS_MAX}; thin it out"
         )
     return ""
-
-
-def kept_compensation(
-    description: MachineDescription, folder: "Path", say: "Callable[[str], None]"
-) -> Compensation | None:
-    """Return what corrects axes by the tables that a service kept in FOLDER; None without [axis_tables].
-
-    SAY gets a sentence for each that cannot be used.
-    """
-    if description.axis_tables is None:
-        return None
-    tables, problems = TableStore(folder).load()
-    compensation = Compensation(description.limits)
-    for axis, table in tables.items():
-        if why := why_not_corrected(description, table):
-            problems.append(why)
-        else:
-            compensation.want(axis, table)
-    for problem in problems:
-        say(problem)
-    return compensation

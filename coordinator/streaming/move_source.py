@@ -83,15 +83,3 @@ class Planned:
     """``toolhead``, ``gcode_move``, extruders and carriages as macros see them (gcode/figures.py)."""
     unit_mm: float = 1.0
     """Of the program: 25.4 after G20."""
-
-
-@dataclass(frozen=True, slots=True)
-class JobState:
-    """How far a job is."""
-
-    done_bytes: int
-    size_bytes: int | None
-    print_time_s: float
-    """Seconds of the job executed."""
-    moves: int
-    planned: Planned

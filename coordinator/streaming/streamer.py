@@ -9,11 +9,10 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
-from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import Emergency, End, Event, Notice, StandstillAction
 from coordinator.runtime.machine import Machine, MachineStopped, link_of
 from coordinator.streaming.compensation import Compensation
-from coordinator.streaming.move_source import JobState, MoveSource, Planned, ProgramOutput, Witness
+from coordinator.streaming.move_source import MoveSource, Planned, ProgramOutput, Witness
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.standstill import StandstillTask
 from coordinator.streaming.timed_events import Due, DueEvents
@@ -33,8 +32,8 @@ CAUSE_WAIT_S: Final = 0.1
 class Streamer:
     """Runs one JOB on MACHINE, whose nodes are READY.
 
-    ON_TOLD gets replies and notices, ON_STATE how far it is in every cycle; ON_CYCLE is called at its end.
-    WITNESS sees the moves and the commands go by, COMPENSATION has the tables of the axes.
+    ON_OUTPUT gets replies and notices, ON_STATE the state of the planner in every cycle, ON_CYCLE is called at
+    the end of each. WITNESS sees moves and commands pass, COMPENSATION has the tables of the axes.
     """
 
     def __init__(
@@ -46,7 +45,7 @@ class Streamer:
         witness: Witness | None = None,
         compensation: "Compensation | None" = None,
         on_output: Callable[[ProgramOutput], None],
-        on_state: Callable[[JobState], None],
+        on_state: Callable[[Planned], None],
         on_cycle: Callable[[], None] = lambda: None,
     ) -> None:
         self._machine = machine
@@ -67,6 +66,12 @@ class Streamer:
     def print_time_now(self) -> float:
         """Return the present print time."""
         return self.worker.print_time_now()
+
+    @property
+    def executed_s(self) -> float:
+        """Return for how long the machine has moved since ``began_s``, in s of print time."""
+        now = self.print_time_now()
+        return max(0.0, min(now, self.worker.pipeline.appended_until) - self.began_s)
 
     def hold(self, cause: str) -> None:
         """Let the g-code wait, from the control loop: what is planned is carried out, to a standstill.
@@ -90,6 +95,7 @@ class Streamer:
         Raises MachineStopped when the machine stops meanwhile, CanductorError when the job or a link fails;
         the machine is stopped then.
         """
+        self.worker.began_at = await self._machine.query_stepper_counts()
         self._look_at_load()
         self.began_s = self.worker.begin()
         with self._machine.job(self):
@@ -113,9 +119,7 @@ class Streamer:
                 await self._standstill.close()
 
     async def _stop_after(self, error: BaseException | None, watch: asyncio.Future[MachineStopped]) -> None:
-        """Stop the machine after ERROR of the stream, unless it is that of a program and all stands still."""
-        if isinstance(error, GCodeError):
-            return
+        """Stop the machine after ERROR of the stream."""
         # The link may have failed a moment before its node is known to be lost: that is the better cause.
         await asyncio.wait((watch,), timeout=CAUSE_WAIT_S)
         self._machine.stop(f"{error}; all nodes were stopped")
@@ -143,8 +147,6 @@ class Streamer:
                     await asyncio.sleep(CYCLE_S)
             self.ended_s = self._job.planner.print_time_end_s
             await self._settle(thread)
-        if self.worker.failure is not None:
-            raise self.worker.failure
 
     async def _attend(self, event: StandstillAction) -> None:
         """Have EVENT performed once all moves before it are executed."""
@@ -184,7 +186,7 @@ class Streamer:
         await asyncio.sleep(0)
         self._tell(cycle)
         await asyncio.sleep(0)
-        self._report(cycle.planned)
+        self._on_state(cycle.planned)
         await asyncio.sleep(0)
         self._on_cycle()
         await asyncio.sleep(0)
@@ -199,18 +201,6 @@ class Streamer:
     def _look_at_load(self) -> None:
         busy = self._machine.is_busy(BUSY_LOAD)
         self.worker.start_lead_s = BUSY_START_LEAD_S if busy else START_LEAD_S
-
-    def _report(self, planned: Planned) -> None:
-        now = self.print_time_now()
-        self._on_state(
-            JobState(
-                self.worker.done.done_bytes,
-                self.worker.done.size_bytes,
-                max(0.0, min(now, self.worker.pipeline.appended_until) - self.began_s),
-                self.worker.pipeline.moves,
-                planned,
-            )
-        )
 
     async def _settle(self, thread: ThreadPoolExecutor) -> None:
         """Bring what is left to the nodes and wait until the last step is executed."""

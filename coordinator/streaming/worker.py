@@ -8,12 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import (
     Emergency,
-    End,
     Event,
-    Full,
     MachineChange,
     Notice,
     PositionSet,
@@ -82,15 +79,12 @@ class MotionWorker:
         self._time_base = machine.time_base()
         self._batches: list[tuple[int, bytes]] = []
         self.began_at: dict[str, int] = {}
-        """By stepper: where its node says that it stood when motion was last begun anew."""
+        """By stepper: steps that its node counted when motion last started."""
         self.maps: list[ClockMap] = []
         """Per moving node: print time to ticks, as the steps were timed; without a record only its end."""
         self.start_lead_s = START_LEAD_S
         self.held: str | None = None
         """Why the g-code waits, or None."""
-        self.failure: GCodeError | None = None
-        """Why the job ends early."""
-        self.done = Progress(0, 0, None)
         self._set_up()
 
     def _set_up(self) -> None:
@@ -148,19 +142,13 @@ class MotionWorker:
         event = waiting_for
         if self.pipeline.compensation_due and self._all_generated():
             self.pipeline.compensate()
-        held = self.held is not None and self.failure is None
-        if self.failure is None and not held and not self._still_waiting(waiting_for, now):
+        held = self.held is not None
+        if not held and not self._still_waiting(waiting_for, now):
             self._planner.plan_until_s = now + PLAN_AHEAD_S
             self._begin_anew(now)
-            try:
-                event = self._advance(told)
-            except GCodeError as error:
-                # What came before the bad line is carried out, to a standstill.
-                self.failure = error
+            event = self._advance(told)
         elif isinstance(waiting_for, StandstillAction) and not waiting_for.over:
             event = self._beside(waiting_for, told)
-        if self.failure is not None:
-            event = self._end_early()
         if held or self._runs_dry(now):
             self._planner.flush()
         self._generate(now)
@@ -176,9 +164,6 @@ class MotionWorker:
             elif isinstance(event, Emergency):
                 return event
         return resting
-
-    def _end_early(self) -> Event:
-        return End(self._job.line, self._planner.print_time_end_s) if self._planner.flush() else Full()
 
     def rest(self) -> Cycle:
         """Make the commands that are due; the job is over."""
@@ -259,7 +244,7 @@ class MotionWorker:
             if isinstance(event, Reply | Notice):
                 told.append(event)
             elif isinstance(event, Progress):
-                self.done = event
+                continue
             elif isinstance(event, Timed):
                 self.pipeline.at_next_move(event)
             elif isinstance(event, PositionSet | MachineChange) and self._acted(event):

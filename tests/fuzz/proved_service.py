@@ -30,8 +30,8 @@ from coordinator.runtime.host import LinuxHost
 from coordinator.service.api.methods import add_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.core.motion_lead import MotionLead
+from coordinator.service.jobs.outcome import Outcome, outcome_of
 from coordinator.service.state.log_ring import Entry
-from coordinator.streaming.job_runner import Outcome, outcome_of
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
 from coordinator.virtual_machine.stage import Stage

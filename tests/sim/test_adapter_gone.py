@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.program import Program
+from coordinator.service.core.job_runner import run_job
+from coordinator.service.jobs.outcome import Outcome
 from coordinator.simulate.scenario import Scenario
 from coordinator.simulate.stage import Stage
-from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.support.progress import Progress
 from nodes.support.errors import CanductorError
 

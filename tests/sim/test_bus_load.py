@@ -8,10 +8,11 @@ import pytest
 
 from coordinator.gcode.program import Program
 from coordinator.runtime.machine import Machine, link_of
+from coordinator.service.core.job_runner import run_job
+from coordinator.service.jobs.outcome import Outcome
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.play import Text
 from coordinator.simulate.stage import Stage
-from coordinator.streaming.job_runner import Outcome, run_job
 from nodes.link import IOStats, LinkError
 from nodes.support.errors import CanductorError
 

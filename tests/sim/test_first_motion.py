@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from coordinator.gcode.program import Program
+from coordinator.service.core.job_runner import run_job
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
-from coordinator.streaming.job_runner import run_job
 
 NS = 1_000_000_000
 

@@ -10,7 +10,7 @@ from coordinator.gcode.program import Program
 from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.machine import Machine
-from coordinator.streaming.move_source import JobState
+from coordinator.streaming.move_source import Planned
 from coordinator.streaming.streamer import Streamer
 from tests.stages.demo_machine import NODES, DemoMachine
 
@@ -64,12 +64,12 @@ def test_a_job_that_is_held_reads_no_further_until_it_is_released(tmp_path: Path
     async def main() -> None:
         held_cycles = 0
 
-        def look(state: JobState) -> None:
+        def look(_: Planned) -> None:
             nonlocal held_cycles
             if streamer.held is None:
                 return
             held_cycles += 1
-            assert (state.done_bytes, state.moves) == (0, 0)
+            assert (program.done_bytes, streamer.worker.pipeline.moves) == (0, 0)
             if held_cycles == 10:
                 streamer.release()
 

@@ -9,7 +9,7 @@ import pytest
 from coordinator.cli.commands.run import RunReport
 from coordinator.gcode.errors import GCodeError
 from coordinator.runtime.machine import MachineStopped
-from coordinator.streaming.job_runner import Outcome
+from coordinator.service.jobs.outcome import Outcome
 from coordinator.streaming.move_source import ProgramOutput
 from coordinator.support.command_options import Terminated
 from nodes.support.errors import CanductorError

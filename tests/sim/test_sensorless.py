@@ -10,8 +10,8 @@ import pytest
 from coordinator.gcode.errors import GCodeError
 from coordinator.modules.drivers.tmc_driver import TmcDriver
 from coordinator.runtime.machine import Machine, MachineStopped
+from coordinator.service.jobs.outcome import Outcome
 from coordinator.simulate.scenario import BusSetting
-from coordinator.streaming.job_runner import Outcome
 from coordinator.streaming.move_source import ProgramOutput
 from coordinator.support.toml_values import Range
 from coordinator.virtual_machine.plant import PlantSettings

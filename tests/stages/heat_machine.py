@@ -108,7 +108,7 @@ class HeatMachine(MachineStage):
 
         self.run(whole)
 
-    def print(self, *lines: str, ready: Callable[[Machine], None] | None = None) -> None:
+    def print(self, *lines: str, ready: Callable[[Machine], None] = lambda _: None) -> None:
         """Run a program to its end, as a job; READY gets the machine when it begins."""
         self.print_lines(lines, on_output=lambda told: self.notices.append(str(told)), on_ready=ready)
 

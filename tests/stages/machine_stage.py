@@ -7,9 +7,10 @@ from typing import Any, TypeVar
 
 from coordinator.gcode.program import Program
 from coordinator.runtime.machine import Machine
+from coordinator.service.core.job_runner import run_job
+from coordinator.service.jobs.outcome import Outcome
 from coordinator.simulate.scenario import BusSetting, NodeSetting, Scenario
 from coordinator.simulate.stage import Stage
-from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.streaming.move_source import ProgramOutput
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from nodes.virtual.plant_page import PlantItemKind, PlantPage
@@ -73,9 +74,9 @@ class MachineStage:
         lines: Iterable[str],
         *,
         on_output: Callable[[ProgramOutput], None] = lambda _: None,
-        on_ready: Callable[[Machine], None] | None = None,
+        on_ready: Callable[[Machine], None] = lambda _: None,
     ) -> Outcome:
-        """Run a program to its end, as a job; ON_TOLD gets what it says, ON_READY the connected machine."""
+        """Run a program to its end, as a job; ON_OUTPUT gets what it says, ON_READY the connected machine."""
         return self.run(
             lambda: run_job(
                 self.description,

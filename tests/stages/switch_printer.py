@@ -5,9 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from coordinator.gcode.program import Program
+from coordinator.service.core.job_runner import run_job
+from coordinator.service.jobs.outcome import Outcome
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
-from coordinator.streaming.job_runner import Outcome, run_job
 from coordinator.streaming.move_source import ProgramOutput
 from tests.stages.printer_text import SWITCHES_CFG
 

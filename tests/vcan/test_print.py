@@ -9,7 +9,7 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.gcode.program import Program
-from coordinator.streaming.job_runner import run_job
+from coordinator.service.core.job_runner import run_job
 from nodes.virtual.processes import NodeProcess
 from tests.vcan.kernel import INTERFACE, why_no_socketcan
 

@@ -1,4 +1,4 @@
-"""``canductor run``: brings up a configured machine and prints a file, or what comes on standard input."""
+"""``canductor run``: start a configured machine and print a file, or what comes on standard input."""
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -9,8 +9,8 @@ from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
 from coordinator.gcode.program import Program
 from coordinator.runtime.host import Computer, LinuxHost
-from coordinator.streaming.compensation import kept_compensation
-from coordinator.streaming.job_runner import NodeOutcome, Outcome, run_job
+from coordinator.service.core.job_runner import run_job
+from coordinator.service.jobs.outcome import NodeOutcome, Outcome
 from coordinator.support.command_options import RunOptions, machine_name
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.progress import Progress, ProgressDisplay
@@ -20,7 +20,7 @@ from nodes.dictionary.cache import DictionaryCache
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """What became of a job; ``ok`` only when every node counted the steps that it was sent."""
+    """The result of a job; ``ok`` only when every node counted the steps that it was sent."""
 
     gcode: str
     outcome: Outcome
@@ -105,7 +105,6 @@ def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
         )
         _announce(description)
         show = stack.enter_context(_progress(options, program))
-        compensation = kept_compensation(description, table_folder(machine_name(options.config)), _say)
         outcome = run_to_end(
             lambda: run_job(
                 description,
@@ -113,7 +112,7 @@ def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
                 show,
                 on_output=lambda told: _say(told.text),
                 cache=DictionaryCache.of_user(),
-                compensation=compensation,
+                tables=table_folder(machine_name(options.config)),
                 host=host,
             ),
             host.make_loop,

@@ -81,10 +81,14 @@ class Feeder:
         homed_position: Mapping[str, float],
         machine: MachineState,
         vocabulary: Vocabulary = NO_WORDS,
+        *,
+        has_jobs: bool = True,
     ) -> None:
         self.planner = planner
         self.machine = machine
-        self._setting = Setting(planner, machine, dict(homed_position), vocabulary, self)
+        prints = self if has_jobs else None
+        self._setting = Setting(planner, machine, dict(homed_position), vocabulary, prints)
+        self._name = "nothing"
         self._waiting: deque[QueuedWork] = deque()
         self._interjections: deque[QueuedWork] = deque()
         self._interjection: QueuedWork | None = None
@@ -110,9 +114,8 @@ class Feeder:
 
     @property
     def name(self) -> str:
-        """What is being read."""
-        now = self._now
-        return now.work.name if now is not None else "nothing"
+        """What is being read, or was read last."""
+        return self._name
 
     @property
     def line(self) -> int:
@@ -205,6 +208,7 @@ class Feeder:
             return event
         queued = self._now
         assert queued is not None
+        self._name = queued.work.name
         if queued.read or queued.cancelled:
             return self._finish(queued)
         if self._gives_way(queued):
@@ -335,6 +339,7 @@ class Feeder:
             if queued.begun_at_s is None:
                 queued.begun_at_s = self.planner.print_time_end_s
                 queued.work.begin(self._setting)
+            self._name = queued.work.name
             while not isinstance(event := queued.work.step(), End | Emergency):
                 if isinstance(event, Full):
                     return False

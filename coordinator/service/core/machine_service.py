@@ -1,4 +1,4 @@
-"""The machine's life as a service: it starts, is ready, prints, stops, starts again; clients come and go.
+"""The machine as a service: it starts, is ready, prints, stops and restarts, for clients or for one job.
 
 One object owns it. All of it runs on the control loop; clients' methods only change attributes or wait.
 """
@@ -6,7 +6,7 @@ One object owns it. All of it runs on the control loop; clients' methods only ch
 import asyncio
 import contextlib
 import secrets
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Final
 
 from coordinator.config.model import MachineDescription
 from coordinator.gcode.events import Notice
+from coordinator.gcode.program import Program
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.ipc.server.state import StateTree
@@ -28,11 +29,13 @@ from coordinator.service.core.work import FileWork
 from coordinator.service.jobs.fed import FedJobs
 from coordinator.service.jobs.job_folder import JobFolder
 from coordinator.service.jobs.jobs import JobPhase, JobRun
+from coordinator.service.jobs.outcome import Outcome, job_progress, outcome_of
 from coordinator.service.jobs.recovery import Recovery
 from coordinator.service.state.figures import Figures
 from coordinator.service.state.log_ring import Entry, LogRing
 from coordinator.streaming.move_source import ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
+from coordinator.support.progress import Progress
 from coordinator.tables.store import TableStore
 from nodes.dictionary.cache import DictionaryCache
 from nodes.node.errors import NodeShutdown
@@ -41,6 +44,7 @@ from nodes.support.errors import CanductorError
 REFRESH_S: Final = 0.1
 """How often the state tree is brought up to date."""
 BY_USER: Final = "emergency stop by"
+BY_INTERRUPT: Final = "stopped by the user"
 
 
 class ServiceState(StrEnum):
@@ -51,9 +55,9 @@ class ServiceState(StrEnum):
     PRINTING = "printing"
     PAUSED = "paused"
     SHUTDOWN = "shutdown"
-    """Stopped for safety; ``machine.restart`` begins anew."""
+    """Stopped for safety; ``machine.restart`` starts it again."""
     ERROR = "error"
-    """It could not be started; put the cause right, then ``machine.restart``."""
+    """The start failed; remove the cause, then call ``machine.restart``."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,18 +70,19 @@ class ServiceSettings:
     node_commands: bool = False
     """Whether ``node.command`` may send raw commands."""
     id: str = field(default_factory=lambda: secrets.token_hex(8))
-    """Of this life of the service: tells whether two addresses lead to the same one."""
+    """Of this run of the service: shows whether two addresses lead to the same one."""
     tables: Path | None = None
     """Where accepted axis tables are kept; None: only as long as the service lives."""
     own_process: bool = False
-    """Whether the process is there for this service alone, which then has its garbage collector to itself."""
+    """Whether the process runs nothing else: the service controls its garbage collector and allocator."""
 
 
 class MachineService:
     """Runs the machine that LOAD describes (called again at every restart; CanductorError).
 
-    ``run`` until it is cancelled. ON_LINE hears every line of the log. RECORD keeps all that is planned, for
-    a proof; memory grows with it.
+    ``run`` serves clients until it is cancelled, ``run_job`` prints one program. ON_LINE gets every line of
+    the log, ON_OUTPUT every reply and notice in full. RECORD keeps all that is planned, for a proof; memory
+    grows with it.
     """
 
     def __init__(
@@ -90,12 +95,14 @@ class MachineService:
         cache: DictionaryCache | None = None,
         record: PlanRecord | None = None,
         on_line: Callable[[Entry], None],
+        on_output: Callable[[ProgramOutput], None] = lambda _: None,
     ) -> None:
         self.settings = settings
         self.state = ServiceState.STARTUP
         self.cause = ""
         """Why it is in shutdown or error: a sentence."""
         self.log = LogRing(on_line)
+        self._on_output = on_output
         self.folder = None if settings.jobs is None else JobFolder(settings.jobs)
         self.machine: Machine | None = None
         self.motion: Motion | None = None
@@ -106,7 +113,7 @@ class MachineService:
         self.tables = TableService(
             None if settings.tables is None else TableStore(settings.tables),
             state,
-            lambda text: self.log.add("notice", text),
+            self._notice,
         )
         self.starts = 0
         self.cut_off = False
@@ -117,8 +124,8 @@ class MachineService:
         self._cache = cache
         self._record = record
         self._figures = Figures(state)
-        self.programs = Programs(self)
         self.recovery = Recovery(self)
+        self.programs = Programs(self, self.recovery)
         self.fed = FedJobs(self)
         self._restart = asyncio.Event()
         self._reset_nodes = False
@@ -129,7 +136,7 @@ class MachineService:
     # ------------------------------------------------------------------------------------------- life
 
     async def run(self) -> None:
-        """Be the machine. Cancelled while it moves, it stops all nodes, as Ctrl-C does."""
+        """Serve clients until cancelled; when that happens during motion, stop all nodes, as Ctrl-C does."""
         if self.settings.own_process:
             keep_small()
         refresh = asyncio.ensure_future(self._refresh())
@@ -148,8 +155,51 @@ class MachineService:
             await self._let_go()
             await asyncio.to_thread(self.recovery.close)
 
+    async def run_job(
+        self,
+        program: Program,
+        *,
+        on_ready: Callable[[Machine], None],
+        on_progress: Callable[[Progress], None],
+    ) -> Outcome:
+        """Start the machine, print PROGRAM and return the result; ON_READY gets the machine before that.
+
+        Programs have no job control then: nobody could resume. Raises CanductorError; cancelled, or when the
+        machine cannot go on, all nodes are stopped.
+        """
+        try:
+            machine = await self._start(self._load())
+            on_ready(machine)
+            try:
+                return await self._print(machine, program, on_progress)
+            except asyncio.CancelledError:
+                machine.stop(BY_INTERRUPT)
+                await machine.confirm_stop()
+                raise
+        finally:
+            await self._let_go()
+
+    async def _print(
+        self, machine: Machine, program: Program, on_progress: Callable[[Progress], None]
+    ) -> Outcome:
+        def look() -> None:
+            self.look()
+            on_progress(job_progress(machine, motion, job, self.now_s))
+
+        async with self._stop_on_failure(machine):
+            motion = self._begin_motion(machine, look, has_jobs=False)
+            job = self.start_job(FileWork(program))
+            motion.finish()
+            await motion.run()
+            if job.error is None:
+                return await outcome_of(machine, motion.streamer)
+        if machine.stopped is not None:
+            raise MachineStopped(f"{machine.stopped}{_confirmations(self.confirmed_s)}")
+        assert job.error is not None
+        raise job.error
+
     async def _live_once(self) -> None:
-        """Start, move, and return when that is over, with ``state`` telling why."""
+        """Start, move, and return when that is over; ``state`` has the reason."""
         self._restart.clear()
         self.confirmed_s = {}
         self.starts += 1
@@ -162,15 +212,15 @@ class MachineService:
             except NodeShutdown as error:
                 if self._asked_to_stop is not None:
                     raise
-                # The service before this one was killed a moment ago, and the node misses it.
-                self.log.add("notice", f"{error}; all nodes are reset, and started once more")
+                # The service before this one was killed a moment ago, and the node lost its host.
+                self._notice(f"{error}; all nodes are reset and started again")
                 self._reset_nodes = True
                 machine = await self._start(description)
         except CanductorError as error:
             stopped = None if self.machine is None else self.machine.stopped
             self._enter(ServiceState.SHUTDOWN if stopped else ServiceState.ERROR, str(stopped or error))
             return
-        await self._move(machine)
+        await self._serve_clients(machine)
 
     async def _start(self, description: MachineDescription) -> Machine:
         """Return the machine, ready; raises CanductorError."""
@@ -178,7 +228,7 @@ class MachineService:
             description,
             self.host,
             build_modules(description),
-            on_notice=lambda text: self.log.add("notice", text),
+            on_notice=self._notice,
             cache=self._cache,
             reset_nodes=self._reset_nodes,
             prepare_restart=self._prepare_restart,
@@ -189,23 +239,40 @@ class MachineService:
         await machine.start()
         return machine
 
-    async def _move(self, machine: Machine) -> None:
+    async def _serve_clients(self, machine: Machine) -> None:
         care = asyncio.ensure_future(self.tables.care(machine, self.stands))
         try:
-            self.programs.begin(machine)
-            self.recovery.open()
-            compensation = self.tables.compensation_of(machine)
-            self.motion = Motion(
-                machine,
-                on_output=self.tell,
-                on_cycle=self.look,
-                record=self._record,
-                compensation=compensation,
-            )
-            if self.settings.own_process:
-                pass_by_what_stays()
-            self._enter(ServiceState.READY)
-            await self.motion.run()
+            async with self._stop_on_failure(machine):
+                self.programs.begin(machine)
+                self.recovery.open()
+                await self._begin_motion(machine, self.look).run()
+        finally:
+            care.cancel()
+            (ended,) = await asyncio.gather(care, return_exceptions=True)
+            if isinstance(ended, Exception):
+                raise ended  # a bug: it handles all failures that are to be expected
+
+    def _begin_motion(
+        self, machine: Machine, on_cycle: Callable[[], None], *, has_jobs: bool = True
+    ) -> Motion:
+        motion = self.motion = Motion(
+            machine,
+            on_output=self.report,
+            on_cycle=on_cycle,
+            record=self._record,
+            compensation=self.tables.compensation_of(machine),
+            has_jobs=has_jobs,
+        )
+        if self.settings.own_process:
+            pass_by_what_stays()
+        self._enter(ServiceState.READY)
+        return motion
+
+    @contextlib.asynccontextmanager
+    async def _stop_on_failure(self, machine: Machine) -> AsyncIterator[None]:
+        """Stop MACHINE when the block raises; a CanductorError ends here, with the state SHUTDOWN."""
+        try:
+            yield
         except CanductorError as error:
             machine.stop(str(error))
             self._stopped(machine)
@@ -213,14 +280,9 @@ class MachineService:
         except Exception as bug:
             machine.stop(f"internal error: {type(bug).__name__}: {bug}; all nodes were stopped")
             raise
-        finally:
-            care.cancel()
-            (ended,) = await asyncio.gather(care, return_exceptions=True)
-            if isinstance(ended, Exception):
-                raise ended  # a bug of it, which expects all that may happen
 
     def _stopped(self, machine: Machine) -> None:
-        """Take note that the machine is stopped; again, without effect."""
+        """Enter SHUTDOWN; without effect when that was done."""
         if self.state is ServiceState.SHUTDOWN:
             return
         cause = str(machine.stopped)
@@ -233,7 +295,7 @@ class MachineService:
         machine, motion = self.machine, self.motion
         if machine is not None and motion is not None and machine.stopped is None and not motion.standing:
             self.cut_off = True
-            machine.stop("stopped by the user")
+            machine.stop(BY_INTERRUPT)
             await machine.confirm_stop()
 
     async def _let_go(self) -> None:
@@ -255,9 +317,9 @@ class MachineService:
             self._stopped(self.machine)
 
     def restart(self, *, firmware: bool = False) -> None:
-        """Begin anew with the configuration read again; raises ApiError while the machine starts or works.
+        """Restart with the configuration read again; raises ApiError while the machine starts or works.
 
-        Nodes are configured anew where they have to be; with FIRMWARE all are reset.
+        Nodes are configured again where that is needed; with FIRMWARE all are reset.
         """
         if self.state is ServiceState.STARTUP:
             raise ApiError("busy", "the machine is starting already")
@@ -265,19 +327,19 @@ class MachineService:
             motion = self.ready_motion()
             if motion.feeder.busy or not motion.standing:
                 raise ApiError("busy", "the machine moves; wait until it stands, or cancel the job first")
-        self._begin_anew(firmware)
+        self._restart_now(firmware)
 
-    def _begin_anew(self, firmware: bool) -> None:
+    def _restart_now(self, firmware: bool) -> None:
         self._reset_nodes = firmware
         self._restart.set()
         if self.motion is not None:
             self.motion.finish_early()
 
     def _prepare_restart(self) -> Callable[[bool], None]:
-        """Return what a program begins anew with, as its last act; raises ApiError in a job."""
+        """Return the function by which a program restarts the machine; raises ApiError in a job."""
         if self.active_job is not None:
             raise ApiError("busy", "a job prints; wait for its end, or cancel it with job.cancel")
-        return self._begin_anew
+        return self._restart_now
 
     def start_job(self, work: FileWork, *, behind_others: bool = False, fed: bool = False) -> JobRun:
         """Print; raises ApiError unless the machine is ready and idle, or BEHIND_OTHERS without a job.
@@ -298,7 +360,13 @@ class MachineService:
         self.look()
         return self.job
 
-    # --------------------------------------------------------------------------------------- looking at
+    def job_folder(self, otherwise: Path) -> JobFolder:
+        """Return the folder of jobs; the one at OTHERWISE unless the settings name one."""
+        if self.folder is None or self.settings.jobs is None:
+            self.folder = JobFolder(otherwise)
+        return self.folder
+
+    # ------------------------------------------------------------------------------------------- state
 
     @property
     def now_s(self) -> float:
@@ -311,7 +379,7 @@ class MachineService:
         return self.job if self.job is not None and self.job.active else None
 
     def stands(self) -> bool:
-        """Tell whether nothing moves, and nothing is about to."""
+        """Return whether nothing moves, and nothing is about to."""
         motion = self.motion
         return motion is not None and motion.standing and not motion.feeder.busy and self.active_job is None
 
@@ -319,10 +387,10 @@ class MachineService:
         """Return what moves the machine; raises ApiError when that is not possible now."""
         motion = self.motion
         if self.state is ServiceState.SHUTDOWN:
-            raise ApiError("stopped", f"the machine stopped: {self.cause}; machine.restart begins anew")
+            raise ApiError("stopped", f"the machine stopped: {self.cause}; machine.restart starts it again")
         if motion is None or self.state in (ServiceState.STARTUP, ServiceState.ERROR):
-            told = f": {self.cause}" if self.cause else ""
-            raise ApiError("not_ready", f"the machine is in {self.state}{told}")
+            cause = f": {self.cause}" if self.cause else ""
+            raise ApiError("not_ready", f"the machine is in {self.state}{cause}")
         return motion
 
     def up_machine(self) -> Machine:
@@ -365,12 +433,18 @@ class MachineService:
         self.log.add("state", f"{state}: {cause}" if cause else str(state))
         self._figures.show(self)
 
-    def tell(self, told: ProgramOutput) -> None:
-        """Log what a line of g-code answered."""
-        if isinstance(told, Notice):
-            self.log.add("notice", told.text, ReplyKind.INFORMATION)
+    def report(self, output: ProgramOutput) -> None:
+        """Log a reply or a notice of a line of g-code."""
+        if isinstance(output, Notice):
+            self.log.add("notice", output.text, ReplyKind.INFORMATION)
         else:
-            self.log.add("reply", told.text, told.kind)
+            self.log.add("reply", output.text, output.kind)
+        self._on_output(output)
+
+    def _notice(self, text: str) -> None:
+        """Log a sentence of the machine."""
+        self.log.add("notice", text)
+        self._on_output(Notice(0, text))
 
     async def _refresh(self) -> None:
         while True:
@@ -378,3 +452,9 @@ class MachineService:
                 for _ in self._figures.parts(self):
                     await asyncio.sleep(0)
             await asyncio.sleep(REFRESH_S)
+
+
+def _confirmations(confirmed_s: dict[str, float]) -> str:
+    """Return the part of a sentence that states how fast the nodes confirmed the stop."""
+    nodes = [f"{name} after {delay_s * 1e3:.0f} ms" for name, delay_s in confirmed_s.items()]
+    return f" ({', '.join(nodes)})" if nodes else ""

@@ -13,7 +13,7 @@ from coordinator.service.core.work import LinesWork, Work
 from coordinator.service.state.toolpath import Toolpath
 from coordinator.service.state.trace import KEEP_S, Moment, MotionTrace
 from coordinator.streaming.compensation import Compensation
-from coordinator.streaming.move_source import JobState, Planned, ProgramOutput
+from coordinator.streaming.move_source import Planned, ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.program_machine import machine_state
 from coordinator.streaming.streamer import Streamer
@@ -22,10 +22,11 @@ UNMOVED = Planned((0.0,) * 4, (0.0,) * 4, (0.0,) * 4, "", 1.0, 1.0, 0.0)
 
 
 class Motion:
-    """What moves MACHINE, whose nodes are READY.
+    """Moves MACHINE, whose nodes are READY.
 
-    ON_TOLD gets replies and notices, ON_CYCLE is called at the end of every cycle. RECORD keeps all that is
-    planned, for a proof. COMPENSATION has the tables of the axes.
+    ON_OUTPUT gets replies and notices, ON_CYCLE is called at the end of every cycle. RECORD keeps all that is
+    planned, for a proof. COMPENSATION has the tables of the axes. HAS_JOBS: whether programs control jobs;
+    else the one that runs is all there is.
     """
 
     def __init__(
@@ -36,6 +37,7 @@ class Motion:
         on_cycle: Callable[[], None],
         record: PlanRecord | None = None,
         compensation: Compensation | None = None,
+        has_jobs: bool = True,
     ) -> None:
         described = machine.description
         self.feeder = Feeder(
@@ -43,6 +45,7 @@ class Motion:
             described.homed_position,
             machine_state(described),
             machine.modules.vocabulary,
+            has_jobs=has_jobs,
         )
         self.trace = MotionTrace(len(machine.moving))
         self.toolpath = Toolpath()
@@ -132,10 +135,10 @@ class Motion:
 
     # ----------------------------------------------------------------------------------- cycle by cycle
 
-    def _cycle_ended(self, state: JobState) -> None:
-        self.planned = state.planned
+    def _cycle_ended(self, planned: Planned) -> None:
+        self.planned = planned
         now_s = self.now_s
-        comes_to_rest = state.planned.stands_from_s is not None
+        comes_to_rest = planned.stands_from_s is not None
         self.lead.look(now_s, self.streamer.worker.steps.generated_until, comes_to_rest=comes_to_rest)
         self.trace.forget_before_s = now_s - KEEP_S
         self.toolpath.add(self.trace.take_fresh())

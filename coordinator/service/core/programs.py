@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from coordinator.gcode.print_control import Recovering
 from coordinator.gcode.reply_kinds import ReplyKind
@@ -14,15 +14,13 @@ from coordinator.modules.programs.virtual_sdcard import VirtualSdcard
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.feeder import FeederFull
+from coordinator.service.core.interface import ServiceInterface
 from coordinator.service.core.motion import MotionOver
 from coordinator.service.core.work import FileWork, LinesWork, Rest
-from coordinator.service.jobs.job_folder import JobFolder
 from coordinator.service.jobs.jobs import JobPhase, JobRun
+from coordinator.service.jobs.recovery import Recovery
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.service.core.machine_service import MachineService
 
 _STATES: Final[Mapping[JobPhase, str]] = {
     JobPhase.NONE: "standby",
@@ -40,8 +38,9 @@ _STATES: Final[Mapping[JobPhase, str]] = {
 class Programs:
     """Serves the modules of SERVICE's machine (coordinator/runtime/module_runner.py); on the control loop."""
 
-    def __init__(self, service: "MachineService") -> None:
+    def __init__(self, service: ServiceInterface, recovery: Recovery) -> None:
         self._service = service
+        self._recovery = recovery
         self._tasks: set[asyncio.Task[None]] = set()
         self._stats: PrintStats | None = None
         self._card: VirtualSdcard | None = None
@@ -63,10 +62,7 @@ class Programs:
         self._told = None if last is None or last.active else (last, last.phase)
         if self._card is None:
             return
-        if self._service.settings.jobs is None:
-            self._service.folder = JobFolder(self._card.path)
-        folder = self._service.folder
-        assert folder is not None
+        folder = self._service.job_folder(self._card.path)
         self._card.files = lambda: [(job.name, job.size_bytes) for job in folder.files()]
         self._card.check = lambda name: folder.open(name).close()
 
@@ -129,7 +125,7 @@ class Programs:
                 work.beside = True
                 queued = await motion.do_interjection(work)
                 for told in queued.told:
-                    self._service.tell(told)
+                    self._service.report(told)
             else:
                 queued = await motion.do(work)
         except FeederFull as error:
@@ -207,7 +203,7 @@ class Programs:
 
     async def _recover(self, how: Recovering) -> None:
         try:
-            await self._service.recovery.recover(how)
+            await self._recovery.recover(how)
         except (CanductorError, MotionOver) as error:
             self._service.log.add("notice", f"RESUME_INTERRUPTED: {error}", ReplyKind.ERROR)
 

@@ -38,6 +38,7 @@ class Setting:
     homed_position: Mapping[str, float]
     vocabulary: Vocabulary
     prints: PrintControl | None = None
+    """Control of the job for programs; None: the program that is read is all there is."""
 
     def job(self, program: Program, *, beside: bool = False) -> Job:
         """Return what reads PROGRAM; BESIDE: between two lines of a job that prints."""
@@ -49,7 +50,7 @@ class Setting:
             self.vocabulary,
             beside=beside,
             prints=self.prints,
-            strict=True,
+            strict=self.prints is not None,
         )
 
 

@@ -10,16 +10,14 @@ Two threads meet in a ``FedSource``: the control loop puts, the motion worker re
 
 import asyncio
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError, shown
+from coordinator.service.core.interface import ServiceInterface
 from coordinator.service.core.work import FileWork
 from coordinator.service.jobs.jobs import JobPhase, JobRun
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.service.core.machine_service import MachineService
 
 LINES_AHEAD_MAX: Final = 256
 """Lines that wait for the machine, beside those of the piece that comes when there is room."""
@@ -89,7 +87,7 @@ class FedSource:
 class FedJobs:
     """The job of SERVICE that is fed, one at a time; on the control loop."""
 
-    def __init__(self, service: "MachineService") -> None:
+    def __init__(self, service: ServiceInterface) -> None:
         self._service = service
         self._source: FedSource | None = None
         self._job: JobRun | None = None

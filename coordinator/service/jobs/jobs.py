@@ -7,6 +7,7 @@ from typing import Final
 from coordinator.service.core.feeder import Feeder, QueuedWork
 from coordinator.service.core.motion import Motion
 from coordinator.service.core.work import FileWork
+from nodes.support.errors import CanductorError
 
 
 class JobPhase(StrEnum):
@@ -64,6 +65,11 @@ class JobRun:
     def active(self) -> bool:
         """Whether it is on its way."""
         return self.phase in ACTIVE
+
+    @property
+    def error(self) -> CanductorError | None:
+        """Why it ended before its last line; None: it did not."""
+        return self._queued.error
 
     @property
     def gives_way(self) -> bool:

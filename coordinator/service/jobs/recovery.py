@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from coordinator.gcode.builtins.state import come_back
 from coordinator.gcode.events import Event, Full, Notice
@@ -20,6 +20,7 @@ from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.machine_modules import MachineModules
 from coordinator.service.core.feeder import COME_BACK_MM_S
+from coordinator.service.core.interface import ServiceInterface
 from coordinator.service.core.motion import Motion
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Setting, Work
 from coordinator.service.jobs.forward import Reached, read_forward
@@ -34,9 +35,6 @@ from coordinator.service.jobs.resume_homing import (
     sure_height,
 )
 from nodes.support.errors import CanductorError
-
-if TYPE_CHECKING:
-    from coordinator.service.core.machine_service import MachineService
 
 NEAR_K: Final = 2.0
 """A heater that is no further below its target is hot enough."""
@@ -91,7 +89,7 @@ class RecoverWork(FileWork):
 class Recovery:
     """Keeps the journal of SERVICE's jobs, and has an interrupted one go on; on the control loop."""
 
-    def __init__(self, service: "MachineService") -> None:
+    def __init__(self, service: ServiceInterface) -> None:
         self.interrupted: Interrupted | None = None
         self._service = service
         self._journal: Journal | None = None

@@ -6,11 +6,12 @@ docs/run.md lists the fields; names end in their unit.
 import re
 from collections import deque
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from coordinator.ipc.server.state import StateTree
 from coordinator.motion.planner.planner import AXIS_LETTERS, Position
 from coordinator.runtime.machine import Machine, link_of
+from coordinator.service.core.interface import ServiceInterface
 from coordinator.service.core.motion import Motion
 from coordinator.service.jobs.jobs import JobRun
 from coordinator.support.values import Value
@@ -19,8 +20,6 @@ from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
 
-if TYPE_CHECKING:
-    from coordinator.service.core.machine_service import MachineService
 RECENT_LOOKS: Final = 10
 """A lead is recent for so many looks: about a second."""
 _NOT_IN_A_PATH = re.compile(r"[^A-Za-z0-9_-]")
@@ -40,12 +39,12 @@ class Figures:
         self._shown: set[str] = set()
         """Prefixes of the nodes and buses shown, to be taken away with them."""
 
-    def show(self, service: "MachineService") -> None:
+    def show(self, service: ServiceInterface) -> None:
         """Bring the tree up to date."""
         for _ in self.parts(service):
             pass
 
-    def parts(self, service: "MachineService") -> Iterator[None]:
+    def parts(self, service: ServiceInterface) -> Iterator[None]:
         """Do the same in parts of some 0.2 ms, so that others get their turn between two of them."""
         self._tree.update("job", job_figures(service.job, service.now_s))
         if service.motion is not None and service.machine is not None and service.machine.stopped is None:
@@ -213,11 +212,15 @@ def _firmware(node: Node) -> dict[str, Value]:
 
 def _clock(node: Node) -> dict[str, Value]:
     error_s = node.clock_error_s
+    try:
+        clock_freq_hz = node.clock_freq_hz
+    except CanductorError:  # it is brought back, and its dictionary is not known yet
+        error_s = None
     if error_s is None:
         return {"clock_error_us": None, "clock_drift_ppm": None, "clock_offset_s": None, "clock_source": None}
     estimate = node.clock.estimate()
-    drift = estimate.freq_hz / node.clock_freq_hz - 1.0
-    offset_s = estimate.at_ticks / node.clock_freq_hz - estimate.at_ns * 1e-9
+    drift = estimate.freq_hz / clock_freq_hz - 1.0
+    offset_s = estimate.at_ticks / clock_freq_hz - estimate.at_ns * 1e-9
     return {
         "clock_error_us": round(error_s * 1e6, 2),
         "clock_drift_ppm": round(drift * 1e6, 3),

@@ -11,10 +11,15 @@ from numpy.typing import NDArray
 
 from coordinator.assembly.load import load_machine
 from coordinator.cli import main as cli
-from coordinator.config.model import AxisTablesDescription
+from coordinator.config.model import AxisTablesDescription, MachineDescription
+from coordinator.ipc.server.state import StateTree
+from coordinator.modules.module_set import build_modules
 from coordinator.motion.steps.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps.steps import TABLE_POINTS_MAX, StepError, StepGenerator
-from coordinator.streaming.compensation import NO_CORRECTION, Compensation, kept_compensation
+from coordinator.runtime.host import LinuxHost
+from coordinator.runtime.machine import Machine
+from coordinator.service.core.tables import TableService
+from coordinator.streaming.compensation import NO_CORRECTION, Compensation
 from coordinator.tables.axis_table import AxisTable, Direction, Unit
 from coordinator.tables.store import TableStore
 from tests.coordinator.motion.exact_program import Planned, plan_program
@@ -302,14 +307,19 @@ def test_bad_tables_are_refused(positions: list[float], take_up: float) -> None:
         generator().set_table(2, positions, zeros, zeros, take_up_mm_s=take_up)
 
 
-def test_a_run_without_a_service_takes_what_was_kept(tmp_path: Path) -> None:
+def test_a_service_takes_the_kept_tables_that_it_can_use(tmp_path: Path) -> None:
     plain = load_machine(str(DEMO / "machine.cfg"))
     described = replace(plain, axis_tables=AxisTablesDescription(64, plain.nodes[0].place))
     store, said = TableStore(tmp_path), list[str]()
     for table in (flat("x", 0.5), flat("a", 0.5), replace(flat("y", 0.5), unit=Unit.DEG)):
         store.save(table)
-    assert kept_compensation(plain, tmp_path, said.append) is None
-    compensation = kept_compensation(described, tmp_path, said.append)
+
+    def compensation_of(description: MachineDescription) -> Compensation | None:
+        machine = Machine(description, LinuxHost(), build_modules(description))
+        return TableService(store, StateTree(), said.append).compensation_of(machine)
+
+    assert compensation_of(plain) is None
+    compensation = compensation_of(described)
     assert compensation is not None
     assert dict(compensation.wanted) == {"x": flat("x", 0.5)}
     assert [line.split(":")[0] for line in said] == ["axis a is not corrected", "axis y is not corrected"]

@@ -8,9 +8,9 @@ import pytest
 from coordinator.assembly.check import check_config
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.program import Program
+from coordinator.service.core.job_runner import run_job
 from coordinator.simulate import scenario
 from coordinator.simulate.stage import Stage
-from coordinator.streaming.job_runner import run_job
 
 MACHINE = """
 [mcu]

@@ -11,8 +11,9 @@ from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
+from coordinator.service.core.motion import Motion
+from coordinator.service.core.work import FileWork
 from coordinator.streaming.program_machine import machine_state
-from coordinator.streaming.streamer import Streamer
 from tests.coordinator.motion.planner_helpers import drain
 from tests.stages.heat_machine import HeatMachine
 from tests.stages.program_stage import events_of
@@ -28,8 +29,12 @@ def job(stage: HeatMachine, vocabulary: Vocabulary, *lines: str) -> Job:
 
 
 async def play(stage: HeatMachine, *lines: str) -> None:
-    work = job(stage, stage.machine.modules.vocabulary, *lines)
-    await Streamer(stage.machine, work, on_output=lambda _: None, on_state=lambda _: None).run()
+    motion = Motion(stage.machine, on_output=lambda _: None, on_cycle=lambda: None)
+    queued = motion.feeder.submit(FileWork(Program.from_lines(lines, "part.gcode")))
+    motion.finish()
+    await motion.run()
+    if queued.error is not None:
+        raise queued.error
 
 
 @pytest.mark.parametrize("line", ["G1 E1 F300", "G1 X10 E0.5 F3000", "G1 E-1 F300"])
