@@ -7,16 +7,16 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
-from coordinator.ipc.protocol.json_values import has_more_items
+from coordinator.ipc.protocol.decoding import RejectedError, check_values, decode_json
+from coordinator.ipc.protocol.limits import Limits
 from nodes.support.errors import CanductorError
 
 END: Final = b"\x03"
 MESSAGE_BYTES_MAX: Final = 262_144
 """One message of a client, without its end."""
-VALUES_MAX: Final = 8_192
-"""In all lists and objects of a message together."""
+LIMITS: Final = Limits(nesting=64, items=8_192)
 URGENT: Final = (b"emergency_stop", b"M112")
 """A message with one of these words is looked at before all others that wait."""
 
@@ -70,14 +70,11 @@ def is_urgent(body: bytes) -> bool:
 
 def read_request(body: bytes) -> Request:
     """Return the call in BODY; raises Unreadable."""
-    if has_more_items(body, VALUES_MAX):
-        raise Unreadable(f"a message has more than {VALUES_MAX:,} values")
     try:
-        message = json.loads(body, parse_constant=_refuse_constant)
-    except RecursionError:
-        raise Unreadable("a message is nested too deeply") from None
-    except ValueError as error:  # no JSON, no UTF-8, a number with thousands of digits
-        raise Unreadable(f"a message is no JSON: {str(error)[:80]}") from None
+        message = decode_json(body, LIMITS)
+        check_values(message, LIMITS)
+    except RejectedError as error:
+        raise Unreadable(str(error)) from None
     if not isinstance(message, dict):
         raise Unreadable("a message is no object")
     method, params = message.get("method"), message.get("params", {})
@@ -110,10 +107,6 @@ def error_message(request_id: Any, sentence: str) -> bytes:
 def event_message(template: Mapping[str, Any], params: Mapping[str, Any]) -> bytes:
     """Return what a client gets without a call: its TEMPLATE with PARAMS."""
     return encode({**template, "params": params})
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no number")
 
 
 def _finite(value: Any) -> Any:

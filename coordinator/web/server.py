@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from aiohttp import WSMsgType, web
 
-from coordinator.ipc.protocol.messages import Fault
+from coordinator.ipc.protocol.limits import EndReason
 from coordinator.ipc.protocol.methods import ApiError, Scope
 from coordinator.ipc.server.auth import Grant, digest_of
 from coordinator.ipc.server.connection import Connection
@@ -131,7 +131,7 @@ class WebServer:
         """End all sessions with their connections, and all links; return how many sessions there were."""
         count = self._access.sign_all_out()
         for connection in list(self._clients):
-            connection.session.end(Fault("bad_token", "all browsers were signed out"))
+            connection.session.end(EndReason("bad_token", "all browsers were signed out"))
             connection.flush()
         await self._save_sessions()
         return count

@@ -6,13 +6,13 @@ from typing import Any
 
 import msgpack
 
-from coordinator.ipc.protocol.messages import Encoder, Encoding, Fault, WireReader
+from coordinator.ipc.protocol.limits import EndReason, Limits
+from coordinator.ipc.protocol.messages import Encoder, Encoding, WireReader
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope
 from coordinator.ipc.server.auth import Grant, Tokens
 from coordinator.ipc.server.publisher import Publisher
 from coordinator.ipc.server.session import Common, Session
 from coordinator.ipc.server.session_methods import add_session_methods
-from coordinator.ipc.server.settings import Limits
 from coordinator.ipc.server.state import StateTree
 from coordinator.support.values import Value
 
@@ -134,7 +134,7 @@ def _check_output(output: bytes, encoding: Encoding) -> None:
     reader.encoding = encoding
     reader.feed(output, 0.0)
     while (message := reader.next_message()) is not None:
-        assert not isinstance(message, Fault), message
+        assert not isinstance(message, EndReason), message
         assert message.keys() & {"id", "event", "error"}
         if "error" in message:
             assert "\n" not in message["error"]["message"]

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.ipc.client.client import Client
-from coordinator.ipc.protocol.messages import Encoding, Fault, WireReader
-from coordinator.ipc.server.settings import Limits
+from coordinator.ipc.protocol.limits import EndReason, Limits
+from coordinator.ipc.protocol.messages import Encoding, WireReader
 from tests.fuzz.ipc_target import line, packed
 
 ENDS: Final = frozenset(
@@ -284,7 +284,7 @@ class Visit:
             raw += len(data)
             parser.feed(data, 0.0)
             while (message := parser.next_message()) is not None:
-                if isinstance(message, Fault):
+                if isinstance(message, EndReason):
                     self._problem(f"it said what is no message: {message.sentence}")
                     return
                 last = message

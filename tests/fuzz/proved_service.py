@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 
 from coordinator.assembly.load import load_machine
 from coordinator.demo.run import Prover, report_of
+from coordinator.ipc.protocol.limits import Limits
 from coordinator.ipc.protocol.methods import Registry, Scope
 from coordinator.ipc.server.server import IpcServer
-from coordinator.ipc.server.settings import IpcSettings, Limits, TcpSettings
+from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.uploads import upload_method
 from coordinator.motion.trapezoid_array import TRAPEZOID

@@ -10,10 +10,10 @@ from typing import Any, Final, Self
 from coordinator.ipc.client.connect_errors import doubt, why_no_answer, why_refused
 from coordinator.ipc.client.feeds import Event, Feed, Update, Watch
 from coordinator.ipc.protocol.address import Address, read_address
-from coordinator.ipc.protocol.messages import LENGTH_MAX, Encoder, Encoding, Fault, WireReader
+from coordinator.ipc.protocol.limits import EndReason, Limits
+from coordinator.ipc.protocol.messages import LENGTH_MAX, Encoder, Encoding, WireReader
 from coordinator.ipc.protocol.methods import ApiError, Scope
 from coordinator.ipc.server.session_methods import API_VERSION
-from coordinator.ipc.server.settings import Limits
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
@@ -339,7 +339,7 @@ class Client:
             raise ConnectionLost(f"{self.address} has closed the connection{addition}")
         self._wire.feed(data, 0.0)
         while (message := self._wire.next_message()) is not None:
-            if isinstance(message, Fault):
+            if isinstance(message, EndReason):
                 raise ConnectionLost(f"{self.address} sent what is no message: {message.sentence}")
             self._take(message)
 

@@ -159,9 +159,9 @@ class Connection(asyncio.BufferedProtocol):
         session, transport = self.session, self.transport
         if transport.is_closing() or self._ended:
             return
-        if (session.writable or session.fault is not None) and (data := session.take_output()):
+        if (session.writable or session.end_reason is not None) and (data := session.take_output()):
             transport.write(data)
-        if session.fault is not None:
+        if session.end_reason is not None:
             self._cut_off()
         elif self._half_closed and session.is_idle:
             transport.close()

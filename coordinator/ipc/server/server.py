@@ -9,7 +9,8 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
 
-from coordinator.ipc.protocol.messages import Encoder, Encoding, Fault
+from coordinator.ipc.protocol.limits import EndReason, Limits
+from coordinator.ipc.protocol.messages import Encoder, Encoding
 from coordinator.ipc.protocol.methods import ApiError, Registry
 from coordinator.ipc.server.auth import FailureBrake, Grant, Tokens, digest_of, stamp_of
 from coordinator.ipc.server.connection import Connection
@@ -17,7 +18,7 @@ from coordinator.ipc.server.fair_scheduler import Turns
 from coordinator.ipc.server.publisher import Publisher
 from coordinator.ipc.server.session import Common, Session, SessionCounters
 from coordinator.ipc.server.session_methods import add_session_methods
-from coordinator.ipc.server.settings import IpcSettings, Limits, TcpSettings
+from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, Door
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
@@ -109,7 +110,7 @@ class IpcServer:
         if self._door is not None:
             self._door.close()
         for connection in list(self._connections):
-            connection.session.end(Fault("closing", "the server ends"))
+            connection.session.end(EndReason("closing", "the server ends"))
             connection.flush()
             connection.transport.close()
         if self._servers and self._settings.unix_path is not None:
@@ -201,7 +202,7 @@ class IpcServer:
         for connection, token in list(self._shown.items()):
             grant, caller = tokens.grant_of(token), connection.session.caller
             if caller is not None and (grant is None or grant.scope < caller.scope):
-                connection.session.end(Fault("bad_token", "the token was taken away"))
+                connection.session.end(EndReason("bad_token", "the token was taken away"))
                 connection.flush()
 
     # ---------------------------------------------------------------------------------------- clients
@@ -268,7 +269,7 @@ class IpcServer:
         session = self._session(connection, f"uid {uid}, pid {pid}", self._token_check(connection, ""))
         session.granted = self._settings.unix_scope
         if not may_use(uid):
-            self._refuse(session, Fault("not_allowed", f"this socket is not for the user with uid {uid}"))
+            self._refuse(session, EndReason("not_allowed", f"this socket is not for the user with uid {uid}"))
         return session
 
     def _admit_tcp(self, transport: asyncio.Transport, connection: Connection) -> Session:
@@ -276,9 +277,9 @@ class IpcServer:
         session = self._session(connection, address, self._token_check(connection, address))
         wait_s = self._shut_out_s(address)
         if len(self._tcp) >= self._settings.tcp_connections_max:
-            self._refuse(session, Fault("busy", "there are too many connections over TCP; close others"))
+            self._refuse(session, EndReason("busy", "there are too many connections over TCP; close others"))
         elif wait_s > 0:
-            self._refuse(session, Fault("too_many_failures", _shut_out_sentence(address, wait_s)))
+            self._refuse(session, EndReason("too_many_failures", _shut_out_sentence(address, wait_s)))
         self._tcp.add(connection)
         return session
 
@@ -301,12 +302,12 @@ class IpcServer:
         )
         self._connections.add(connection)
         if len(self._connections) > self._settings.connections_max:
-            self._refuse(session, Fault("busy", "there are too many connections; close others"))
+            self._refuse(session, EndReason("busy", "there are too many connections; close others"))
         if len(self._connections) > self._settings.connections_max + REFUSALS_MAX:
             connection.transport.abort()
         return session
 
-    def _refuse(self, session: Session, fault: Fault) -> None:
+    def _refuse(self, session: Session, fault: EndReason) -> None:
         self._refused += 1
         session.end(fault)
 

@@ -12,12 +12,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from coordinator.ipc.protocol.messages import Encoding, Fault, WireReader
+from coordinator.ipc.protocol.limits import EndReason, Limits
+from coordinator.ipc.protocol.messages import Encoding, WireReader
 from coordinator.ipc.protocol.methods import ApiError, Caller, Method, Registry, Scope, shown
 from coordinator.ipc.server import session_methods
 from coordinator.ipc.server.auth import Grant
 from coordinator.ipc.server.publisher import Publisher, Subscription
-from coordinator.ipc.server.settings import Limits
 from coordinator.ipc.server.state import FieldFilter
 from coordinator.support.values import Value
 
@@ -89,8 +89,8 @@ class Session:
         self.granted = granted
         self.check_token = check_token
         self.caller: Caller | None = None
-        """Set by the hello."""
-        self.fault: Fault | None = None
+        """None until the hello."""
+        self.end_reason: EndReason | None = None
         """Why the session has ended; what is left to send tells the client."""
         self.writable = True
         """Whether the client takes what is sent; set by the driver."""
@@ -100,6 +100,7 @@ class Session:
         self._limits = common.limits
         self._encoder = common.publisher.encoder
         self._reader = WireReader(common.limits)
+        self._reader.message_bytes_max = min(common.limits.hello_bytes, common.limits.message_bytes)
         self._hello_until_s = now_s + common.limits.message_timeout_s
         self._waiting: deque[Request] = deque()
         self._running: set[Request] = set()
@@ -115,7 +116,7 @@ class Session:
 
     def next_deadline(self) -> float | None:
         """Return when ``handle_timer`` has something to do."""
-        if self.fault is not None:
+        if self.end_reason is not None:
             return None
         times = [subscription.next_s for subscription in self.subscriptions.values()]
         if self.caller is None:
@@ -126,13 +127,13 @@ class Session:
 
     def handle_timer(self, now_s: float) -> None:
         """Send what is due, end what took too long."""
-        if self.fault is not None:
+        if self.end_reason is not None:
             return
         if (fault := self._reader.handle_timer(now_s)) is not None:
             self.end(fault)
             return
         if self.caller is None and now_s >= self._hello_until_s:
-            self.end(Fault("timeout", f"no api.hello within {self._limits.message_timeout_s:g} s"))
+            self.end(EndReason("timeout", f"no api.hello within {self._limits.message_timeout_s:g} s"))
             return
         for subscription in self.subscriptions.values():
             if now_s >= subscription.next_s:
@@ -188,7 +189,7 @@ class Session:
         if self._out_bytes + len(data) > self._limits.output_bytes_max:
             self._out.clear()  # it would not be read
             self._out_bytes = 0
-            self.end(Fault("not_reading", "answers are not read; read them, or ask less"))
+            self.end(EndReason("not_reading", "answers are not read; read them, or ask less"))
             return
         self._out.append(data)
         self._out_bytes += len(data)
@@ -196,11 +197,11 @@ class Session:
     def _send(self, message: dict[str, Value]) -> None:
         self._put(self._encoder.message(self.encoding, message))
 
-    def end(self, fault: Fault) -> None:
+    def end(self, fault: EndReason) -> None:
         """End the session for FAULT and tell the client."""
-        if self.fault is not None:
+        if self.end_reason is not None:
             return
-        self.fault = fault
+        self.end_reason = fault
         self._waiting.clear()
         self._notifications.clear()
         self.subscriptions.clear()
@@ -213,10 +214,10 @@ class Session:
         urgent: list[Request] = []
         stop_at = self._reader.waiting_bytes - BYTES_PER_TURN
         for _ in range(MESSAGES_PER_TURN):
-            if self.fault is not None:
+            if self.end_reason is not None:
                 break
             message = self._reader.next_message()
-            if isinstance(message, Fault):
+            if isinstance(message, EndReason):
                 self.end(message)
             elif message is None:
                 break
@@ -229,7 +230,7 @@ class Session:
     @property
     def has_work(self) -> bool:
         """Whether ``read`` or ``next_request`` may have more at once."""
-        if self.fault is not None:
+        if self.end_reason is not None:
             return False
         unread = self._reader.waiting_bytes > 0 and self._reader.next_deadline() is None
         return unread or (bool(self._waiting) and self._may_start)
@@ -250,7 +251,7 @@ class Session:
 
     def next_request(self, now_s: float) -> Request | None:
         """Return the next request to call, None while there is none or none may start."""
-        while self._waiting and self._may_start and self.fault is None:
+        while self._waiting and self._may_start and self.end_reason is None:
             request = self._waiting.popleft()
             own = session_methods.HANDLERS.get(request.method.name)
             if own is None:
@@ -267,7 +268,7 @@ class Session:
     def answer(self, request: Request, result: Value) -> None:
         """End REQUEST with its RESULT."""
         self._forget(request)
-        if request.id is None or self.fault is not None:
+        if request.id is None or self.end_reason is not None:
             return
         if request.ignored and isinstance(result, dict):
             result = result | {"ignored": request.ignored}
@@ -289,16 +290,18 @@ class Session:
 
     def _refuse(self, request_id: int | None, error: ApiError) -> None:
         self.counters.failed += 1
-        if request_id is not None and self.fault is None:
+        if request_id is not None and self.end_reason is None:
             self._send({"id": request_id, "error": {"code": error.code, "message": error.sentence}})
 
     def _take(self, message: dict[str, Any], urgent: list[Request], now_s: float) -> None:
         request_id, name = message.get("id"), message.get("method")
         if type(name) is not str:
-            self.end(Fault("bad_message", "a request must be a map with method, and with id and params"))
+            self.end(EndReason("bad_message", "a request must be a map with method, and with id and params"))
             return
         if len(name) > METHOD_LENGTH_MAX:
-            self.end(Fault("bad_message", f"the name of a method has at most {METHOD_LENGTH_MAX} characters"))
+            self.end(
+                EndReason("bad_message", f"the name of a method has at most {METHOD_LENGTH_MAX} characters")
+            )
             return
         is_id = request_id is None or (type(request_id) is int and 0 <= request_id <= ID_MAX)
         if not is_id and not self._is_urgent(name):
@@ -310,7 +313,7 @@ class Session:
         except ApiError as error:
             self._refuse(request_id, error)
             if self.caller is None:
-                self.end(Fault(error.code, error.sentence))
+                self.end(EndReason(error.code, error.sentence))
             return
         self._sort(request, urgent, now_s)
         if not is_id:
@@ -318,7 +321,7 @@ class Session:
 
     def _end_for_id(self, request_id: object, addition: str = "") -> None:
         sentence = f"an id is a whole number from 0 to 2^53 - 1, not {shown(request_id)}{addition}"
-        self.end(Fault("bad_message", sentence))
+        self.end(EndReason("bad_message", sentence))
 
     def _is_urgent(self, name: str) -> bool:
         try:
@@ -377,6 +380,11 @@ class Session:
 
     # ------------------------------------------------------------------ what session_methods build on
 
+    def admit(self, caller: Caller) -> None:
+        """Let the client call methods, as CALLER."""
+        self.caller = caller
+        self._reader.message_bytes_max = self._limits.message_bytes
+
     def cancel(self, request_id: int) -> bool:
         """Cancel the request REQUEST_ID; return whether there was one."""
         request = self._ids.get(request_id)
@@ -403,7 +411,7 @@ class Session:
 
     def notify(self, event: str, data: bytes) -> None:
         """Send DATA, the notification EVENT as this client writes, if it listens and as far as it reads."""
-        if self.fault is not None or not self.listens.matches(event):
+        if self.end_reason is not None or not self.listens.matches(event):
             return
         self._notifications.append(data)
         if len(self._notifications) > self._limits.notifications:

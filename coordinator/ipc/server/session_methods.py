@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
-from coordinator.ipc.protocol.messages import Fault
+from coordinator.ipc.protocol.limits import EndReason
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope, printable
 from coordinator.ipc.server.state import costly_stars
 from coordinator.support.values import Value
@@ -42,7 +42,7 @@ def _hello(session: "Session", params: dict[str, Any], now_s: float) -> Value:
         raise ApiError("bad_params", "api.hello was said already")
     if params["version"] != API_VERSION:
         sentence = f"this server speaks version {API_VERSION}, not {params['version']}; update the older side"
-        session.end(Fault("bad_version", sentence))
+        session.end(EndReason("bad_version", sentence))
         return None
     scope = _scope_of(session, params["token"])
     if scope is None:
@@ -50,7 +50,7 @@ def _hello(session: "Session", params: dict[str, Any], now_s: float) -> Value:
     wanted = params["scope"]
     if wanted is not None:
         scope = min(scope, Scope[wanted.upper()])
-    session.caller = Caller(f"{printable(params['client']) or 'unnamed'} ({session.peer})", scope)
+    session.admit(Caller(f"{printable(params['client']) or 'unnamed'} ({session.peer})", scope))
     limits = session.common.limits
     return {
         "version": API_VERSION,
@@ -67,11 +67,11 @@ def _scope_of(session: "Session", token: str | None) -> Scope | None:
     """Return what the client may do; None when it may not even come in, and the session has ended."""
     if token is None:
         if session.granted is None:
-            session.end(Fault("no_token", "a token is needed here; give api.hello the parameter token"))
+            session.end(EndReason("no_token", "a token is needed here; give api.hello the parameter token"))
         return session.granted
     grant = None if session.check_token is None else session.check_token(token)
     if grant is None:
-        session.end(Fault("bad_token", "the token is not known here"))
+        session.end(EndReason("bad_token", "the token is not known here"))
         return None
     if grant.name:
         session.peer = f"{session.peer}, token {grant.name}"

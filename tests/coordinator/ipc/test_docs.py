@@ -6,9 +6,10 @@ from pathlib import Path
 
 import msgpack
 
+from coordinator.ipc.protocol.limits import Limits
 from coordinator.ipc.protocol.messages import Encoder, Encoding, WireReader
 from coordinator.ipc.server.session_methods import RATE_HZ_MAX, RATE_HZ_MIN
-from coordinator.ipc.server.settings import IpcSettings, Limits
+from coordinator.ipc.server.settings import IpcSettings
 from tests.coordinator.ipc.served import Served, serving
 from tests.stages import jump_loop
 
@@ -65,7 +66,12 @@ def codes_of(path: Path) -> set[str]:
     """Return the codes of the errors that a file of the source makes."""
     found: set[str] = set()
     for call in ast.walk(ast.parse(path.read_text())):
-        if isinstance(call, ast.Call) and ast.unparse(call.func) in ("ApiError", "Fault", "super().__init__"):
+        if isinstance(call, ast.Call) and ast.unparse(call.func) in (
+            "ApiError",
+            "EndReason",
+            "RejectedError",
+            "super().__init__",
+        ):
             parts = (part for first in call.args[:1] for part in ast.walk(first))
             words = (part.value for part in parts if isinstance(part, ast.Constant))
             found |= {word for word in words if isinstance(word, str) and re.fullmatch("[a-z_]+", word)}

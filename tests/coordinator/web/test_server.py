@@ -13,7 +13,7 @@ import aiohttp
 import pytest
 from yarl import URL
 
-from coordinator.ipc.server.settings import Limits
+from coordinator.ipc.protocol.limits import Limits
 from coordinator.ipc.server.tcp_listener import HANDSHAKE_S, HANDSHAKES_MAX
 from coordinator.web.files import FOLDER
 from coordinator.web.server import CONNECTIONS_MAX, REQUEST_S

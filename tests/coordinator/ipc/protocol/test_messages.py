@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coordinator.ipc.protocol.messages import Encoder, Encoding, Fault, WireReader
-from coordinator.ipc.server.settings import Limits
+from coordinator.ipc.protocol.limits import EndReason, Limits
+from coordinator.ipc.protocol.messages import Encoder, Encoding, WireReader
 from tests.profiles import examples
 
 LIMITS = Limits(message_timeout_s=5.0)
@@ -59,15 +59,15 @@ def test_garbage_ends_in_one_fault_or_waits(data: bytes) -> None:
     while isinstance(reader.next_message(), dict):
         pass
     last = reader.next_message()
-    assert last is None or isinstance(last, Fault)
+    assert last is None or isinstance(last, EndReason)
     if reader.waiting_bytes:
         assert reader.next_deadline() == 6.0
         assert reader.handle_timer(5.9) is None
-        fault = reader.handle_timer(6.0)
-        assert isinstance(fault, Fault)
-        assert fault.code == "timeout"
+        end = reader.handle_timer(6.0)
+        assert isinstance(end, EndReason)
+        assert end.code == "timeout"
         reader.feed(b"x" * 1000, 7.0)
-        assert (reader.next_message(), reader.waiting_bytes) == (fault, 0)
+        assert (reader.next_message(), reader.waiting_bytes) == (end, 0)
 
 
 def test_a_message_that_drips_in_does_not_gain_time() -> None:
@@ -87,7 +87,7 @@ def test_the_limit_of_nesting_is_exact(encoding: Encoding, depth: int) -> None:
     reader = WireReader(LIMITS)
     reader.feed(Encoder().message(encoding, {"x": value}), 0.0)
     message = reader.next_message()
-    assert isinstance(message, Fault) == (depth > LIMITS.nesting)
+    assert isinstance(message, EndReason) == (depth > LIMITS.nesting)
 
 
 @pytest.mark.parametrize("encoding", Encoding)
@@ -97,7 +97,7 @@ def test_what_no_message_can_carry_is_an_error_of_the_sender(encoding: Encoding,
     if encoding is Encoding.MSGPACK and isinstance(value, float | bytes):
         reader = WireReader(LIMITS)
         reader.feed(Encoder().message(encoding, message), 0.0)
-        assert isinstance(reader.next_message(), Fault)
+        assert isinstance(reader.next_message(), EndReason)
         return
     with pytest.raises(ValueError, match=r"."):
         Encoder().message(encoding, message)

@@ -6,11 +6,12 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import pytest
 
+from coordinator.ipc.protocol.limits import Limits
 from coordinator.ipc.server.connection import UNREAD_BYTES
 from coordinator.ipc.server.fair_scheduler import TURN_S
-from coordinator.ipc.server.settings import Limits
 from tests.coordinator.ipc.served import (
     Script,
     Served,
@@ -68,6 +69,54 @@ def test_what_is_wrong_ends_that_client_only_with_a_clear_error(tmp_path: Path, 
         assert "result" in await bystander.ask("machine.info")
         assert not served.stops
         writer.close()
+
+    run(tmp_path, body)
+
+
+BIG_ATTACKS = {  # the same from a client that may send more than a hello
+    "a huge message": "too_long",
+    "a huge line": "too_long",
+    "abysmal msgpack": "too_deep",
+    "abysmal JSON": "too_deep",
+    "many small lists": "too_long",
+    "many small lists in JSON": "too_long",
+}
+
+
+@pytest.mark.parametrize("attack", BIG_ATTACKS)
+def test_who_was_let_in_may_not_do_it_either(tmp_path: Path, attack: str) -> None:
+    data, code = ATTACKS[attack][0], BIG_ATTACKS[attack]
+    hello = {"id": 1, "method": "api.hello", "params": {"version": 1}}
+
+    async def body(served: Served) -> None:
+        bystander = await served.script()
+        reader, writer = await served.dial()
+        packed = data[:1] == b"\0"
+        writer.write(framed(msgpack.packb(hello)) if packed else json.dumps(hello).encode() + b"\n")
+        writer.write(data)
+        raw = await reader.read()
+        assert b"message_bytes_max" in raw
+        assert code.encode() in raw[raw.rindex(b"code") :]
+        assert "result" in await bystander.ask("machine.info")
+        writer.close()
+
+    run(tmp_path, body)
+
+
+def test_before_the_hello_a_message_has_a_few_kilobytes(tmp_path: Path) -> None:
+    async def body(served: Served) -> None:
+        most = served.settings.limits.hello_bytes
+        for size, accepted in ((most, True), (most + 1, False)):
+            script = Script(*await served.dial())
+            line = json.dumps({"id": 1, "method": "api.hello", "params": {"version": 1}}).encode()
+            script.writer.write(line + b" " * (size - len(line)) + b"\n")
+            answer = await script.receive()
+            assert ("result" in answer) == accepted
+            if not accepted:
+                assert answer["error"]["code"] == "too_long"
+                continue
+            script.writer.write(b'{"id":2,"method":"api.ping"}' + b" " * 2 * most + b"\n")
+            assert (await script.receive())["id"] == 2
 
     run(tmp_path, body)
 
@@ -244,11 +293,11 @@ def test_a_client_that_asks_without_reading_is_cut_off(tmp_path: Path) -> None:
         line = json.dumps({"id": 1, "method": "nothing" * 15}).encode() + b"\n"
         (connection,) = served.server._connections
         most = 0
-        while connection.session.fault is None:
+        while connection.session.end_reason is None:
             script.writer.write(line * 500)
             await asyncio.sleep(0)
             most = max(most, connection.session.output_bytes)
-        assert connection.session.fault.code == "not_reading"
+        assert connection.session.end_reason.code == "not_reading"
         assert most <= served.settings.limits.output_bytes_max
         script.writer.transport.abort()
 
