@@ -116,10 +116,13 @@ def reach(graph: dict[str, set[str]], start: str) -> set[str]:
 @pytest.mark.parametrize(
     ("folder", "floors_above"),
     [
-        ("firmware/wire", ("core/", "objects/", "net/", "boards/", "nodes/", "coordinator/")),
-        ("firmware/core", ("objects/", "net/", "boards/linux", "boards/sim", "nodes/", "coordinator/")),
-        ("firmware/objects", ("net/", "boards/linux", "boards/sim", "nodes/", "coordinator/")),
-        ("firmware/net", ("boards/linux", "boards/sim", "nodes/", "coordinator/")),
+        ("firmware/wire", ("core/", "objects/", "net/", "plant/", "boards/", "nodes/", "coordinator/")),
+        (
+            "firmware/core",
+            ("plant/", "objects/", "net/", "boards/linux", "boards/sim", "nodes/", "coordinator/"),
+        ),
+        ("firmware/objects", ("plant/", "net/", "boards/linux", "boards/sim", "nodes/", "coordinator/")),
+        ("firmware/net", ("plant/", "boards/linux", "boards/sim", "nodes/", "coordinator/")),
         ("firmware", ("nodes/", "coordinator/")),
         ("nodes", ("coordinator/",)),
     ],

@@ -14,7 +14,7 @@ from nodes.link.sources import CORE_HEADERS, CORE_SOURCES
 from nodes.support.native_build import ROOT, builder
 
 TABLES = Path("build/sim/tables.c")
-FOLDERS = ("wire", "core", "objects", "net", "boards/virtual", "boards/sim")
+FOLDERS = ("wire", "core", "objects", "net", "plant", "boards/virtual", "boards/sim")
 SOURCES = [
     path.relative_to(ROOT) for folder in FOLDERS for path in sorted((ROOT / "firmware" / folder).glob("*.c"))
 ]

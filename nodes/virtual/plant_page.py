@@ -1,6 +1,6 @@
 """Reads the page of a running plant, which is the truth about it, and switches faults in it.
 
-The layout is that of firmware/boards/virtual/plant_page.h.
+The layout is that of firmware/plant/plant_page.h.
 """
 
 import mmap

@@ -60,7 +60,7 @@ void sim_edges_forget(struct sim_board *board);
 // Edges that were lost because memory was out.
 uint64_t sim_edges_lost(const struct sim_board *board);
 
-// What stands around the board (boards/virtual/plant.h): TEXT describes it (docs/plant.md). It begins now,
+// What stands around the board (plant/plant.h): TEXT describes it (docs/plant.md). It begins now,
 // and outlives resets. NOW_NS: true time; 0: that of the board's last event. -1, with a sentence of at most
 // SIM_ERROR bytes in ERROR: there is one already, TEXT is wrong, or memory is out.
 enum { SIM_ERROR = 200 };

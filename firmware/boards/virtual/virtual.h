@@ -5,7 +5,7 @@
 #define BOARDS_VIRTUAL_H
 
 #include "boards/board.h"
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 
 // Converters idle at what a 100 kOhm thermistor at 25 °C gives below 4.7 kOhm: sensors without a plant are
 // sound.

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // sources: firmware/wire/*.c firmware/core/*.c firmware/objects/*.c firmware/net/*.c
-// sources: firmware/boards/virtual/*.c firmware/boards/sim/sim.c build/sim/tables.c
+// sources: firmware/boards/virtual/*.c firmware/plant/*.c firmware/boards/sim/sim.c build/sim/tables.c
 // Whatever a wire brings, a node survives: random commands with random arguments in sound blocks, and the
 // same with damage, under the sanitizers; on CAN also signals, admin commands, tables and other nodes'
 // frames.

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // sources: firmware/wire/*.c firmware/core/*.c firmware/objects/*.c firmware/net/*.c
-// sources: firmware/boards/virtual/*.c firmware/boards/sim/sim.c build/sim/tables.c
+// sources: firmware/boards/virtual/*.c firmware/plant/*.c firmware/boards/sim/sim.c build/sim/tables.c
 // Timers: their order, also over the rollover, and what happens to those that come too late.
 #include "boards/sim/sim.h"
 #include "core/node.h"

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // sources: firmware/wire/*.c firmware/core/*.c firmware/objects/*.c firmware/net/*.c
-// sources: firmware/boards/virtual/*.c firmware/boards/sim/sim.c build/sim/tables.c
+// sources: firmware/boards/virtual/*.c firmware/plant/*.c firmware/boards/sim/sim.c build/sim/tables.c
 // The uuid of a chip.
 #include "net/can_stream.h"
 #include "tests/check.h"

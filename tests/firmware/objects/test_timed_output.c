@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // sources: firmware/wire/*.c firmware/core/*.c firmware/objects/*.c firmware/net/*.c
-// sources: firmware/boards/virtual/*.c firmware/boards/sim/sim.c build/sim/tables.c
+// sources: firmware/boards/virtual/*.c firmware/plant/*.c firmware/boards/sim/sim.c build/sim/tables.c
 // A timed output by itself: what its stop leaves, whoever calls it.
 #include "objects/timed_output.h"
 

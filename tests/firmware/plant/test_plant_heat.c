@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/boards/virtual/plant*.c
+// sources: firmware/plant/plant*.c
 // Heat against a plain integration in small steps that shares nothing with it; sensors against their formula;
 // faults; energy; what is no description.
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 #include "tests/check.h"
 
 #include <math.h>

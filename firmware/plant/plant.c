@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The plant's edge to its board: which pin is what, faults, and the page.
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 
 #include <stdio.h>
 #include <string.h>

@@ -13,7 +13,7 @@
 #ifndef BOARDS_PLANT_H
 #define BOARDS_PLANT_H
 
-#include "boards/virtual/plant_page.h"
+#include "plant/plant_page.h"
 
 #include <stddef.h>
 

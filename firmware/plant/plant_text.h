@@ -3,7 +3,7 @@
 #ifndef BOARDS_PLANT_TEXT_H
 #define BOARDS_PLANT_TEXT_H
 
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 
 enum plant_type { NAME, PIN, FLAG, SIGN, WHOLE, NUMBER, CURVE, AXIS, BODY, STEPPER, CHIP };
 

@@ -4,7 +4,7 @@
 //
 // The motor follows its field up to an angle: where the axis stands against its stop the rotor stays and the
 // field goes on. Two full steps further it slips: the rotor falls to the field's place four full steps back.
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 
 #include <math.h>
 #include <string.h>

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // From a sensor's temperature to what the converter gives.
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 
 #include <math.h>
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Reads the description of a plant: lines of a kind and of name=value (docs/plant.md). Each kind is a table
 // of its fields.
-#include "boards/virtual/plant_text.h"
+#include "plant/plant_text.h"
 
 #include <math.h>
 #include <string.h>

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/boards/virtual/plant*.c
+// sources: firmware/plant/plant*.c
 // Steps are counted as drivers count them, endstops switch by steppers of several nodes, and a history that
 // is written and read at the same time never gives a count that was not.
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 #include "tests/check.h"
 
 #include <pthread.h>

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Words name=value of a line, by a table of fields.
-#include "boards/virtual/plant_text.h"
+#include "plant/plant_text.h"
 
 #include <math.h>
 #include <stdio.h>

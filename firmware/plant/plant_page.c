@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Reading and writing a page without locks: see plant_page.h.
-#include "boards/virtual/plant_page.h"
+#include "plant/plant_page.h"
 
 #include <string.h>
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// sources: firmware/boards/virtual/plant*.c
+// sources: firmware/plant/plant*.c
 // Drivers with a UART: they answer and keep what was written, step as they are set, and feel a stop.
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 #include "tests/check.h"
 
 #include <stdlib.h>

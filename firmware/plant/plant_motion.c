@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Steps are counted where they are made; an axis adds up counts of any nodes, a switch looks at its axis.
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 
 #include <math.h>
 

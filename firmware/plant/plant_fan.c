@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // A fan's speed follows its duty with a lag; the turns it makes are the exact integral of that.
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 
 #include <math.h>
 

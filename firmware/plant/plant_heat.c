@@ -2,7 +2,7 @@
 // Heat. Bodies with a capacity lose heat to the surroundings and to each other, sensors follow their body
 // with a lag: a linear system x' = m·x, solved exactly by x(t + dt) = exp(m·dt)·x while powers stay as they
 // are. What is connected is one zone; each has its own, small matrix.
-#include "boards/virtual/plant.h"
+#include "plant/plant.h"
 
 #include <math.h>
 #include <stdio.h>
