@@ -108,7 +108,7 @@ def test_what_is_raised_is_a_failure_with_its_place(
     def fails(*_: object) -> Result:
         raise ZeroDivisionError("by design")
 
-    monkeypatch.setattr("coordinator.simulate.play.play", fails)
+    monkeypatch.setattr("coordinator.simulate.run.play", fails)
     assert cli.main(["simulate", "clean", "--seed", "4"]) == cli.EXIT_FAILED
     out = capsys.readouterr().out
     assert "FAILED exception: ZeroDivisionError: by design (tests/sim/test_run.py:" in out
@@ -120,7 +120,7 @@ def test_a_seed_that_does_not_end_is_a_failure(monkeypatch: pytest.MonkeyPatch) 
         while True:
             pass
 
-    monkeypatch.setattr("coordinator.simulate.play.play", hangs)
+    monkeypatch.setattr("coordinator.simulate.run.play", hangs)
     found = run.run_one(scenario.find("clean"), 1, limit_s=0.05)
     assert [v.text for v in found.violations] == ["not over after 0.05 s"]
 
