@@ -1,10 +1,14 @@
 """What the demo found, as figures and as text."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from coordinator.service.jobs.outcome import Outcome
+from coordinator.verification.hardware import Hardware
 from coordinator.verification.heat_proof import HeatProof
 from coordinator.verification.proof import ClockProof, StepperProof
+from coordinator.verification.prover import Prover
 from coordinator.verification.true_position import PlaceProof
 
 
@@ -130,6 +134,44 @@ class DemoReport:
         if cold:
             return f"{', '.join(dict.fromkeys(cold))} left its target in steady state"
         return f"{self.stray_edges} changes of pins that are nobody's"
+
+
+def report_of(
+    prover: Prover,
+    hardware: Hardware,
+    figures: Mapping[str, Mapping[str, Any]],
+    outcome: Outcome,
+    notices: Sequence[str],
+    *,
+    heat: Sequence[HeatProof] = (),
+) -> DemoReport:
+    """Return the report, with every stepper proved; the nodes have ended, with these FIGURES."""
+    frames, frames_lost = hardware.frames()
+    return DemoReport(
+        moves=outcome.moves,
+        print_time_s=outcome.print_time_s,
+        queue_steps=outcome.queue_steps,
+        steppers=tuple(prover.steppers()),
+        places=tuple(prover.places(hardware)),
+        heat=tuple(heat),
+        clocks=tuple(prover.clocks()),
+        stray_edges=prover.stray_edges(),
+        nodes=tuple(
+            NodeReport(
+                name=node.name,
+                bytes_sent=node.link.bytes_sent,
+                retransmitted_bytes=node.link.bytes_repeated,
+                min_lead_s=node.link.min_lead_s,
+                round_trip_s=node.link.srtt_s,
+                clock_error_bound_s=node.clock_error_s,
+                dispatch_late_s=float(figures[node.name]["late_us_max"]) * 1e-6,
+            )
+            for node in outcome.nodes
+        ),
+        frames=frames,
+        frames_lost=frames_lost,
+        notices=tuple(notices),
+    )
 
 
 def _node_line(node: NodeReport) -> str:

@@ -9,7 +9,7 @@ from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
 from coordinator.front_ends.serve import ServeReport, serve
 from coordinator.support.command_options import DEMO_GCODE, DemoOptions, ServeOptions
-from coordinator.virtual_machine.stage import Stage
+from coordinator.virtual_machine.virtual_machine import VirtualMachine
 
 
 def serve_demo(options: DemoOptions) -> ServeReport:
@@ -18,7 +18,7 @@ def serve_demo(options: DemoOptions) -> ServeReport:
     description = load_machine(str(options.machine))
     with (
         tempfile.TemporaryDirectory(prefix="canductor-demo-") as folder,
-        Stage(description, options, Path(folder)) as stage,
+        VirtualMachine(description, options, Path(folder)) as stage,
     ):
         return serve(lambda: stage.description, with_jobs(options.serve, description, Path(folder)))
 

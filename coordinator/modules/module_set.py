@@ -27,6 +27,7 @@ from coordinator.modules.registry import module_for, modules_beside
 from coordinator.modules.status.console import Console
 from coordinator.modules.status.positions import Positions
 from coordinator.motion.planner.planner import Planner
+from coordinator.runtime.machine import Machine
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
@@ -365,9 +366,12 @@ class ModuleSet:
         for device in self._devices.get(node.name, ()):
             device.started(node)
 
-    async def connect(self, live: "ModuleContext") -> None:
-        """Let all begin to act, then tell them that the machine is ready; raises CanductorError."""
-        self._live = live
+    async def connect(self, machine: Machine, say: Callable[[str], None]) -> None:
+        """Connect all modules with MACHINE, then report it ready to them; SAY shows a sentence to the user.
+
+        Raises CanductorError.
+        """
+        live = self._live = ModuleContext(machine, say)
         for module in self._modules:
             with _blamed(type(module), self._places[module]):
                 await module.connect(live)

@@ -1,6 +1,7 @@
 """The configured machine's devices: what each node is configured as, and what motion has to know of it."""
 
 from collections.abc import Iterable, Mapping
+from typing import Protocol
 
 from coordinator.config.model import (
     CanConnection,
@@ -10,7 +11,6 @@ from coordinator.config.model import (
     StepperDescription,
 )
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
-from coordinator.runtime.machine_modules import MachineModules
 from coordinator.tables.axle_map import StepperTables, stepper_tables
 from nodes.devices.endstop import Endstop
 from nodes.devices.stepper import Stepper
@@ -20,13 +20,20 @@ from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
 from nodes.node.config import NodeConfig
 
 
+class ConfiguresNodes(Protocol):
+    """Adds to the configuration of nodes."""
+
+    def configure(self, config: NodeConfig) -> None:
+        """Add to CONFIG what its node needs."""
+
+
 class MachineDevices:
     """The steppers and endstops of a machine and what its MODULES have; of the real and the offline one.
 
     Call ``build_config`` for every node with its dictionary first; the specs are known afterwards.
     """
 
-    def __init__(self, description: MachineDescription, modules: MachineModules) -> None:
+    def __init__(self, description: MachineDescription, modules: ConfiguresNodes) -> None:
         self.description = description
         self.modules = modules
         self.steppers: dict[str, Stepper] = {s.name: _stepper(s) for s in description.steppers}

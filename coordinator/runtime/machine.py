@@ -3,8 +3,9 @@
 import asyncio
 import contextlib
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
 
 from coordinator.config.model import (
     CanConnection,
@@ -13,20 +14,21 @@ from coordinator.config.model import (
     NodePolicy,
     UartConnection,
 )
+from coordinator.config.pins import PinRegistry
 from coordinator.config.saved import PendingConfig
 from coordinator.config.sections.nodes import check_distinct
+from coordinator.gcode.commands import Vocabulary
 from coordinator.motion.specs import NodeStreamSpec
 from coordinator.runtime.bus_overload import BusOverloadDetector
 from coordinator.runtime.devices import MachineDevices, stream_specs
 from coordinator.runtime.filament_forecast import FilamentForecast
 from coordinator.runtime.host import Host
-from coordinator.runtime.machine_modules import MachineModules
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.module_runner import Runner
 from coordinator.runtime.node_recovery import NodeRecovery, PausableJob
 from coordinator.runtime.stepper_positions import StepperPositions
 from coordinator.runtime.timebase import ClockMap, TimeBase
 from coordinator.runtime.wire import Wire
+from coordinator.support.values import Value
 from nodes.bus.assign import Uuid
 from nodes.bus.bus import UartBus
 from nodes.bus.can_bus import CanBus
@@ -37,6 +39,8 @@ from nodes.node.config import NodeConfig
 from nodes.node.node import Node
 from nodes.node.states import NodeState
 from nodes.support.errors import CanductorError
+
+M = TypeVar("M")
 
 
 class MachineStopped(CanductorError):  # noqa: N818
@@ -52,6 +56,35 @@ class _OpenBus:
     bus: CanBus | UartBus
     wire: Wire
     watch: BusOverloadDetector
+
+
+class MachineModules(Protocol):
+    """All modules of one machine; ``coordinator/modules/module_set.py`` provides it."""
+
+    config: Mapping[str, Mapping[str, str]]
+    """The configuration as text: options by section."""
+    settings: Mapping[str, Mapping[str, object]]
+    """As it was read: values and defaults."""
+    notes: list[str]
+    """Sentences about what is no mistake."""
+    pins: PinRegistry
+
+    @property
+    def vocabulary(self) -> Vocabulary: ...  # noqa: D102
+    @property
+    def helps(self) -> Mapping[str, str]: ...  # noqa: D102
+    def configure(self, config: NodeConfig) -> None: ...  # noqa: D102
+    def node_started(self, node: Node) -> None: ...  # noqa: D102
+    async def connect(self, machine: "Machine", say: Callable[[str], None]) -> None: ...  # noqa: D102
+    def before_motion(self, steppers: Collection[str]) -> None: ...  # noqa: D102
+    def job_begins(self) -> None: ...  # noqa: D102
+    def stopped(self, cause: str) -> None: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+    def status(self) -> Mapping[str, Mapping[str, Value]]: ...  # noqa: D102
+    def knows(self, command: str) -> bool: ...  # noqa: D102
+    def names(self, kind: type[Any]) -> list[str]: ...  # noqa: D102
+    def find(self, name: str, kind: type[M]) -> M | None: ...  # noqa: D102
+    def of(self, kind: type[M]) -> Iterator[M]: ...  # noqa: D102
 
 
 def _ignore(_: str) -> None:
@@ -143,7 +176,7 @@ class Machine:
             self._check_gone(node)  # one may have failed while others still started
         if self.stopped is not None:
             raise self.stopped
-        await self.modules.connect(ModuleContext(self, self._on_notice))
+        await self.modules.connect(self, self._on_notice)
 
     async def close(self) -> None:
         """Leave the nodes as they are and release everything."""

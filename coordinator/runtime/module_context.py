@@ -3,13 +3,11 @@
 import asyncio
 import contextlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from coordinator.runtime.machine import Machine
 from nodes.clock.clock import Ticks, extend32
 from nodes.node.node import Node
-
-if TYPE_CHECKING:
-    from coordinator.runtime.machine import Machine
 
 AHEAD_S: Final = 0.1
 """What is to happen as soon as possible happens so far ahead of now: commands need their time to the node."""
@@ -18,7 +16,7 @@ AHEAD_S: Final = 0.1
 class ModuleContext:
     """MACHINE, connected. SAY shows a sentence to the user. Everything on the control loop."""
 
-    def __init__(self, machine: "Machine", say: Callable[[str], None]) -> None:
+    def __init__(self, machine: Machine, say: Callable[[str], None]) -> None:
         self.machine = machine
         """For modules of the project: what others may rely upon are the methods."""
         self.say = say

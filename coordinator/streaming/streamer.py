@@ -32,8 +32,8 @@ CAUSE_WAIT_S: Final = 0.1
 class Streamer:
     """Runs one JOB on MACHINE, whose nodes are READY.
 
-    ON_OUTPUT gets replies and notices, ON_STATE the state of the planner in every cycle, ON_CYCLE is called
-    at the end of each. WITNESS sees moves and commands pass, COMPENSATION has the tables of the axes.
+    ON_OUTPUT gets replies and notices, ON_STATE the state of the planner in every cycle; ON_CYCLE ends each
+    cycle. WITNESS sees moves and commands pass, COMPENSATION has the tables of the axes.
     """
 
     def __init__(

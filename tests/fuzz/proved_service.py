@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.assembly.load import load_machine
-from coordinator.demo.run import Prover, report_of
+from coordinator.demo.report import report_of
 from coordinator.ipc.protocol.limits import Limits
 from coordinator.ipc.protocol.methods import Registry, Scope
 from coordinator.ipc.server.server import IpcServer
@@ -35,7 +35,8 @@ from coordinator.service.jobs.outcome import Outcome, outcome_of
 from coordinator.service.state.log_ring import Entry
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
-from coordinator.virtual_machine.stage import Stage
+from coordinator.verification.prover import Prover
+from coordinator.virtual_machine.virtual_machine import VirtualMachine
 
 WATCH_TOKEN, ADMIN_TOKEN = "watch" * 8, "admin" * 8
 LOOK_S = 0.02
@@ -67,7 +68,7 @@ class FiledRecord(PlanRecord):
 class Proved:
     """The service, its server, and what was noted of them."""
 
-    def __init__(self, stage: Stage, folder: Path, jobs: Path) -> None:
+    def __init__(self, stage: VirtualMachine, folder: Path, jobs: Path) -> None:
         self.record = FiledRecord(folder / "trapezoids")
         self.leads: list[float | None] = []
         self.both_edges: dict[str, bool] = {}
@@ -181,7 +182,7 @@ def main() -> None:
     machine.write_text(re.sub(r"endstop_pin: .*\n", "", DEMO_MACHINE.read_text()))
     options = DemoOptions(machine=machine)
     description = load_machine(str(options.machine))
-    with Stage(description, options, folder) as stage:
+    with VirtualMachine(description, options, folder) as stage:
         # What is proved is that clients do no harm through the sockets. Other processes may: a busy computer
         # was seen to leave the service without a processor for a second, and boards, which have their own.
         for node in stage.processes.values():

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from coordinator.ipc.protocol.methods import ApiError
-from coordinator.simulate.safety_rig import Rig
 from tests.stages.plant_stage import STEP_MM, PlantStage
+from tests.stages.safety_rig import Rig
 from tests.stages.served import running
 
 LINES = ("G28 X Y", "M118 homed", "G1 X60 Y200 F6000", "G1 X20", "M118 read", "G4 P5000")

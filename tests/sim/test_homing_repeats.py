@@ -2,7 +2,7 @@
 
 import pytest
 
-from coordinator.simulate.homings import MICROSTEP_MM, home_repeatedly, main, report, spread_mm
+from tests.sim.homings import MICROSTEP_MM, home_repeatedly, main, report, spread_mm
 
 
 def test_homing_repeats_within_a_microstep_with_any_clocks_and_lost_frames() -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from coordinator.ipc.protocol.methods import ApiError
-from coordinator.simulate.safety_rig import MACHINE
 from tests.stages.plant_stage import PlantStage
+from tests.stages.safety_rig import MACHINE
 from tests.stages.served import running
 
 

@@ -90,7 +90,7 @@ def test_nodes_that_are_shut_down_come_back(tmp_path: Path, command: str) -> Non
         await stage.until_state("shutdown")
         await stage.until(lambda: len(stage.service.confirmed_s) > 0, "nodes in shutdown")
         for script in (f"{command}\nG28", "G28"):
-            with pytest.raises(ApiError, match=r"machine\.restart begins anew"):
+            with pytest.raises(ApiError, match=r"machine\.restart starts it again"):
                 await run(stage, script)
         await run(stage, command)
         await begun_anew(stage, 2)

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from coordinator.simulate.safety import _judged, cases, main, run
-from coordinator.simulate.safety_rig import Found, HeaterFound
+from tests.sim.safety.cases import _judged, cases, main, run
+from tests.stages.safety_rig import Found, HeaterFound
 
 CASES = {case.name: case for case in cases()}
 QUIET = Found(

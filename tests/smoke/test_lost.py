@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from coordinator.simulate import safety_real
+from tests.sim.safety import real_host
 from tests.stages.processes import LONG, Command, Hardware, write_gcode
 
 MOVING = "taken as already home"
@@ -14,11 +14,11 @@ MOVING = "taken as already home"
 
 @pytest.mark.parametrize(
     ("end", "told"),
-    [(safety_real.killed, "^$"), (safety_real.stopped, "node toolhead shut down|lost node")],
+    [(real_host.killed, "^$"), (real_host.stopped, "node toolhead shut down|lost node")],
     ids=["SIGKILL", "SIGSTOP"],
 )
-def test_without_its_host_a_node_switches_its_heater_off(end: safety_real.End, told: str) -> None:
-    row = safety_real.row("a host that ends", end)  # raises when the heater stays on
+def test_without_its_host_a_node_switches_its_heater_off(end: real_host.End, told: str) -> None:
+    row = real_host.row("a host that ends", end)  # raises when the heater stays on
     assert row.off_after_s > 0
     assert re.search(told, row.told), row
 

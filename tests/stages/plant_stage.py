@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from coordinator.kinematics.base import Point
-from coordinator.simulate.safety_rig import MACHINE, START
 from coordinator.simulate.scenario import NodeSetting
 from coordinator.virtual_machine.plant import PlantSettings
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from tests.stages.machine_stage import MachineStage
+from tests.stages.safety_rig import MACHINE, START
 from tests.stages.served import Served, running
 
 STEP_MM = 40 / 200 / 16

@@ -14,7 +14,7 @@ from coordinator.gcode.program import Program
 from coordinator.simulate.scenario import BusSetting, NodeSetting
 from coordinator.virtual_machine.plant import PlantSettings, start_point
 from coordinator.virtual_machine.plant_heat import HeatSettings
-from coordinator.virtual_machine.stage import START_MM, WARM_C
+from coordinator.virtual_machine.virtual_machine import START_MM, WARM_C
 from nodes.virtual.edge_log import Clocks, Directions, steps_of
 from nodes.virtual.plant_log import PlantEvent
 from nodes.virtual.plant_page import Motor, PlantItemKind
@@ -91,7 +91,7 @@ class SimulatedDemo(MachineStage):
                 self._warmth.append((node, event))
         self.stage.call_at(now_ns + round(LOOK_S * 1e9), self._look)
 
-    # ------------------------------------------------------------------- coordinator.demo.hardware.Hardware
+    # ------------------------------------------------- Hardware (coordinator/verification/hardware.py)
 
     def motors(self) -> Mapping[str, Mapping[str, Motor]]:
         return {name: plant.page.motors for name, plant in self.plants.items()}

@@ -7,7 +7,7 @@ import pytest
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import CanConnection, UartConnection
 from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
-from coordinator.virtual_machine.stage import Stage
+from coordinator.virtual_machine.virtual_machine import VirtualMachine
 from tests.canbus_tools.command import Command
 from tests.vcan.kernel import INTERFACE, SECOND_INTERFACE, why_no_socketcan
 
@@ -23,7 +23,7 @@ def test_nodes_on_two_interfaces_and_a_uart(tmp_path: Path, capsys: pytest.Captu
     machine = tmp_path / "machine.cfg"
     machine.write_text(text.replace(f"{TOOLHEAD}0", f"{TOOLHEAD}1"))
     options = DemoOptions(machine=machine, socketcan={"can0": INTERFACE, "can1": SECOND_INTERFACE})
-    with Stage(load_machine(str(machine)), options, tmp_path) as stage:
+    with VirtualMachine(load_machine(str(machine)), options, tmp_path) as stage:
         mcu, toolhead, zboard = (node.connection for node in stage.description.nodes)
         for connection, interface in ((mcu, INTERFACE), (toolhead, SECOND_INTERFACE)):
             assert isinstance(connection, CanConnection)

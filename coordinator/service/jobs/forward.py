@@ -15,7 +15,7 @@ from coordinator.modules.module_set import build_modules
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner
-from coordinator.runtime.machine_modules import MachineModules
+from coordinator.runtime.machine import MachineModules
 from coordinator.streaming.program_machine import machine_state
 from nodes.support.errors import CanductorError
 

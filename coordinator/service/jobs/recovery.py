@@ -18,7 +18,7 @@ from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner
-from coordinator.runtime.machine_modules import MachineModules
+from coordinator.runtime.machine import MachineModules
 from coordinator.service.core.feeder import COME_BACK_MM_S
 from coordinator.service.core.interface import ServiceInterface
 from coordinator.service.core.motion import Motion

@@ -14,7 +14,7 @@ from coordinator.gcode.commands import Done
 from coordinator.gcode.events import Event, Full
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.homing.homing import Homing
-from coordinator.runtime.machine_modules import MachineModules
+from coordinator.runtime.machine import MachineModules
 from coordinator.service.core.work import LinesWork, Setting
 
 LIFT_MM: Final = 5.0

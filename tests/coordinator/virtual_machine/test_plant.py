@@ -13,7 +13,7 @@ from coordinator.kinematics.base import Point
 from coordinator.support.command_options import EXAMPLES, DemoOptions
 from coordinator.virtual_machine.plant import START_MM, PlantSettings, machine_plants, start_point
 from coordinator.virtual_machine.plant_heat import HeatSettings, steinhart, table_of
-from coordinator.virtual_machine.stage import Stage
+from coordinator.virtual_machine.virtual_machine import VirtualMachine
 from nodes.virtual.plant import Axis, Beta, NodePlant, Rtd, Steinhart
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from nodes.virtual.sim import SimNode
@@ -250,7 +250,7 @@ def test_the_machines_of_the_shared_data_have_plants() -> None:
 def test_the_stage_of_the_demo_has_it(tmp_path: Path) -> None:
     options = DemoOptions(machine=EXAMPLES / "demo" / "machine.cfg")
     description = load_machine(str(options.machine))
-    with Stage(description, options, tmp_path) as stage:
+    with VirtualMachine(description, options, tmp_path) as stage:
         page = stage.plant_page("mcu")
         assert set(page.motors) == {s.name for s in description.steppers if s.node == "mcu"}
         stage.stop_nodes()

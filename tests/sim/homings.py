@@ -1,6 +1,6 @@
 """How well homing repeats: homes again and again on a lossy bus, each seed with clocks of its own.
 
-``python -m coordinator.simulate.homings --seeds 0:50`` prints what the homings found and the spread of all;
+``python -m tests.sim.homings --seeds 0:50`` prints what the homings found and the spread of all;
 with ``--real`` in real time, on virtual nodes that are processes.
 The machine is a corexy with its motors on two boards and the endstop of one axis on each; where the endstops
 are, and when they switch, is the plant's, which knows nothing of the host.
@@ -28,11 +28,11 @@ from coordinator.simulate.scenario import BusSetting, Scenario
 from coordinator.simulate.stage import Stage
 from coordinator.support.toml_values import Dice, Range
 from coordinator.virtual_machine.plant import AXES, PlantSettings, machine_plants
-from coordinator.virtual_machine.real_nodes import CONFIG, real_nodes
 from nodes.support.errors import CanductorError
 from nodes.virtual.plant_page import PlantPage
+from tests.stages.real_nodes import CONFIG, real_nodes
 
-MACHINE: Final = Path(__file__).parent / "machines" / "homing.cfg"
+MACHINE: Final = Path(__file__).parents[1] / "stages" / "machines" / "homing.cfg"
 START: Final = (9.0, 238.0, 30.0)
 """Where the head begins, mm: near its endstops."""
 LOSS: Final = 0.01
@@ -177,7 +177,7 @@ def report(homings: Sequence[Homing]) -> str:
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command line; status 0: all axes repeat within one microstep."""
-    parser = argparse.ArgumentParser(prog="python -m coordinator.simulate.homings", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.sim.homings", description=__doc__)
     parser.add_argument("--seeds", default="0:50", help="FIRST:BEHIND; each has clocks of its own")
     parser.add_argument("--times", type=int, default=1, help="homings of each axis with each seed")
     parser.add_argument("--loss", type=float, default=LOSS, help="share of frames that get lost")

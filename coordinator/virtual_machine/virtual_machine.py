@@ -43,7 +43,7 @@ def _plant_settings(description: MachineDescription, options: DemoOptions) -> Pl
     )
 
 
-class Stage:
+class VirtualMachine:
     """Virtual hardware for DESCRIPTION; a context manager that leaves no process behind.
 
     Every bus of the configuration becomes a virtual one in FOLDER, or the SocketCAN interface that the

@@ -1,6 +1,6 @@
 """What ends with the heaters off: every case is caused on a simulated machine, and judged by its pins.
 
-``python -m coordinator.simulate.safety`` prints a table: the case, the heater, how long after the cause its
+``python -m tests.sim.safety`` prints a table: the case, the heater, how long after the cause its
 pin went off for good, and within what it has to. A cause that only the host can find, such as a heater that
 runs away, counts from when it did. ``--real`` adds hosts that are processes, killed or stopped by a signal.
 """
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from coordinator.simulate import safety_real
-from coordinator.simulate.safety_rig import Found, Rig
-from coordinator.simulate.safety_row import MAX_DURATION_S, Row, table
 from nodes.support.errors import CanductorError
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
+from tests.sim.safety import real_host
+from tests.sim.safety.row import MAX_DURATION_S, Row, table
+from tests.stages.safety_rig import Found, Rig
 
 STOP_S: Final = 0.02
 """From the host's decision to stop to the nodes' having done so."""
@@ -190,7 +190,7 @@ def _judged(case: Case, found: Found, heater: str) -> Row:
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command line; status 0: every heater was off in time."""
-    parser = argparse.ArgumentParser(prog="python -m coordinator.simulate.safety", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m tests.sim.safety", description=__doc__)
     parser.add_argument("--case", default="", help="only cases whose names contain this")
     parser.add_argument("--real", action="store_true", help="also kill and stop hosts that are processes")
     given = parser.parse_args(arguments)
@@ -200,13 +200,9 @@ def main(arguments: Sequence[str]) -> int:
     try:
         rows = [row for case in chosen for row in run(case)]
         if given.real:
-            rows += safety_real.rows()
+            rows += real_host.rows()
     except CanductorError as error:
         sys.stderr.write(f"{error}\n")
         return 1
     sys.stdout.write(f"{table(rows)}\n")
     return int(not all(row.ok for row in rows))
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

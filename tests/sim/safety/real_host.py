@@ -15,13 +15,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
 
-from coordinator.simulate.safety_rig import HEATERS, MACHINE
-from coordinator.simulate.safety_row import MAX_DURATION_S, Row
-from coordinator.virtual_machine.real_nodes import CONFIG, real_nodes
 from nodes.support.errors import CanductorError
 from nodes.virtual.edge_log import EdgeLog
 from nodes.virtual.firmware import firmware_dictionary
 from nodes.virtual.plant_page import PlantItemKind, PlantPage
+from tests.sim.safety.row import MAX_DURATION_S, Row
+from tests.stages.real_nodes import CONFIG, real_nodes
+from tests.stages.safety_rig import HEATERS, MACHINE
 
 PATIENCE_S: Final = 60.0
 STALL_S: Final = 2.0
@@ -85,7 +85,7 @@ def _last_words(host: "subprocess.Popen[bytes]") -> str:
 @contextmanager
 def _host(config: Path) -> "Iterator[subprocess.Popen[bytes]]":
     """Run a host that heats."""
-    command = [sys.executable, "-m", "coordinator.simulate.heating_host", str(config), f"{TARGET_C:g}"]
+    command = [sys.executable, "-m", "tests.sim.safety.heating_host", str(config), f"{TARGET_C:g}"]
     host = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         assert host.stdout is not None
