@@ -35,7 +35,6 @@ from coordinator.web.methods import add_page_methods
 from coordinator.web.server import WebServer
 from coordinator.web.settings import WebSettings
 from nodes.dictionary.cache import DictionaryCache
-from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import socket_folder
 from nodes.support.state_folder import state_folder
 
@@ -75,17 +74,17 @@ def serve(
 ) -> ServeReport:
     """Serve the machine that LOAD describes; raises as ``serve_machine``."""
     raise_files_limit()
-    hall = _Hall(load, options, cache)
+    process = _ServiceProcess(load, options, cache)
     try:
-        run_to_end(hall.serve)
+        run_to_end(process.serve)
     except KeyboardInterrupt:
-        if hall.cut_off:
+        if process.cut_off:
             raise
-    return ServeReport(str(hall.path), str(hall.state))
+    return ServeReport(str(process.path), str(process.state))
 
 
-class _Hall:
-    """A service and its server, on one loop."""
+class _ServiceProcess:
+    """A service and the servers of its front ends, on one loop."""
 
     def __init__(
         self, load: Callable[[], MachineDescription], options: ServeOptions, cache: DictionaryCache | None
@@ -101,7 +100,7 @@ class _Hall:
         self._gateway: Gateway | None = None
 
     async def serve(self) -> None:
-        """Be there for front ends until cancelled."""
+        """Serve front ends until cancelled."""
         registry, tree = Registry(), StateTree()
         settings = ServiceSettings(
             name=self._options.name,
@@ -175,17 +174,11 @@ class _Hall:
             raise
         _say(f"serving Moonraker at {path}")
 
-    def _page(self, registry: Registry, service: MachineService) -> "WebServer | None":
-        """Return the live page if it is asked for, with its methods in REGISTRY; raises CanductorError."""
+    def _page(self, registry: Registry, service: MachineService) -> WebServer | None:
+        """Return the live page if it is asked for, with its methods in REGISTRY."""
         options = self._options
         if options.web is None:
             return None
-        try:
-            from coordinator.web.server import WebServer  # noqa: PLC0415 (the extra web)
-        except ModuleNotFoundError as error:
-            raise CanductorError(
-                f"the live page needs {error.name}, which is not installed; run: pip install {error.name}"
-            ) from None
         host, port = options.web
         sessions = state_folder(options.name) / f"page-{port}.json"
         settings = WebSettings(host=host, port=port, names=options.web_names, sessions=sessions)
@@ -195,7 +188,7 @@ class _Hall:
         add_page_methods(registry, page)
         return page
 
-    async def _open_page(self, page: "WebServer | None") -> None:
+    async def _open_page(self, page: WebServer | None) -> None:
         """Open PAGE, if there is one; raises CanductorError with the server closed."""
         try:
             if page is not None:
@@ -204,7 +197,7 @@ class _Hall:
             await self._server.close()
             raise
 
-    async def _open_metrics(self, tree: StateTree) -> "MetricsServer | None":
+    async def _open_metrics(self, tree: StateTree) -> MetricsServer | None:
         """Open the endpoint for Prometheus if asked for; raises CanductorError with the server closed."""
         if self._options.metrics is None:
             return None

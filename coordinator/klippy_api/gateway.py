@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
-from coordinator.ipc.server.fair_scheduler import Turns
+from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
 from coordinator.klippy_api.client import RUNNING_MAX, Client
 from coordinator.klippy_api.endpoints import Endpoints, Result
@@ -32,9 +32,9 @@ LINES_MAX: Final = 1_000
 class Connection(asyncio.BufferedProtocol):
     """One client's end of the socket."""
 
-    def __init__(self, gateway: "Gateway", turns: Turns) -> None:
+    def __init__(self, gateway: "Gateway", scheduler: FairScheduler) -> None:
         self._gateway = gateway
-        self._turns = turns
+        self._scheduler = scheduler
         self._loop = asyncio.get_running_loop()
         self._blocked: asyncio.TimerHandle | None = None
         self.client: Client
@@ -59,17 +59,17 @@ class Connection(asyncio.BufferedProtocol):
         del exc
         if self._blocked is not None:
             self._blocked.cancel()
-        self._turns.leave(self)
+        self._scheduler.leave(self)
         self._gateway.forget(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
         """Tell where to put what comes."""
         del sizehint
-        return self._turns.received
+        return self._scheduler.received
 
     def buffer_updated(self, nbytes: int) -> None:
         """Take what has come there."""
-        self.receive(self._turns.received[:nbytes])
+        self.receive(self._scheduler.received[:nbytes])
 
     def receive(self, data: bytes | memoryview) -> None:
         """Take DATA."""
@@ -77,7 +77,7 @@ class Connection(asyncio.BufferedProtocol):
         if self.client.fault is not None:
             self.drop(str(self.client.fault))
         elif not self.transport.is_closing():
-            self._turns.ask(self)
+            self._scheduler.ask(self)
 
     def pause_writing(self) -> None:
         """Give the client some time to read."""
@@ -149,7 +149,7 @@ class Gateway:
         self._starts = service.starts
         self._server: asyncio.AbstractServer | None = None
         self._path: Path | None = None
-        self._turns = Turns()
+        self._scheduler = FairScheduler()
 
     # ------------------------------------------------------------------------------------------- life
 
@@ -181,7 +181,7 @@ class Gateway:
 
     def make_connection(self) -> Connection:
         """Return the protocol of a new client."""
-        return Connection(self, self._turns)
+        return Connection(self, self._scheduler)
 
     def note(self, entry: "Entry") -> None:
         """Take note of a line of the service's log: what g-code answers goes to clients."""

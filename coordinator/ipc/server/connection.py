@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final
 
 from coordinator.ipc.protocol.methods import ApiError
-from coordinator.ipc.server.fair_scheduler import Turns
+from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.session import Request, Session
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
@@ -31,11 +31,11 @@ class Connection(asyncio.BufferedProtocol):
         self,
         admit: Callable[[asyncio.Transport, "Connection"], Session],
         on_gone: Callable[["Connection"], None],
-        turns: Turns,
+        scheduler: FairScheduler,
     ) -> None:
         self._admit = admit
         self._on_gone = on_gone
-        self._turns = turns
+        self._scheduler = scheduler
         self._loop = asyncio.get_running_loop()
         self._tasks: dict[Request, asyncio.Task[None]] = {}
         self._timer: asyncio.TimerHandle | None = None
@@ -58,11 +58,11 @@ class Connection(asyncio.BufferedProtocol):
     def get_buffer(self, sizehint: int) -> memoryview:
         """Tell where to put what comes: memory of its own for each message would cost as much as the rest."""
         del sizehint
-        return self._turns.received
+        return self._scheduler.received
 
     def buffer_updated(self, nbytes: int) -> None:
         """Take what has come there."""
-        self.receive(self._turns.received[:nbytes])
+        self.receive(self._scheduler.received[:nbytes])
 
     def receive(self, data: bytes | memoryview) -> None:
         """Take DATA."""
@@ -112,7 +112,7 @@ class Connection(asyncio.BufferedProtocol):
         self._timer = self._linger = None
         for task in self._tasks.values():
             task.cancel()
-        self._turns.leave(self)
+        self._scheduler.leave(self)
         if (caller := self.session.caller) is not None:
             for leave in caller.at_end:
                 leave(caller)
@@ -122,7 +122,7 @@ class Connection(asyncio.BufferedProtocol):
 
     def _turn(self) -> None:
         if not self.transport.is_closing():
-            self._turns.ask(self)
+            self._scheduler.ask(self)
 
     def hold(self) -> None:
         """Wait for the next turn; take no more in meanwhile than what may be unread."""

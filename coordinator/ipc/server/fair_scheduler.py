@@ -24,7 +24,7 @@ class Worker(Protocol):
         """Take no more in until the next turn."""
 
 
-class Turns:
+class FairScheduler:
     """Shares the rounds of the loop that makes it; NOW_S is the loop's clock."""
 
     def __init__(self, now_s: Callable[[], float] | None = None) -> None:

@@ -14,13 +14,13 @@ from coordinator.ipc.protocol.messages import Encoder, Encoding
 from coordinator.ipc.protocol.methods import ApiError, Registry
 from coordinator.ipc.server.auth import FailureBrake, Grant, Tokens, digest_of, stamp_of
 from coordinator.ipc.server.connection import Connection
-from coordinator.ipc.server.fair_scheduler import Turns
+from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.publisher import Publisher
 from coordinator.ipc.server.session import Common, Session, SessionCounters
 from coordinator.ipc.server.session_methods import add_session_methods
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
-from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, Door
+from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, TcpListener
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
@@ -63,7 +63,7 @@ class IpcServer:
         self._encoder = Encoder()
         self._common = Common(registry, Publisher(state, self._encoder), settings.limits)
         self._servers: list[asyncio.AbstractServer] = []
-        self._door: Door | None = None
+        self._listener: TcpListener | None = None
         self._connections: set[Connection] = set()
         self._brake = FailureBrake()
         self._on_notice = on_notice
@@ -72,7 +72,7 @@ class IpcServer:
         self._tcp: set[Connection] = set()
         """Connections that count against ``tcp_connections_max``."""
         self._watch: asyncio.Task[None] | None = None
-        self._turns: Turns | None = None
+        self._scheduler: FairScheduler | None = None
         self._sessions = 0
         self._refused = 0
         self._unsendable = 0  # notifications that no message can carry
@@ -86,14 +86,14 @@ class IpcServer:
 
     async def start(self) -> None:
         """Open the sockets; raises CanductorError with all closed."""
-        turns = self._turns = Turns()
+        scheduler = self._scheduler = FairScheduler()
         try:
             if self._settings.tokens is not None:
                 self._tokens = await asyncio.to_thread(Tokens.read, self._settings.tokens)
             if self._settings.unix_path is not None:
-                await self._open_unix(self._settings.unix_path, turns)
+                await self._open_unix(self._settings.unix_path, scheduler)
             if self._settings.tcp is not None:
-                await self._open_tcp(self._settings.tcp, turns)
+                await self._open_tcp(self._settings.tcp, scheduler)
             path = self._settings.tokens if self._settings.tcp is None else self._settings.tcp.tokens
             if path is not None and self._tokens is not None:
                 self._watch = asyncio.ensure_future(self._watch_tokens(path, self._tokens))
@@ -107,8 +107,8 @@ class IpcServer:
             self._watch.cancel()
         for server in self._servers:
             server.close()
-        if self._door is not None:
-            self._door.close()
+        if self._listener is not None:
+            self._listener.close()
         for connection in list(self._connections):
             connection.session.end(EndReason("closing", "the server ends"))
             connection.flush()
@@ -144,38 +144,38 @@ class IpcServer:
                 counted[name] += value
         return {
             "connections": len(self._connections),
-            "refused_connections": self._refused + (0 if self._door is None else self._door.refused),
+            "refused_connections": self._refused + (0 if self._listener is None else self._listener.refused),
             "unsendable": self._unsendable + self._common.publisher.unsendable,
             **counted,
         }
 
     # ---------------------------------------------------------------------------------------- sockets
 
-    async def _open_unix(self, path: Path, turns: Turns) -> None:
+    async def _open_unix(self, path: Path, scheduler: FairScheduler) -> None:
         listener = await listen_at(path)
         server = await asyncio.get_running_loop().create_unix_server(
-            lambda: Connection(self._admit_unix, self._drop, turns), sock=listener, backlog=BACKLOG
+            lambda: Connection(self._admit_unix, self._drop, scheduler), sock=listener, backlog=BACKLOG
         )
         self._servers.append(server)
 
-    async def _open_tcp(self, tcp: TcpSettings, turns: Turns) -> None:
+    async def _open_tcp(self, tcp: TcpSettings, scheduler: FairScheduler) -> None:
         context = await asyncio.to_thread(_tls_of_tcp, tcp)
         self._tokens = await asyncio.to_thread(Tokens.read, tcp.tokens)
         most = self._settings.tcp_connections_max
-        door = self._door = Door(
-            lambda: Connection(self._admit_tcp, self._drop, turns),
+        listener = self._listener = TcpListener(
+            lambda: Connection(self._admit_tcp, self._drop, scheduler),
             context,
             handshakes_max=min(HANDSHAKES_MAX, most),
             may_enter=lambda entering: entering + len(self._tcp) < most + REFUSALS_MAX,
         )
         try:
-            await door.open(tcp.host, tcp.port)
+            await listener.open(tcp.host, tcp.port)
         except OSError as error:
             raise CanductorError(
                 f"port {tcp.port} of {tcp.host} cannot be opened: {error.strerror}"
             ) from None
-        self.tcp_port = door.names[0][1]
-        self.tcp_addresses = [address for address, _ in door.names]
+        self.tcp_port = listener.addresses[0][1]
+        self.tcp_addresses = [address for address, _ in listener.addresses]
 
     # ----------------------------------------------------------------------------------------- tokens
 
@@ -231,8 +231,8 @@ class IpcServer:
 
             return self._session(connection, address, check)
 
-        assert self._turns is not None, "the server is not started"
-        connection = Connection(admit, self._drop, self._turns)
+        assert self._scheduler is not None, "the server is not started"
+        connection = Connection(admit, self._drop, self._scheduler)
         connection.connection_made(transport)
         return connection
 

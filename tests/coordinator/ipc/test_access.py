@@ -1,4 +1,4 @@
-"""Who gets in at the server's doors, and what each may do."""
+"""Who gets into the server, on each way, and what each may do."""
 
 import asyncio
 import json
