@@ -11,7 +11,7 @@ from coordinator.assembly.load import load_machine
 from coordinator.cli.parser import version
 from coordinator.config.model import MachineDescription
 from coordinator.ipc.discovery.announcement import Announcement, bracketed, host_word
-from coordinator.ipc.discovery.announcer import Announcer
+from coordinator.ipc.discovery.announcer_process import AnnouncerProcess
 from coordinator.ipc.protocol.methods import Registry, Scope
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.session_methods import API_VERSION
@@ -96,7 +96,7 @@ class _ServiceProcess:
         self._load = load
         self._options = options
         self._cache = cache
-        self._announcer: Announcer | None = None
+        self._announcer: AnnouncerProcess | None = None
         self._gateway: Gateway | None = None
 
     async def serve(self) -> None:
@@ -217,8 +217,8 @@ class _ServiceProcess:
         _say(f"metrics are at http://{bracketed(host)}:{metrics.port}/metrics")
         return metrics
 
-    def _announce(self, service: MachineService) -> Announcer | None:
-        """Have the network told of the machine, if it is to be."""
+    def _announce(self, service: MachineService) -> AnnouncerProcess | None:
+        """Announce the machine on the network, if wanted."""
         bound, port = self._server.tcp_addresses, self._server.tcp_port
         wanted = self._options.announce
         if wanted is None:
@@ -236,7 +236,7 @@ class _ServiceProcess:
             port=port,
             addresses=(),
         )
-        announcer = Announcer(machine, bound, lambda sentence: service.log.add("network", sentence))
+        announcer = AnnouncerProcess(machine, bound, lambda sentence: service.log.add("network", sentence))
         announcer.start()
         return announcer
 
@@ -246,7 +246,7 @@ class _ServiceProcess:
         if self._gateway is not None:
             self._gateway.note(entry)
         if self._announcer is not None and entry["kind"] == "state":
-            self._announcer.state(str(service.state))
+            self._announcer.set_state(str(service.state))
 
 
 def _ipc_settings(options: ServeOptions, path: Path) -> IpcSettings:

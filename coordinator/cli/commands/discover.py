@@ -11,7 +11,7 @@ from typing import Any, Final
 from coordinator.ipc.client.client import Client
 from coordinator.ipc.discovery.announcement import Announcement, host_word
 from coordinator.ipc.discovery.browser import Browser, Listen
-from coordinator.ipc.discovery.multicast import places
+from coordinator.ipc.discovery.multicast import interface_addresses
 from coordinator.ipc.protocol.methods import Scope, printable
 from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import host_sockets
@@ -106,7 +106,7 @@ async def find_machines(timeout_s: float, listen: Listen | None = None) -> Disco
     asked = await asking
     found = [machine for machine in asked if machine is not None]
     silent = [path for path, machine in zip(paths, asked, strict=True) if machine is None]
-    own = {str(place.address) for place in places()}
+    own = {str(each.address) for each in interface_addresses()}
     for machine in announced:
         _add(found, machine, own)
     found.sort(key=lambda machine: (not machine.here, machine.name, machine.host, machine.at))

@@ -10,7 +10,7 @@ from zeroconf import Error
 from zeroconf.asyncio import AsyncServiceBrowser, AsyncServiceInfo, AsyncZeroconf
 
 from coordinator.ipc.discovery.announcement import SERVICE_TYPE, Announcement
-from coordinator.ipc.discovery.multicast import open_mdns, places
+from coordinator.ipc.discovery.multicast import interface_addresses, open_mdns
 
 INSTANCES_MAX: Final = 256
 """Announcements that are looked at; further ones are counted."""
@@ -120,7 +120,7 @@ class Browser:
 class _Multicast:
     """Multicast DNS on all networks of this computer."""
 
-    def __init__(self, mdns: "AsyncZeroconf", heard: Heard) -> None:
+    def __init__(self, mdns: AsyncZeroconf, heard: Heard) -> None:
         def handle(*, name: str, state_change: Any, **_: object) -> None:
             heard(name, state_change.name != "Removed")
 
@@ -132,8 +132,8 @@ class _Multicast:
     @classmethod
     async def listen(cls, heard: Heard) -> Self:
         """Begin; raises CanductorError when there is no network."""
-        here = await asyncio.to_thread(places)
-        return cls(open_mdns(str(place.address) for place in here), heard)
+        here = await asyncio.to_thread(interface_addresses)
+        return cls(open_mdns(str(each.address) for each in here), heard)
 
     async def resolve(self, instance: str) -> Announcement | None:
         """Ask the network."""

@@ -5,10 +5,10 @@ from collections.abc import Iterable
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any, cast
 
-from coordinator.ipc.discovery.announce_process import Announcing, follow, lines_of
 from coordinator.ipc.discovery.announcement import Announcement
+from coordinator.ipc.discovery.announcer import Announcer, follow
 from coordinator.ipc.discovery.browser import Heard
-from coordinator.ipc.discovery.multicast import Place
+from coordinator.ipc.discovery.multicast import InterfaceAddress
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ class MemoryNetwork:
     """Its records, and those who listen."""
 
     def __init__(self) -> None:
-        self.places: tuple[Place, ...] = (Place(ip_address("127.0.0.1"), 1),)
+        self.addresses: tuple[InterfaceAddress, ...] = (InterfaceAddress(ip_address("127.0.0.1"), 1),)
         self.problem = ""
         """Why nobody can speak; empty: they can."""
         self.records: dict[str, ServiceInfo] = {}
@@ -28,8 +28,8 @@ class MemoryNetwork:
         """When a record was sent to all, by the loop's time."""
         self.listeners: list[Heard] = []
 
-    def find_places(self) -> tuple[Place, ...]:
-        return self.places
+    def find_addresses(self) -> tuple[InterfaceAddress, ...]:
+        return self.addresses
 
     def open_dns(self, addresses: Iterable[str]) -> "AsyncZeroconf":
         """Stand where zeroconf does."""
@@ -102,20 +102,18 @@ class _Listener:
 class MemoryProcess:
     """Stands where the process of an announcer does: its code on this loop, its pipes in memory."""
 
-    def __init__(self, network: MemoryNetwork) -> None:
+    def __init__(self, network: MemoryNetwork, bound: list[str]) -> None:
         self.stdin = _Pipe()
         self.stdout = asyncio.StreamReader()
-        self._task = asyncio.ensure_future(self._run(network))
+        self._task = asyncio.ensure_future(self._run(network, bound))
 
-    async def _run(self, network: MemoryNetwork) -> None:
-        def say(kind: str, sentence: str) -> None:
-            self.stdout.feed_data(f'{{"{kind}": "{sentence}"}}\n'.encode())
+    async def _run(self, network: MemoryNetwork, bound: list[str]) -> None:
+        def report(sentence: str) -> None:
+            self.stdout.feed_data(f'"{sentence}"\n'.encode())
 
-        def announce(machine: Announcement, bound: list[str]) -> Announcing:
-            return Announcing(machine, bound, say, find_places=network.find_places, open_dns=network.open_dns)
-
+        announcer = Announcer(bound, report, find_addresses=network.find_addresses, open_dns=network.open_dns)
         try:
-            await follow(lines_of(self.stdin.reader), announce)
+            await follow(self.stdin.reader, announcer)
         finally:
             self.stdout.feed_eof()
 
