@@ -19,12 +19,12 @@ class Kind(StrEnum):
     BY_KEY = "by key"
     """A gauge for each entry of a map, or each letter of a word."""
     INFO = "info"
-    """A gauge that is always 1, with what is told in its labels."""
+    """A gauge that is always 1, with the information in its labels."""
     HISTOGRAM = "histogram"
 
     @property
     def type(self) -> str:
-        """The type that Prometheus is told."""
+        """The type for Prometheus."""
         return str(self) if self in (Kind.COUNTER, Kind.HISTOGRAM) else "gauge"
 
 

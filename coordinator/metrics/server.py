@@ -106,7 +106,7 @@ class MetricsServer:
     def _refusal(self, request: web.BaseRequest) -> web.Response | None:
         """Return the answer to a request that is not to be served; None: it is."""
         if not self._settings.open and not _names_loopback(request.headers.get("Host", "")):
-            # A page of the web that has its own name mean 127.0.0.1 shall not read along.
+            # A website must not read them by making its own name mean 127.0.0.1 (DNS rebinding).
             return _refuse(HTTPStatus.FORBIDDEN, "ask by an address of the loopback, or as localhost")
         if request.method not in ("GET", "HEAD"):
             return _refuse(HTTPStatus.METHOD_NOT_ALLOWED, "only GET is answered")

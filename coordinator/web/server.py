@@ -15,21 +15,21 @@ from coordinator.ipc.protocol.limits import EndReason
 from coordinator.ipc.protocol.methods import ApiError, Scope
 from coordinator.ipc.server.auth import Grant, digest_of
 from coordinator.ipc.server.connection import Connection
-from coordinator.ipc.server.server import Adopted, IpcServer, tls_context
+from coordinator.ipc.server.server import ExternalGrant, IpcServer, tls_context
 from coordinator.web.access import LINK_S, SESSION_S, PageAccess, PageSession, is_key_of
 from coordinator.web.files import PageFile, page_files
 from coordinator.web.http_server import HttpServer
 from coordinator.web.names import is_known_host, is_own_origin
-from coordinator.web.pipe import Pipe
 from coordinator.web.session_file import read_sessions, write_sessions
 from coordinator.web.settings import WebSettings
+from coordinator.web.websocket_transport import WebSocketTransport
 from nodes.support.errors import CanductorError
 
 SOCKET_PATH: Final = "/socket"
 LOGIN_PATH: Final = "/login"
 """Takes a link's code, or a token; gives a session."""
 SESSION_PATH: Final = "/session"
-"""Whether the browser has a session: it is not told why a WebSocket was refused."""
+"""Whether the browser has a session: browsers do not report why a WebSocket was refused."""
 LOGIN_BYTES_MAX: Final = 4_096
 COOKIES_MAX: Final = 8
 """Of our name that are looked at: programs on other ports of this computer can set such cookies, too."""
@@ -115,7 +115,7 @@ class WebServer:
         return replace(self._settings, port=self.port).url
 
     async def close(self) -> None:
-        """Let go of every browser; the IPC server has told them why when it was closed before."""
+        """Disconnect every browser; they got the reason when the IPC server was closed before."""
         if self._http is not None:
             await self._http.close()
 
@@ -178,7 +178,7 @@ class WebServer:
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         if not is_known_host(request.headers.get("Host", ""), self._names):
             name = repr(request.host)
-            return self._refuse(f"{name} is no name of this page; use its IP address, or give --web-name")
+            return self._refuse(f"{name} is not a name of this page; use its IP address, or give --web-name")
         if request.path == SOCKET_PATH:
             return await self._serve_socket(request)
         if request.path == LOGIN_PATH:
@@ -252,23 +252,23 @@ class WebServer:
             await self._save_sessions()
         await socket.prepare(request)
         HttpServer.keep(request)
-        await self._pass_on(socket, _address(request), session)
+        await self._relay(socket, _address(request), session)
         return socket
 
-    async def _pass_on(self, socket: web.WebSocketResponse, address: str, session: PageSession) -> None:
+    async def _relay(self, socket: web.WebSocketResponse, address: str, session: PageSession) -> None:
         """Carry messages both ways until one side ends."""
 
-        def check_key(key: str) -> Adopted | None:
+        def check_key(key: str) -> ExternalGrant | None:
             grant = self._grant(session)
             if grant is None or session not in self._access.sessions or not is_key_of(session, key):
                 return None
-            return Adopted(grant, session.token)
+            return ExternalGrant(grant, session.token)
 
-        pipe = Pipe(socket)
-        connection = self._ipc.adopt(pipe, address, check_key)
-        pipe.connection = connection
+        transport = WebSocketTransport(socket)
+        connection = self._ipc.adopt(transport, address, check_key)
+        transport.connection = connection
         self._clients[connection] = session
-        sending = asyncio.ensure_future(pipe.run())
+        sending = asyncio.ensure_future(transport.run())
         begun = False
         try:
             async for message in socket:
@@ -277,10 +277,10 @@ class WebServer:
                     break
                 begun = True
                 connection.receive(message.data.encode() + b"\n")
-                await pipe.readable()
+                await transport.readable()
         finally:
             del self._clients[connection]
-            pipe.abort()
+            transport.abort()
             connection.connection_lost(None)
             sending.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError):
@@ -304,7 +304,7 @@ def _cookies(request: web.BaseRequest, name: str) -> list[str]:
 
 
 def _read_login(body: bytes) -> tuple[str, bool] | None:
-    """Return the code or token of BODY, and whether the browser shall keep its session when it is closed."""
+    """Return the code or token of BODY, and whether its session outlives the browser."""
     try:
         given: Any = json.loads(body)
     except (ValueError, RecursionError):

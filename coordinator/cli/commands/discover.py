@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from coordinator.ipc.client.client import Client
 from coordinator.ipc.discovery.announcement import Announcement, host_word
-from coordinator.ipc.discovery.browser import Browser, Listen
+from coordinator.ipc.discovery.browser import Browser, OpenServices
 from coordinator.ipc.discovery.multicast import interface_addresses
 from coordinator.ipc.protocol.methods import Scope, printable
 from nodes.support.errors import CanductorError
@@ -98,7 +98,7 @@ def _table(machines: Sequence[Found]) -> list[str]:
     ]
 
 
-async def find_machines(timeout_s: float, listen: Listen | None = None) -> Discovered:
+async def find_machines(timeout_s: float, listen: OpenServices | None = None) -> Discovered:
     """Return the machines that answer within TIMEOUT_S; LISTEN as of Browser."""
     paths = host_sockets()[:SOCKETS_MAX]
     asking = asyncio.gather(*(_ask(path, timeout_s) for path in paths))
@@ -137,7 +137,9 @@ def _add(found: list[Found], announced: Announcement, own: set[str]) -> None:
     )
 
 
-async def _browse(timeout_s: float, listen: Listen | None) -> tuple[list[Announcement], int, str | None]:
+async def _browse(
+    timeout_s: float, listen: OpenServices | None
+) -> tuple[list[Announcement], int, str | None]:
     try:
         async with Browser(listen) as browser:
             await asyncio.sleep(timeout_s)

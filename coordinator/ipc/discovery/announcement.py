@@ -1,6 +1,6 @@
-"""What a machine says of itself on the network: one DNS-SD service of type ``_canductor._tcp``.
+"""What a machine announces of itself on the network: one DNS-SD service of type ``_canductor._tcp``.
 
-docs/ipc.md tells what its TXT record has. Everybody on the network can say anything, so reading is total: an
+docs/ipc.md describes its TXT record. Everybody on the network can send anything, so reading is total: an
 announcement, or None.
 """
 
@@ -31,7 +31,7 @@ class Announcement:
 
     name: str
     host: str
-    """The computer it runs on, by its own word."""
+    """The name that the computer it runs on has for itself."""
     version: str
     state: str
     api: int

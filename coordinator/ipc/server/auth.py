@@ -15,7 +15,7 @@ from nodes.support.secret_file import read_secret
 TOKEN_LENGTH_MIN: Final = 32
 FAILURES_MAX: Final = 5
 """Failures in a row after which an address is shut out."""
-SHUT_OUT_S: Final = 30.0
+LOCKOUT_S: Final = 30.0
 """For so long after the last failure; then its failures are forgotten."""
 ADDRESSES_MAX: Final = 1_024
 """Addresses whose failures are remembered; the one that failed longest ago makes room."""
@@ -92,7 +92,7 @@ def _stamp(status: os.stat_result) -> tuple[int, ...]:
     return (status.st_ino, status.st_mtime_ns, status.st_ctime_ns, status.st_size)
 
 
-class FailureBrake:
+class LoginThrottle:
     """Shuts an address out that failed too often; sans-IO, times in seconds of one clock."""
 
     def __init__(self) -> None:
@@ -102,16 +102,16 @@ class FailureBrake:
         """Note that ADDRESS gave a wrong token."""
         network = _network(address)
         count, last_s = self._failures.pop(network, (0, now_s))
-        if now_s - last_s > SHUT_OUT_S:
+        if now_s - last_s > LOCKOUT_S:
             count = 0
         if len(self._failures) >= ADDRESSES_MAX:
             del self._failures[next(iter(self._failures))]
         self._failures[network] = (count + 1, now_s)
 
-    def shut_out_s(self, address: str, now_s: float) -> float:
+    def lockout_s(self, address: str, now_s: float) -> float:
         """Return for how long ADDRESS has to wait, 0 if it may come in."""
         count, last_s = self._failures.get(_network(address), (0, 0.0))
-        return max(0.0, last_s + SHUT_OUT_S - now_s) if count >= FAILURES_MAX else 0.0
+        return max(0.0, last_s + LOCKOUT_S - now_s) if count >= FAILURES_MAX else 0.0
 
 
 def _network(address: str) -> str:

@@ -12,11 +12,11 @@ from typing import Final
 from coordinator.ipc.protocol.limits import EndReason, Limits
 from coordinator.ipc.protocol.messages import Encoder, Encoding
 from coordinator.ipc.protocol.methods import ApiError, Registry
-from coordinator.ipc.server.auth import FailureBrake, Grant, Tokens, digest_of, stamp_of
+from coordinator.ipc.server.auth import Grant, LoginThrottle, Tokens, digest_of, stamp_of
 from coordinator.ipc.server.connection import Connection
 from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.publisher import Publisher
-from coordinator.ipc.server.session import Common, Session, SessionCounters
+from coordinator.ipc.server.session import Session, SessionContext, SessionCounters
 from coordinator.ipc.server.session_methods import add_session_methods
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
@@ -25,19 +25,19 @@ from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
-TOKENS_LOOK_S: Final = 1.0
+TOKENS_CHECK_S: Final = 1.0
 """Between looks at whether the tokens' file has changed."""
 REFUSALS_MAX: Final = 32
-"""Connections beyond the most that are still told so; further ones are just closed."""
+"""Connections beyond the most that still get the reason; further ones are just closed."""
 
 
 @dataclass(frozen=True, slots=True)
-class Adopted:
-    """What a client may do that came by another way."""
+class ExternalGrant:
+    """What a client may do that connected to another server, such as the live page's."""
 
     grant: Grant
     token: bytes | None
-    """Digest of the token behind it: when that is taken away the client is let go. None: there is none."""
+    """Digest of the token behind it: when that is revoked the client is disconnected. None: there is none."""
 
 
 def _ignore(_: str) -> None:
@@ -61,14 +61,14 @@ class IpcServer:
         add_session_methods(registry)
         self._settings = settings
         self._encoder = Encoder()
-        self._common = Common(registry, Publisher(state, self._encoder), settings.limits)
+        self._context = SessionContext(registry, Publisher(state, self._encoder), settings.limits)
         self._servers: list[asyncio.AbstractServer] = []
         self._listener: TcpListener | None = None
         self._connections: set[Connection] = set()
-        self._brake = FailureBrake()
+        self._throttle = LoginThrottle()
         self._on_notice = on_notice
         self._tokens: Tokens | None = None
-        self._shown: dict[Connection, bytes] = {}  # digests of the tokens that clients came in with
+        self._digests: dict[Connection, bytes] = {}  # digests of the tokens that clients came in with
         self._tcp: set[Connection] = set()
         """Connections that count against ``tcp_connections_max``."""
         self._watch: asyncio.Task[None] | None = None
@@ -76,7 +76,7 @@ class IpcServer:
         self._sessions = 0
         self._refused = 0
         self._unsendable = 0  # notifications that no message can carry
-        self._gone = SessionCounters()
+        self._closed_totals = SessionCounters()
         self.tcp_port: int | None = None
         """The port, once open; of use where the settings say 0, any port."""
         self.tcp_addresses: list[str] = []
@@ -102,7 +102,7 @@ class IpcServer:
             raise
 
     async def close(self) -> None:
-        """Let go of every client and close the sockets."""
+        """Disconnect every client and close the sockets."""
         if self._watch is not None:
             self._watch.cancel()
         for server in self._servers:
@@ -110,7 +110,7 @@ class IpcServer:
         if self._listener is not None:
             self._listener.close()
         for connection in list(self._connections):
-            connection.session.end(EndReason("closing", "the server ends"))
+            connection.session.end(EndReason("closing", "the server is closing"))
             connection.flush()
             connection.transport.close()
         if self._servers and self._settings.unix_path is not None:
@@ -137,15 +137,15 @@ class IpcServer:
             connection.flush()
 
     def figures(self) -> dict[str, Value]:
-        """Return how many clients there are, and what became of all messages since the start."""
-        counted = asdict(self._gone)
+        """Return how many clients there are, and the counters of all messages since the start."""
+        counted = asdict(self._closed_totals)
         for connection in self._connections:
             for name, value in asdict(connection.session.counters).items():
                 counted[name] += value
         return {
             "connections": len(self._connections),
             "refused_connections": self._refused + (0 if self._listener is None else self._listener.refused),
-            "unsendable": self._unsendable + self._common.publisher.unsendable,
+            "unsendable": self._unsendable + self._context.publisher.unsendable,
             **counted,
         }
 
@@ -181,28 +181,28 @@ class IpcServer:
 
     async def _watch_tokens(self, path: Path, tokens: Tokens) -> None:
         """Read PATH again when it changes. While it cannot be read no token lets anybody in."""
-        known, told = tokens.stamp, ""
+        known, failure = tokens.stamp, ""
         while True:
-            await asyncio.sleep(TOKENS_LOOK_S)
-            if await asyncio.to_thread(stamp_of, path) == known and not told:
+            await asyncio.sleep(TOKENS_CHECK_S)
+            if await asyncio.to_thread(stamp_of, path) == known and not failure:
                 continue
             try:
                 tokens = await asyncio.to_thread(Tokens.read, path)
             except CanductorError as error:
-                if str(error) != told:
-                    self._on_notice(f"{error}; until then no token lets anybody in")
-                self._tokens, told = None, str(error)
+                if str(error) != failure:
+                    self._on_notice(f"{error}; until then no token is accepted")
+                self._tokens, failure = None, str(error)
                 continue
-            self._tokens, known, told = tokens, tokens.stamp, ""
+            self._tokens, known, failure = tokens, tokens.stamp, ""
             self._on_notice(f"the tokens of {path.name} were read again")
-            self._part_from(tokens)
+            self._end_revoked(tokens)
 
-    def _part_from(self, tokens: Tokens) -> None:
+    def _end_revoked(self, tokens: Tokens) -> None:
         """End the clients whose token is not in TOKENS any more, or has a lower scope."""
-        for connection, token in list(self._shown.items()):
+        for connection, token in list(self._digests.items()):
             grant, caller = tokens.grant_of(token), connection.session.caller
             if caller is not None and (grant is None or grant.scope < caller.scope):
-                connection.session.end(EndReason("bad_token", "the token was taken away"))
+                connection.session.end(EndReason("bad_token", "the token was revoked"))
                 connection.flush()
 
     # ---------------------------------------------------------------------------------------- clients
@@ -210,10 +210,10 @@ class IpcServer:
     @property
     def limits(self) -> Limits:
         """What one client may cost."""
-        return self._common.limits
+        return self._context.limits
 
     def adopt(
-        self, transport: asyncio.Transport, address: str, check_key: Callable[[str], Adopted | None]
+        self, transport: asyncio.Transport, address: str, check_key: Callable[[str], ExternalGrant | None]
     ) -> Connection:
         """Take a client that came by another way, such as the live page's; TRANSPORT carries JSON lines.
 
@@ -226,7 +226,7 @@ class IpcServer:
                 if adopted is None:
                     return None
                 if adopted.token is not None:
-                    self._shown[connection] = adopted.token
+                    self._digests[connection] = adopted.token
                 return adopted.grant
 
             return self._session(connection, address, check)
@@ -241,8 +241,8 @@ class IpcServer:
 
         Raises ApiError ``too_many_failures``, ``bad_token``.
         """
-        if (wait_s := self._shut_out_s(address)) > 0:
-            raise ApiError("too_many_failures", _shut_out_sentence(address, wait_s))
+        if (wait_s := self._lockout_s(address)) > 0:
+            raise ApiError("too_many_failures", _lockout_sentence(address, wait_s))
         grant = self._grant(token, address)
         if grant is None:
             raise ApiError("bad_token", "the token is not known here")
@@ -258,11 +258,11 @@ class IpcServer:
             return None
         grant = self._tokens.check(token)
         if grant is None and address:
-            self._brake.failed(address, asyncio.get_running_loop().time())
+            self._throttle.failed(address, asyncio.get_running_loop().time())
         return grant
 
-    def _shut_out_s(self, address: str) -> float:
-        return self._brake.shut_out_s(address, asyncio.get_running_loop().time())
+    def _lockout_s(self, address: str) -> float:
+        return self._throttle.lockout_s(address, asyncio.get_running_loop().time())
 
     def _admit_unix(self, transport: asyncio.Transport, connection: Connection) -> Session:
         pid, uid = peer_of(transport.get_extra_info("socket"))
@@ -275,11 +275,11 @@ class IpcServer:
     def _admit_tcp(self, transport: asyncio.Transport, connection: Connection) -> Session:
         address = str((transport.get_extra_info("peername") or ("unknown",))[0])
         session = self._session(connection, address, self._token_check(connection, address))
-        wait_s = self._shut_out_s(address)
+        wait_s = self._lockout_s(address)
         if len(self._tcp) >= self._settings.tcp_connections_max:
             self._refuse(session, EndReason("busy", "there are too many connections over TCP; close others"))
         elif wait_s > 0:
-            self._refuse(session, EndReason("too_many_failures", _shut_out_sentence(address, wait_s)))
+            self._refuse(session, EndReason("too_many_failures", _lockout_sentence(address, wait_s)))
         self._tcp.add(connection)
         return session
 
@@ -289,7 +289,7 @@ class IpcServer:
         def check(token: str) -> Grant | None:
             grant = self._grant(token, address)
             if grant is not None:
-                self._shown[connection] = digest_of(token)
+                self._digests[connection] = digest_of(token)
             return grant
 
         return check
@@ -298,7 +298,7 @@ class IpcServer:
         self._sessions += 1
         now_s = asyncio.get_running_loop().time()
         session = Session(
-            self._common, now_s, number=self._sessions, peer=peer, granted=None, check_token=check
+            self._context, now_s, number=self._sessions, peer=peer, granted=None, check_token=check
         )
         self._connections.add(connection)
         if len(self._connections) > self._settings.connections_max:
@@ -314,13 +314,15 @@ class IpcServer:
     def _drop(self, connection: Connection) -> None:
         self._connections.discard(connection)
         self._tcp.discard(connection)
-        self._shown.pop(connection, None)
+        self._digests.pop(connection, None)
         for field in fields(SessionCounters):
-            total = getattr(self._gone, field.name) + getattr(connection.session.counters, field.name)
-            setattr(self._gone, field.name, total)
+            total = getattr(self._closed_totals, field.name) + getattr(
+                connection.session.counters, field.name
+            )
+            setattr(self._closed_totals, field.name, total)
 
 
-def _shut_out_sentence(address: str, wait_s: float) -> str:
+def _lockout_sentence(address: str, wait_s: float) -> str:
     return f"too many wrong tokens from {address}; wait {wait_s:.0f} s"
 
 

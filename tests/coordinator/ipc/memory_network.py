@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from coordinator.ipc.discovery.announcement import Announcement
 from coordinator.ipc.discovery.announcer import Announcer, follow
-from coordinator.ipc.discovery.browser import Heard
+from coordinator.ipc.discovery.browser import ChangeHandler
 from coordinator.ipc.discovery.multicast import InterfaceAddress
 from nodes.support.errors import CanductorError
 
@@ -26,7 +26,7 @@ class MemoryNetwork:
         self.records: dict[str, ServiceInfo] = {}
         self.sent_s: list[float] = []
         """When a record was sent to all, by the loop's time."""
-        self.listeners: list[Heard] = []
+        self.listeners: list[ChangeHandler] = []
 
     def find_addresses(self) -> tuple[InterfaceAddress, ...]:
         return self.addresses
@@ -38,23 +38,23 @@ class MemoryNetwork:
         assert list(addresses)
         return cast("AsyncZeroconf", _Speaker(self))
 
-    async def listen(self, heard: Heard) -> "_Listener":
+    async def listen(self, on_change: ChangeHandler) -> "_Listener":
         """Stand where a browser of zeroconf does."""
-        self.listeners.append(heard)
+        self.listeners.append(on_change)
         for name in self.records:
-            heard(name, True)
-        return _Listener(self, heard)
+            on_change(name, True)
+        return _Listener(self, on_change)
 
     def put(self, info: "ServiceInfo") -> None:
         self.records[info.name] = info
         self.sent_s.append(asyncio.get_running_loop().time())
-        for heard in self.listeners:
-            heard(info.name, True)
+        for on_change in self.listeners:
+            on_change(info.name, True)
 
     def remove(self, name: str) -> None:
         del self.records[name]
-        for heard in self.listeners:
-            heard(name, False)
+        for on_change in self.listeners:
+            on_change(name, False)
 
 
 class _Speaker:
@@ -84,9 +84,9 @@ class _Speaker:
 
 
 class _Listener:
-    def __init__(self, network: MemoryNetwork, heard: Heard) -> None:
+    def __init__(self, network: MemoryNetwork, on_change: ChangeHandler) -> None:
         self._network = network
-        self._heard = heard
+        self._heard = on_change
 
     async def resolve(self, instance: str) -> Announcement | None:
         await asyncio.sleep(0)

@@ -314,11 +314,11 @@ def test_more_announcements_than_anybody_has_are_counted_only() -> None:
     async def main() -> None:
         network = MemoryNetwork()
         async with Browser(network.listen) as browser:
-            (heard,) = network.listeners
+            (on_change,) = network.listeners
             for n in range(2 * INSTANCES_MAX + 50):
-                heard(f"flood-{n}.{SERVICE_TYPE}", True)
+                on_change(f"flood-{n}.{SERVICE_TYPE}", True)
             assert browser.skipped == 2 * INSTANCES_MAX
-            assert len(browser._asking) <= INSTANCES_MAX
+            assert len(browser._resolving) <= INSTANCES_MAX
 
     jump_loop.run(main())
 
@@ -332,7 +332,7 @@ def test_sockets_and_announcements_in_one_table(tmp_path: Path, monkeypatch: pyt
     async def main() -> None:
         network = MemoryNetwork()
         async with serving(folder) as served:
-            info = served.server._common.registry.methods["machine.info"]
+            info = served.server._context.registry.methods["machine.info"]
             told = {"name": "here", "state": "ready", "host": "box", "version": "0.1.0", "id": here.id}
             object.__setattr__(info, "call", lambda _caller, _params: told)
             with socket.socket(socket.AF_UNIX) as nobody:
