@@ -132,7 +132,7 @@ class StatusBuilder:
         return self._slow
 
     def _mend(self, objects: dict[str, Mapping[str, Any]], fixed: _Fixed) -> None:
-        """Give names, units and types that clients expect where modules tell them otherwise."""
+        """Convert to the names, units and types that clients expect where modules differ."""
         stats = objects.get("print_stats", {**NOTHING, "info": _NO_LAYERS})
         objects["print_stats"] = stats
         card, folder = objects.get("virtual_sdcard"), self._service.folder

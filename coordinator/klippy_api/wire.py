@@ -76,12 +76,12 @@ def read_request(body: bytes) -> Request:
     except RejectedError as error:
         raise UnreadableError(str(error)) from None
     if not isinstance(message, dict):
-        raise UnreadableError("a message is no object")
+        raise UnreadableError("a message is not an object")
     method, params = message.get("method"), message.get("params", {})
     if not isinstance(method, str):
         raise UnreadableError("a message has no method")
     if not isinstance(params, dict):
-        raise UnreadableError("the params of a message are no object")
+        raise UnreadableError("the params of a message are not an object")
     return Request(method, params, message.get("id"))
 
 

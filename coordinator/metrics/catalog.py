@@ -100,7 +100,7 @@ JOB: Final = Group(
     "The job",
     (),
     (
-        Metric("state", "job_state", "what becomes of the last one", Kind.STATE, words=JOB_STATES),
+        Metric("state", "job_state", "the state of the last one", Kind.STATE, words=JOB_STATES),
         Metric("progress", "job_progress_ratio", "share of the file that is done"),
         Metric("size_bytes", "job_size_bytes", "size of the file"),
         Metric("done_bytes", "job_done_bytes", "of the file, done"),

@@ -340,7 +340,7 @@ class Client:
         self._wire.feed(data, 0.0)
         while (message := self._wire.next_message()) is not None:
             if isinstance(message, EndReason):
-                raise ConnectionLost(f"{self.address} sent what is no message: {message.sentence}")
+                raise ConnectionLost(f"{self.address} sent an invalid message: {message.sentence}")
             self._handle_message(message)
 
     def _handle_message(self, message: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Who may come in: tokens with scopes from a file, and a brake on those who guess."""
+"""Authentication: tokens with scopes from a file, and a lockout for addresses that guess."""
 
 import hashlib
 import hmac
@@ -14,7 +14,7 @@ from nodes.support.secret_file import read_secret
 
 TOKEN_LENGTH_MIN: Final = 32
 FAILURES_MAX: Final = 5
-"""Failures in a row after which an address is shut out."""
+"""Failures in a row after which an address is locked out."""
 LOCKOUT_S: Final = 30.0
 """For so long after the last failure; then its failures are forgotten."""
 ADDRESSES_MAX: Final = 1_024
@@ -41,7 +41,7 @@ class Tokens:
 
     @classmethod
     def read(cls, path: Path) -> "Tokens":
-        """Read the file PATH; raises CanductorError when others may read it, or a line is none."""
+        """Read the file PATH; raises CanductorError when others may read it, or a line is malformed."""
         text, status = read_secret(path, "the tokens' file")
         grants: dict[str, Grant] = {}
         for number, line in enumerate(text.splitlines(), 1):
@@ -58,7 +58,7 @@ class Tokens:
                     "make one with: python3 -c 'import secrets; print(secrets.token_urlsafe())'"
                 )
             if words[2] in grants:
-                raise CanductorError(f"{path}, line {number}: the token is there twice; make another one")
+                raise CanductorError(f"{path}, line {number}: the token occurs twice; make another one")
             grants[words[2]] = Grant(words[1], _SCOPES[words[0]])
         return cls(grants, _stamp(status))
 
@@ -93,7 +93,7 @@ def _stamp(status: os.stat_result) -> tuple[int, ...]:
 
 
 class LoginThrottle:
-    """Shuts an address out that failed too often; sans-IO, times in seconds of one clock."""
+    """Locks an address out that failed too often; sans-IO, times in seconds of one clock."""
 
     def __init__(self) -> None:
         self._failures: dict[str, tuple[int, float]] = {}  # the latest at the end
@@ -109,7 +109,7 @@ class LoginThrottle:
         self._failures[network] = (count + 1, now_s)
 
     def lockout_s(self, address: str, now_s: float) -> float:
-        """Return for how long ADDRESS has to wait, 0 if it may come in."""
+        """Return for how long ADDRESS has to wait, 0 if it may connect."""
         count, last_s = self._failures.get(_network(address), (0, 0.0))
         return max(0.0, last_s + LOCKOUT_S - now_s) if count >= FAILURES_MAX else 0.0
 

@@ -44,7 +44,7 @@ def _make_way(path: Path) -> None:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not path.is_socket():
             if path.exists():
-                raise CanductorError(f"{path} exists and is no socket; choose another path or remove it")
+                raise CanductorError(f"{path} exists and is not a socket; choose another path or remove it")
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
             probe.settimeout(1.0)

@@ -29,7 +29,7 @@ def test_tokens(tmp_path: Path) -> None:
         ("operate phone", "line 1: must be SCOPE NAME TOKEN"),
         (f"\nking phone {TOKEN}", "line 2: must be SCOPE NAME TOKEN"),
         ("watch a short", "fewer than 32"),
-        (f"watch a {TOKEN}\nadmin b {TOKEN}", "line 2: the token is there twice"),
+        (f"watch a {TOKEN}\nadmin b {TOKEN}", "line 2: the token occurs twice"),
     ],
 )
 def test_lines_that_are_none(tmp_path: Path, text: str, sentence: str) -> None:
