@@ -11,7 +11,7 @@ from coordinator.assembly.load import load_machine
 from coordinator.cli.parser import version
 from coordinator.config.model import MachineDescription
 from coordinator.ipc.discovery.announcement import Announcement, bracketed, host_word
-from coordinator.ipc.discovery.announcer import Announcer
+from coordinator.ipc.discovery.announcer_process import AnnouncerProcess
 from coordinator.ipc.protocol.methods import Registry, Scope
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.session_methods import API_VERSION
@@ -35,7 +35,6 @@ from coordinator.web.methods import add_page_methods
 from coordinator.web.server import WebServer
 from coordinator.web.settings import WebSettings
 from nodes.dictionary.cache import DictionaryCache
-from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import socket_folder
 from nodes.support.state_folder import state_folder
 
@@ -75,17 +74,17 @@ def serve(
 ) -> ServeReport:
     """Serve the machine that LOAD describes; raises as ``serve_machine``."""
     raise_files_limit()
-    hall = _Hall(load, options, cache)
+    process = _ServiceProcess(load, options, cache)
     try:
-        run_to_end(hall.serve)
+        run_to_end(process.serve)
     except KeyboardInterrupt:
-        if hall.cut_off:
+        if process.cut_off:
             raise
-    return ServeReport(str(hall.path), str(hall.state))
+    return ServeReport(str(process.path), str(process.state))
 
 
-class _Hall:
-    """A service and its server, on one loop."""
+class _ServiceProcess:
+    """A service and the servers of its front ends, on one loop."""
 
     def __init__(
         self, load: Callable[[], MachineDescription], options: ServeOptions, cache: DictionaryCache | None
@@ -97,11 +96,11 @@ class _Hall:
         self._load = load
         self._options = options
         self._cache = cache
-        self._announcer: Announcer | None = None
+        self._announcer: AnnouncerProcess | None = None
         self._gateway: Gateway | None = None
 
     async def serve(self) -> None:
-        """Be there for front ends until cancelled."""
+        """Serve front ends until cancelled."""
         registry, tree = Registry(), StateTree()
         settings = ServiceSettings(
             name=self._options.name,
@@ -175,17 +174,11 @@ class _Hall:
             raise
         _say(f"serving Moonraker at {path}")
 
-    def _page(self, registry: Registry, service: MachineService) -> "WebServer | None":
-        """Return the live page if it is asked for, with its methods in REGISTRY; raises CanductorError."""
+    def _page(self, registry: Registry, service: MachineService) -> WebServer | None:
+        """Return the live page if it is asked for, with its methods in REGISTRY."""
         options = self._options
         if options.web is None:
             return None
-        try:
-            from coordinator.web.server import WebServer  # noqa: PLC0415 (the extra web)
-        except ModuleNotFoundError as error:
-            raise CanductorError(
-                f"the live page needs {error.name}, which is not installed; run: pip install {error.name}"
-            ) from None
         host, port = options.web
         sessions = state_folder(options.name) / f"page-{port}.json"
         settings = WebSettings(host=host, port=port, names=options.web_names, sessions=sessions)
@@ -195,7 +188,7 @@ class _Hall:
         add_page_methods(registry, page)
         return page
 
-    async def _open_page(self, page: "WebServer | None") -> None:
+    async def _open_page(self, page: WebServer | None) -> None:
         """Open PAGE, if there is one; raises CanductorError with the server closed."""
         try:
             if page is not None:
@@ -204,7 +197,7 @@ class _Hall:
             await self._server.close()
             raise
 
-    async def _open_metrics(self, tree: StateTree) -> "MetricsServer | None":
+    async def _open_metrics(self, tree: StateTree) -> MetricsServer | None:
         """Open the endpoint for Prometheus if asked for; raises CanductorError with the server closed."""
         if self._options.metrics is None:
             return None
@@ -224,8 +217,8 @@ class _Hall:
         _say(f"metrics are at http://{bracketed(host)}:{metrics.port}/metrics")
         return metrics
 
-    def _announce(self, service: MachineService) -> Announcer | None:
-        """Have the network told of the machine, if it is to be."""
+    def _announce(self, service: MachineService) -> AnnouncerProcess | None:
+        """Announce the machine on the network, if wanted."""
         bound, port = self._server.tcp_addresses, self._server.tcp_port
         wanted = self._options.announce
         if wanted is None:
@@ -243,7 +236,7 @@ class _Hall:
             port=port,
             addresses=(),
         )
-        announcer = Announcer(machine, bound, lambda sentence: service.log.add("network", sentence))
+        announcer = AnnouncerProcess(machine, bound, lambda sentence: service.log.add("network", sentence))
         announcer.start()
         return announcer
 
@@ -253,7 +246,7 @@ class _Hall:
         if self._gateway is not None:
             self._gateway.note(entry)
         if self._announcer is not None and entry["kind"] == "state":
-            self._announcer.state(str(service.state))
+            self._announcer.set_state(str(service.state))
 
 
 def _ipc_settings(options: ServeOptions, path: Path) -> IpcSettings:

@@ -5,7 +5,14 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from coordinator.klippy_api.subscription import Subscription
-from coordinator.klippy_api.wire import Framer, Request, TooLong, Unreadable, is_urgent, read_request
+from coordinator.klippy_api.wire import (
+    Framer,
+    Request,
+    TooLongError,
+    UnreadableError,
+    is_urgent,
+    read_request,
+)
 
 RUNNING_MAX: Final = 64
 """Calls of one client that run; more are answered with an error."""
@@ -26,7 +33,7 @@ class Client:
         """Calls that are not answered yet."""
         self.dropped = 0
         """Messages that could not be understood."""
-        self.fault: TooLong | None = None
+        self.fault: TooLongError | None = None
         """Why the connection has to end."""
         self._framer = Framer()
         self._urgent: deque[bytes] = deque()
@@ -43,7 +50,7 @@ class Client:
             return
         try:
             bodies = self._framer.feed(data)
-        except TooLong as fault:
+        except TooLongError as fault:
             self.fault = fault
             return
         for body in bodies:
@@ -52,14 +59,14 @@ class Client:
     def next_request(self) -> Request | None:
         """Return the call that is next, one that stops the machine first; None: there is none.
 
-        Raises Unreadable for a message that is dropped.
+        Raises UnreadableError for a message that is dropped.
         """
         waiting = self._urgent or self._waiting
         if not waiting:
             return None
         try:
             return read_request(waiting.popleft())
-        except Unreadable:
+        except UnreadableError:
             self.dropped += 1
             raise
 

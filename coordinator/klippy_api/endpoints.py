@@ -13,9 +13,9 @@ from coordinator.gcode.commands import AtOnce, Call
 from coordinator.gcode.parser import WordError, parse
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.klippy_api.client import REMOTE_METHODS_MAX, Client
-from coordinator.klippy_api.params import RequestError, template_of, text_of, wishes_of
+from coordinator.klippy_api.params import RequestError, objects_param, template_param, text_param
 from coordinator.klippy_api.status import StatusBuilder, state_of
-from coordinator.klippy_api.subscription import Subscription, pick
+from coordinator.klippy_api.subscription import Subscription, select_fields
 from coordinator.klippy_api.wire import Request
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.programs.pause_resume import PauseResume
@@ -118,13 +118,13 @@ class Endpoints:
         return {"objects": list(self.status.build())}
 
     def _objects_query(self, _client: Client, request: Request) -> Result:
-        shown = pick(wishes_of(request), self.status.build())
+        shown = select_fields(objects_param(request), self.status.build())
         return {"eventtime": self._service.now_s, "status": shown}
 
     def _objects_subscribe(self, client: Client, request: Request) -> Result:
-        subscription = Subscription(template_of(request), wishes_of(request))
+        subscription = Subscription(template_param(request), objects_param(request))
         shown = subscription.begin(self.status.build())
-        client.subscription = subscription if subscription.wishes else None
+        client.subscription = subscription if subscription.requested else None
         return {"eventtime": self._service.now_s, "status": shown}
 
     def _endstops(self, _client: Client, _request: Request) -> Awaitable[Result]:
@@ -148,14 +148,14 @@ class Endpoints:
         return {name: text for name, text in helps.items() if text}
 
     def _script(self, _client: Client, request: Request) -> Awaitable[Result] | Result:
-        script = text_of(request, "script")
+        script = text_param(request, "script")
         if _EMERGENCY.search(script):
             self._service.emergency_stop(f"M112 of {WHO}")
             return {}
         return self._lines(script)
 
     async def _lines(self, script: str) -> Result:
-        """Have SCRIPT done; what fails is told to all who listen to g-code, too."""
+        """Run SCRIPT; errors also go to all who listen to g-code."""
         lines = [line for line in script.splitlines() if line.strip()]
         try:
             for first in range(0, len(lines), LINES_MAX):
@@ -198,11 +198,11 @@ class Endpoints:
     # --------------------------------------------------------------------------------------- the others
 
     def _subscribe_output(self, client: Client, request: Request) -> Result:
-        client.output = template_of(request)
+        client.output = template_param(request)
         return {}
 
     def _register_remote_method(self, client: Client, request: Request) -> Result:
-        name, template = text_of(request, "remote_method"), template_of(request)
+        name, template = text_param(request, "remote_method"), template_param(request)
         if not client.register(name, template):
             raise RequestError(f"a client may register {REMOTE_METHODS_MAX} remote methods")
         self._registered()

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Final
 
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
-from coordinator.ipc.server.fair_scheduler import Turns
+from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
 from coordinator.klippy_api.client import RUNNING_MAX, Client
 from coordinator.klippy_api.endpoints import Endpoints, Result
-from coordinator.klippy_api.wire import Request, Unreadable, error_message, event_message, result_message
+from coordinator.klippy_api.wire import Request, UnreadableError, error_message, event_message, result_message
 from coordinator.service.core.machine_service import MachineService, ServiceState
 from coordinator.service.state.log_ring import Entry
 from nodes.support.errors import CanductorError
@@ -22,9 +22,9 @@ CLIENTS_MAX: Final = 64
 CALLS_MAX: Final = 256
 """That run for all clients together, also for those that have left."""
 OUTPUT_BYTES_MAX: Final = 4_194_304
-"""A client with more unread is let go."""
+"""A client with more unread is disconnected."""
 BLOCKED_S: Final = 5.0
-"""A client that reads nothing for so long is let go."""
+"""A client that reads nothing for so long is disconnected."""
 LINES_MAX: Final = 1_000
 """Of g-code's answers that wait to be sent together; of more the first are left out."""
 
@@ -32,9 +32,9 @@ LINES_MAX: Final = 1_000
 class Connection(asyncio.BufferedProtocol):
     """One client's end of the socket."""
 
-    def __init__(self, gateway: "Gateway", turns: Turns) -> None:
+    def __init__(self, gateway: "Gateway", scheduler: FairScheduler) -> None:
         self._gateway = gateway
-        self._turns = turns
+        self._scheduler = scheduler
         self._loop = asyncio.get_running_loop()
         self._blocked: asyncio.TimerHandle | None = None
         self.client: Client
@@ -59,17 +59,17 @@ class Connection(asyncio.BufferedProtocol):
         del exc
         if self._blocked is not None:
             self._blocked.cancel()
-        self._turns.leave(self)
+        self._scheduler.remove(self)
         self._gateway.forget(self)
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """Tell where to put what comes."""
+        """Return the shared buffer to receive into."""
         del sizehint
-        return self._turns.received
+        return self._scheduler.received
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Take what has come there."""
-        self.receive(self._turns.received[:nbytes])
+        """Process what was received."""
+        self.receive(self._scheduler.received[:nbytes])
 
     def receive(self, data: bytes | memoryview) -> None:
         """Take DATA."""
@@ -77,7 +77,7 @@ class Connection(asyncio.BufferedProtocol):
         if self.client.fault is not None:
             self.drop(str(self.client.fault))
         elif not self.transport.is_closing():
-            self._turns.ask(self)
+            self._scheduler.request_turn(self)
 
     def pause_writing(self) -> None:
         """Give the client some time to read."""
@@ -91,7 +91,7 @@ class Connection(asyncio.BufferedProtocol):
             self._blocked.cancel()
             self._blocked = None
 
-    def hold(self) -> None:
+    def pause(self) -> None:
         """Read no more until the next turn."""
         self.transport.pause_reading()
 
@@ -100,7 +100,7 @@ class Connection(asyncio.BufferedProtocol):
         while not self.transport.is_closing():
             try:
                 request = self.client.next_request()
-            except Unreadable as problem:
+            except UnreadableError as problem:
                 if self.client.dropped == 1:
                     self._gateway.notice(
                         f"{self.client.peer} of the Klippy API sent what is dropped: {problem}"
@@ -111,7 +111,7 @@ class Connection(asyncio.BufferedProtocol):
                     return False
                 self._gateway.call(self, request)
             if self.client.has_work and self._loop.time() >= until_s:
-                self.hold()
+                self.pause()
                 return True
         return False
 
@@ -125,9 +125,9 @@ class Connection(asyncio.BufferedProtocol):
             self.drop(f"it has not read {unread:,} bytes")
 
     def drop(self, why: str) -> None:
-        """Let the client go."""
+        """Disconnect the client."""
         if not self.transport.is_closing():
-            self._gateway.notice(f"{self.client.peer} of the Klippy API was let go: {why}")
+            self._gateway.notice(f"{self.client.peer} of the Klippy API was disconnected: {why}")
             self.transport.abort()
 
 
@@ -149,7 +149,7 @@ class Gateway:
         self._starts = service.starts
         self._server: asyncio.AbstractServer | None = None
         self._path: Path | None = None
-        self._turns = Turns()
+        self._scheduler = FairScheduler()
 
     # ------------------------------------------------------------------------------------------- life
 
@@ -164,7 +164,7 @@ class Gateway:
         self._updates = asyncio.get_running_loop().create_task(self._update())
 
     async def close(self) -> None:
-        """Let go of every client and close the socket."""
+        """Disconnect every client and close the socket."""
         if self._updates is not None:
             self._updates.cancel()
             await asyncio.gather(self._updates, return_exceptions=True)
@@ -181,7 +181,7 @@ class Gateway:
 
     def make_connection(self) -> Connection:
         """Return the protocol of a new client."""
-        return Connection(self, self._turns)
+        return Connection(self, self._scheduler)
 
     def note(self, entry: "Entry") -> None:
         """Take note of a line of the service's log: what g-code answers goes to clients."""

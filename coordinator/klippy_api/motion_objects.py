@@ -13,7 +13,7 @@ def motion_objects(motion: "Motion", described: "MachineDescription", *, stopped
     planned = motion.planned
     figures = planned.figures
     if not figures:
-        return resting_objects(described)
+        return idle_objects(described)
     objects: Objects = {name: dict(fields) for name, fields in figures.items()}
     toolhead, move = objects["toolhead"], objects["gcode_move"]
     for fields in (toolhead, move):
@@ -46,7 +46,7 @@ def _names(described: "MachineDescription") -> dict[str, Any]:
     return {"steppers": steppers, "trapq": ["toolhead", *(extruder.name for extruder in described.extruders)]}
 
 
-def resting_objects(described: "MachineDescription") -> Objects:
+def idle_objects(described: "MachineDescription") -> Objects:
     """Return the same of a machine that is not ready yet: its limits, and nothing homed."""
     limits, extruder = described.limits, described.extruder
     active = "" if extruder is None else extruder.name

@@ -10,7 +10,7 @@ TEMPLATE_ITEMS_MAX: Final = 32
 OBJECTS_MAX: Final = 1024
 """In one query or subscription."""
 
-Wishes = Mapping[str, list[str] | None]
+RequestedFields = Mapping[str, list[str] | None]
 """By object: its fields; None: all."""
 
 
@@ -18,7 +18,7 @@ class RequestError(CanductorError):
     """A call that fails; the text is for people, and may have several lines."""
 
 
-def text_of(request: Request, name: str) -> str:
+def text_param(request: Request, name: str) -> str:
     """Return the text NAME; raises RequestError."""
     found = _given(request, name)
     if not isinstance(found, str):
@@ -26,7 +26,7 @@ def text_of(request: Request, name: str) -> str:
     return found
 
 
-def template_of(request: Request) -> Mapping[str, Any]:
+def template_param(request: Request) -> Mapping[str, Any]:
     """Return ``response_template``, which the messages to come are made from; raises RequestError."""
     found = _given(request, "response_template", {})
     if not isinstance(found, dict) or len(found) > TEMPLATE_ITEMS_MAX:
@@ -34,7 +34,7 @@ def template_of(request: Request) -> Mapping[str, Any]:
     return found
 
 
-def wishes_of(request: Request) -> Wishes:
+def objects_param(request: Request) -> RequestedFields:
     """Return ``objects``: names with null or a list of fields; raises RequestError."""
     found = _given(request, "objects")
     if not isinstance(found, dict) or len(found) > OBJECTS_MAX:

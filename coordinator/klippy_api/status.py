@@ -5,7 +5,7 @@ import time
 from collections.abc import Mapping
 from typing import Any, Final
 
-from coordinator.klippy_api.motion_objects import motion_objects, resting_objects
+from coordinator.klippy_api.motion_objects import idle_objects, motion_objects
 from coordinator.klippy_api.node_objects import firmware_of, node_objects
 from coordinator.klippy_api.subscription import Status
 from coordinator.modules.base import Module
@@ -105,7 +105,7 @@ class StatusBuilder:
         objects.update((name, fields) for name, fields in status.items() if name != "configfile")
         motion, described = service.motion, machine.description
         moving = (
-            resting_objects(described)
+            idle_objects(described)
             if motion is None
             else motion_objects(motion, described, stopped=machine.stopped is not None)
         )
@@ -132,7 +132,7 @@ class StatusBuilder:
         return self._slow
 
     def _mend(self, objects: dict[str, Mapping[str, Any]], fixed: _Fixed) -> None:
-        """Give names, units and types that clients expect where modules tell them otherwise."""
+        """Convert to the names, units and types that clients expect where modules differ."""
         stats = objects.get("print_stats", {**NOTHING, "info": _NO_LAYERS})
         objects["print_stats"] = stats
         card, folder = objects.get("virtual_sdcard"), self._service.folder

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from coordinator.klippy_api.params import Wishes
+from coordinator.klippy_api.params import RequestedFields
 
 Status = Mapping[str, Mapping[str, Any]]
 """Objects by name, each with its fields."""
@@ -12,24 +12,24 @@ Status = Mapping[str, Mapping[str, Any]]
 class Subscription:
     """Fields of objects. Those that are wanted with null are all that the object has at the first look."""
 
-    def __init__(self, template: Mapping[str, Any], wishes: Wishes) -> None:
+    def __init__(self, template: Mapping[str, Any], requested: RequestedFields) -> None:
         self.template = template
-        self.wishes: dict[str, list[str] | None] = dict(wishes)
+        self.requested: dict[str, list[str] | None] = dict(requested)
         self._sent: dict[str, dict[str, Any]] = {}
 
     def begin(self, status: Status) -> Status:
         """Return all that is wanted of STATUS, and remember it as sent."""
-        shown = pick(self.wishes, status)
+        shown = select_fields(self.requested, status)
         for name, fields in shown.items():
-            if self.wishes[name] is None and fields:
-                self.wishes[name] = list(fields)
+            if self.requested[name] is None and fields:
+                self.requested[name] = list(fields)
         self._sent = {name: dict(fields) for name, fields in shown.items()}
         return shown
 
     def changes(self, status: Status) -> Status:
         """Return the fields that are not as they were sent last, and remember them as sent."""
         changed: dict[str, dict[str, Any]] = {}
-        for name, wanted in self.wishes.items():
+        for name, wanted in self.requested.items():
             fields = status.get(name)
             if fields is None:
                 continue
@@ -44,10 +44,10 @@ class Subscription:
         return changed
 
 
-def pick(wishes: Wishes, status: Status) -> dict[str, dict[str, Any]]:
+def select_fields(requested: RequestedFields, status: Status) -> dict[str, dict[str, Any]]:
     """Return what is wanted of STATUS: unknown objects are empty, unknown fields None."""
     shown: dict[str, dict[str, Any]] = {}
-    for name, wanted in wishes.items():
+    for name, wanted in requested.items():
         fields = status.get(name)
         if fields is None:
             shown[name] = {}

@@ -18,14 +18,14 @@ MESSAGE_BYTES_MAX: Final = 262_144
 """One message of a client, without its end."""
 LIMITS: Final = Limits(nesting=64, items=8_192)
 URGENT: Final = (b"emergency_stop", b"M112")
-"""A message with one of these words is looked at before all others that wait."""
+"""A message with one of these words overtakes all others that wait."""
 
 
-class TooLong(CanductorError):  # noqa: N818
+class TooLongError(CanductorError):
     """A client sends a message that nobody would read."""
 
 
-class Unreadable(CanductorError):  # noqa: N818
+class UnreadableError(CanductorError):
     """A message that is dropped; the text says why."""
 
 
@@ -47,7 +47,7 @@ class Framer:
         self._scanned = 0
 
     def feed(self, data: bytes | memoryview) -> list[bytes]:
-        """Return the messages that DATA completes; raises TooLong."""
+        """Return the messages that DATA completes; raises TooLongError."""
         self._rest += data
         found: list[bytes] = []
         begin = 0
@@ -59,29 +59,29 @@ class Framer:
         if self._scanned > MESSAGE_BYTES_MAX or any(len(body) > MESSAGE_BYTES_MAX for body in found):
             self._rest.clear()
             self._scanned = 0
-            raise TooLong(f"a message has more than {MESSAGE_BYTES_MAX:,} bytes")
+            raise TooLongError(f"a message has more than {MESSAGE_BYTES_MAX:,} bytes")
         return found
 
 
 def is_urgent(body: bytes) -> bool:
-    """Tell whether BODY may be a call that stops the machine."""
+    """Return whether BODY may be a call that stops the machine."""
     return any(word in body for word in URGENT)
 
 
 def read_request(body: bytes) -> Request:
-    """Return the call in BODY; raises Unreadable."""
+    """Return the call in BODY; raises UnreadableError."""
     try:
         message = decode_json(body, LIMITS)
         check_values(message, LIMITS)
     except RejectedError as error:
-        raise Unreadable(str(error)) from None
+        raise UnreadableError(str(error)) from None
     if not isinstance(message, dict):
-        raise Unreadable("a message is no object")
+        raise UnreadableError("a message is not an object")
     method, params = message.get("method"), message.get("params", {})
     if not isinstance(method, str):
-        raise Unreadable("a message has no method")
+        raise UnreadableError("a message has no method")
     if not isinstance(params, dict):
-        raise Unreadable("the params of a message are no object")
+        raise UnreadableError("the params of a message are not an object")
     return Request(method, params, message.get("id"))
 
 

@@ -1,1 +1,1 @@
-"""What machines tell to Prometheus: the figures of the state tree (docs/metrics.md)."""
+"""What Prometheus reads of a machine: the figures of the state tree (docs/metrics.md)."""

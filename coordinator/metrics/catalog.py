@@ -19,12 +19,12 @@ class Kind(StrEnum):
     BY_KEY = "by key"
     """A gauge for each entry of a map, or each letter of a word."""
     INFO = "info"
-    """A gauge that is always 1, with what is told in its labels."""
+    """A gauge that is always 1, with the information in its labels."""
     HISTOGRAM = "histogram"
 
     @property
     def type(self) -> str:
-        """The type that Prometheus is told."""
+        """The type for Prometheus."""
         return str(self) if self in (Kind.COUNTER, Kind.HISTOGRAM) else "gauge"
 
 
@@ -100,7 +100,7 @@ JOB: Final = Group(
     "The job",
     (),
     (
-        Metric("state", "job_state", "what becomes of the last one", Kind.STATE, words=JOB_STATES),
+        Metric("state", "job_state", "the state of the last one", Kind.STATE, words=JOB_STATES),
         Metric("progress", "job_progress_ratio", "share of the file that is done"),
         Metric("size_bytes", "job_size_bytes", "size of the file"),
         Metric("done_bytes", "job_done_bytes", "of the file, done"),

@@ -78,7 +78,7 @@ def _split(fields: Fields) -> dict[str, dict[str, dict[str, Value]]]:
 
 
 def _labels(group: Group, entities: Sequence[tuple[str, Fields]]) -> list[list[str]]:
-    """Return what tells the ENTITIES of GROUP from one another: no two may be the same."""
+    """Return the labels that tell the ENTITIES of GROUP apart; no two may be the same."""
     labels: list[list[str]] = []
     names: set[str] = set()
     for path, fields in entities:

@@ -1,1 +1,1 @@
-"""The live page: a thin server in front of coordinator.ipc, and the page itself. Needs the extra ``web``."""
+"""The live page: a thin server in front of coordinator.ipc, and the page itself."""

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import json
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,21 +15,21 @@ from coordinator.ipc.protocol.limits import EndReason
 from coordinator.ipc.protocol.methods import ApiError, Scope
 from coordinator.ipc.server.auth import Grant, digest_of
 from coordinator.ipc.server.connection import Connection
-from coordinator.ipc.server.server import Adopted, IpcServer, tls_context
-from coordinator.ipc.server.tcp_listener import Door
+from coordinator.ipc.server.server import ExternalGrant, IpcServer, tls_context
 from coordinator.web.access import LINK_S, SESSION_S, PageAccess, PageSession, is_key_of
 from coordinator.web.files import PageFile, page_files
+from coordinator.web.http_server import HttpServer
 from coordinator.web.names import is_known_host, is_own_origin
-from coordinator.web.pipe import Pipe
 from coordinator.web.session_file import read_sessions, write_sessions
 from coordinator.web.settings import WebSettings
+from coordinator.web.websocket_transport import WebSocketTransport
 from nodes.support.errors import CanductorError
 
 SOCKET_PATH: Final = "/socket"
 LOGIN_PATH: Final = "/login"
 """Takes a link's code, or a token; gives a session."""
 SESSION_PATH: Final = "/session"
-"""Whether the browser has a session: it is not told why a WebSocket was refused."""
+"""Whether the browser has a session: browsers do not report why a WebSocket was refused."""
 LOGIN_BYTES_MAX: Final = 4_096
 COOKIES_MAX: Final = 8
 """Of our name that are looked at: programs on other ports of this computer can set such cookies, too."""
@@ -76,15 +75,8 @@ class WebServer:
         self._access = PageAccess()
         self._saving = asyncio.Lock()
         self._clients: dict[Connection, PageSession] = {}
-        self._door: Door | None = None
-        self._sockets: set[asyncio.BaseProtocol] = set()
-        """Connections that have become WebSockets."""
-        quiet = logging.getLogger("canductor.web")
-        quiet.addHandler(logging.NullHandler())
-        quiet.propagate = False
-        self._http = web.Server(self._answer, logger=quiet, access_log=None, keepalive_timeout=REQUEST_S)
-        self.refused = 0
-        """Connections and WebSockets."""
+        self._http: HttpServer | None = None
+        self._refused = 0
 
     # ------------------------------------------------------------------------------------------- life
 
@@ -95,9 +87,11 @@ class WebServer:
         context = None
         if settings.certificate is not None and settings.private_key is not None:
             context = await asyncio.to_thread(tls_context, settings.certificate, settings.private_key)
+        self._http = HttpServer(
+            self._answer, connections_max=CONNECTIONS_MAX, connection_s=REQUEST_S, context=context
+        )
         try:
-            self._door = Door(self._protocol, context, may_enter=self._may_enter)
-            await self._door.open(settings.host, settings.port)
+            await self._http.open(settings.host, settings.port)
         except OSError as error:
             raise CanductorError(
                 f"the live page's port {settings.port} of {settings.host} cannot be opened: {error.strerror};"
@@ -107,8 +101,13 @@ class WebServer:
     @property
     def port(self) -> int:
         """The port, once open."""
-        assert self._door is not None
-        return self._door.names[0][1]
+        assert self._http is not None
+        return self._http.port
+
+    @property
+    def refused(self) -> int:
+        """How many connections, requests and WebSockets were refused."""
+        return self._refused + (0 if self._http is None else self._http.refused)
 
     @property
     def url(self) -> str:
@@ -116,10 +115,9 @@ class WebServer:
         return replace(self._settings, port=self.port).url
 
     async def close(self) -> None:
-        """Let go of every browser; the IPC server has told them why when it was closed before."""
-        if self._door is not None:
-            self._door.close()
-        await self._http.shutdown(timeout=1.0)
+        """Disconnect every browser; they got the reason when the IPC server was closed before."""
+        if self._http is not None:
+            await self._http.close()
 
     # --------------------------------------------------------------------------------------- sessions
 
@@ -175,29 +173,12 @@ class WebServer:
     def _cookie_name(self) -> str:
         return f"canductor-{self.port}"  # cookies are shared by all ports of a host
 
-    # ------------------------------------------------------------------------------------ connections
-
-    def _may_enter(self, entering: int) -> bool:
-        if len(self._http.connections) + entering < CONNECTIONS_MAX:
-            return True
-        self.refused += 1
-        return False
-
-    def _protocol(self) -> asyncio.BaseProtocol:
-        protocol = self._http()
-        asyncio.get_running_loop().call_later(REQUEST_S, self._end_idle, protocol)
-        return protocol
-
-    def _end_idle(self, protocol: web.RequestHandler) -> None:
-        if protocol not in self._sockets and protocol.transport is not None:
-            protocol.transport.abort()
-
     # --------------------------------------------------------------------------------------- requests
 
     async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
         if not is_known_host(request.headers.get("Host", ""), self._names):
             name = repr(request.host)
-            return self._refuse(f"{name} is no name of this page; use its IP address, or give --web-name")
+            return self._refuse(f"{name} is not a name of this page; use its IP address, or give --web-name")
         if request.path == SOCKET_PATH:
             return await self._serve_socket(request)
         if request.path == LOGIN_PATH:
@@ -231,7 +212,7 @@ class WebServer:
             try:
                 scope, digest = self._ipc.check_token(token, _address(request)).scope, digest_of(token)
             except ApiError as error:
-                self.refused += 1
+                self._refused += 1
                 return _fault(HTTPStatus.FORBIDDEN, UNKNOWN if error.code == UNKNOWN.code else error)
         former = self._session_of(request)
         if former is not None:
@@ -252,7 +233,7 @@ class WebServer:
         return answer
 
     def _refuse(self, sentence: str) -> web.Response:
-        self.refused += 1
+        self._refused += 1
         return web.Response(status=403, text=sentence + "\n", headers=HEADERS)
 
     async def _serve_socket(self, request: web.BaseRequest) -> web.StreamResponse:
@@ -265,32 +246,29 @@ class WebServer:
             return web.Response(status=426, headers={**HEADERS, "Upgrade": "websocket"})
         session = self._session_of(request)
         if session is None:
-            self.refused += 1
+            self._refused += 1
             return web.Response(status=401, text="sign in first\n", headers=HEADERS)
         if self._access.note_use(session, time.time()):
             await self._save_sessions()
         await socket.prepare(request)
-        self._sockets.add(request.protocol)
-        try:
-            await self._pass_on(socket, _address(request), session)
-        finally:
-            self._sockets.discard(request.protocol)
+        HttpServer.keep(request)
+        await self._relay(socket, _address(request), session)
         return socket
 
-    async def _pass_on(self, socket: web.WebSocketResponse, address: str, session: PageSession) -> None:
+    async def _relay(self, socket: web.WebSocketResponse, address: str, session: PageSession) -> None:
         """Carry messages both ways until one side ends."""
 
-        def check_key(key: str) -> Adopted | None:
+        def check_key(key: str) -> ExternalGrant | None:
             grant = self._grant(session)
             if grant is None or session not in self._access.sessions or not is_key_of(session, key):
                 return None
-            return Adopted(grant, session.token)
+            return ExternalGrant(grant, session.token)
 
-        pipe = Pipe(socket)
-        connection = self._ipc.adopt(pipe, address, check_key)
-        pipe.connection = connection
+        transport = WebSocketTransport(socket)
+        connection = self._ipc.adopt(transport, address, check_key)
+        transport.connection = connection
         self._clients[connection] = session
-        sending = asyncio.ensure_future(pipe.run())
+        sending = asyncio.ensure_future(transport.run())
         begun = False
         try:
             async for message in socket:
@@ -299,10 +277,10 @@ class WebServer:
                     break
                 begun = True
                 connection.receive(message.data.encode() + b"\n")
-                await pipe.readable()
+                await transport.readable()
         finally:
             del self._clients[connection]
-            pipe.abort()
+            transport.abort()
             connection.connection_lost(None)
             sending.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionError):
@@ -326,7 +304,7 @@ def _cookies(request: web.BaseRequest, name: str) -> list[str]:
 
 
 def _read_login(body: bytes) -> tuple[str, bool] | None:
-    """Return the code or token of BODY, and whether the browser shall keep its session when it is closed."""
+    """Return the code or token of BODY, and whether its session outlives the browser."""
     try:
         given: Any = json.loads(body)
     except (ValueError, RecursionError):

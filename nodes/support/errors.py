@@ -2,8 +2,8 @@
 
 
 class CanductorError(Exception):
-    """A failure told in one sentence: what went wrong, where, and what to do about it.
+    """A failure described in one sentence: what went wrong, where, and what to do about it.
 
     The command line prints the sentence and exits with status 1; everything else that escapes is a bug.
-    Subclasses exist where a caller must tell failures apart.
+    Subclasses exist where a caller must distinguish failures.
     """

@@ -1,4 +1,4 @@
-"""Where the programs of this project that drive machines can be asked: their sockets."""
+"""The sockets of this user's machines."""
 
 import os
 import tempfile
@@ -12,5 +12,5 @@ def socket_folder() -> Path:
 
 
 def host_sockets() -> list[Path]:
-    """Return the sockets of this user's machines; whether anybody answers there is another question."""
+    """Return the sockets of this user's machines; their programs may have ended."""
     return sorted(path for path in socket_folder().glob("*.sock") if path.is_socket())

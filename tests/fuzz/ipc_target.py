@@ -11,7 +11,7 @@ from coordinator.ipc.protocol.messages import Encoder, Encoding, WireReader
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Registry, Scope
 from coordinator.ipc.server.auth import Grant, Tokens
 from coordinator.ipc.server.publisher import Publisher
-from coordinator.ipc.server.session import Common, Session
+from coordinator.ipc.server.session import Session, SessionContext
 from coordinator.ipc.server.session_methods import add_session_methods
 from coordinator.ipc.server.state import StateTree
 from coordinator.support.values import Value
@@ -81,9 +81,9 @@ def run_session(data: bytes, cuts: int = 1) -> None:
     stops: list[str] = []
     state = StateTree()
     state.update("a", {"x": 1, "y": "text"})
-    common = Common(_registry(stops), Publisher(state, Encoder()), LIMITS)
+    context = SessionContext(_registry(stops), Publisher(state, Encoder()), LIMITS)
     tokens = Tokens({TOKEN: Grant("fuzz", Scope.OPERATE)})
-    session = Session(common, 0.0, number=1, peer="fuzz", granted=Scope.WATCH, check_token=tokens.check)
+    session = Session(context, 0.0, number=1, peer="fuzz", granted=Scope.WATCH, check_token=tokens.check)
     output = bytearray()
     now_s, position, slow = 0.0, 0, []
     while position < len(data) or session.has_work:
@@ -108,7 +108,7 @@ def run_session(data: bytes, cuts: int = 1) -> None:
             session.answer(slow.pop(), 1)
         state.set("a.x", cuts)
         session.notify(
-            "log", common.publisher.encoder.message(session.encoding, {"event": "log", "values": {}})
+            "log", context.publisher.encoder.message(session.encoding, {"event": "log", "values": {}})
         )
         session.handle_timer(now_s)
         _check_limits(session)

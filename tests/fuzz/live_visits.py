@@ -331,7 +331,7 @@ class Visit:
 
 
 async def pester(site: Site, seed: int, ended: asyncio.Event, *, at_once: int = 16) -> Tally:
-    """Visit SITE, AT_ONCE at a time, until ENDED."""
+    """Visit SITE, IMMEDIATE_HANDLERS at a time, until ENDED."""
     tally, seeds = Tally(), iter(range(seed, seed + 2**31))
 
     async def go_on() -> None:

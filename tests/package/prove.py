@@ -107,7 +107,7 @@ def prove(archive: Path, python: str, folder: Path) -> str:
     run(folder, *pip, "wheel", "--no-deps", "--wheel-dir", folder, archive)
     built_s = time.monotonic() - begun_s
     (wheel,) = folder.glob("*.whl")
-    run(folder, *pip, "install", f"{wheel}[web]")
+    run(folder, *pip, "install", wheel)
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
     installed = environment / "bin"

@@ -11,7 +11,7 @@ from typing import Any
 import msgpack
 
 from coordinator.ipc.protocol.methods import ApiError, Scope
-from coordinator.ipc.server.server import Adopted, IpcServer
+from coordinator.ipc.server.server import ExternalGrant, IpcServer
 from coordinator.ipc.server.settings import IpcSettings
 from tests.stages.served import Served
 
@@ -61,12 +61,12 @@ class MemoryTransport(asyncio.Transport):
 ADDRESS = "127.0.0.1"
 
 
-def _check_token_by(server: IpcServer) -> Callable[[str], Adopted | None]:
+def _check_token_by(server: IpcServer) -> Callable[[str], ExternalGrant | None]:
     """Return a check of tokens by the file of SERVER, as TCP clients have it."""
 
-    def check(token: str) -> Adopted | None:
+    def check(token: str) -> ExternalGrant | None:
         try:
-            return Adopted(server.check_token(token, ADDRESS), None)
+            return ExternalGrant(server.check_token(token, ADDRESS), None)
         except ApiError:
             return None
 

@@ -45,7 +45,7 @@ def declare(command: argparse.ArgumentParser, name: str) -> None:
     elif name == "send":
         add("file", type=Path, help="g-code file")
         add("--name", help="what it is called there; its own name if not given")
-        add("--replace", action="store_true", help="a file of that name may be there")
+        add("--replace", action="store_true", help="overwrite an existing file of that name")
         add("--no-start", action="store_true", help="only send it")
     elif name == "page":
         add("--watch", action="store_true", help="the browser may look, and do nothing else")

@@ -10,8 +10,8 @@ from typing import Any, Final
 
 from coordinator.ipc.client.client import Client
 from coordinator.ipc.discovery.announcement import Announcement, host_word
-from coordinator.ipc.discovery.browser import Browser, Listen
-from coordinator.ipc.discovery.multicast import places
+from coordinator.ipc.discovery.browser import Browser, OpenServices
+from coordinator.ipc.discovery.multicast import interface_addresses
 from coordinator.ipc.protocol.methods import Scope, printable
 from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import host_sockets
@@ -98,7 +98,7 @@ def _table(machines: Sequence[Found]) -> list[str]:
     ]
 
 
-async def find_machines(timeout_s: float, listen: Listen | None = None) -> Discovered:
+async def find_machines(timeout_s: float, listen: OpenServices | None = None) -> Discovered:
     """Return the machines that answer within TIMEOUT_S; LISTEN as of Browser."""
     paths = host_sockets()[:SOCKETS_MAX]
     asking = asyncio.gather(*(_ask(path, timeout_s) for path in paths))
@@ -106,7 +106,7 @@ async def find_machines(timeout_s: float, listen: Listen | None = None) -> Disco
     asked = await asking
     found = [machine for machine in asked if machine is not None]
     silent = [path for path, machine in zip(paths, asked, strict=True) if machine is None]
-    own = {str(place.address) for place in places()}
+    own = {str(each.address) for each in interface_addresses()}
     for machine in announced:
         _add(found, machine, own)
     found.sort(key=lambda machine: (not machine.here, machine.name, machine.host, machine.at))
@@ -137,7 +137,9 @@ def _add(found: list[Found], announced: Announcement, own: set[str]) -> None:
     )
 
 
-async def _browse(timeout_s: float, listen: Listen | None) -> tuple[list[Announcement], int, str | None]:
+async def _browse(
+    timeout_s: float, listen: OpenServices | None
+) -> tuple[list[Announcement], int, str | None]:
     try:
         async with Browser(listen) as browser:
             await asyncio.sleep(timeout_s)

@@ -1,4 +1,4 @@
-"""A program's side of the interface: calls, watches and notifications; comes back when the machine does."""
+"""The client of the interface: calls, watches and notifications; reconnects when the machine is back."""
 
 import asyncio
 import contextlib
@@ -7,8 +7,8 @@ from collections.abc import AsyncGenerator, Coroutine, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
-from coordinator.ipc.client.connect_errors import doubt, why_no_answer, why_refused
-from coordinator.ipc.client.feeds import Event, Feed, Update, Watch
+from coordinator.ipc.client.connect_errors import connect_error_sentence, refusal_sentence, tls_hint
+from coordinator.ipc.client.feeds import Event, EventQueue, Update, Watch
 from coordinator.ipc.protocol.address import Address, read_address
 from coordinator.ipc.protocol.limits import EndReason, Limits
 from coordinator.ipc.protocol.messages import LENGTH_MAX, Encoder, Encoding, WireReader
@@ -21,11 +21,11 @@ __all__ = ["Client", "ConnectionLost", "Event", "Hello", "Refused", "Update"]
 
 READ_BYTES: Final = 65_536
 RETRY_S: Final = (0.1, 0.2, 0.5, 1.0, 2.0)
-"""Pauses between attempts to come back; the last one repeats."""
-FINAL: Final = ("bad_token", "no_token", "bad_version", "not_allowed")
-"""Reasons to be cut off for which another attempt would end alike."""
+"""Pauses between attempts to reconnect; the last one repeats."""
+FINAL_CODES: Final = ("bad_token", "no_token", "bad_version", "not_allowed")
+"""Codes with which the server ends a connection for good."""
 LIMITS: Final = Limits(message_bytes=LENGTH_MAX, nesting=32, items=2_000_000, message_timeout_s=30.0)
-"""What is taken from a server: it is trusted more than a client is."""
+"""Of what a server sends: it is trusted more than a client is."""
 
 
 class ConnectionLost(CanductorError):  # noqa: N818
@@ -33,7 +33,7 @@ class ConnectionLost(CanductorError):  # noqa: N818
 
 
 class Refused(ApiError):  # noqa: N818
-    """The server ended the connection and said why; a new attempt would end alike."""
+    """The server ended the connection and said why; another attempt would end the same way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,11 +66,11 @@ class Client:
         self.address = address
         self.hello: Hello | None = None
         """Of the connection that is open; None while there is none."""
-        self._introduction: dict[str, Value] = {"version": API_VERSION, "client": name}
+        self._hello_params: dict[str, Value] = {"version": API_VERSION, "client": name}
         if token is not None:
-            self._introduction["token"] = token
+            self._hello_params["token"] = token
         if scope is not None:
-            self._introduction["scope"] = scope.word
+            self._hello_params["scope"] = scope.word
         self._tls = tls
         self._encoding = encoding
         self._timeout_s = timeout_s
@@ -82,7 +82,7 @@ class Client:
         self._answers: dict[int, asyncio.Future[Value]] = {}
         self._begun: dict[int, Watch] = {}  # by the id of the request that begins it
         self._watches: set[Watch] = set()
-        self._feeds: set[Feed] = set()
+        self._event_queues: set[EventQueue] = set()
         self._connected = asyncio.Event()
         self._refusal: Refused | None = None
         self._keeper: asyncio.Task[None] | None = None
@@ -120,10 +120,10 @@ class Client:
             async with asyncio.timeout(self._timeout_s):
                 await self._open()
         except TimeoutError:
-            await self._hang_up()
+            await self._disconnect()
             raise ConnectionLost(f"{self.address} did not answer within {self._timeout_s:g} s") from None
         except CanductorError:
-            await self._hang_up()
+            await self._disconnect()
             raise
         self._keeper = asyncio.create_task(self._keep())
         return self
@@ -135,7 +135,7 @@ class Client:
                 task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._keeper
-        await self._hang_up()
+        await self._disconnect()
 
     # ------------------------------------------------------------------------------------------ calls
 
@@ -144,17 +144,17 @@ class Client:
 
         Raises ApiError as the machine does, ConnectionLost.
         """
-        await self._be_connected()
+        await self._wait_connected()
         return await self._ask(method, params or {})
 
-    async def _be_connected(self) -> None:
+    async def _wait_connected(self) -> None:
         if self._connected.is_set():
             return
         try:
             async with asyncio.timeout(self._timeout_s):
                 await self._connected.wait()
         except TimeoutError:
-            raise ConnectionLost(f"{self.address} is not there; waited {self._timeout_s:g} s") from None
+            raise ConnectionLost(f"{self.address} is not connected; waited {self._timeout_s:g} s") from None
         if self._refusal is not None:
             raise self._refusal.with_traceback(None)
 
@@ -178,15 +178,15 @@ class Client:
         except OSError as error:
             raise ConnectionLost(f"{self.address} is gone: {error.strerror or error}") from None
         except asyncio.CancelledError:
-            self._tell("api.cancel", {"id": request_id})
+            self._send("api.cancel", {"id": request_id})
             raise
         finally:
             answer.cancel()
             self._answers.pop(request_id, None)
             self._begun.pop(request_id, None)
 
-    def _tell(self, method: str, params: dict[str, Value]) -> None:
-        """Send a request without wanting an answer."""
+    def _send(self, method: str, params: dict[str, Value]) -> None:
+        """Send a request that gets no answer."""
         if self._writer is not None and not self._writer.is_closing():
             self._writer.write(self._encoder.message(self._encoding, {"method": method, "params": params}))
 
@@ -200,7 +200,7 @@ class Client:
         Updates that come while the last one is looked at are merged. Raises ApiError, ConnectionLost.
         """
         watch = Watch(list(fields), rate_hz)
-        await self._be_connected()
+        await self._wait_connected()
         await self._begin_watch(watch)
         self._watches.add(watch)
         try:
@@ -209,26 +209,26 @@ class Client:
         finally:
             self._watches.discard(watch)
             if watch.number is not None:
-                self._tell("api.unwatch", {"subscription": watch.number})
+                self._send("api.unwatch", {"subscription": watch.number})
 
     async def events(self, names: Iterable[str] = ("*",)) -> AsyncGenerator[Event, None]:
         """Yield the notifications that match the globs NAMES; when not taken, the oldest are dropped."""
-        feed = Feed(tuple(names))
-        self._feeds.add(feed)
+        queue = EventQueue(tuple(names))
+        self._event_queues.add(queue)
         try:
-            await self._be_connected()
+            await self._wait_connected()
             await self._listen()
             while True:
-                yield await feed.next()
+                yield await queue.next()
         finally:
-            self._feeds.discard(feed)
+            self._event_queues.discard(queue)
 
     async def _begin_watch(self, watch: Watch) -> None:
         watch.number = None
         await self._ask("api.watch", {"fields": list(watch.fields), "rate_hz": watch.rate_hz}, watch)
 
     async def _listen(self) -> None:
-        names = sorted({name for feed in self._feeds for name in feed.names})
+        names = sorted({name for queue in self._event_queues for name in queue.names})
         await self._ask("api.listen", {"events": list(names)})
 
     # ------------------------------------------------------------------------------------- connection
@@ -245,31 +245,31 @@ class Client:
                     address.host, address.port, ssl=tls
                 )
         except OSError as error:
-            raise ConnectionLost(why_no_answer(address, error)) from None
+            raise ConnectionLost(connect_error_sentence(address, error)) from None
         self._wire = WireReader(LIMITS, checked=False)
-        hello = asyncio.create_task(self._ask("api.hello", self._introduction))
+        hello = asyncio.create_task(self._ask("api.hello", self._hello_params))
         try:
             while not hello.done():
-                await self._read_some(doubt(address))
+                await self._read_some(tls_hint(address))
                 await asyncio.sleep(0)
-            told = hello.result()
+            answer = hello.result()
         finally:
             hello.cancel()
-        self.hello = Hello(told["version"], told["session"], Scope[told["scope"].upper()])
+        self.hello = Hello(answer["version"], answer["session"], Scope[answer["scope"].upper()])
         self._connected.set()
 
     async def _keep(self) -> None:
-        """Read for as long as there is a connection, and get a new one when it is lost."""
+        """Read while there is a connection, and reconnect when it is lost."""
         while True:
             with contextlib.suppress(ConnectionLost):
                 while True:
                     await self._read_some()
-            await self._hang_up()
-            if not await self._come_back():
+            await self._disconnect()
+            if not await self._reconnect():
                 return
 
-    async def _come_back(self) -> bool:
-        """Connect again, with all feeds; return False when that is refused."""
+    async def _reconnect(self) -> bool:
+        """Reconnect, and resume watches and notifications; return False when that is refused."""
         attempt = 0
         while True:
             await asyncio.sleep(RETRY_S[min(attempt, len(RETRY_S) - 1)])
@@ -278,24 +278,24 @@ class Client:
                 async with asyncio.timeout(self._timeout_s):
                     await self._open()
             except (ConnectionLost, TimeoutError):
-                await self._hang_up()
+                await self._disconnect()
                 continue
             except ApiError as error:
-                await self._hang_up()
+                await self._disconnect()
                 self._refuse(error)
                 return False
-            self._begin(self._resume_feeds())
+            self._spawn(self._resume())
             return True
 
-    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _resume_feeds(self) -> None:
+    async def _resume(self) -> None:
         for watch in list(self._watches):
             await self._resume_watch(watch)
-        if self._feeds:
+        if self._event_queues:
             with contextlib.suppress(ConnectionLost):  # the next connection listens again
                 await self._listen()
 
@@ -312,10 +312,10 @@ class Client:
         self._connected.set()  # so that nobody waits
         for watch in self._watches:
             watch.fail(self._refusal)
-        for feed in self._feeds:
-            feed.fail(self._refusal)
+        for queue in self._event_queues:
+            queue.fail(self._refusal)
 
-    async def _hang_up(self) -> None:
+    async def _disconnect(self) -> None:
         self._connected.clear()
         self.hello = None
         writer, self._writer = self._writer, None
@@ -340,20 +340,20 @@ class Client:
         self._wire.feed(data, 0.0)
         while (message := self._wire.next_message()) is not None:
             if isinstance(message, EndReason):
-                raise ConnectionLost(f"{self.address} sent what is no message: {message.sentence}")
-            self._take(message)
+                raise ConnectionLost(f"{self.address} sent an invalid message: {message.sentence}")
+            self._handle_message(message)
 
-    def _take(self, message: dict[str, Any]) -> None:
+    def _handle_message(self, message: dict[str, Any]) -> None:
         if "event" in message:
-            self._take_event(message)
+            self._handle_event(message)
             return
         failure: ApiError | None = None
         if "error" in message:
-            told = message["error"]
-            failure = ApiError(str(told.get("code")), str(told.get("message")))
+            error = message["error"]
+            failure = ApiError(str(error.get("code")), str(error.get("message")))
         if "id" not in message:
             if failure is not None:
-                self._take_fault(failure)
+                self._fail_answers(failure)
             return
         answer = self._answers.get(message["id"])
         if answer is None or answer.done():
@@ -368,21 +368,21 @@ class Client:
             )  # its updates may follow
         answer.set_result(result)
 
-    def _take_fault(self, fault: ApiError) -> None:
-        """Tell whoever waits for an answer why there will be none."""
-        sentence = why_refused(self.address, fault)
+    def _fail_answers(self, fault: ApiError) -> None:
+        """Fail all calls under way, for the reason that the server gave."""
+        sentence = refusal_sentence(self.address, fault)
         refused = ConnectionLost(sentence) if fault.code == "closing" else Refused(fault.code, sentence)
         for answer in self._answers.values():
             if not answer.done():
                 answer.set_exception(refused)
 
-    def _take_event(self, message: dict[str, Any]) -> None:
+    def _handle_event(self, message: dict[str, Any]) -> None:
         if message["event"] != "state":
             event = Event(message["event"], message.get("values", {}))
-            for feed in self._feeds:
-                feed.put(event)
+            for queue in self._event_queues:
+                queue.put(event)
             return
         for watch in self._watches:
             if watch.number == message["subscription"] and not watch.take(message):
-                self._tell("api.unwatch", {"subscription": watch.number})
-                self._begin(self._resume_watch(watch))
+                self._send("api.unwatch", {"subscription": watch.number})
+                self._spawn(self._resume_watch(watch))

@@ -1,4 +1,4 @@
-"""What comes to a client without being asked for each time: updates of the state, and notifications."""
+"""What a client gets without a call for each: updates of the state, and notifications."""
 
 import asyncio
 from collections import deque
@@ -15,7 +15,7 @@ EVENTS_MAX: Final = 1_024
 
 @dataclass(slots=True)
 class Update:
-    """What changed up to SEQUENCE. SNAPSHOT: it is all there is, forget what was known."""
+    """What changed up to SEQUENCE. SNAPSHOT: these are all fields; what was known before is void."""
 
     sequence: int
     values: dict[str, Value] = field(default_factory=dict)
@@ -42,13 +42,13 @@ class Watch:
         self._sequence = 0
         self._merged: Update | None = None
         self._failure: ApiError | None = None
-        self._news = asyncio.Event()
+        self._changed = asyncio.Event()
 
     def begin(self, number: int, sequence: int, values: dict[str, Value]) -> None:
         """Begin (again) with a snapshot."""
         self.number, self._sequence = number, sequence
         self._merged = Update(sequence, values, snapshot=True)
-        self._news.set()
+        self._changed.set()
 
     def take(self, message: dict[str, Any]) -> bool:
         """Merge an update into what waits; False: one is missing before it."""
@@ -66,27 +66,27 @@ class Watch:
                 merged.values.pop(path, None)
             merged.values |= values
             merged.removed = (merged.removed | set(removed)) - values.keys()
-        self._news.set()
+        self._changed.set()
         return True
 
     def fail(self, error: ApiError) -> None:
         """End with ERROR."""
         self._failure = error
-        self._news.set()
+        self._changed.set()
 
     async def next(self) -> Update:
         """Wait for an update; raises ApiError."""
-        await self._news.wait()
+        await self._changed.wait()
         if self._failure is not None:
             raise self._failure.with_traceback(None)
-        self._news.clear()
+        self._changed.clear()
         update, self._merged = self._merged, None
         assert update is not None
         return update
 
 
-class Feed:
-    """Notifications that match NAMES, in order."""
+class EventQueue:
+    """Notifications that match NAMES, in order; the oldest are dropped."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self.names = names
@@ -94,7 +94,7 @@ class Feed:
         self._wanted = FieldFilter((*names, "api.lost"))
         self._waiting: deque[Event] = deque()
         self._failure: ApiError | None = None
-        self._news = asyncio.Event()
+        self._changed = asyncio.Event()
 
     def put(self, event: Event) -> None:
         """Take EVENT if it is wanted."""
@@ -104,18 +104,18 @@ class Feed:
         if len(self._waiting) > EVENTS_MAX:
             self._waiting.popleft()
             self.dropped += 1
-        self._news.set()
+        self._changed.set()
 
     def fail(self, error: ApiError) -> None:
         """End with ERROR."""
         self._failure = error
-        self._news.set()
+        self._changed.set()
 
     async def next(self) -> Event:
         """Wait for a notification; raises ApiError."""
         while not self._waiting:
             if self._failure is not None:
                 raise self._failure.with_traceback(None)
-            self._news.clear()
-            await self._news.wait()
+            self._changed.clear()
+            await self._changed.wait()
         return self._waiting.popleft()

@@ -1,6 +1,6 @@
-"""What a machine says of itself on the network: one DNS-SD service of type ``_canductor._tcp``.
+"""What a machine announces of itself on the network: one DNS-SD service of type ``_canductor._tcp``.
 
-docs/ipc.md tells what its TXT record has. Everybody on the network can say anything, so reading is total: an
+docs/ipc.md describes its TXT record. Everybody on the network can send anything, so reading is total: an
 announcement, or None.
 """
 
@@ -31,14 +31,14 @@ class Announcement:
 
     name: str
     host: str
-    """The computer it runs on, by its own word."""
+    """The name that the computer it runs on has for itself."""
     version: str
     state: str
     api: int
     """Version of the interface (docs/ipc.md)."""
     tls: bool
     id: str
-    """One life of a coordinator, to tell that two ways lead to the same one."""
+    """Identifies one run of a coordinator: two addresses with the same id lead to the same one."""
     port: int
     addresses: tuple[str, ...]
     """IP addresses, IPv4 first."""
@@ -62,7 +62,7 @@ class Announcement:
     def read(
         cls, txt: Mapping[bytes, bytes | None], port: int | None, addresses: Iterable[str]
     ) -> Self | None:
-        """Return what a service record and its TXT say; None when that is no machine one could reach."""
+        """Return what a service record and its TXT say; None when it is not a machine that can be reached."""
         words: dict[str, str] = {}
         for key, rule in _WORDS.items():
             word = (txt.get(key.encode()) or b"").decode("ascii", "replace")

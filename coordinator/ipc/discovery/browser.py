@@ -10,12 +10,12 @@ from zeroconf import Error
 from zeroconf.asyncio import AsyncServiceBrowser, AsyncServiceInfo, AsyncZeroconf
 
 from coordinator.ipc.discovery.announcement import SERVICE_TYPE, Announcement
-from coordinator.ipc.discovery.multicast import open_mdns, places
+from coordinator.ipc.discovery.multicast import interface_addresses, open_mdns
 
 INSTANCES_MAX: Final = 256
 """Announcements that are looked at; further ones are counted."""
 RESOLVE_S: Final = 10.0
-"""For an announcement to tell its port, addresses and TXT record."""
+"""For the port, addresses and TXT record of an announcement to arrive."""
 
 
 class Services(Protocol):
@@ -26,14 +26,14 @@ class Services(Protocol):
         ...
 
     async def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         ...
 
 
-Heard = Callable[[str, bool], None]
+ChangeHandler = Callable[[str, bool], None]
 """Gets the name of an instance, and whether it is there (it was added, or updated) or gone."""
-Listen = Callable[[Heard], Awaitable[Services]]
-"""Begins to listen to the networks; raises CanductorError when there is none."""
+OpenServices = Callable[[ChangeHandler], Awaitable[Services]]
+"""Starts listening to the networks; raises CanductorError when there is none."""
 
 
 class Browser:
@@ -43,11 +43,11 @@ class Browser:
     network to ask. Garbage is skipped and counted.
     """
 
-    def __init__(self, listen: Listen | None = None) -> None:
-        self._listen: Listen = _Multicast.listen if listen is None else listen
-        self._told: dict[str, Announcement | None] = {}  # by instance; None: not known yet, or garbage
+    def __init__(self, listen: OpenServices | None = None) -> None:
+        self._listen: OpenServices = _Multicast.listen if listen is None else listen
+        self._known: dict[str, Announcement | None] = {}  # by instance; None: not known yet, or garbage
         self._beyond: set[str] = set()
-        self._asking: dict[str, asyncio.Task[None]] = {}
+        self._resolving: dict[str, asyncio.Task[None]] = {}
         self._stale: set[str] = set()  # instances that said something since they were last asked
         self._changed = asyncio.Event()
         self._services: Services
@@ -55,13 +55,13 @@ class Browser:
     @property
     def machines(self) -> list[Announcement]:
         """All that are there now, by name and computer."""
-        known = (machine for machine in self._told.values() if machine is not None)
+        known = (machine for machine in self._known.values() if machine is not None)
         return sorted(known, key=lambda machine: (machine.name, machine.host, machine.at))
 
     @property
     def skipped(self) -> int:
-        """Announcements that told no machine one could reach (yet), and those beyond the most."""
-        return sum(1 for machine in self._told.values() if machine is None) + len(self._beyond)
+        """Announcements of no machine that can be reached (yet), and those beyond the most."""
+        return sum(1 for machine in self._known.values() if machine is None) + len(self._beyond)
 
     async def change(self) -> None:
         """Wait for ``machines`` or ``skipped`` to be others than when this was last waited for."""
@@ -69,60 +69,60 @@ class Browser:
         self._changed.clear()
 
     async def __aenter__(self) -> Self:
-        self._services = await self._listen(self._hear)
+        self._services = await self._listen(self._handle_change)
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        asking = list(self._asking.values())
+        asking = list(self._resolving.values())
         for task in asking:
             task.cancel()
         await asyncio.gather(*asking, return_exceptions=True)
         await self._services.close()
 
-    def _hear(self, name: str, there: bool) -> None:
+    def _handle_change(self, name: str, there: bool) -> None:
         """Take that the instance NAME was added or updated, or is not THERE any more."""
         if not there:
             self._forget(name)
             return
-        if name not in self._told and len(self._told) >= INSTANCES_MAX:
+        if name not in self._known and len(self._known) >= INSTANCES_MAX:
             if len(self._beyond) < INSTANCES_MAX:
                 self._beyond.add(name)
                 self._changed.set()
             return
-        if name not in self._told:
-            self._told[name] = None
+        if name not in self._known:
+            self._known[name] = None
             self._changed.set()
         self._stale.add(name)
-        if name not in self._asking:
-            self._asking[name] = asyncio.ensure_future(self._ask(name))
+        if name not in self._resolving:
+            self._resolving[name] = asyncio.ensure_future(self._resolve(name))
 
     def _forget(self, name: str) -> None:
-        if (task := self._asking.pop(name, None)) is not None:
+        if (task := self._resolving.pop(name, None)) is not None:
             task.cancel()
         self._stale.discard(name)
         self._beyond.discard(name)
-        self._told.pop(name, None)
+        self._known.pop(name, None)
         self._changed.set()
 
-    async def _ask(self, name: str) -> None:
+    async def _resolve(self, name: str) -> None:
         """Learn what the instance NAME says, and again whatever it says meanwhile."""
         while name in self._stale:
             self._stale.discard(name)
             machine = await self._services.resolve(name)
-            if machine != self._told.get(name):
-                self._told[name] = machine
+            if machine != self._known.get(name):
+                self._known[name] = machine
                 self._changed.set()
-        del self._asking[name]
+        del self._resolving[name]
 
 
 class _Multicast:
     """Multicast DNS on all networks of this computer."""
 
-    def __init__(self, mdns: "AsyncZeroconf", heard: Heard) -> None:
+    def __init__(self, mdns: AsyncZeroconf, on_change: ChangeHandler) -> None:
         def handle(*, name: str, state_change: Any, **_: object) -> None:
-            heard(name, state_change.name != "Removed")
+            on_change(name, state_change.name != "Removed")
 
         self._mdns = mdns
         self._browser: AsyncServiceBrowser = AsyncServiceBrowser(
@@ -130,10 +130,10 @@ class _Multicast:
         )
 
     @classmethod
-    async def listen(cls, heard: Heard) -> Self:
+    async def listen(cls, on_change: ChangeHandler) -> Self:
         """Begin; raises CanductorError when there is no network."""
-        here = await asyncio.to_thread(places)
-        return cls(open_mdns(str(place.address) for place in here), heard)
+        here = await asyncio.to_thread(interface_addresses)
+        return cls(open_mdns(str(each.address) for each in here), on_change)
 
     async def resolve(self, instance: str) -> Announcement | None:
         """Ask the network."""
@@ -145,6 +145,6 @@ class _Multicast:
         return None
 
     async def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         await self._browser.async_cancel()
         await self._mdns.async_close()

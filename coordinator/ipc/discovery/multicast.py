@@ -1,7 +1,4 @@
-"""This computer's networks, and multicast DNS on them.
-
-zeroconf is imported when it is used: no other command shall pay for it.
-"""
+"""This computer's networks, and multicast DNS on them."""
 
 import logging
 from collections.abc import Iterable
@@ -16,55 +13,59 @@ from zeroconf.asyncio import AsyncZeroconf
 from nodes.support.errors import CanductorError
 
 INTERFACE_ADDRESSES_MAX: Final = 64
-"""Addresses of this computer on which multicast DNS is spoken; it has a socket for each."""
+"""Addresses of this computer that multicast DNS uses; it opens a socket for each."""
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class InterfaceAddress:
     """An address of this computer, and the number of the interface that has it."""
 
     address: IPv4Address | IPv6Address
     interface: int
 
 
-def places() -> tuple[Place, ...]:
+def interface_addresses() -> tuple[InterfaceAddress, ...]:
     """Return all of this computer's addresses that mean something beyond one link."""
     found = []
     for adapter in ifaddr.get_adapters():
         for ip in adapter.ips:
             address = ip_address(ip.ip if isinstance(ip.ip, str) else ip.ip[0])
             if not (isinstance(address, IPv6Address) and address.is_link_local):
-                found.append(Place(address, adapter.index or 0))
-    found.sort(key=lambda place: (place.address.version, int(place.address)))
+                found.append(InterfaceAddress(address, adapter.index or 0))
+    found.sort(key=lambda each: (each.address.version, int(each.address)))
     return tuple(found[:INTERFACE_ADDRESSES_MAX])
 
 
-def reached_at(bound: Iterable[str], here: Iterable[Place]) -> tuple[Place, ...]:
-    """Return the places HERE through which sockets BOUND to these addresses are reached.
+def reachable_addresses(
+    bound: Iterable[str], here: Iterable[InterfaceAddress]
+) -> tuple[InterfaceAddress, ...]:
+    """Return the addresses HERE through which sockets BOUND to these addresses are reached.
 
-    A socket for all addresses is reached through each of its family but the loopback.
+    A socket for all addresses is reached through each of its IP version but the loopback.
     """
     wanted = [ip_address(text.partition("%")[0]) for text in bound]
     return tuple(
-        place
-        for place in here
+        each
+        for each in here
         if any(
-            (ip.is_unspecified and ip.version == place.address.version and not place.address.is_loopback)
-            or ip == place.address
+            (ip.is_unspecified and ip.version == each.address.version and not each.address.is_loopback)
+            or ip == each.address
             for ip in wanted
         )
     )
 
 
-def spoken_on(reached: Iterable[Place], here: Iterable[Place]) -> tuple[str, ...]:
-    """Return the addresses on which to speak of REACHED: all those of the same interfaces."""
-    interfaces = {place.interface for place in reached}
-    return tuple(str(place.address) for place in here if place.interface in interfaces)
+def mdns_addresses(
+    reachable: Iterable[InterfaceAddress], here: Iterable[InterfaceAddress]
+) -> tuple[str, ...]:
+    """Return the addresses on which to announce what is REACHABLE: all those of the same interfaces."""
+    interfaces = {each.interface for each in reachable}
+    return tuple(str(each.address) for each in here if each.interface in interfaces)
 
 
-def open_mdns(addresses: Iterable[str]) -> "AsyncZeroconf":
+def open_mdns(addresses: Iterable[str]) -> AsyncZeroconf:
     """Return multicast DNS on the interfaces that have ADDRESSES; raises CanductorError."""
-    logging.getLogger("zeroconf").setLevel(logging.CRITICAL)  # strangers' garbage is no news
+    logging.getLogger("zeroconf").setLevel(logging.CRITICAL)  # what strangers send is not logged
     chosen = list(addresses)
     if not chosen:
         raise CanductorError("this computer has no network address; connect it, or look at 'ip address'")

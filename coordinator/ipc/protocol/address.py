@@ -1,4 +1,4 @@
-"""Where a machine is found: its address in words."""
+"""Addresses of machines: paths of sockets, tcp:// and tls://."""
 
 import socket
 from dataclasses import dataclass
@@ -40,13 +40,15 @@ def read_address(text: str | None) -> Address:
     except ValueError:
         host, port = None, None
     if scheme not in ("tcp", "tls") or not host or not port:
-        raise CanductorError(f"'{text}' is no address; it must be a path, tcp://HOST:PORT or tls://HOST:PORT")
+        raise CanductorError(
+            f"'{text}' is not an address; it must be a path, tcp://HOST:PORT or tls://HOST:PORT"
+        )
     return Address(host=host, port=port, tls=scheme == "tls")
 
 
 def _only_machine() -> Address:
     folder, found = socket_folder(), host_sockets()
-    if len(found) > 1:  # one is taken as it is: connecting tells the same, and a stop shall not wait
+    if len(found) > 1:  # a single one is not probed: connecting shows the same, and a stop must not wait
         found = [path for path in found if _is_served(path)] or found[:1]
     if len(found) == 1:
         return Address(path=found[0])

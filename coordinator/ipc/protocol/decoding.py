@@ -34,7 +34,7 @@ def decode_json(body: bytes, limits: Limits) -> Any:
     except UnicodeDecodeError:
         raise _bad_text() from None
     except json.JSONDecodeError as error:
-        sentence = f"a message is no JSON: {error.msg}, at character {error.pos + 1}"
+        sentence = f"a message is not valid JSON: {error.msg}, at character {error.pos + 1}"
         raise RejectedError("bad_message", sentence) from None
     except ValueError:  # of int()
         raise RejectedError("bad_message", "a whole number has too many digits") from None
@@ -62,7 +62,7 @@ def decode_msgpack(body: bytes, limits: Limits, *, checked: bool = True) -> Any:
     except UnicodeDecodeError:
         raise _bad_text() from None
     except (ValueError, msgpack.UnpackException):
-        sentence = f"a message is no msgpack, or has lists of more than {limits.items:,} items"
+        sentence = f"a message is not valid msgpack, or has lists of more than {limits.items:,} items"
         raise RejectedError("bad_message", sentence) from None
 
 
@@ -130,16 +130,16 @@ def _check_text(text: str) -> None:
     try:
         text.isascii() or text.encode()
     except UnicodeEncodeError:
-        raise RejectedError("bad_message", "a string is no Unicode") from None
+        raise RejectedError("bad_message", "a string is not valid Unicode") from None
 
 
 def _reject_constant(word: str) -> None:
     """Reject NaN, Infinity and -Infinity."""
-    raise RejectedError("bad_message", f"{word} is no number of JSON; numbers are finite")
+    raise RejectedError("bad_message", f"{word} is not a JSON number; numbers are finite")
 
 
 def _bad_text() -> RejectedError:
-    return RejectedError("bad_message", "a message has text that is no UTF-8")
+    return RejectedError("bad_message", "a message has text that is not UTF-8")
 
 
 def _too_many(limits: Limits) -> RejectedError:

@@ -79,23 +79,23 @@ class Param:
     choices: tuple[str, ...] = ()
 
     def schema(self) -> dict[str, Value]:
-        """Return the declaration as "api.methods" shows it; what is not said is left out."""
-        told: dict[str, Value] = {"name": self.name, "kind": self.kind.value, "sentence": self.sentence}
+        """Return the declaration as "api.methods" shows it; defaults are left out."""
+        schema: dict[str, Value] = {"name": self.name, "kind": self.kind.value, "sentence": self.sentence}
         if self.unit:
-            told["unit"] = self.unit
+            schema["unit"] = self.unit
         if not self.required:
-            told |= {"required": False, "default": self.default}
+            schema |= {"required": False, "default": self.default}
         for name, bound in (("low", self.low), ("high", self.high)):
             if bound is not None:
-                told[name] = bound
+                schema[name] = bound
         if self.choices:
-            told["choices"] = list(self.choices)
-        return told
+            schema["choices"] = list(self.choices)
+        return schema
 
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who calls: NAME tells people which program it is, and is never trusted for more."""
+    """Who calls: NAME is the program's, for people, and is never trusted for more."""
 
     name: str
     scope: Scope

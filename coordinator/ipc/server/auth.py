@@ -1,4 +1,4 @@
-"""Who may come in: tokens with scopes from a file, and a brake on those who guess."""
+"""Authentication: tokens with scopes from a file, and a lockout for addresses that guess."""
 
 import hashlib
 import hmac
@@ -14,8 +14,8 @@ from nodes.support.secret_file import read_secret
 
 TOKEN_LENGTH_MIN: Final = 32
 FAILURES_MAX: Final = 5
-"""Failures in a row after which an address is shut out."""
-SHUT_OUT_S: Final = 30.0
+"""Failures in a row after which an address is locked out."""
+LOCKOUT_S: Final = 30.0
 """For so long after the last failure; then its failures are forgotten."""
 ADDRESSES_MAX: Final = 1_024
 """Addresses whose failures are remembered; the one that failed longest ago makes room."""
@@ -41,7 +41,7 @@ class Tokens:
 
     @classmethod
     def read(cls, path: Path) -> "Tokens":
-        """Read the file PATH; raises CanductorError when others may read it, or a line is none."""
+        """Read the file PATH; raises CanductorError when others may read it, or a line is malformed."""
         text, status = read_secret(path, "the tokens' file")
         grants: dict[str, Grant] = {}
         for number, line in enumerate(text.splitlines(), 1):
@@ -58,7 +58,7 @@ class Tokens:
                     "make one with: python3 -c 'import secrets; print(secrets.token_urlsafe())'"
                 )
             if words[2] in grants:
-                raise CanductorError(f"{path}, line {number}: the token is there twice; make another one")
+                raise CanductorError(f"{path}, line {number}: the token occurs twice; make another one")
             grants[words[2]] = Grant(words[1], _SCOPES[words[0]])
         return cls(grants, _stamp(status))
 
@@ -92,8 +92,8 @@ def _stamp(status: os.stat_result) -> tuple[int, ...]:
     return (status.st_ino, status.st_mtime_ns, status.st_ctime_ns, status.st_size)
 
 
-class FailureBrake:
-    """Shuts an address out that failed too often; sans-IO, times in seconds of one clock."""
+class LoginThrottle:
+    """Locks an address out that failed too often; sans-IO, times in seconds of one clock."""
 
     def __init__(self) -> None:
         self._failures: dict[str, tuple[int, float]] = {}  # the latest at the end
@@ -102,16 +102,16 @@ class FailureBrake:
         """Note that ADDRESS gave a wrong token."""
         network = _network(address)
         count, last_s = self._failures.pop(network, (0, now_s))
-        if now_s - last_s > SHUT_OUT_S:
+        if now_s - last_s > LOCKOUT_S:
             count = 0
         if len(self._failures) >= ADDRESSES_MAX:
             del self._failures[next(iter(self._failures))]
         self._failures[network] = (count + 1, now_s)
 
-    def shut_out_s(self, address: str, now_s: float) -> float:
-        """Return for how long ADDRESS has to wait, 0 if it may come in."""
+    def lockout_s(self, address: str, now_s: float) -> float:
+        """Return for how long ADDRESS has to wait, 0 if it may connect."""
         count, last_s = self._failures.get(_network(address), (0, 0.0))
-        return max(0.0, last_s + SHUT_OUT_S - now_s) if count >= FAILURES_MAX else 0.0
+        return max(0.0, last_s + LOCKOUT_S - now_s) if count >= FAILURES_MAX else 0.0
 
 
 def _network(address: str) -> str:

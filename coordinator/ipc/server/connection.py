@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final
 
 from coordinator.ipc.protocol.methods import ApiError
-from coordinator.ipc.server.fair_scheduler import Turns
+from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.session import Request, Session
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
@@ -25,17 +25,17 @@ HANG_UP_CHECK_S: Final = 0.5
 
 
 class Connection(asyncio.BufferedProtocol):
-    """A client; ADMIT makes its session once it is there, ON_GONE hears when it has left."""
+    """A client; ADMIT makes its session once it is there, ON_GONE is called when it has left."""
 
     def __init__(
         self,
         admit: Callable[[asyncio.Transport, "Connection"], Session],
         on_gone: Callable[["Connection"], None],
-        turns: Turns,
+        scheduler: FairScheduler,
     ) -> None:
         self._admit = admit
         self._on_gone = on_gone
-        self._turns = turns
+        self._scheduler = scheduler
         self._loop = asyncio.get_running_loop()
         self._tasks: dict[Request, asyncio.Task[None]] = {}
         self._timer: asyncio.TimerHandle | None = None
@@ -52,29 +52,29 @@ class Connection(asyncio.BufferedProtocol):
         assert isinstance(transport, asyncio.Transport)
         self.transport = transport
         self.session = self._admit(transport, self)
-        self.transport.set_write_buffer_limits(high=self.session.common.limits.output_bytes)
-        self._turn()
+        self.transport.set_write_buffer_limits(high=self.session.context.limits.output_bytes)
+        self._request_turn()
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """Tell where to put what comes: memory of its own for each message would cost as much as the rest."""
+        """Return the shared buffer to receive into: one for each message would double the cost."""
         del sizehint
-        return self._turns.received
+        return self._scheduler.received
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Take what has come there."""
-        self.receive(self._turns.received[:nbytes])
+        """Process what was received."""
+        self.receive(self._scheduler.received[:nbytes])
 
     def receive(self, data: bytes | memoryview) -> None:
         """Take DATA."""
         self.session.receive(data, self._loop.time())
-        self._turn()
+        self._request_turn()
 
     def eof_received(self) -> bool:
-        """Answer what was asked before the client closed its side; on TCP this counts as leaving."""
+        """Answer what was requested before the client closed its side; on TCP this counts as leaving."""
         if self._ended or self._has_left():
             return False
         self._half_closed = True
-        self._turn()
+        self._request_turn()
         self._check_hang_up()
         return not self.transport.is_closing()
 
@@ -101,10 +101,10 @@ class Connection(asyncio.BufferedProtocol):
     def resume_writing(self) -> None:
         """Go on."""
         self.session.writable = True
-        self._turn()
+        self._request_turn()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """End whatever still runs for the client."""
+        """End everything that still runs for the client."""
         del exc
         for handle in (self._timer, self._linger):
             if handle is not None:
@@ -112,7 +112,7 @@ class Connection(asyncio.BufferedProtocol):
         self._timer = self._linger = None
         for task in self._tasks.values():
             task.cancel()
-        self._turns.leave(self)
+        self._scheduler.remove(self)
         if (caller := self.session.caller) is not None:
             for leave in caller.at_end:
                 leave(caller)
@@ -120,12 +120,12 @@ class Connection(asyncio.BufferedProtocol):
 
     # ------------------------------------------------------------------------------------------- work
 
-    def _turn(self) -> None:
+    def _request_turn(self) -> None:
         if not self.transport.is_closing():
-            self._turns.ask(self)
+            self._scheduler.request_turn(self)
 
-    def hold(self) -> None:
-        """Wait for the next turn; take no more in meanwhile than what may be unread."""
+    def pause(self) -> None:
+        """Read no more until the next turn, if enough is unread."""
         if self.session.unread_bytes >= UNREAD_BYTES and not self._half_closed:
             self.transport.pause_reading()
 
@@ -149,13 +149,13 @@ class Connection(asyncio.BufferedProtocol):
         if self.transport.is_closing():
             return False
         if more:
-            self.hold()
+            self.pause()
         elif not self._half_closed:
             self.transport.resume_reading()
         return more
 
     def flush(self) -> None:
-        """Send what the session has to say, as far as the client reads."""
+        """Send what the session has to send, as far as the client reads."""
         session, transport = self.session, self.transport
         if transport.is_closing() or self._ended:
             return
@@ -169,7 +169,7 @@ class Connection(asyncio.BufferedProtocol):
             self._set_timer()
 
     def _cut_off(self) -> None:
-        """Give the client a moment to take the reason, and go."""
+        """Give the client a moment to receive the reason, then close."""
         self._ended = True
         for task in self._tasks.values():
             task.cancel()
@@ -220,7 +220,7 @@ class Connection(asyncio.BufferedProtocol):
             result.close()
         del self._tasks[request]
         self.session.fail(request, ApiError("cancelled", f"{request.method.name} was cancelled"))
-        self._turn()
+        self._request_turn()
 
     async def _finish(self, request: Request, result: Awaitable[Value]) -> None:
         try:
@@ -231,7 +231,7 @@ class Connection(asyncio.BufferedProtocol):
             self._fail(request, error)
         del self._tasks[request]
         if not self.transport.is_closing():
-            self._turn()
+            self._request_turn()
 
     def _fail(self, request: Request, error: Exception) -> None:
         name = request.method.name

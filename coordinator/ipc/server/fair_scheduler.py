@@ -1,4 +1,4 @@
-"""Whose turn it is: however many clients ask for however much, the loop gets to its other work in time.
+"""Fair shares of the control loop: however many clients request however much, its other work is in time.
 
 The control loop also hands motion over. In each of its rounds all clients together work for ROUND_S and the
 turn that reaches it; one client for TURN_S, then the others that wait come first.
@@ -20,11 +20,11 @@ class Worker(Protocol):
         """Do what there is to do, until UNTIL_S by the loop's clock; return whether there is more."""
         ...
 
-    def hold(self) -> None:
-        """Take no more in until the next turn."""
+    def pause(self) -> None:
+        """Read no more until the next turn."""
 
 
-class Turns:
+class FairScheduler:
     """Shares the rounds of the loop that makes it; NOW_S is the loop's clock."""
 
     def __init__(self, now_s: Callable[[], float] | None = None) -> None:
@@ -34,23 +34,23 @@ class Turns:
         self._spent_s = 0.0  # in this round, and in those before it that nobody had to wait in
         self._round_is_due = False
         self.received = memoryview(bytearray(RECEIVE_BYTES))
-        """Where a connection puts what it reads, until it has taken it: at once."""
+        """Buffer that all connections receive into; each processes it at once."""
 
-    def ask(self, worker: Worker) -> None:
-        """Let WORKER work: now, or when those before it did."""
+    def request_turn(self, worker: Worker) -> None:
+        """Let WORKER work: now, or after those that wait."""
         if worker in self._waiting:
-            worker.hold()
+            worker.pause()
         elif self._waiting or self._spent_s >= ROUND_S:
             self._wait(worker)
-            worker.hold()
+            worker.pause()
         else:
-            self._let(worker)
+            self._run(worker)
 
-    def leave(self, worker: Worker) -> None:
+    def remove(self, worker: Worker) -> None:
         """Forget WORKER."""
         self._waiting.pop(worker, None)
 
-    def _let(self, worker: Worker) -> None:
+    def _run(self, worker: Worker) -> None:
         begun_s = self._now_s()
         more = worker.work(begun_s + TURN_S)
         self._spent_s += self._now_s() - begun_s
@@ -76,6 +76,6 @@ class Turns:
                 break
             if worker in self._waiting:
                 del self._waiting[worker]
-                self._let(worker)
+                self._run(worker)
         if self._waiting:
             self._expect_round()

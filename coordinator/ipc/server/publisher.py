@@ -1,4 +1,4 @@
-"""The state tree as messages, made once for all watchers that are equally far."""
+"""Updates of the state tree as messages, encoded once for all watchers that are at the same point."""
 
 from typing import Final
 
@@ -7,7 +7,7 @@ from coordinator.ipc.server.state import FieldFilter, StateTree
 from coordinator.support.values import Value
 
 FILTERS_MAX: Final = 256
-"""Different filters that are kept for those who will watch the same."""
+"""Different filters that are kept, for watchers of the same fields."""
 UPDATE_ENTRIES: Final = 8
 """Of the message "state": event, subscription, since, sequence, skipped, snapshot, values, removed."""
 
@@ -72,26 +72,26 @@ class Publisher:
 
 
 class Subscription:
-    """What one watcher has been told, and when it will be told more; times in s of one clock."""
+    """What one watcher has received, and when the next update is due; times in s of one clock."""
 
     def __init__(
         self, number: int, wanted: FieldFilter, period_s: float, phase: float, sequence: int
     ) -> None:
         self.number = number
         self.skipped = 0
-        """Updates that were due since the last one, and got merged since the watcher did not read."""
+        """Updates since the last one that were due and merged, as the watcher did not read."""
         self.next_s = 0.0
         self._wanted = wanted
         self._period_s = period_s
         self._phase = phase
-        self._seen = self._told = sequence
+        self._seen = self._sent = sequence
 
     def schedule(self, now_s: float) -> None:
         """Put the next update to the next multiple of the period, so that watchers of one rate share it."""
         self.next_s = (now_s / self._period_s // 1 + 1 + self._phase) * self._period_s
 
     def update(self, publisher: Publisher, encoding: Encoding) -> bytes | None:
-        """Return the next message, None when there is nothing to tell."""
+        """Return the next message, None when nothing changed."""
         body = publisher.body(self._wanted, self._seen, encoding)
         self._seen = sequence = publisher.state.sequence
         if body is None:
@@ -101,10 +101,10 @@ class Subscription:
             {
                 "event": "state",
                 "subscription": self.number,
-                "since": self._told,
+                "since": self._sent,
                 "sequence": sequence,
                 "skipped": self.skipped,
             },
         )
-        self._told, self.skipped = sequence, 0
+        self._sent, self.skipped = sequence, 0
         return publisher.encoder.joined(encoding, UPDATE_ENTRIES, head, body)

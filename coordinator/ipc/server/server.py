@@ -12,32 +12,32 @@ from typing import Final
 from coordinator.ipc.protocol.limits import EndReason, Limits
 from coordinator.ipc.protocol.messages import Encoder, Encoding
 from coordinator.ipc.protocol.methods import ApiError, Registry
-from coordinator.ipc.server.auth import FailureBrake, Grant, Tokens, digest_of, stamp_of
+from coordinator.ipc.server.auth import Grant, LoginThrottle, Tokens, digest_of, stamp_of
 from coordinator.ipc.server.connection import Connection
-from coordinator.ipc.server.fair_scheduler import Turns
+from coordinator.ipc.server.fair_scheduler import FairScheduler
 from coordinator.ipc.server.publisher import Publisher
-from coordinator.ipc.server.session import Common, Session, SessionCounters
+from coordinator.ipc.server.session import Session, SessionContext, SessionCounters
 from coordinator.ipc.server.session_methods import add_session_methods
 from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
-from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, Door
+from coordinator.ipc.server.tcp_listener import HANDSHAKES_MAX, TcpListener
 from coordinator.ipc.server.unix_socket import BACKLOG, listen_at, may_use, peer_of
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
-TOKENS_LOOK_S: Final = 1.0
+TOKENS_CHECK_S: Final = 1.0
 """Between looks at whether the tokens' file has changed."""
 REFUSALS_MAX: Final = 32
-"""Connections beyond the most that are still told so; further ones are just closed."""
+"""Connections beyond the most that still get the reason; further ones are just closed."""
 
 
 @dataclass(frozen=True, slots=True)
-class Adopted:
-    """What a client may do that came by another way."""
+class ExternalGrant:
+    """What a client may do that connected to another server, such as the live page's."""
 
     grant: Grant
     token: bytes | None
-    """Digest of the token behind it: when that is taken away the client is let go. None: there is none."""
+    """Digest of the token behind it: when that is revoked the client is disconnected. None: there is none."""
 
 
 def _ignore(_: str) -> None:
@@ -61,22 +61,22 @@ class IpcServer:
         add_session_methods(registry)
         self._settings = settings
         self._encoder = Encoder()
-        self._common = Common(registry, Publisher(state, self._encoder), settings.limits)
+        self._context = SessionContext(registry, Publisher(state, self._encoder), settings.limits)
         self._servers: list[asyncio.AbstractServer] = []
-        self._door: Door | None = None
+        self._listener: TcpListener | None = None
         self._connections: set[Connection] = set()
-        self._brake = FailureBrake()
+        self._throttle = LoginThrottle()
         self._on_notice = on_notice
         self._tokens: Tokens | None = None
-        self._shown: dict[Connection, bytes] = {}  # digests of the tokens that clients came in with
+        self._digests: dict[Connection, bytes] = {}  # digests of the tokens that clients came in with
         self._tcp: set[Connection] = set()
         """Connections that count against ``tcp_connections_max``."""
         self._watch: asyncio.Task[None] | None = None
-        self._turns: Turns | None = None
+        self._scheduler: FairScheduler | None = None
         self._sessions = 0
         self._refused = 0
         self._unsendable = 0  # notifications that no message can carry
-        self._gone = SessionCounters()
+        self._closed_totals = SessionCounters()
         self.tcp_port: int | None = None
         """The port, once open; of use where the settings say 0, any port."""
         self.tcp_addresses: list[str] = []
@@ -86,14 +86,14 @@ class IpcServer:
 
     async def start(self) -> None:
         """Open the sockets; raises CanductorError with all closed."""
-        turns = self._turns = Turns()
+        scheduler = self._scheduler = FairScheduler()
         try:
             if self._settings.tokens is not None:
                 self._tokens = await asyncio.to_thread(Tokens.read, self._settings.tokens)
             if self._settings.unix_path is not None:
-                await self._open_unix(self._settings.unix_path, turns)
+                await self._open_unix(self._settings.unix_path, scheduler)
             if self._settings.tcp is not None:
-                await self._open_tcp(self._settings.tcp, turns)
+                await self._open_tcp(self._settings.tcp, scheduler)
             path = self._settings.tokens if self._settings.tcp is None else self._settings.tcp.tokens
             if path is not None and self._tokens is not None:
                 self._watch = asyncio.ensure_future(self._watch_tokens(path, self._tokens))
@@ -102,15 +102,15 @@ class IpcServer:
             raise
 
     async def close(self) -> None:
-        """Let go of every client and close the sockets."""
+        """Disconnect every client and close the sockets."""
         if self._watch is not None:
             self._watch.cancel()
         for server in self._servers:
             server.close()
-        if self._door is not None:
-            self._door.close()
+        if self._listener is not None:
+            self._listener.close()
         for connection in list(self._connections):
-            connection.session.end(EndReason("closing", "the server ends"))
+            connection.session.end(EndReason("closing", "the server is closing"))
             connection.flush()
             connection.transport.close()
         if self._servers and self._settings.unix_path is not None:
@@ -137,72 +137,72 @@ class IpcServer:
             connection.flush()
 
     def figures(self) -> dict[str, Value]:
-        """Return how many clients there are, and what became of all messages since the start."""
-        counted = asdict(self._gone)
+        """Return how many clients there are, and the counters of all messages since the start."""
+        counted = asdict(self._closed_totals)
         for connection in self._connections:
             for name, value in asdict(connection.session.counters).items():
                 counted[name] += value
         return {
             "connections": len(self._connections),
-            "refused_connections": self._refused + (0 if self._door is None else self._door.refused),
-            "unsendable": self._unsendable + self._common.publisher.unsendable,
+            "refused_connections": self._refused + (0 if self._listener is None else self._listener.refused),
+            "unsendable": self._unsendable + self._context.publisher.unsendable,
             **counted,
         }
 
     # ---------------------------------------------------------------------------------------- sockets
 
-    async def _open_unix(self, path: Path, turns: Turns) -> None:
+    async def _open_unix(self, path: Path, scheduler: FairScheduler) -> None:
         listener = await listen_at(path)
         server = await asyncio.get_running_loop().create_unix_server(
-            lambda: Connection(self._admit_unix, self._drop, turns), sock=listener, backlog=BACKLOG
+            lambda: Connection(self._admit_unix, self._drop, scheduler), sock=listener, backlog=BACKLOG
         )
         self._servers.append(server)
 
-    async def _open_tcp(self, tcp: TcpSettings, turns: Turns) -> None:
+    async def _open_tcp(self, tcp: TcpSettings, scheduler: FairScheduler) -> None:
         context = await asyncio.to_thread(_tls_of_tcp, tcp)
         self._tokens = await asyncio.to_thread(Tokens.read, tcp.tokens)
         most = self._settings.tcp_connections_max
-        door = self._door = Door(
-            lambda: Connection(self._admit_tcp, self._drop, turns),
+        listener = self._listener = TcpListener(
+            lambda: Connection(self._admit_tcp, self._drop, scheduler),
             context,
             handshakes_max=min(HANDSHAKES_MAX, most),
             may_enter=lambda entering: entering + len(self._tcp) < most + REFUSALS_MAX,
         )
         try:
-            await door.open(tcp.host, tcp.port)
+            await listener.open(tcp.host, tcp.port)
         except OSError as error:
             raise CanductorError(
                 f"port {tcp.port} of {tcp.host} cannot be opened: {error.strerror}"
             ) from None
-        self.tcp_port = door.names[0][1]
-        self.tcp_addresses = [address for address, _ in door.names]
+        self.tcp_port = listener.addresses[0][1]
+        self.tcp_addresses = [address for address, _ in listener.addresses]
 
     # ----------------------------------------------------------------------------------------- tokens
 
     async def _watch_tokens(self, path: Path, tokens: Tokens) -> None:
         """Read PATH again when it changes. While it cannot be read no token lets anybody in."""
-        known, told = tokens.stamp, ""
+        known, failure = tokens.stamp, ""
         while True:
-            await asyncio.sleep(TOKENS_LOOK_S)
-            if await asyncio.to_thread(stamp_of, path) == known and not told:
+            await asyncio.sleep(TOKENS_CHECK_S)
+            if await asyncio.to_thread(stamp_of, path) == known and not failure:
                 continue
             try:
                 tokens = await asyncio.to_thread(Tokens.read, path)
             except CanductorError as error:
-                if str(error) != told:
-                    self._on_notice(f"{error}; until then no token lets anybody in")
-                self._tokens, told = None, str(error)
+                if str(error) != failure:
+                    self._on_notice(f"{error}; until then no token is accepted")
+                self._tokens, failure = None, str(error)
                 continue
-            self._tokens, known, told = tokens, tokens.stamp, ""
+            self._tokens, known, failure = tokens, tokens.stamp, ""
             self._on_notice(f"the tokens of {path.name} were read again")
-            self._part_from(tokens)
+            self._end_revoked(tokens)
 
-    def _part_from(self, tokens: Tokens) -> None:
+    def _end_revoked(self, tokens: Tokens) -> None:
         """End the clients whose token is not in TOKENS any more, or has a lower scope."""
-        for connection, token in list(self._shown.items()):
+        for connection, token in list(self._digests.items()):
             grant, caller = tokens.grant_of(token), connection.session.caller
             if caller is not None and (grant is None or grant.scope < caller.scope):
-                connection.session.end(EndReason("bad_token", "the token was taken away"))
+                connection.session.end(EndReason("bad_token", "the token was revoked"))
                 connection.flush()
 
     # ---------------------------------------------------------------------------------------- clients
@@ -210,10 +210,10 @@ class IpcServer:
     @property
     def limits(self) -> Limits:
         """What one client may cost."""
-        return self._common.limits
+        return self._context.limits
 
     def adopt(
-        self, transport: asyncio.Transport, address: str, check_key: Callable[[str], Adopted | None]
+        self, transport: asyncio.Transport, address: str, check_key: Callable[[str], ExternalGrant | None]
     ) -> Connection:
         """Take a client that came by another way, such as the live page's; TRANSPORT carries JSON lines.
 
@@ -226,13 +226,13 @@ class IpcServer:
                 if adopted is None:
                     return None
                 if adopted.token is not None:
-                    self._shown[connection] = adopted.token
+                    self._digests[connection] = adopted.token
                 return adopted.grant
 
             return self._session(connection, address, check)
 
-        assert self._turns is not None, "the server is not started"
-        connection = Connection(admit, self._drop, self._turns)
+        assert self._scheduler is not None, "the server is not started"
+        connection = Connection(admit, self._drop, self._scheduler)
         connection.connection_made(transport)
         return connection
 
@@ -241,8 +241,8 @@ class IpcServer:
 
         Raises ApiError ``too_many_failures``, ``bad_token``.
         """
-        if (wait_s := self._shut_out_s(address)) > 0:
-            raise ApiError("too_many_failures", _shut_out_sentence(address, wait_s))
+        if (wait_s := self._lockout_s(address)) > 0:
+            raise ApiError("too_many_failures", _lockout_sentence(address, wait_s))
         grant = self._grant(token, address)
         if grant is None:
             raise ApiError("bad_token", "the token is not known here")
@@ -258,11 +258,11 @@ class IpcServer:
             return None
         grant = self._tokens.check(token)
         if grant is None and address:
-            self._brake.failed(address, asyncio.get_running_loop().time())
+            self._throttle.failed(address, asyncio.get_running_loop().time())
         return grant
 
-    def _shut_out_s(self, address: str) -> float:
-        return self._brake.shut_out_s(address, asyncio.get_running_loop().time())
+    def _lockout_s(self, address: str) -> float:
+        return self._throttle.lockout_s(address, asyncio.get_running_loop().time())
 
     def _admit_unix(self, transport: asyncio.Transport, connection: Connection) -> Session:
         pid, uid = peer_of(transport.get_extra_info("socket"))
@@ -275,11 +275,11 @@ class IpcServer:
     def _admit_tcp(self, transport: asyncio.Transport, connection: Connection) -> Session:
         address = str((transport.get_extra_info("peername") or ("unknown",))[0])
         session = self._session(connection, address, self._token_check(connection, address))
-        wait_s = self._shut_out_s(address)
+        wait_s = self._lockout_s(address)
         if len(self._tcp) >= self._settings.tcp_connections_max:
             self._refuse(session, EndReason("busy", "there are too many connections over TCP; close others"))
         elif wait_s > 0:
-            self._refuse(session, EndReason("too_many_failures", _shut_out_sentence(address, wait_s)))
+            self._refuse(session, EndReason("too_many_failures", _lockout_sentence(address, wait_s)))
         self._tcp.add(connection)
         return session
 
@@ -289,7 +289,7 @@ class IpcServer:
         def check(token: str) -> Grant | None:
             grant = self._grant(token, address)
             if grant is not None:
-                self._shown[connection] = digest_of(token)
+                self._digests[connection] = digest_of(token)
             return grant
 
         return check
@@ -298,7 +298,7 @@ class IpcServer:
         self._sessions += 1
         now_s = asyncio.get_running_loop().time()
         session = Session(
-            self._common, now_s, number=self._sessions, peer=peer, granted=None, check_token=check
+            self._context, now_s, number=self._sessions, peer=peer, granted=None, check_token=check
         )
         self._connections.add(connection)
         if len(self._connections) > self._settings.connections_max:
@@ -314,13 +314,15 @@ class IpcServer:
     def _drop(self, connection: Connection) -> None:
         self._connections.discard(connection)
         self._tcp.discard(connection)
-        self._shown.pop(connection, None)
+        self._digests.pop(connection, None)
         for field in fields(SessionCounters):
-            total = getattr(self._gone, field.name) + getattr(connection.session.counters, field.name)
-            setattr(self._gone, field.name, total)
+            total = getattr(self._closed_totals, field.name) + getattr(
+                connection.session.counters, field.name
+            )
+            setattr(self._closed_totals, field.name, total)
 
 
-def _shut_out_sentence(address: str, wait_s: float) -> str:
+def _lockout_sentence(address: str, wait_s: float) -> str:
     return f"too many wrong tokens from {address}; wait {wait_s:.0f} s"
 
 

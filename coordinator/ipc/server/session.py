@@ -1,8 +1,8 @@
 """One client as the server sees it; sans-IO: bytes and times in, requests and bytes out.
 
 The way of a request: ``receive`` takes bytes, ``read`` turns some of them into requests and returns the
-urgent ones, ``next_request`` gives the others in order, and ``answer`` or ``fail`` ends each. What is to be
-told to the client collects for ``take_output``. While the client does not read (``writable`` is False)
+urgent ones, ``next_request`` gives the others in order, and ``answer`` or ``fail`` ends each. Messages
+to the client wait for ``take_output``. While the client does not read (``writable`` is False)
 requests wait, updates merge and notifications are dropped, but reading never stops: behind whatever waits
 there may be an emergency stop.
 """
@@ -36,7 +36,7 @@ PHASES: Final = 8
 class Request:
     """A request with its parameters, checked. ID is None when no answer is wanted.
 
-    IGNORED tells what was wrong with an urgent one, which is carried out all the same; empty: nothing.
+    IGNORED: what was wrong with an urgent one, which is carried out all the same; empty: nothing.
     """
 
     id: int | None
@@ -47,7 +47,7 @@ class Request:
 
 @dataclass(slots=True)
 class SessionCounters:
-    """What became of a client's messages."""
+    """Counters of a client's messages."""
 
     requests: int = 0
     failed: int = 0
@@ -59,7 +59,7 @@ class SessionCounters:
 
 
 @dataclass(frozen=True, slots=True)
-class Common:
+class SessionContext:
     """What all sessions of a server share."""
 
     registry: Registry
@@ -68,14 +68,14 @@ class Common:
 
 
 class Session:
-    """One client. PEER tells people who it is; GRANTED is what it may do without a token.
+    """One client. PEER names it for people; GRANTED is what it may do without a token.
 
     CHECK_TOKEN is None where there are no tokens. Times are seconds of one clock.
     """
 
     def __init__(
         self,
-        common: Common,
+        context: SessionContext,
         now_s: float,
         *,
         number: int,
@@ -83,7 +83,7 @@ class Session:
         granted: Scope | None,
         check_token: Callable[[str], Grant | None] | None = None,
     ) -> None:
-        self.common = common
+        self.context = context
         self.number = number
         self.peer = peer
         self.granted = granted
@@ -91,17 +91,17 @@ class Session:
         self.caller: Caller | None = None
         """None until the hello."""
         self.end_reason: EndReason | None = None
-        """Why the session has ended; what is left to send tells the client."""
+        """Why the session has ended; the last message to the client has it."""
         self.writable = True
         """Whether the client takes what is sent; set by the driver."""
         self.counters = SessionCounters()
         self.subscriptions: dict[int, Subscription] = {}
         self.listens = FieldFilter(())
-        self._limits = common.limits
-        self._encoder = common.publisher.encoder
-        self._reader = WireReader(common.limits)
-        self._reader.message_bytes_max = min(common.limits.hello_bytes, common.limits.message_bytes)
-        self._hello_until_s = now_s + common.limits.message_timeout_s
+        self._limits = context.limits
+        self._encoder = context.publisher.encoder
+        self._reader = WireReader(context.limits)
+        self._reader.message_bytes_max = min(context.limits.hello_bytes, context.limits.message_bytes)
+        self._hello_until_s = now_s + context.limits.message_timeout_s
         self._waiting: deque[Request] = deque()
         self._running: set[Request] = set()
         self._cancelled: list[Request] = []
@@ -109,7 +109,7 @@ class Session:
         self._out: list[bytes] = []
         self._out_bytes = 0
         self._notifications: deque[bytes] = deque()
-        self._lost = 0  # notifications, and not told yet
+        self._lost = 0  # notifications, since the last "api.lost"
         self._last_subscription = 0
 
     # ------------------------------------------------------------------------------------------- time
@@ -129,8 +129,8 @@ class Session:
         """Send what is due, end what took too long."""
         if self.end_reason is not None:
             return
-        if (fault := self._reader.handle_timer(now_s)) is not None:
-            self.end(fault)
+        if (reason := self._reader.handle_timer(now_s)) is not None:
+            self.end(reason)
             return
         if self.caller is None and now_s >= self._hello_until_s:
             self.end(EndReason("timeout", f"no api.hello within {self._limits.message_timeout_s:g} s"))
@@ -145,7 +145,7 @@ class Session:
             subscription.skipped += 1
             self.counters.updates_skipped += 1
             return
-        update = subscription.update(self.common.publisher, self.encoding)
+        update = subscription.update(self.context.publisher, self.encoding)
         if update is not None:
             self.counters.updates += 1
             self._put(update)
@@ -197,15 +197,15 @@ class Session:
     def _send(self, message: dict[str, Value]) -> None:
         self._put(self._encoder.message(self.encoding, message))
 
-    def end(self, fault: EndReason) -> None:
-        """End the session for FAULT and tell the client."""
+    def end(self, reason: EndReason) -> None:
+        """End the session and send the client the reason."""
         if self.end_reason is not None:
             return
-        self.end_reason = fault
+        self.end_reason = reason
         self._waiting.clear()
         self._notifications.clear()
         self.subscriptions.clear()
-        self._send({"error": {"code": fault.code, "message": fault.sentence}})
+        self._send({"error": {"code": reason.code, "message": reason.sentence}})
 
     # --------------------------------------------------------------------------------------- requests
 
@@ -222,7 +222,7 @@ class Session:
             elif message is None:
                 break
             else:
-                self._take(message, urgent, now_s)
+                self._handle_message(message, urgent, now_s)
             if self._reader.waiting_bytes <= stop_at:
                 break
         return urgent
@@ -293,7 +293,7 @@ class Session:
         if request_id is not None and self.end_reason is None:
             self._send({"id": request_id, "error": {"code": error.code, "message": error.sentence}})
 
-    def _take(self, message: dict[str, Any], urgent: list[Request], now_s: float) -> None:
+    def _handle_message(self, message: dict[str, Any], urgent: list[Request], now_s: float) -> None:
         request_id, name = message.get("id"), message.get("method")
         if type(name) is not str:
             self.end(EndReason("bad_message", "a request must be a map with method, and with id and params"))
@@ -315,7 +315,7 @@ class Session:
             if self.caller is None:
                 self.end(EndReason(error.code, error.sentence))
             return
-        self._sort(request, urgent, now_s)
+        self._dispatch(request, urgent, now_s)
         if not is_id:
             self._end_for_id(request_id, f"; {name} was carried out all the same")
 
@@ -346,7 +346,7 @@ class Session:
         """Return the method NAME if this client may call it now; raises ApiError."""
         if self.caller is None and name != session_methods.HELLO:
             raise ApiError("no_hello", "the first request must be api.hello")
-        method = self.common.registry.methods.get(name)
+        method = self.context.registry.methods.get(name)
         if method is None:
             raise ApiError("no_such_method", f"there is no method {shown(name)}; api.methods lists them")
         if self.caller is not None and method.scope > self.caller.scope:
@@ -354,11 +354,11 @@ class Session:
             raise ApiError("not_allowed", f"{name} needs the scope {needed}, this client has {has}")
         return method
 
-    def _sort(self, request: Request, urgent: list[Request], now_s: float) -> None:
+    def _dispatch(self, request: Request, urgent: list[Request], now_s: float) -> None:
         """Put REQUEST where it belongs: done at once, urgent, or waiting."""
-        at_once = session_methods.AT_ONCE.get(request.method.name)
-        if at_once is not None:
-            self._perform(request, at_once, now_s)
+        immediate = session_methods.IMMEDIATE_HANDLERS.get(request.method.name)
+        if immediate is not None:
+            self._perform(request, immediate, now_s)
         elif request.method.urgent:
             urgent.append(request)
         elif len(self._waiting) >= self._limits.pending_requests:

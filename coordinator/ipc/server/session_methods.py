@@ -1,4 +1,4 @@
-"""The methods of the interface itself: who is there, what can be called, what shall be told."""
+"""The methods of the interface itself: hello, introspection, watching, cancelling."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
@@ -39,7 +39,7 @@ def add_session_methods(registry: Registry) -> None:
 def _hello(session: "Session", params: dict[str, Any], now_s: float) -> Value:
     del now_s
     if session.caller is not None:
-        raise ApiError("bad_params", "api.hello was said already")
+        raise ApiError("bad_params", "api.hello was called already")
     if params["version"] != API_VERSION:
         sentence = f"this server speaks version {API_VERSION}, not {params['version']}; update the older side"
         session.end(EndReason("bad_version", sentence))
@@ -51,7 +51,7 @@ def _hello(session: "Session", params: dict[str, Any], now_s: float) -> Value:
     if wanted is not None:
         scope = min(scope, Scope[wanted.upper()])
     session.admit(Caller(f"{printable(params['client']) or 'unnamed'} ({session.peer})", scope))
-    limits = session.common.limits
+    limits = session.context.limits
     return {
         "version": API_VERSION,
         "session": session.number,
@@ -80,7 +80,7 @@ def _scope_of(session: "Session", token: str | None) -> Scope | None:
 
 def _methods(session: "Session", params: dict[str, Any], now_s: float) -> Value:
     del params, now_s
-    return {"version": API_VERSION, "methods": session.common.registry.schema()}
+    return {"version": API_VERSION, "methods": session.context.registry.schema()}
 
 
 def _ping(session: "Session", params: dict[str, Any], now_s: float) -> Value:
@@ -95,13 +95,13 @@ def _cancel(session: "Session", params: dict[str, Any], now_s: float) -> Value:
 
 def _get(session: "Session", params: dict[str, Any], now_s: float) -> Value:
     del now_s
-    publisher = session.common.publisher
+    publisher = session.context.publisher
     taken = publisher.state.snapshot(publisher.filter(_globs(session, params, "fields")))
     return {"sequence": taken.sequence, "values": taken.values}
 
 
 def _watch(session: "Session", params: dict[str, Any], now_s: float) -> Value:
-    limits, publisher = session.common.limits, session.common.publisher
+    limits, publisher = session.context.limits, session.context.publisher
     if len(session.subscriptions) >= limits.subscriptions:
         raise ApiError(
             "busy", f"a client may watch {limits.subscriptions} times at once; api.unwatch ends one"
@@ -123,13 +123,13 @@ def _unwatch(session: "Session", params: dict[str, Any], now_s: float) -> Value:
 def _listen(session: "Session", params: dict[str, Any], now_s: float) -> Value:
     del now_s
     globs = _globs(session, params, "events")
-    session.listens = session.common.publisher.filter(globs)
+    session.listens = session.context.publisher.filter(globs)
     return {}
 
 
 def _globs(session: "Session", params: dict[str, Any], name: str) -> list[str]:
     globs: list[str] = params[name]
-    most = session.common.limits.filters
+    most = session.context.limits.filters
     if len(globs) > most or any(type(g) is not str or len(g) > GLOB_LENGTH_MAX for g in globs):
         raise ApiError(
             "bad_params", f"{name} must be at most {most} strings of at most {GLOB_LENGTH_MAX} characters"
@@ -143,14 +143,14 @@ def _globs(session: "Session", params: dict[str, Any], name: str) -> list[str]:
 
 
 def _of_session(caller: Caller, params: dict[str, Any]) -> Value:
-    """Stand where the function of other methods stands; sessions perform their own methods themselves."""
+    """Fail: sessions perform these methods themselves."""
     del caller, params
     raise ApiError("internal", "a method of the session was called without one")
 
 
 # ---------------------------------------------------------------------------------------------- declared
 
-AT_ONCE: Final[dict[str, Handler]] = {HELLO: _hello, "api.cancel": _cancel}
+IMMEDIATE_HANDLERS: Final[dict[str, Handler]] = {HELLO: _hello, "api.cancel": _cancel}
 """Performed while they are received."""
 HANDLERS: Final[dict[str, Handler]] = {
     "api.methods": _methods,

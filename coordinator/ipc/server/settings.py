@@ -30,7 +30,7 @@ class IpcSettings:
     """What the owner's programs may do on the Unix socket, without a token."""
     tcp: TcpSettings | None = None
     tokens: Path | None = None
-    """As of TCP, for clients that come by other doors (the live page) when there is no TCP."""
+    """As of TCP, for clients that come in otherwise (by the live page) when there is no TCP."""
     connections_max: int = 512
     tcp_connections_max: int = 256
     """Of those; a flood from the network leaves room for the owner's programs."""

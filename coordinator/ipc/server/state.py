@@ -34,7 +34,7 @@ class FieldFilter:
         self._known: dict[str, bool] = {}
 
     def matches(self, path: str) -> bool:
-        """Tell whether PATH is wanted."""
+        """Return whether PATH matches."""
         if path in self._whole or path.startswith(self._begins):
             return True
         if not self._others:
@@ -53,7 +53,7 @@ def costly_stars(globs: Iterable[str]) -> int:
 
 
 def _matches_any(globs: Iterable[tuple[str, ...]], path: str) -> bool:
-    """Tell whether PATH consists of the pieces of one of GLOBS with anything between them."""
+    """Return whether PATH consists of the pieces of one of GLOBS with anything between them."""
     for pieces in globs:
         first, last = pieces[0], pieces[-1]
         if not path.endswith(last) or not path.startswith(first):

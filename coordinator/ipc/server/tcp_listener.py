@@ -1,4 +1,8 @@
-"""Accepts TCP connections, so that those whose TLS handshake is not done yet are counted, too (asyncio)."""
+"""Listens on a TCP port and bounds what waits there, TLS handshakes included (asyncio).
+
+The servers of asyncio keep any number of clients that never finish their handshake: they cannot count or
+refuse them. So connections are accepted here (docs/adr/0013-network-edge.md).
+"""
 
 import asyncio
 import resource
@@ -9,7 +13,7 @@ from typing import Final
 
 BACKLOG: Final = 128
 HANDSHAKES_MAX: Final = 128
-"""TLS handshakes at a time; who comes beyond that is let go at once, before it costs more than a file."""
+"""TLS handshakes at a time; further connections are closed at once, before they cost more than a file."""
 HANDSHAKE_S: Final = 5.0
 ACCEPTS_PER_ROUND: Final = 8
 """Connections taken before the rest of the loop gets its turn."""
@@ -19,25 +23,25 @@ FILES_MAX: Final = 65_536
 """More than all connections and logs of a service need."""
 
 
-def _open(_: int) -> bool:
+def _always(_: int) -> bool:
     return True
 
 
-class Door:
-    """A TCP port, with TLS where there is a CONTEXT. PROTOCOLS makes the protocol of each connection.
+class TcpListener:
+    """A TCP port, with TLS where there is a CONTEXT. MAKE_PROTOCOL makes the protocol of each connection.
 
-    MAY_ENTER gets how many connections are on their way in, and says whether one more may come.
+    MAY_ENTER gets how many connections are being set up, and returns whether there may be one more.
     """
 
     def __init__(
         self,
-        protocols: Callable[[], asyncio.BaseProtocol],
+        make_protocol: Callable[[], asyncio.BaseProtocol],
         context: ssl.SSLContext | None,
         *,
         handshakes_max: int = HANDSHAKES_MAX,
-        may_enter: Callable[[int], bool] = _open,
+        may_enter: Callable[[int], bool] = _always,
     ) -> None:
-        self._protocols = protocols
+        self._make_protocol = make_protocol
         self._context = context
         self._handshakes_max = handshakes_max
         self._may_enter = may_enter
@@ -45,16 +49,16 @@ class Door:
         self._accepting: list[asyncio.Task[None]] = []
         self._entering: set[asyncio.Task[None]] = set()
         self.refused = 0
-        """Connections that were let go before their handshake."""
+        """Connections that were closed before their handshake."""
         self.starved = 0
-        """Times that the system had no file left for one."""
+        """How often the system had no file left for a connection."""
 
     async def open(self, host: str, port: int) -> None:
         """Listen at HOST, any port if PORT is 0; raises OSError."""
         loop = asyncio.get_running_loop()
         server = await loop.create_server(asyncio.Protocol, host, port, start_serving=False)
         try:
-            for bound in server.sockets:  # asyncio has found the addresses; accepting is ours
+            for bound in server.sockets:  # asyncio has resolved the addresses
                 self._listeners.append(bound.dup())
             for listener in self._listeners:
                 listener.setblocking(False)
@@ -67,12 +71,17 @@ class Door:
         self._accepting = [loop.create_task(self._accept(listener)) for listener in self._listeners]
 
     @property
-    def names(self) -> list[tuple[str, int]]:
+    def addresses(self) -> list[tuple[str, int]]:
         """The addresses and ports that are open; 0.0.0.0 and :: stand for all addresses."""
         return [listener.getsockname()[:2] for listener in self._listeners]
 
+    @property
+    def entering(self) -> int:
+        """How many connections are being set up: with TLS, shake hands."""
+        return len(self._entering)
+
     def close(self) -> None:
-        """Let nobody in any more, and go who is on the way."""
+        """Accept nobody any more, and end the handshakes; connections stay."""
         for task in (*self._accepting, *self._entering):
             task.cancel()
         for listener in self._listeners:
@@ -86,16 +95,16 @@ class Door:
         while True:
             try:
                 opened, _ = await loop.sock_accept(listener)
-            except ConnectionAbortedError:  # it has left already
+            except ConnectionAbortedError:  # the client has left already
                 continue
-            except OSError:  # no file or memory for it: others may give some back
+            except OSError:  # no file or memory for it: others may free some
                 self.starved += 1
                 await asyncio.sleep(RETRY_S)
                 continue
             self._take(opened, loop)
             taken += 1
             if taken % ACCEPTS_PER_ROUND == 0:
-                await asyncio.sleep(0)  # who waits already is accepted without a pause
+                await asyncio.sleep(0)  # sock_accept returns without a pause while some wait
 
     def _take(self, opened: socket.socket, loop: asyncio.AbstractEventLoop) -> None:
         full = self._context is not None and len(self._entering) >= self._handshakes_max
@@ -112,7 +121,7 @@ class Door:
         limit_s = None if self._context is None else HANDSHAKE_S
         try:
             await loop.connect_accepted_socket(
-                self._protocols,
+                self._make_protocol,
                 arrived.pop(),
                 ssl=self._context,
                 ssl_handshake_timeout=limit_s,

@@ -1,4 +1,4 @@
-"""Unix sockets of the service: for the owner's programs only, whatever becomes of the one before."""
+"""Unix sockets of the service: for the owner's programs only."""
 
 import asyncio
 import os
@@ -34,7 +34,7 @@ def peer_of(opened: socket.socket) -> tuple[int, int]:
 
 
 def may_use(uid: int) -> bool:
-    """Tell whether the user UID may use this user's sockets."""
+    """Return whether the user UID may use this user's sockets."""
     return uid in (0, os.geteuid())
 
 
@@ -44,7 +44,7 @@ def _make_way(path: Path) -> None:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not path.is_socket():
             if path.exists():
-                raise CanductorError(f"{path} is there and no socket; choose another path or remove it")
+                raise CanductorError(f"{path} exists and is not a socket; choose another path or remove it")
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
             probe.settimeout(1.0)

@@ -33,14 +33,16 @@ def upload_method(folder: Path) -> Method:
     return Method(
         "job.upload",
         Scope.OPERATE,
-        "Write a part of a file for the job folder; the file is there once the last part is.",
+        "Write a part of a file for the job folder; the file appears with its last part.",
         uploads.upload,
         (
             Param("file", Kind.STR, f"a plain name that ends in one of {', '.join(SUFFIXES)}", high=NAME_MAX),
-            Param("offset", Kind.INT, "bytes sent before; 0 begins anew", "bytes", low=0, high=SIZE_MAX),
-            Param("text", Kind.STR, "what comes there", high=PART_MAX),
+            Param("offset", Kind.INT, "bytes sent before; 0 starts over", "bytes", low=0, high=SIZE_MAX),
+            Param("text", Kind.STR, "the text at that offset", high=PART_MAX),
             Param("done", Kind.BOOL, "this is the last part", required=False, default=False),
-            Param("replace", Kind.BOOL, "a file of that name may be there", required=False, default=False),
+            Param(
+                "replace", Kind.BOOL, "overwrite an existing file of that name", required=False, default=False
+            ),
         ),
         (Param("size_bytes", Kind.INT, "so far", "bytes"),),
     )
@@ -83,17 +85,16 @@ class _Uploads:
     def _part(self, caller: Caller, name: str, offset: int) -> _Part:
         part = self._parts.get(name)
         if part is not None and part.owner is not caller:
-            raise ApiError("busy", f"another client sends {shown(name)}; wait, or choose another name")
+            raise ApiError("busy", f"another client is uploading {shown(name)}; wait, or choose another name")
         if part is not None:
             return part
         if offset:
             raise ApiError(
-                "bad_params", f"{shown(name)} has 0 bytes so far of this client, not {offset}; begin anew"
+                "bad_params",
+                f"{shown(name)} has 0 bytes so far of this client, not {offset}; start over with offset 0",
             )
         if sum(1 for other in self._parts.values() if other.owner is caller) >= PARTS_MAX:
-            raise ApiError(
-                "busy", f"{PARTS_MAX} files of this client are not complete; send their ends first"
-            )
+            raise ApiError("busy", f"{PARTS_MAX} files of this client are not complete; finish those first")
         part = self._parts[name] = _Part(caller)
         if self._left not in caller.at_end:
             caller.at_end.append(self._left)
@@ -116,13 +117,13 @@ class _Uploads:
 
 
 class _FullError(ApiError):
-    """The disk has no place for more."""
+    """The disk is full."""
 
     def __init__(self, free: int) -> None:
         super().__init__(
             "failed",
             f"the job folder's disk has {free >> 20:,} MiB left, of which {FREE_MIN >> 20} stay free;"
-            " make room there, then send it again",
+            " free some space there, then upload it again",
         )
 
 
@@ -167,7 +168,7 @@ def _write(folder: Path, params: dict[str, Any], part: _Part) -> int:
 def _write_into(directory: int, params: dict[str, Any], part: _Part) -> int:
     name, offset, data = params["file"], params["offset"], params["text"].encode()
     if not params["replace"] and _exists(name, directory):
-        raise ApiError("file_exists", f"{shown(name)} is there already; choose another name, or replace")
+        raise ApiError("file_exists", f"{shown(name)} exists already; choose another name, or set replace")
     if (free := shutil.disk_usage(directory).free) - len(data) < FREE_MIN:
         raise _FullError(free)
     partial = _partial_of(name)
@@ -187,7 +188,8 @@ def _append(out: int, name: str, offset: int, data: bytes) -> int:
     status = os.fstat(out)
     if not stat.S_ISREG(status.st_mode) or status.st_size != offset:
         raise ApiError(
-            "bad_params", f"{shown(name)} has {status.st_size} bytes so far, not {offset}; begin anew"
+            "bad_params",
+            f"{shown(name)} has {status.st_size} bytes so far, not {offset}; start over with offset 0",
         )
     if offset + len(data) > SIZE_MAX:
         raise ApiError("bad_params", f"{shown(name)} gets longer than {SIZE_MAX:,} bytes")

@@ -87,7 +87,7 @@ def machine(folder: Path, **settings: Any) -> Iterator[AtWork]:
             end = Param("end", Kind.BOOL, required=False, default=False)
             failure = Param("failure", Kind.STR, required=False)
             params = (name, Param("first_line", Kind.INT), text, end, failure)
-            registry = served.server._common.registry
+            registry = served.server._context.registry
             registry.add(upload_method(folder / "jobs"))
             registry.add(Method("job.start", Scope.OPERATE, "", start, (Param("file", Kind.STR),)))
             registry.add(Method("job.stream", Scope.OPERATE, "", at_work.job.stream, (name,)))

@@ -5,10 +5,10 @@ from collections.abc import Iterable
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any, cast
 
-from coordinator.ipc.discovery.announce_process import Announcing, follow, lines_of
 from coordinator.ipc.discovery.announcement import Announcement
-from coordinator.ipc.discovery.browser import Heard
-from coordinator.ipc.discovery.multicast import Place
+from coordinator.ipc.discovery.announcer import Announcer, follow
+from coordinator.ipc.discovery.browser import ChangeHandler
+from coordinator.ipc.discovery.multicast import InterfaceAddress
 from nodes.support.errors import CanductorError
 
 if TYPE_CHECKING:
@@ -20,16 +20,16 @@ class MemoryNetwork:
     """Its records, and those who listen."""
 
     def __init__(self) -> None:
-        self.places: tuple[Place, ...] = (Place(ip_address("127.0.0.1"), 1),)
+        self.addresses: tuple[InterfaceAddress, ...] = (InterfaceAddress(ip_address("127.0.0.1"), 1),)
         self.problem = ""
         """Why nobody can speak; empty: they can."""
         self.records: dict[str, ServiceInfo] = {}
         self.sent_s: list[float] = []
         """When a record was sent to all, by the loop's time."""
-        self.listeners: list[Heard] = []
+        self.listeners: list[ChangeHandler] = []
 
-    def find_places(self) -> tuple[Place, ...]:
-        return self.places
+    def find_addresses(self) -> tuple[InterfaceAddress, ...]:
+        return self.addresses
 
     def open_dns(self, addresses: Iterable[str]) -> "AsyncZeroconf":
         """Stand where zeroconf does."""
@@ -38,23 +38,23 @@ class MemoryNetwork:
         assert list(addresses)
         return cast("AsyncZeroconf", _Speaker(self))
 
-    async def listen(self, heard: Heard) -> "_Listener":
+    async def listen(self, on_change: ChangeHandler) -> "_Listener":
         """Stand where a browser of zeroconf does."""
-        self.listeners.append(heard)
+        self.listeners.append(on_change)
         for name in self.records:
-            heard(name, True)
-        return _Listener(self, heard)
+            on_change(name, True)
+        return _Listener(self, on_change)
 
     def put(self, info: "ServiceInfo") -> None:
         self.records[info.name] = info
         self.sent_s.append(asyncio.get_running_loop().time())
-        for heard in self.listeners:
-            heard(info.name, True)
+        for on_change in self.listeners:
+            on_change(info.name, True)
 
     def remove(self, name: str) -> None:
         del self.records[name]
-        for heard in self.listeners:
-            heard(name, False)
+        for on_change in self.listeners:
+            on_change(name, False)
 
 
 class _Speaker:
@@ -84,9 +84,9 @@ class _Speaker:
 
 
 class _Listener:
-    def __init__(self, network: MemoryNetwork, heard: Heard) -> None:
+    def __init__(self, network: MemoryNetwork, on_change: ChangeHandler) -> None:
         self._network = network
-        self._heard = heard
+        self._heard = on_change
 
     async def resolve(self, instance: str) -> Announcement | None:
         await asyncio.sleep(0)
@@ -102,20 +102,18 @@ class _Listener:
 class MemoryProcess:
     """Stands where the process of an announcer does: its code on this loop, its pipes in memory."""
 
-    def __init__(self, network: MemoryNetwork) -> None:
+    def __init__(self, network: MemoryNetwork, bound: list[str]) -> None:
         self.stdin = _Pipe()
         self.stdout = asyncio.StreamReader()
-        self._task = asyncio.ensure_future(self._run(network))
+        self._task = asyncio.ensure_future(self._run(network, bound))
 
-    async def _run(self, network: MemoryNetwork) -> None:
-        def say(kind: str, sentence: str) -> None:
-            self.stdout.feed_data(f'{{"{kind}": "{sentence}"}}\n'.encode())
+    async def _run(self, network: MemoryNetwork, bound: list[str]) -> None:
+        def report(sentence: str) -> None:
+            self.stdout.feed_data(f'"{sentence}"\n'.encode())
 
-        def announce(machine: Announcement, bound: list[str]) -> Announcing:
-            return Announcing(machine, bound, say, find_places=network.find_places, open_dns=network.open_dns)
-
+        announcer = Announcer(bound, report, find_addresses=network.find_addresses, open_dns=network.open_dns)
         try:
-            await follow(lines_of(self.stdin.reader), announce)
+            await follow(self.stdin.reader, announcer)
         finally:
             self.stdout.feed_eof()
 

@@ -11,7 +11,7 @@ import socket
 import sys
 
 from coordinator.ipc.discovery.announcement import Announcement
-from coordinator.ipc.discovery.announcer import Announcer
+from coordinator.ipc.discovery.announcer_process import AnnouncerProcess
 from coordinator.ipc.discovery.browser import Browser
 
 _MACHINE = Announcement(
@@ -36,9 +36,9 @@ def main() -> None:
 
 
 async def _announce() -> None:
-    announcer = Announcer(_MACHINE, ["127.0.0.1"], lambda _: None)
+    announcer = AnnouncerProcess(_MACHINE, ["127.0.0.1"], lambda _: None)
     announcer.start()
-    announcer.state("ready")
+    announcer.set_state("ready")
     await asyncio.Event().wait()
 
 
@@ -47,7 +47,7 @@ async def _browse(child: int) -> None:
         while [each.state for each in browser.machines] != ["ready"]:
             await browser.change()
         _send_noise()
-        os.kill(child, signal.SIGKILL)  # its announcer's process sees that, and says good-bye
+        os.kill(child, signal.SIGKILL)  # its announcer sees that, and withdraws the announcement
         while browser.machines:
             await browser.change()
 

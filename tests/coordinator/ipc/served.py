@@ -47,8 +47,8 @@ class Served:
 
     async def server_has(self, entering: int) -> None:
         """Wait until so many connections are on their way in."""
-        assert self.server._door is not None
-        while len(self.server._door._entering) != entering:  # noqa: ASYNC110 (it tells nobody)
+        assert self.server._listener is not None
+        while self.server._listener.entering != entering:  # noqa: ASYNC110 (it tells nobody)
             await asyncio.sleep(0.01)
 
     async def script(self, **hello: Any) -> "Script":

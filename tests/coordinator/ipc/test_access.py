@@ -1,4 +1,4 @@
-"""Who gets in at the server's doors, and what each may do."""
+"""Who gets into the server, on each way, and what each may do."""
 
 import asyncio
 import json
@@ -51,7 +51,7 @@ def test_a_dead_socket_is_replaced_a_live_one_and_a_file_are_not(tmp_path: Path)
         await third.close()
         dead.write_text("precious")
         fourth = IpcServer(registry_of(served), served.state, IpcSettings(unix_path=dead))
-        with pytest.raises(CanductorError, match="no socket"):
+        with pytest.raises(CanductorError, match="not a socket"):
             await fourth.start()
         assert dead.read_text() == "precious"
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from coordinator.ipc.server.server import TOKENS_LOOK_S
+from coordinator.ipc.server.server import TOKENS_CHECK_S
 from coordinator.ipc.server.settings import TcpSettings
 from tests.coordinator.ipc.served import Script, Served, serving
 from tests.stages import jump_loop
@@ -27,7 +27,7 @@ async def hello(served: Served, token: str) -> tuple[Script, dict[str, Any]]:
 
 
 async def notice(served: Served) -> str:
-    async with asyncio.timeout(2 * TOKENS_LOOK_S):
+    async with asyncio.timeout(2 * TOKENS_CHECK_S):
         return await served.notices.get()
 
 
@@ -44,7 +44,7 @@ def test_tokens_come_and_go_without_a_restart(tmp_path: Path) -> None:
             write(tokens, f"watch tablet {NEW}\nadmin desk {THIRD}\n")
             assert "read again" in await notice(served)
             (end,) = await phone.rest()
-            assert end == {"error": {"code": "bad_token", "message": "the token was taken away"}}
+            assert end == {"error": {"code": "bad_token", "message": "the token was revoked"}}
             assert (await hello(served, OLD))[1]["error"]["code"] == "bad_token"
             tablet, said = await hello(served, NEW)
             assert said["result"]["scope"] == "watch"
@@ -80,7 +80,7 @@ def test_while_the_file_cannot_be_read_nobody_new_comes_in(
                 write(tokens, text, mode)
             told = await notice(served)
             assert sentence in told
-            assert "until then no token lets anybody in" in told
+            assert "until then no token is accepted" in told
             for _ in range(8):  # which is no fault of theirs: nobody is shut out for it
                 assert (await hello(served, OLD))[1]["error"]["code"] == "bad_token"
             assert "result" in await phone.ask("machine.info")  # who is in may go on

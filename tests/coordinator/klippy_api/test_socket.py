@@ -71,7 +71,7 @@ def test_a_path_that_cannot_be_served(tmp_path: Path) -> None:
     path.write_text("mine")
 
     async def main() -> None:
-        with pytest.raises(CanductorError, match="is there and no socket"):
+        with pytest.raises(CanductorError, match="exists and is not a socket"):
             await _gateway([]).start(path)
 
     run(main())

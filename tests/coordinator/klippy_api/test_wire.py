@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coordinator.klippy_api.client import Client
-from coordinator.klippy_api.params import RequestError, template_of, text_of, wishes_of
-from coordinator.klippy_api.subscription import Status, Subscription, pick
+from coordinator.klippy_api.params import RequestError, objects_param, template_param, text_param
+from coordinator.klippy_api.subscription import Status, Subscription, select_fields
 from coordinator.klippy_api.wire import (
     MESSAGE_BYTES_MAX,
     Framer,
     Request,
-    TooLong,
-    Unreadable,
+    TooLongError,
+    UnreadableError,
     encode,
     read_request,
     result_message,
@@ -38,14 +38,14 @@ def test_a_message_may_have_so_many_bytes_and_no_more() -> None:
     body = b"x" * MESSAGE_BYTES_MAX
     assert Framer().feed(body + b"\x03") == [body]
     for too_long in (body + b"x", body + b"x\x03"):
-        with pytest.raises(TooLong):
+        with pytest.raises(TooLongError):
             Framer().feed(too_long)
 
 
 @given(st.binary(max_size=200))
 @settings(max_examples=examples(60))
 def test_garbage_is_a_call_or_is_dropped(body: bytes) -> None:
-    with contextlib.suppress(Unreadable):
+    with contextlib.suppress(UnreadableError):
         assert isinstance(read_request(body).method, str)
 
 
@@ -67,7 +67,7 @@ def test_garbage_is_a_call_or_is_dropped(body: bytes) -> None:
     ],
 )
 def test_what_is_no_call_is_dropped(body: bytes) -> None:
-    with pytest.raises(Unreadable):
+    with pytest.raises(UnreadableError):
         read_request(body)
 
 
@@ -100,20 +100,20 @@ def test_parameters() -> None:
         "gcode/script", {"script": 3, "objects": {"a": None, "b": ["c"]}, "response_template": {}}
     )
     with pytest.raises(RequestError, match="'script' must be a text"):
-        text_of(request, "script")
+        text_param(request, "script")
     with pytest.raises(RequestError, match="'remote_method' is missing"):
-        text_of(request, "remote_method")
-    assert wishes_of(request) == {"a": None, "b": ["c"]}
-    assert template_of(request) == {}
+        text_param(request, "remote_method")
+    assert objects_param(request) == {"a": None, "b": ["c"]}
+    assert template_param(request) == {}
     wrong: list[object] = [[], "a", {"a": 3}, {"a": [3]}, {"a": {}}, None]
     for objects in wrong:
         with pytest.raises(RequestError):
-            wishes_of(Request("objects/query", {"objects": objects}))
+            objects_param(Request("objects/query", {"objects": objects}))
 
 
 def test_a_subscription_tells_whole_fields_that_changed() -> None:
     status: Status = {"fan": {"speed": 0.0, "rpm": None}, "toolhead": {"position": [0, 0, 0, 0]}}
-    assert pick({"fan": ["speed", "colour"], "none": None}, status) == {
+    assert select_fields({"fan": ["speed", "colour"], "none": None}, status) == {
         "fan": {"speed": 0.0, "colour": None},
         "none": {},
     }

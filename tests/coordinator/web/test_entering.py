@@ -14,8 +14,8 @@ import pytest
 from yarl import URL
 
 from coordinator.ipc.protocol.methods import Scope
-from coordinator.ipc.server.auth import FAILURES_MAX, SHUT_OUT_S
-from coordinator.ipc.server.server import TOKENS_LOOK_S
+from coordinator.ipc.server.auth import FAILURES_MAX, LOCKOUT_S
+from coordinator.ipc.server.server import TOKENS_CHECK_S
 from coordinator.web.access import LINK_S
 from coordinator.web.methods import add_page_methods
 from coordinator.web.names import is_known_host, is_own_origin
@@ -340,7 +340,7 @@ def test_a_disk_that_takes_nothing_keeps_nobody_out(tmp_path: Path) -> None:
 
 def test_the_owner_makes_links_and_signs_all_out(tmp_path: Path) -> None:
     async def go(paged: Paged) -> None:
-        add_page_methods(paged.served.server._common.registry, paged.page)
+        add_page_methods(paged.served.server._context.registry, paged.page)
         owner = await paged.served.script()
         operator = await paged.served.script(scope="operate")
         for method in ("page.link", "page.sign_out"):
@@ -393,11 +393,11 @@ def test_a_token_that_is_taken_away_ends_its_sessions(tmp_path: Path) -> None:
         async with paged.socket() as page:
             assert "result" in await paged.hello(page)
             tokens_file(tmp_path).write_text(f"watch somebody {'w' * 32}\n")
-            await asyncio.sleep(2 * TOKENS_LOOK_S)
-            assert json.loads((await page.receive()).data)["error"]["message"] == "the token was taken away"
+            await asyncio.sleep(2 * TOKENS_CHECK_S)
+            assert json.loads((await page.receive()).data)["error"]["message"] == "the token was revoked"
             assert await status_of_socket(paged) == 401
             tokens_file(tmp_path)
-            await asyncio.sleep(2 * TOKENS_LOOK_S)
+            await asyncio.sleep(2 * TOKENS_CHECK_S)
             assert await paged.session_status() == 204, "it is good again"
 
     run(tmp_path, go, tokens=tokens_file(tmp_path))
@@ -413,7 +413,7 @@ def test_who_guesses_tokens_is_shut_out_but_not_the_owner(tmp_path: Path) -> Non
             async with owner.socket() as page:
                 assert "result" in await owner.hello(page)
                 assert "result" in await ask(page, "machine.emergency_stop", 2)
-        await asyncio.sleep(SHUT_OUT_S + 1)
+        await asyncio.sleep(LOCKOUT_S + 1)
         assert (await paged.log_in(TOKENS[Scope.ADMIN]))[0] == 200
 
     run(tmp_path, go, tokens=tokens_file(tmp_path))

@@ -51,7 +51,7 @@ def machine(folder: Path, **settings: Any) -> Iterator[Served]:
     @contextlib.asynccontextmanager
     async def serve() -> AsyncIterator[Served]:
         async with serving(folder / "canductor", **settings) as served:
-            registry = served.server._common.registry
+            registry = served.server._context.registry
             registry.add(upload_method(jobs))
             file = Param("file", Kind.STR)
             registry.add(
@@ -86,7 +86,7 @@ def test_links_to_the_page(tmp_path: Path, canductor: Command) -> None:
             status, _, err = canductor(*words)
             assert (status, err) == (1, "canductor: the machine serves no live page; start it with --web\n")
         page = StandInPage()
-        add_page_methods(served.server._common.registry, cast("WebServer", page))
+        add_page_methods(served.server._context.registry, cast("WebServer", page))
         status, out, _ = canductor("page", "--watch")
         assert (status, out) == (0, f"{LINK}\nOpen it in a browser within 10 minutes; it works once.\n")
         assert canductor("page")[0] == 0
@@ -193,8 +193,8 @@ def test_a_token_that_others_can_read_is_not_used(tmp_path: Path, canductor: Com
             assert (status, err) == (1, f"canductor: the token's file {token} {sentence}\n")
         status, _, err = canductor(*words[:3])
         assert (status, len(served.stops)) == (1, 1)
-        assert f"{words[2]} wants a token; name the file that holds it with --token-file" in err
-        assert not served.server._brake._failures  # nothing that is no token was sent as one
+        assert f"{words[2]} needs a token; give the file that holds it with --token-file" in err
+        assert not served.server._throttle._failures  # nothing that is no token was sent as one
 
 
 def test_watch(tmp_path: Path, canductor: Command) -> None:
@@ -239,7 +239,7 @@ def test_send(tmp_path: Path, canductor: Command) -> None:
         assert json.loads(out)["result"] == {"file": "part.gcode"}
         assert (tmp_path / "jobs" / "part.gcode").read_text() == text
         status, _, err = canductor("send", str(part))
-        assert "is there already" in err
+        assert "exists already" in err
         assert (canductor("send", str(part), "--replace", "--no-start"))[0] == 0
         for name in ("../evil.gcode", ".hidden.gcode", "-x.gcode", "part.cfg", "a/b.gcode", "a\nb.gcode"):
             _, _, err = canductor("send", str(part), "--name=" + name)
@@ -267,7 +267,7 @@ def test_an_upload_follows_no_link_and_keeps_its_order(tmp_path: Path) -> None:
                 return str(error)
 
         assert "cannot be written" in await upload(file="a.gcode", offset=0, text="x", done=True)
-        assert "is there already" in await upload(file="b.gcode", offset=0, text="x", done=True)
+        assert "exists already" in await upload(file="b.gcode", offset=0, text="x", done=True)
         await upload(file="b.gcode", offset=0, text="new", done=True, replace=True)
         assert not (jobs / "b.gcode").is_symlink()
         assert "has 0 bytes so far" in await upload(file="c.gcode", offset=5, text="x")

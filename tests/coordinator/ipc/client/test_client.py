@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.client.client import Client, ConnectionLost, Refused
-from coordinator.ipc.client.connect_errors import why_no_answer
+from coordinator.ipc.client.connect_errors import connect_error_sentence
 from coordinator.ipc.protocol.address import read_address
 from coordinator.ipc.protocol.messages import Encoding
 from coordinator.ipc.protocol.methods import ApiError, Scope
@@ -78,7 +78,7 @@ def test_a_gap_is_noticed_and_filled_with_a_snapshot(tmp_path: Path) -> None:
             await anext(updates)
             (connection,) = served.server._connections
             (subscription,) = connection.session.subscriptions.values()
-            subscription._told += 1  # as if a message had got lost
+            subscription._sent += 1  # as if a message had got lost
             served.state.set("b", 2)
             healed = await anext(updates)
             assert healed.snapshot
@@ -112,7 +112,7 @@ def test_it_comes_back_and_goes_on_watching(tmp_path: Path) -> None:
             lost = asyncio.create_task(client.call("wait"))
             await client.call("machine.info")
             await served.server.close()
-            with pytest.raises(ConnectionLost, match="server ends"):
+            with pytest.raises(ConnectionLost, match="server is closing"):
                 await lost
             served.state.set("a", 2)
             again = IpcServer(registry_of(served), served.state, served.settings)
@@ -161,7 +161,7 @@ def test_addresses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert str(read_address("tls://printer.local:7130")) == "tls://printer.local:7130"
     assert read_address("unix:/a/b").path == Path("/a/b")
     for bad in ("http://x:1", "tcp://x", "tcp://:1", "tcp://x:99999", "tcp://[x:1"):
-        with pytest.raises(CanductorError, match="is no address"):
+        with pytest.raises(CanductorError, match="is not an address"):
             read_address(bad)
     with pytest.raises(CanductorError, match="no machine runs here"):
         read_address(None)
@@ -205,24 +205,24 @@ def test_who_may_have_taken_the_wrong_address_or_certificate_is_told(
     async def with_tls(served: Served) -> None:
         port = served.server.tcp_port
         tls_at, plain_at = f"tls://127.0.0.1:{port}", f"tcp://127.0.0.1:{port}"
-        assert f"before it said a word; a port with TLS is named {tls_at}" in await refusal(plain_at, token)
+        assert f"before it sent anything; with TLS its address is {tls_at}" in await refusal(plain_at, token)
         for trusted in (None, other):
-            told = await refusal(tls_at, token, trusted)
-            assert told.startswith(
+            answer = await refusal(tls_at, token, trusted)
+            assert answer.startswith(
                 f"the certificate of {tls_at} cannot be trusted: self-signed certificate; "
             )
-            assert told.endswith("name the one that it must have with --certificate PEM")
-        told = await refusal(f"tls://localhost:{port}", token, pem)
-        assert "is not valid for 'localhost'; call it by a name that is in its certificate" in told
+            assert answer.endswith("give the certificate that it must have with --certificate PEM")
+        answer = await refusal(f"tls://localhost:{port}", token, pem)
+        assert "is not valid for 'localhost'; use a name that is in its certificate" in answer
         assert await refusal(tls_at, None, pem) == (
-            f"{tls_at} wants a token; name the file that holds it with --token-file (programs: token)"
+            f"{tls_at} needs a token; give the file that holds it with --token-file (programs: token)"
         )
 
     async def without(served: Served) -> None:
         port = served.server.tcp_port
         tls_at, plain_at = f"tls://127.0.0.1:{port}", f"tcp://127.0.0.1:{port}"
-        told = await refusal(tls_at, token, pem)
-        assert told == f"{tls_at} does not speak TLS; a port without TLS is named {plain_at}"
+        answer = await refusal(tls_at, token, pem)
+        assert answer == f"{tls_at} does not use TLS; without TLS its address is {plain_at}"
         await served.server.close()
         assert (
             await refusal(plain_at, token) == f"{plain_at} does not answer: no program listens at this port"
@@ -235,7 +235,7 @@ def test_who_may_have_taken_the_wrong_address_or_certificate_is_told(
 def test_a_certificate_of_yesterday_is_called_so() -> None:
     error = ssl.SSLCertVerificationError(1, "certificate verify failed")
     error.verify_code, error.verify_message = 10, "certificate has expired"
-    assert why_no_answer(read_address("tls://printer.local:7130"), error) == (
+    assert connect_error_sentence(read_address("tls://printer.local:7130"), error) == (
         "the certificate of tls://printer.local:7130 cannot be trusted: certificate has expired; "
-        "check the clocks of both computers, and make a new one if they are right"
+        "check the clocks of both computers, and renew the certificate if they are right"
     )

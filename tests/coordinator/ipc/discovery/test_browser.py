@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from zeroconf import ServiceInfo
 
 from coordinator.cli.commands.discover import Found, find_machines
-from coordinator.ipc.discovery.announce_process import RESCAN_S, UPDATE_SPACING_S, Announcing
 from coordinator.ipc.discovery.announcement import ADDRESSES_MAX, SERVICE_TYPE, Announcement, usable_addresses
-from coordinator.ipc.discovery.announcer import RESTART_S, Announcer
+from coordinator.ipc.discovery.announcer import RESCAN_S, UPDATE_SPACING_S, Announcer
+from coordinator.ipc.discovery.announcer_process import RESTART_S, AnnouncerProcess
 from coordinator.ipc.discovery.browser import INSTANCES_MAX, Browser
-from coordinator.ipc.discovery.multicast import Place, reached_at, spoken_on
+from coordinator.ipc.discovery.multicast import InterfaceAddress, mdns_addresses, reachable_addresses
 from tests.coordinator.ipc.memory_network import MemoryNetwork, MemoryProcess
 from tests.coordinator.ipc.served import serving
 from tests.profiles import examples
@@ -110,7 +110,7 @@ def test_reading_is_total(txt: dict[str, bytes | None], port: int | None, addres
 
 
 HERE = tuple(
-    Place(ip_address(text), interface)
+    InterfaceAddress(ip_address(text), interface)
     for text, interface in (("127.0.0.1", 1), ("10.0.0.2", 2), ("10.0.1.2", 3), ("::1", 1), ("fd00::2", 2))
 )
 
@@ -130,9 +130,9 @@ HERE = tuple(
 def test_it_is_announced_where_its_sockets_are_reached(
     bound: list[str], reached: list[str], spoken: list[str]
 ) -> None:
-    places = reached_at(bound, HERE)
-    assert [str(place.address) for place in places] == reached
-    assert list(spoken_on(places, HERE)) == spoken
+    found = reachable_addresses(bound, HERE)
+    assert [str(each.address) for each in found] == reached
+    assert list(mdns_addresses(found, HERE)) == spoken
 
 
 # -------------------------------------------------------------------------------------------- announcing
@@ -142,15 +142,19 @@ class Announced:
     """A machine that is announced in virtual time, without a process."""
 
     def __init__(self, network: MemoryNetwork, one: Announcement, bound: str = "127.0.0.1") -> None:
-        self.said: list[tuple[str, str]] = []
-        self.announcing = Announcing(
-            dataclasses.replace(one, addresses=()),
+        self.said: list[str] = []
+        self._machine = dataclasses.replace(one, addresses=())
+        self._announcer = Announcer(
             [bound],
-            lambda *words: self.said.append(words),
-            find_places=network.find_places,
+            self.said.append,
+            find_addresses=network.find_addresses,
             open_dns=network.open_dns,
         )
-        self._task = asyncio.ensure_future(self.announcing.run())
+        self._announcer.announce(self._machine)
+        self._task = asyncio.ensure_future(self._announcer.run())
+
+    def set_state(self, state: str, change: int) -> None:
+        self._announcer.announce(dataclasses.replace(self._machine, state=state, change=change))
 
     async def end(self) -> None:
         self._task.cancel()
@@ -171,9 +175,9 @@ def test_machines_come_change_and_go() -> None:
             first, second = Announced(network, one), Announced(network, other)
             await asyncio.sleep(UPDATE_SPACING_S)
             assert seen(browser) == [one, other], "of one name, and apart"
-            assert first.said == [("announced", "announced as same-11111111: tcp://127.0.0.1:7125")]
+            assert first.said == ["announced as same-11111111: tcp://127.0.0.1:7125"]
             for change, state in enumerate(("ready", "printing", "shutdown"), 1):
-                first.announcing.state(state, change)
+                first.set_state(state, change)
             await asyncio.sleep(UPDATE_SPACING_S)
             assert seen(browser) == [dataclasses.replace(one, state="shutdown"), other]
             await second.end()
@@ -194,7 +198,7 @@ def test_states_that_follow_fast_are_merged() -> None:
         network = MemoryNetwork()
         announced = Announced(network, machine("mini"))
         for change in range(1, 100):
-            announced.announcing.state("ready" if change % 2 else "printing", change)
+            announced.set_state("ready" if change % 2 else "printing", change)
             await asyncio.sleep(0.1)
         await asyncio.sleep(2 * UPDATE_SPACING_S)
         spacing_s = [b - a for a, b in zip(network.sent_s, network.sent_s[1:], strict=False)]
@@ -210,21 +214,21 @@ def test_states_that_follow_fast_are_merged() -> None:
 def test_an_announcer_waits_for_a_network_and_follows_it() -> None:
     async def main() -> None:
         network = MemoryNetwork()
-        network.places = (Place(ip_address("127.0.0.1"), 1),)
+        network.addresses = (InterfaceAddress(ip_address("127.0.0.1"), 1),)
         announced = Announced(network, machine("mini", tls=True), EVERYWHERE)
         await asyncio.sleep(3 * RESCAN_S)
-        waits = "there is no network to announce the machine on; it will be when there is"
-        assert announced.said == [("failed", waits)], "once"
-        network.places += (Place(ip_address("10.0.0.7"), 2),)
+        waits = "there is no network to announce the machine on; it will be announced when there is one"
+        assert announced.said == [waits], "once"
+        network.addresses += (InterfaceAddress(ip_address("10.0.0.7"), 2),)
         network.problem = "the port is taken"
         await asyncio.sleep(RESCAN_S + UPDATE_SPACING_S)
-        assert announced.said[1:] == [("failed", "the port is taken")]
+        assert announced.said[1:] == ["the port is taken"]
         network.problem = ""
-        announced.announcing.state("printing", 1)
+        announced.set_state("printing", 1)
         await asyncio.sleep(RESCAN_S + UPDATE_SPACING_S)
-        assert announced.said[2:] == [("announced", announced.said[2][1])]
-        assert announced.said[2][1].endswith(": tls://10.0.0.7:7125")
-        network.places = (Place(ip_address("10.0.9.9"), 2),)
+        assert len(announced.said) == 3
+        assert announced.said[2].endswith(": tls://10.0.0.7:7125")
+        network.addresses = (InterfaceAddress(ip_address("10.0.9.9"), 2),)
         await asyncio.sleep(RESCAN_S + UPDATE_SPACING_S)
         async with Browser(network.listen) as browser:
             await asyncio.sleep(1)
@@ -243,20 +247,20 @@ def test_a_process_that_ends_is_begun_again_with_the_state_of_now() -> None:
     async def main() -> None:
         network, said, processes = MemoryNetwork(), list[str](), list[MemoryProcess]()
 
-        async def launch() -> "Process":
+        async def launch(bound: list[str]) -> "Process":
             if len(processes) == 1 and len(said) == 2:
                 raise PermissionError(13, "Permission denied")
-            processes.append(MemoryProcess(network))
+            processes.append(MemoryProcess(network, bound))
             return cast("Process", processes[-1])
 
-        announcer = Announcer(one, ["127.0.0.1"], said.append, launch=launch)
+        announcer = AnnouncerProcess(one, ["127.0.0.1"], said.append, launch=launch)
         announcer.start()
-        announcer.state("ready")
+        announcer.set_state("ready")
         async with Browser(network.listen) as browser:
             await asyncio.sleep(2 * UPDATE_SPACING_S)
             assert [each.state for each in browser.machines] == ["ready"]
             processes[0].kill()
-            announcer.state("printing")
+            announcer.set_state("printing")
             await asyncio.sleep(RESTART_S / 2)
             assert browser.machines == []
             await asyncio.sleep(RESTART_S / 2 + UPDATE_SPACING_S)
@@ -267,7 +271,7 @@ def test_a_process_that_ends_is_begun_again_with_the_state_of_now() -> None:
             assert browser.machines == []
         assert [words.split(":")[0] for words in said] == [
             f"announced as mini-{one.id[:8]}",
-            f"announcing the machine ended; it begins again in {RESTART_S:g} s",
+            f"announcing the machine ended; it starts again in {RESTART_S:g} s",
             "the machine cannot be announced",
             f"announced as mini-{one.id[:8]}",
         ]
@@ -310,11 +314,11 @@ def test_more_announcements_than_anybody_has_are_counted_only() -> None:
     async def main() -> None:
         network = MemoryNetwork()
         async with Browser(network.listen) as browser:
-            (heard,) = network.listeners
+            (on_change,) = network.listeners
             for n in range(2 * INSTANCES_MAX + 50):
-                heard(f"flood-{n}.{SERVICE_TYPE}", True)
+                on_change(f"flood-{n}.{SERVICE_TYPE}", True)
             assert browser.skipped == 2 * INSTANCES_MAX
-            assert len(browser._asking) <= INSTANCES_MAX
+            assert len(browser._resolving) <= INSTANCES_MAX
 
     jump_loop.run(main())
 
@@ -328,7 +332,7 @@ def test_sockets_and_announcements_in_one_table(tmp_path: Path, monkeypatch: pyt
     async def main() -> None:
         network = MemoryNetwork()
         async with serving(folder) as served:
-            info = served.server._common.registry.methods["machine.info"]
+            info = served.server._context.registry.methods["machine.info"]
             told = {"name": "here", "state": "ready", "host": "box", "version": "0.1.0", "id": here.id}
             object.__setattr__(info, "call", lambda _caller, _params: told)
             with socket.socket(socket.AF_UNIX) as nobody:

@@ -54,7 +54,7 @@ def test_msgpack_makes_no_more_lists_and_maps_than_may_be(container: bytes) -> N
     # What comes behind is not even looked at: these bytes are no msgpack.
     with pytest.raises(RejectedError, match="more than 100 items"):
         decode_msgpack(b"\xdc\x0f\xa0" + container * 102 + b"\xc1", limits)
-    with pytest.raises(RejectedError, match="is no msgpack"):
+    with pytest.raises(RejectedError, match="is not valid msgpack"):
         decode_msgpack(b"\xdc\x0f\xa0" + container * 99 + b"\xc1", limits)
 
 
@@ -100,11 +100,11 @@ def test_what_stands_in_a_string_counts_for_nothing() -> None:
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        (b'{"a":NaN}', "NaN is no number of JSON; numbers are finite"),
-        (b'{"a":-Infinity}', "-Infinity is no number of JSON; numbers are finite"),
+        (b'{"a":NaN}', "NaN is not a JSON number; numbers are finite"),
+        (b'{"a":-Infinity}', "-Infinity is not a JSON number; numbers are finite"),
         (b'{"a":' + b"9" * 5_000 + b"}", "a whole number has too many digits"),
-        (b'{"a":"\xff"}', "a message has text that is no UTF-8"),
-        (b'{"a":1,}', "a message is no JSON: "),
+        (b'{"a":"\xff"}', "a message has text that is not UTF-8"),
+        (b'{"a":1,}', "a message is not valid JSON: "),
         (b'{"a":[' + b"1," * 4_096 + b"1]}", "a list or map has more than 4,096 items"),
     ],
 )

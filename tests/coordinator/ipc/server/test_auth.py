@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.ipc.protocol.methods import Scope
-from coordinator.ipc.server.auth import ADDRESSES_MAX, FAILURES_MAX, SHUT_OUT_S, FailureBrake, Grant, Tokens
+from coordinator.ipc.server.auth import ADDRESSES_MAX, FAILURES_MAX, LOCKOUT_S, Grant, LoginThrottle, Tokens
 from nodes.support.errors import CanductorError
 
 TOKEN = "a" * 31 + "b"
@@ -29,7 +29,7 @@ def test_tokens(tmp_path: Path) -> None:
         ("operate phone", "line 1: must be SCOPE NAME TOKEN"),
         (f"\nking phone {TOKEN}", "line 2: must be SCOPE NAME TOKEN"),
         ("watch a short", "fewer than 32"),
-        (f"watch a {TOKEN}\nadmin b {TOKEN}", "line 2: the token is there twice"),
+        (f"watch a {TOKEN}\nadmin b {TOKEN}", "line 2: the token occurs twice"),
     ],
 )
 def test_lines_that_are_none(tmp_path: Path, text: str, sentence: str) -> None:
@@ -39,25 +39,25 @@ def test_lines_that_are_none(tmp_path: Path, text: str, sentence: str) -> None:
 
 
 def test_the_brake() -> None:
-    brake = FailureBrake()
+    brake = LoginThrottle()
     for n in range(FAILURES_MAX):
-        assert brake.shut_out_s("10.0.0.1", float(n)) == 0
+        assert brake.lockout_s("10.0.0.1", float(n)) == 0
         brake.failed("10.0.0.1", float(n))
     last_s = FAILURES_MAX - 1.0
-    assert brake.shut_out_s("10.0.0.1", last_s + 1) == SHUT_OUT_S - 1
-    assert brake.shut_out_s("::ffff:10.0.0.1", last_s + 1) == SHUT_OUT_S - 1
-    assert brake.shut_out_s("10.0.0.2", last_s) == 0
-    assert brake.shut_out_s("10.0.0.1", last_s + SHUT_OUT_S) == 0
-    brake.failed("10.0.0.1", last_s + SHUT_OUT_S + 1)  # counts from one again
-    assert brake.shut_out_s("10.0.0.1", last_s + SHUT_OUT_S + 1) == 0
+    assert brake.lockout_s("10.0.0.1", last_s + 1) == LOCKOUT_S - 1
+    assert brake.lockout_s("::ffff:10.0.0.1", last_s + 1) == LOCKOUT_S - 1
+    assert brake.lockout_s("10.0.0.2", last_s) == 0
+    assert brake.lockout_s("10.0.0.1", last_s + LOCKOUT_S) == 0
+    brake.failed("10.0.0.1", last_s + LOCKOUT_S + 1)  # counts from one again
+    assert brake.lockout_s("10.0.0.1", last_s + LOCKOUT_S + 1) == 0
 
 
 def test_the_brake_takes_a_network_for_one() -> None:
-    brake = FailureBrake()
+    brake = LoginThrottle()
     for n in range(FAILURES_MAX):
         brake.failed(f"2001:db8::{n}", 0.0)
-    assert brake.shut_out_s("2001:db8::ffff", 0.0) > 0
-    assert brake.shut_out_s("2001:db8:0:1::", 0.0) == 0
+    assert brake.lockout_s("2001:db8::ffff", 0.0) > 0
+    assert brake.lockout_s("2001:db8:0:1::", 0.0) == 0
     for n in range(2 * ADDRESSES_MAX):
         brake.failed(f"10.0.{n >> 8}.{n & 255}", 1.0)
     assert len(brake._failures) <= ADDRESSES_MAX

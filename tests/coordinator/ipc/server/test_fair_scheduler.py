@@ -2,7 +2,7 @@
 
 import asyncio
 
-from coordinator.ipc.server.fair_scheduler import ROUND_S, TURN_S, Turns
+from coordinator.ipc.server.fair_scheduler import ROUND_S, TURN_S, FairScheduler
 
 TURNS_IN_A_ROUND = round(ROUND_S / TURN_S)
 
@@ -32,7 +32,7 @@ class Client:
         self.turns -= 1
         return self.turns > 0
 
-    def hold(self) -> None:
+    def pause(self) -> None:
         self.held += 1
 
 
@@ -50,11 +50,11 @@ async def rounds(worked: list[str]) -> list[list[str]]:
 def test_a_round_is_bounded_and_turns_are_fair() -> None:
     async def body() -> None:
         clock, worked = Clock(), list[str]()
-        turns = Turns(clock)
+        scheduler = FairScheduler(clock)
         clients = [Client(name, 3, clock, worked) for name in "abcdefgh"]
         for client in clients:
-            turns.ask(client)
-            turns.ask(client)  # twice is once
+            scheduler.request_turn(client)
+            scheduler.request_turn(client)  # twice is once
         found = await rounds(worked)
         # The first one has more to do than a turn, so all others wait behind it.
         assert list(map("".join, found)) == ["a", "abcd", "efgh", "abcd", "efgh", "bcde", "fgh"]
@@ -67,15 +67,15 @@ def test_a_round_is_bounded_and_turns_are_fair() -> None:
 def test_who_asks_little_is_served_at_once_until_the_round_is_spent() -> None:
     async def body() -> None:
         clock, worked = Clock(), list[str]()
-        turns = Turns(clock)
+        scheduler = FairScheduler(clock)
         clients = [Client(str(number), 1, clock, worked) for number in range(2 * TURNS_IN_A_ROUND)]
         for client in clients:
-            turns.ask(client)
+            scheduler.request_turn(client)
         assert len(worked) == TURNS_IN_A_ROUND
-        turns.leave(clients[-1])
+        scheduler.remove(clients[-1])
         found = await rounds(worked)
         assert found[1:] == [[client.name for client in clients[TURNS_IN_A_ROUND:-1]]]
-        turns.ask(clients[0])  # a new round: at once again
+        scheduler.request_turn(clients[0])  # a new round: at once again
         assert worked[-1] == "0"
 
     asyncio.run(body())

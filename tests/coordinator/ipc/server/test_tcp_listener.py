@@ -14,7 +14,7 @@ import pytest
 from coordinator.ipc.client.client import Client
 from coordinator.ipc.protocol.methods import Scope
 from coordinator.ipc.server.settings import TcpSettings
-from coordinator.ipc.server.tcp_listener import FILES_MAX, HANDSHAKE_S, Door, raise_files_limit
+from coordinator.ipc.server.tcp_listener import FILES_MAX, HANDSHAKE_S, TcpListener, raise_files_limit
 from tests.coordinator.ipc.served import TOKENS, Served, plain_tcp, run
 from tests.stages import jump_loop
 
@@ -37,12 +37,12 @@ def test_silence_before_tls_takes_no_more_places_than_there_are(
     tmp_path: Path, certificate: tuple[Path, Path]
 ) -> None:
     async def body(served: Served) -> None:
-        assert served.server._door is not None
+        assert served.server._listener is not None
         silent = [await served.dial(tcp=True) for _ in range(6)]
         ends = [asyncio.ensure_future(reader.read()) for reader, _ in silent]
         await asyncio.wait(ends, timeout=HANDSHAKE_S / 10)
         assert not any(end.done() for end in ends[:2]), "two may take their time"
-        assert served.server._door.refused == 4
+        assert served.server._listener.refused == 4
         assert served.server.figures()["refused_connections"] == 4
         assert "result" in await (await served.script()).ask("machine.info"), "the owner gets in"
         silent[0][1].close()
@@ -77,16 +77,16 @@ def test_without_files_left_connections_wait_and_nothing_is_said(
                 come.put_nowait(None)
                 transport.close()
 
-        door = Door(Guest, None)
-        await door.open("127.0.0.1", 0)
+        listener = TcpListener(Guest, None)
+        await listener.open("127.0.0.1", 0)
         await asyncio.sleep(0)  # it listens, and accepts
-        guest = socket.create_connection(door.names[0])
+        guest = socket.create_connection(listener.addresses[0])
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, files_limit[1]))  # what is open stays so
-        while not door.starved:  # noqa: ASYNC110 (it tells nobody)
+        while not listener.starved:  # noqa: ASYNC110 (it tells nobody)
             await asyncio.sleep(0.01)
         resource.setrlimit(resource.RLIMIT_NOFILE, files_limit)
         await come.get()
-        door.close()
+        listener.close()
         guest.close()
 
     with caplog.at_level(logging.ERROR):

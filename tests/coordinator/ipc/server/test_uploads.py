@@ -18,7 +18,7 @@ def run(folder: Path, body: Callable[[Served, Path], Awaitable[None]]) -> None:
         async with serving(folder) as served:
             jobs = folder / "jobs"
             jobs.mkdir(exist_ok=True)
-            served.server._common.registry.add(upload_method(jobs))
+            served.server._context.registry.add(upload_method(jobs))
             await body(served, jobs)
 
     jump_loop.run(main())
@@ -47,7 +47,7 @@ def test_a_file_that_is_not_complete_goes_with_its_client(tmp_path: Path) -> Non
         script.writer.close()
         await until(jobs, ["b.gcode"])
         other = await served.script()
-        assert "begin anew" in (await upload(other, "a.gcode", 4, "x"))["message"]
+        assert "start over" in (await upload(other, "a.gcode", 4, "x"))["message"]
 
     run(tmp_path, body)
 

@@ -1,6 +1,6 @@
 """A WebSocket as the transport of a connection of coordinator.ipc: lines of JSON, text frames on the way.
 
-The connection sees what it sees of a socket: it is told to wait when the browser does not read.
+The connection gets what it gets of a socket: it has to pause when the browser does not read.
 """
 
 import asyncio
@@ -15,8 +15,8 @@ LOW_SHARE: Final = 4
 """Sending goes on when a quarter of the limit is left."""
 
 
-class Pipe(asyncio.Transport):
-    """Sends to SOCKET in ``run``; CONNECTION is told when to wait and when to go on."""
+class WebSocketTransport(asyncio.Transport):
+    """Sends to SOCKET in ``run``; CONNECTION is called to pause and resume writing."""
 
     def __init__(self, socket: "web.WebSocketResponse") -> None:
         super().__init__()
@@ -79,11 +79,11 @@ class Pipe(asyncio.Transport):
             self.connection.pause_writing()
 
     def can_write_eof(self) -> bool:
-        """Tell that a WebSocket cannot be half closed."""
+        """Return that a WebSocket cannot be half closed."""
         return False
 
     def is_closing(self) -> bool:
-        """Tell whether nothing more is taken."""
+        """Return whether nothing more is taken."""
         return self._closing
 
     def close(self) -> None:
@@ -98,7 +98,7 @@ class Pipe(asyncio.Transport):
         self.close()
 
     def pause_reading(self) -> None:
-        """Let the browser wait."""
+        """Stop reading."""
         self._readable.clear()
 
     def resume_reading(self) -> None:
