@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from coordinator.runtime.host import Computer, LinuxHost
 from coordinator.runtime.machine import Machine
 from coordinator.streaming.job_runner import OnProgress, Outcome, run_job
 from coordinator.streaming.pipeline import PlanRecord
-from coordinator.support.command_options import DEMO_GCODE, DemoOptions
+from coordinator.support.examples import DEMO_GCODE, DEMO_MACHINE
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.progress import ProgressDisplay
 from coordinator.verification.exact_program import program_legs
@@ -27,11 +28,24 @@ from coordinator.verification.expected_curved import expected_curved
 from coordinator.verification.heat_proof import HeatProof, HeatWatch, not_steady, prove_heat
 from coordinator.verification.proof import ClockProof, PrimaryClock, StepperProof, prove_clock, prove_stepper
 from coordinator.verification.true_position import PlaceProof, prove_places
-from coordinator.virtual_machine.stage import Stage
+from coordinator.virtual_machine.stage import Stage, VirtualMachineOptions
 from nodes.virtual.firmware import firmware_dictionary
 
 BEFORE_S = 1e-3
 """What moves a stepper so long before the plan begins does not belong to it: that was homing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoOptions(VirtualMachineOptions):
+    """``canductor demo``."""
+
+    machine: Path = DEMO_MACHINE
+    """Configuration file whose nodes are played by virtual ones."""
+    gcode: Path = DEMO_GCODE
+    keep: Path | None = None
+    """Folder that keeps step logs and captures; None: they are removed at the end."""
+    json: bool = False
+    """Show no progress."""
 
 
 def run_demo(options: DemoOptions) -> DemoReport:
@@ -39,7 +53,7 @@ def run_demo(options: DemoOptions) -> DemoReport:
     description = load_machine(str(options.machine))
     with ExitStack() as stack:
         folder = stack.enter_context(_folder(options.keep))
-        program = stack.enter_context(Program.open(options.gcode or DEMO_GCODE))
+        program = stack.enter_context(Program.open(options.gcode))
         stage = stack.enter_context(Stage(description, options, folder))
         display = stack.enter_context(ProgressDisplay(f"printing {program.name}", quiet=options.json))
         return print_and_prove(stage, program, LinuxHost(), display.update)

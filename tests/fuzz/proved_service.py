@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coordinator.assembly.load import load_machine
-from coordinator.demo.run import Prover, report_of
+from coordinator.demo.run import DemoOptions, Prover, report_of
 from coordinator.ipc.protocol.methods import Registry, Scope
 from coordinator.ipc.server.server import IpcServer
 from coordinator.ipc.server.settings import IpcSettings, Limits, TcpSettings
@@ -33,7 +33,7 @@ from coordinator.service.core.motion_lead import MotionLead
 from coordinator.service.state.log_ring import Entry
 from coordinator.streaming.job_runner import Outcome, outcome_of
 from coordinator.streaming.pipeline import PlanRecord
-from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
+from coordinator.support.examples import DEMO_MACHINE
 from coordinator.virtual_machine.stage import Stage
 
 WATCH_TOKEN, ADMIN_TOKEN = "watch" * 8, "admin" * 8

@@ -8,11 +8,10 @@ from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
 
-from coordinator.cli.commands.run import RunReport, run_machine
+from coordinator.cli.commands.run import RunOptions, RunReport, run_machine
 from coordinator.gcode.program import Program
 from coordinator.simulate.scenario import BusSetting, NodeSetting
 from coordinator.streaming.job_runner import Outcome, run_job
-from coordinator.support.command_options import RunOptions
 from tests.stages.machine_stage import MachineStage
 from tests.stages.printer_text import without_endstops
 from tests.stages.served import Served, running

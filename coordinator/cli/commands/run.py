@@ -1,26 +1,68 @@
-"""``canductor run``: brings up a configured machine and prints a file, or what comes on standard input."""
+"""``canductor run``: brings up a machine; serves it, or prints a file or what comes on standard input."""
 
+import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from coordinator.assembly.load import load_machine
+from coordinator.cli.arguments.serving import declare_serving, is_asked_to_serve, serving_options
 from coordinator.config.model import MachineDescription
+from coordinator.front_ends.serve import serve_machine
 from coordinator.gcode.program import Program
 from coordinator.runtime.host import Computer, LinuxHost
 from coordinator.streaming.compensation import kept_compensation
 from coordinator.streaming.job_runner import NodeOutcome, Outcome, run_job
-from coordinator.support.command_options import RunOptions, machine_name
+from coordinator.support.examples import machine_name
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.progress import Progress, ProgressDisplay
+from coordinator.support.report import Report
 from coordinator.tables.store import table_folder
 from nodes.dictionary.cache import DictionaryCache
+from nodes.support.option_values import UsageError, add_command, existing_file, options_from
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOptions:
+    """``canductor run`` of one program."""
+
+    config: Path
+    gcode: Path | None = None
+    """Printed once the machine is ready; None: commands come from standard input."""
+    json: bool = False
+    """Show no progress."""
+
+
+def add_to(commands: Any) -> None:
+    """Add the command."""
+    add_command(commands, "run", "bring up the machine of a configuration file", _declare, _make_job)
+
+
+def _declare(command: argparse.ArgumentParser) -> None:
+    command.add_argument("config", type=existing_file, help="configuration file")
+    command.add_argument(
+        "--gcode", type=existing_file, metavar="FILE", help="print this G-code file and exit"
+    )
+    declare_serving(command)
+
+
+def _make_job(given: argparse.Namespace) -> Callable[[], Report]:
+    asked = is_asked_to_serve(given)
+    if asked and given.gcode is not None:
+        raise UsageError("--gcode prints a file and exits; leave it out to serve front ends")
+    if asked or (given.gcode is None and sys.stdin is not None and sys.stdin.isatty()):
+        serving = serving_options(given, given.config)
+        return lambda: serve_machine(serving)
+    options = options_from(RunOptions, given)
+    return lambda: run_machine(options)
 
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """What became of a job; ``ok`` only when every node counted the steps that it was sent."""
+    """The result of a job; ``ok`` only when every node counted the steps that it was sent."""
 
     gcode: str
     outcome: Outcome

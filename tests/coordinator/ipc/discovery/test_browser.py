@@ -4,8 +4,6 @@ import asyncio
 import dataclasses
 import random
 import socket
-import subprocess
-import sys
 from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -15,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from zeroconf import ServiceInfo
 
-from coordinator.cli.commands.discover import Found, find_machines
 from coordinator.ipc.discovery.announce_process import RESCAN_S, UPDATE_SPACING_S, Announcing
 from coordinator.ipc.discovery.announcement import ADDRESSES_MAX, SERVICE_TYPE, Announcement, usable_addresses
 from coordinator.ipc.discovery.announcer import RESTART_S, Announcer
 from coordinator.ipc.discovery.browser import INSTANCES_MAX, Browser
+from coordinator.ipc.discovery.find import Found, find_machines
 from coordinator.ipc.discovery.multicast import Place, reached_at, spoken_on
 from tests.coordinator.ipc.memory_network import MemoryNetwork, MemoryProcess
 from tests.coordinator.ipc.served import serving
@@ -382,13 +380,3 @@ def test_a_coordinator_that_is_killed_is_seen_to_go() -> None:
     """Real processes, and nonsense on the network meanwhile."""
     code = "from tests.coordinator.ipc import multicast_smoke; multicast_smoke.main()"
     assert on_own_networks(LOOPBACK_UP + code) == "seen to come and to go\n"
-
-
-def test_no_other_command_pays_for_it() -> None:
-    code = (
-        "import sys; from coordinator.cli.main import main; "
-        "main(['plan', '--help']); main(['estop', '--help']); "
-        "import coordinator.cli.commands.front_ends, coordinator.front_ends.serve;"
-        "sys.exit(any(m.split('.')[0] in ('zeroconf', 'ifaddr', 'prometheus_client') for m in sys.modules))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0

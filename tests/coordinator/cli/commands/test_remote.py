@@ -300,11 +300,3 @@ def test_completion_knows_every_command(canductor: Command, shell: str) -> None:
         pytest.skip(f"{shell} is not installed: what was written for it was not run")
     checked = subprocess.run([program, "-n"], input=out, text=True, capture_output=True, check=False)
     assert checked.returncode == 0, checked.stderr
-
-
-def test_planning_does_not_pay_for_the_interface() -> None:
-    code = (
-        "import sys; from coordinator.cli.main import main; main(['plan', '--help']);"
-        "sys.exit(any(m.split('.')[0] in ('msgpack', 'shtab', 'asyncio') or 'ipc' in m for m in sys.modules))"
-    )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
