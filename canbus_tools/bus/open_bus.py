@@ -2,13 +2,12 @@
 
 import argparse
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import can
 
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, parse_int
+from nodes.support.option_values import UsageError, integer
 
 BITRATE_MIN, BITRATE_MAX = 10_000, 1_000_000
 
@@ -39,17 +38,12 @@ class BusOptions:
 def declare_bus(command: argparse.ArgumentParser) -> None:
     """Add the options that say which bus."""
     add = command.add_argument
-    add(
-        "-i",
-        "--interface",
-        default="socketcan",
-        help="backend of python-can (default: %(default)s)",
-    )
+    add("-i", "--interface", default="socketcan", help="backend of python-can (default: %(default)s)")
     add("-c", "--channel", help="channel of the backend (default: can0)")
     add(
         "-b",
         "--bitrate",
-        type=partial(parse_int, low=BITRATE_MIN, high=BITRATE_MAX),
+        type=integer(BITRATE_MIN, BITRATE_MAX),
         metavar="BIT/S",
         help="set the adapter to this bit rate, if the backend can",
     )

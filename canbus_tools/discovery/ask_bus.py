@@ -1,7 +1,6 @@
 """Asking a live bus who is there: drives the census on an open bus, and options common to those who ask."""
 
 import argparse
-from functools import partial
 from typing import Final
 
 from canbus_tools.bus.open_bus import BusOptions
@@ -9,7 +8,7 @@ from canbus_tools.bus.talk import LISTEN_S, BusTalk
 from canbus_tools.discovery.node_discovery import ROUNDS, Census, CensusResult
 from nodes.link import Frame
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import parse_float
+from nodes.support.option_values import decimal
 from nodes.transport.frame import BUS_OFF
 
 _CAUSE_S: Final = 0.2
@@ -64,10 +63,10 @@ def declare_listen(command: argparse.ArgumentParser) -> None:
     """Add the option ``listen``: how long to listen for other hosts, in seconds."""
     command.add_argument(
         "--listen",
-        type=partial(parse_float, low=_LISTEN_MIN_S, high=_LISTEN_MAX_S, unit="s"),
+        type=decimal(_LISTEN_MIN_S, _LISTEN_MAX_S, "s"),
         metavar="S",
         default=LISTEN_S,
-        help="how long to listen for other hosts first, in seconds (default: %(default)g)",
+        help="how long to listen for other hosts first, in seconds",
     )
 
 

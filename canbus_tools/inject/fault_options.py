@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, parse_float, parse_hex, parse_int, parse_ratio
+from nodes.support.option_values import Help, UsageError, parse_float, parse_hex, parse_int, parse_ratio
 from nodes.virtual.faults import CLIENTS, ID_MAX, TIME_S_MAX, Fault, FaultKind
 
 _KINDS: Final = {
@@ -42,12 +42,16 @@ EXPLAINED: Final = """faults:
   The same --seed affects the same frames of every sender."""
 
 
+class _RawHelp(Help, argparse.RawDescriptionHelpFormatter):
+    """Keeps the lines of the explanation."""
+
+
 def declare_faults(command: argparse.ArgumentParser) -> None:
     """Add an option for every kind of fault."""
     group = command.add_argument_group("faults (explained below)")
     for name, (_, metavar, meaning) in _KINDS.items():
         group.add_argument(f"--{name}", action="append", default=[], metavar=f"{metavar},…", help=meaning)
-    command.formatter_class = argparse.RawDescriptionHelpFormatter
+    command.formatter_class = _RawHelp
     command.epilog = EXPLAINED
 
 

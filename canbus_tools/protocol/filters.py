@@ -4,13 +4,12 @@ import argparse
 import re
 from collections.abc import Iterable
 from fnmatch import translate
-from functools import partial
 from typing import Final
 
 from canbus_tools.protocol.decoded import Decoded, Kind
 from canbus_tools.protocol.protocol import Direction
 from nodes.support.can_protocol import DATA_NODEID_MAX
-from nodes.support.option_values import UsageError, parse_int
+from nodes.support.option_values import UsageError, integer
 
 ALL: Final = "all"
 DEFAULT_KINDS: Final = frozenset(Kind) - {Kind.ACK}
@@ -47,7 +46,7 @@ def declare_filter(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add(
         "--node",
-        type=partial(parse_int, low=1, high=DATA_NODEID_MAX),
+        type=integer(1, DATA_NODEID_MAX),
         metavar="NODE",
         action="append",
         help="show only this node id; may be repeated",

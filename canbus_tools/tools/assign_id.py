@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
@@ -14,7 +13,7 @@ from canbus_tools.discovery.inventory import PROBED, State, SurveyResult, survey
 from canbus_tools.discovery.node_info import Facts, interview
 from nodes.bus.assign import AssignError, Uuid
 from nodes.support.can_protocol import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID
-from nodes.support.option_values import UsageError, parse_int
+from nodes.support.option_values import UsageError, integer
 
 TRIES: Final = 3
 """Nobody acknowledges an id, and frames get lost."""
@@ -26,7 +25,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     add("uuid", type=parse_uuid, metavar="UUID", help="12 hex digits, as printed by 'canductor can query'")
     add(
         "nodeid",
-        type=partial(parse_int, low=FIRST_NODEID, high=LAST_NODEID),
+        type=integer(FIRST_NODEID, LAST_NODEID),
         metavar="NODEID",
         help=f"id to assign, {FIRST_NODEID} to {LAST_NODEID}",
     )

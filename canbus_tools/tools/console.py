@@ -7,7 +7,6 @@ import re
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from canbus_tools.bus.computer import Computer
@@ -19,7 +18,7 @@ from canbus_tools.console.session import Quit, Session
 from canbus_tools.discovery.inventory import survey
 from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, existing_file, options_from, parse_int
+from nodes.support.option_values import UsageError, existing_file, integer, options_from, parse_int
 from nodes.transport import BAUD_DEFAULT
 
 NODEID_MAX = 255
@@ -55,7 +54,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     add("--uart", type=Path, metavar="PATH", help="serial device of the node")
     add(
         "--baud",
-        type=partial(parse_int, low=BAUD_MIN, high=BAUD_MAX),
+        type=integer(BAUD_MIN, BAUD_MAX),
         metavar="BIT/S",
         help=f"baud rate of the serial device (default: {BAUD_DEFAULT})",
     )

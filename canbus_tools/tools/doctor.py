@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
@@ -18,7 +17,7 @@ from canbus_tools.doctor.population import check_nodes
 from canbus_tools.doctor.traffic import check_traffic
 from canbus_tools.support.text_table import count, paragraph
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, parse_float
+from nodes.support.option_values import UsageError, decimal
 
 LISTEN_S: Final = 3.0
 LISTEN_S_MIN, LISTEN_S_MAX = 0.2, 600.0
@@ -32,10 +31,10 @@ def declare(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add(
         "--listen",
-        type=partial(parse_float, low=LISTEN_S_MIN, high=LISTEN_S_MAX, unit="s"),
+        type=decimal(LISTEN_S_MIN, LISTEN_S_MAX, "s"),
         default=LISTEN_S,
         metavar="S",
-        help="how long to listen first, in seconds (default: %(default)g)",
+        help="how long to listen first, in seconds",
     )
     add("--quiet-bus", action="store_true", help="send nothing: only listen and read the interface's state")
     add(

@@ -16,14 +16,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack, ExitStack
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Final, cast
 
 from canbus_tools.inject.fault_options import declare_faults, read_faults
 from canbus_tools.inject.inject_report import InjectReport, StatusLine
 from canbus_tools.inject.socketcand_server import PORT, SocketcandServer
-from nodes.support.option_values import UsageError, options_from, parse_float, parse_int
+from nodes.support.option_values import UsageError, decimal, integer, options_from, parse_int
 from nodes.virtual.faults import Fault
 from nodes.virtual.hub import BITRATE_MAX, BusStats, VirtualBus
 from nodes.virtual.processes import Flavour, NodeProcess
@@ -66,28 +65,28 @@ def declare(command: argparse.ArgumentParser) -> None:
         type=Path,
         default=DEFAULT_PATH,
         metavar="PATH",
-        help="socket of the bus; other tools use it with -i canductor -c PATH (default: %(default)s)",
+        help="socket of the bus; other tools use it with -i canductor -c PATH",
     )
     add(
         "-b",
         "--bitrate",
-        type=partial(parse_int, high=BITRATE_MAX),
+        type=integer(0, BITRATE_MAX),
         default=1_000_000,
         metavar="BIT/S",
-        help="bit rate; 0: unlimited (default: %(default)s)",
+        help="bit rate; 0: unlimited",
     )
     add(
         "--seed",
-        type=partial(parse_int, high=2**64 - 1),
+        type=integer(0, 2**64 - 1),
         default=0,
         metavar="N",
-        help="selects the frames that the faults affect (default: %(default)s)",
+        help="selects the frames that the faults affect",
     )
     add(
         "--duration",
         "--for",
         dest="duration_s",
-        type=partial(parse_float, low=0, high=1e8, unit="s"),
+        type=decimal(0, 1e8, "s"),
         metavar="S",
         help="stop after this many seconds (default: at Ctrl-C)",
     )
@@ -109,7 +108,7 @@ def declare(command: argparse.ArgumentParser) -> None:
         type=_bus_name,
         metavar="NAME",
         default="can0",
-        help="name of the bus for socketcand clients (default: %(default)s)",
+        help="name of the bus for socketcand clients",
     )
     declare_faults(command)
 

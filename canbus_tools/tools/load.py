@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,7 +28,7 @@ from canbus_tools.protocol.protocol import Direction, frame_format, owner_of
 from canbus_tools.recordings.recordings import read_frames
 from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, parse_float, parse_path
+from nodes.support.option_values import UsageError, decimal, parse_path
 
 DURATION_S: Final = 10.0
 DURATION_S_MAX: Final = 86_400.0
@@ -45,17 +44,17 @@ def declare(command: argparse.ArgumentParser) -> None:
     declare_bus(command)
     add(
         "--duration",
-        type=partial(parse_float, low=0.1, high=DURATION_S_MAX, unit="s"),
+        type=decimal(0.1, DURATION_S_MAX, "s"),
         metavar="S",
         help=f"how long to measure, in seconds (default: {DURATION_S:g})",
     )
     add("--watch", action="store_true", help="show the load continuously, until Ctrl-C")
     add(
         "--window",
-        type=partial(parse_float, low=WINDOW_S_MIN, high=WINDOW_S_MAX, unit="s"),
+        type=decimal(WINDOW_S_MIN, WINDOW_S_MAX, "s"),
         default=WINDOW_S,
         metavar="S",
-        help="averaging window of peak and plot, in seconds (default: %(default)g)",
+        help="averaging window of peak and plot, in seconds",
     )
     add("--plot", type=_plot, metavar="FILE", help="draw the load over time: .svg, or .png by rsvg-convert")
 

@@ -6,7 +6,6 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 from canbus_tools.bus.bus_load import BITRATE_MAX, LoadMeter
@@ -29,7 +28,7 @@ from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, options_from, parse_float, parse_int
+from nodes.support.option_values import UsageError, decimal, options_from, parse_int
 
 FETCHED: Final = "fetched from the node"
 EVERY_NODE: Final = "all"
@@ -54,7 +53,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     add(
         "--duration",
         dest="duration_s",
-        type=partial(parse_float, low=0.1, high=DURATION_MAX_S, unit="s"),
+        type=decimal(0.1, DURATION_MAX_S, "s"),
         metavar="S",
         help="stop after this many seconds (default: at Ctrl-C)",
     )

@@ -7,7 +7,6 @@ them and returns the job: a callable that takes the computer (bus/computer.py) a
 
 import argparse
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, Final, Protocol
 
 from canbus_tools.bus.computer import Computer
@@ -63,6 +62,7 @@ def add_to(commands: Any) -> None:
 
 
 def _add(commands: Any, name: str, tool: Tool, summary: str) -> None:
-    add_command(
-        commands, name, summary, tool.declare, lambda given: partial(tool.make_job(given), given.computer)
-    )
+    def run(given: argparse.Namespace) -> Any:
+        return tool.make_job(given)(given.computer)
+
+    add_command(commands, name, summary, tool.declare, run)

@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 from canbus_tools.bus.computer import Computer
@@ -12,7 +11,7 @@ from canbus_tools.bus.talk import BusTalk
 from canbus_tools.discovery.ask_bus import take_census, where
 from canbus_tools.discovery.node_discovery import ROUNDS, Application, CensusResult, WaitingNode
 from canbus_tools.support.text_table import count, paragraph, table
-from nodes.support.option_values import parse_int
+from nodes.support.option_values import integer
 
 NAMES: Final[Mapping[Application, str]] = {
     Application.KLIPPER: "Klipper-type firmware",
@@ -28,10 +27,10 @@ def declare(command: argparse.ArgumentParser) -> None:
     declare_bus(command)
     command.add_argument(
         "--rounds",
-        type=partial(parse_int, low=1, high=_ROUNDS_MAX),
+        type=integer(1, _ROUNDS_MAX),
         metavar="N",
         default=ROUNDS,
-        help="number of queries; answers can collide or get lost (default: %(default)s)",
+        help="number of queries; answers can collide or get lost",
     )
 
 

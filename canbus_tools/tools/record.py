@@ -5,7 +5,6 @@ import contextlib
 import errno
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import BinaryIO, Final, Protocol
 
@@ -20,7 +19,7 @@ from canbus_tools.recordings.mcap_file import McapWriter
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, parse_float, parse_path
+from nodes.support.option_values import UsageError, decimal, parse_path
 
 LOOK_S: Final = 0.1
 """How soon Ctrl-C and the end of the time are noticed on a silent bus."""
@@ -56,7 +55,7 @@ def declare(command: argparse.ArgumentParser) -> None:
     )
     add(
         "--duration",
-        type=partial(parse_float, low=0.1, high=DURATION_MAX_S, unit="s"),
+        type=decimal(0.1, DURATION_MAX_S, "s"),
         metavar="S",
         help="stop after this many seconds (default: at Ctrl-C)",
     )

@@ -18,6 +18,7 @@ from coordinator.cli.commands import (
     simulate,
     table,
 )
+from coordinator.dnc.commands import HERE, Surroundings
 from coordinator.support.report import Report
 from coordinator.support.version import version
 from nodes.support.option_values import Parser, UsageError
@@ -42,18 +43,26 @@ def build_parser() -> Parser:
     return parser
 
 
-def parse_command_line(words: Sequence[str], computer: Computer | None = None) -> Job:
-    """Return the job that WORDS ask for; CAN tools will run on COMPUTER, this one if None.
+def parse_command_line(
+    words: Sequence[str], computer: Computer | None = None, surroundings: Surroundings = HERE
+) -> Job:
+    """Return the job that WORDS ask for. Tests give another COMPUTER to CAN tools, SURROUNDINGS to DNC.
 
     Raises UsageError, ParserExit after --help or --version, CanductorError for a file that cannot be read.
     """
     parser = build_parser()
-    namespace = argparse.Namespace(parser=parser, computer=computer or ThisComputer())
-    given, unknown = parser.parse_known_args(list(words), namespace)
-    try:
-        if unknown:
-            parser.error(f"unrecognized arguments: {' '.join(unknown)}")
-        return cast("Job", given.make_job(given))
-    except UsageError as error:
-        error.command = given.command
-        raise
+    environment = argparse.Namespace(
+        parser=parser, computer=computer or ThisComputer(), surroundings=surroundings
+    )
+    given, unknown = parser.parse_known_args(list(words), environment)
+
+    def job() -> Report:
+        try:
+            if unknown:
+                parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+            return cast("Report", given.run(given))
+        except UsageError as error:
+            error.command = given.command
+            raise
+
+    return job

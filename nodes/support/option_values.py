@@ -8,6 +8,7 @@ import argparse
 import dataclasses
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -27,11 +28,23 @@ class ParserExit(Exception):  # noqa: N818 (no failure: --help or --version was 
     """The parser has printed what was asked for; there is nothing left to do."""
 
 
+class Help(argparse.HelpFormatter):
+    """Adds the default of an option to its help, unless the help contains it."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        text, default = action.help or "", action.default
+        shown = isinstance(default, int | float | str | Path) and not isinstance(default, bool)
+        if not shown or not action.option_strings or default == argparse.SUPPRESS or "(default" in text:
+            return text
+        value = f"{default:g}" if isinstance(default, float) else str(default)
+        return f"{text} (default: {value.replace('%', '%%')})"
+
+
 class Parser(argparse.ArgumentParser):
     """Raises UsageError and ParserExit where argparse prints and exits; refuses abbreviated options."""
 
     def __init__(self, **settings: Any) -> None:
-        super().__init__(**{"allow_abbrev": False, **settings})
+        super().__init__(**{"allow_abbrev": False, "formatter_class": Help, **settings})
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse as argparse does; an error names the innermost command that was reached."""
@@ -137,6 +150,16 @@ def parse_float(text: str, low: float, high: float, unit: str = "", *, name: str
     return value
 
 
+def integer(low: int = 0, high: int | None = None) -> Callable[[str], int]:
+    """Return the converter ``parse_int`` with these bounds."""
+    return partial(parse_int, low=low, high=high)
+
+
+def decimal(low: float, high: float, unit: str = "") -> Callable[[str], float]:
+    """Return the converter ``parse_float`` with these bounds."""
+    return partial(parse_float, low=low, high=high, unit=unit)
+
+
 def parse_ratio(text: str, high: float = 0.5, *, name: str = "") -> float:
     """Return a ratio from 0 to HIGH, also written as a percentage; raises UsageError."""
     try:
@@ -177,17 +200,17 @@ def add_command(
     name: str,
     summary: str,
     declare: Callable[[argparse.ArgumentParser], object],
-    make_job: Callable[[argparse.Namespace], Callable[[], Any]],
+    run: Callable[[argparse.Namespace], Any],
 ) -> None:
     """Add the command NAME to the subparsers COMMANDS.
 
-    SUMMARY begins with a verb and has no full stop. DECLARE adds the options. MAKE_JOB checks them and
-    returns what runs the command; it raises UsageError or CanductorError.
+    SUMMARY begins with a verb and has no full stop. DECLARE adds the options. RUN checks them, runs the
+    command and returns its report; it raises UsageError or CanductorError.
     """
     command = commands.add_parser(name, **_summary(summary))
     declare(command)
     command.add_argument("--json", action="store_true", help="print one JSON object as the last line")
-    command.set_defaults(make_job=make_job, command=command.prog)
+    command.set_defaults(run=run, command=command.prog)
 
 
 def add_group(commands: Any, name: str, summary: str, metavar: str) -> Any:

@@ -60,11 +60,7 @@ def declare_serving(command: argparse.ArgumentParser) -> None:
         metavar="[HOST:]PORT",
         help="serve the live page; beyond this computer (0.0.0.0:PORT) needs --tokens and TLS",
     )
-    add(
-        "--web-without-tls",
-        action="store_true",
-        help="serve the live page unencrypted beyond this computer",
-    )
+    add("--web-without-tls", action="store_true", help="serve the live page unencrypted beyond this computer")
     add(
         "--web-name",
         dest="web_names",

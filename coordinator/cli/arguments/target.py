@@ -1,11 +1,10 @@
 """The options that select a running machine."""
 
 import argparse
-from functools import partial
 
 from coordinator.ipc.client.target import Target
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import existing_file, options_from, parse_float
+from nodes.support.option_values import decimal, existing_file, options_from
 from nodes.support.secret_file import read_secret
 
 
@@ -29,10 +28,10 @@ def declare_target(command: argparse.ArgumentParser) -> None:
     add(
         "--timeout",
         dest="timeout_s",
-        type=partial(parse_float, low=0.1, high=3600, unit="s"),
+        type=decimal(0.1, 3600, "s"),
         default=5.0,
         metavar="S",
-        help="how long to wait for the machine's answer, in seconds (default: 5)",
+        help="how long to wait for the machine's answer, in seconds",
     )
 
 

@@ -1,7 +1,6 @@
 """``canductor completion``: prints the script that makes a shell complete command lines of canductor."""
 
 import argparse
-from collections.abc import Callable
 from typing import Any, Final
 
 import shtab
@@ -15,17 +14,13 @@ SHELLS: Final = ("bash", "zsh", "fish")
 
 def add_to(commands: Any) -> None:
     """Add the command."""
-    add_command(commands, "completion", "print a shell completion script", _declare, _make_job)
+    add_command(commands, "completion", "print a shell completion script", _declare, _run)
 
 
 def _declare(command: argparse.ArgumentParser) -> None:
     command.add_argument("shell", choices=SHELLS, help="shell that the script is for")
 
 
-def _make_job(given: argparse.Namespace) -> Callable[[], Report]:
-    return lambda: _completion(given.parser, given.shell)
-
-
-def _completion(parser: argparse.ArgumentParser, shell: str) -> Answer:
-    script = shtab.complete(parser, shell)
+def _run(given: argparse.Namespace) -> Report:
+    script = shtab.complete(given.parser, given.shell)
     return Answer(script, script.rstrip())

@@ -1,7 +1,7 @@
 """``canductor config``: checks a configuration without hardware, or prints what one may contain."""
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,16 +28,16 @@ def _declare_check(command: argparse.ArgumentParser) -> None:
     command.add_argument("file", type=existing_file, help="configuration file")
 
 
-def _check(given: argparse.Namespace) -> Callable[[], Report]:
-    return lambda: check(str(given.file))
+def _check(given: argparse.Namespace) -> Report:
+    return check(str(given.file))
 
 
 def _declare_reference(command: argparse.ArgumentParser) -> None:
     command.add_argument("section", nargs="*", help="print only sections whose names begin with this")
 
 
-def _reference(given: argparse.Namespace) -> Callable[[], Report]:
-    return lambda: reference(given.section)
+def _reference(given: argparse.Namespace) -> Report:
+    return reference(given.section)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,6 @@
 """``canductor demo``: a machine on virtual nodes, printing or served to front ends."""
 
 import argparse
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from nodes.support.option_values import (
 def add_to(commands: Any) -> None:
     """Add the command."""
     summary = "print on virtual nodes and compare every step with the plan"
-    add_command(commands, "demo", summary, _declare, _make_job)
+    add_command(commands, "demo", summary, _declare, _run)
 
 
 def _declare(command: argparse.ArgumentParser) -> None:
@@ -49,7 +48,7 @@ def _declare(command: argparse.ArgumentParser) -> None:
         type=parse_ratio,
         default=0.0,
         metavar="RATIO",
-        help="ratio of frames that the virtual buses lose, such as 0.01 or 1%% (default: 0)",
+        help="ratio of frames that the virtual buses lose, such as 0.01 or 1%%",
     )
     add("--seed", type=parse_int, default=1, metavar="N", help="selects the frames to lose (default: 1)")
     add(
@@ -82,7 +81,7 @@ def _declare(command: argparse.ArgumentParser) -> None:
     declare_serving(command)
 
 
-def _make_job(given: argparse.Namespace) -> Callable[[], Report]:
+def _run(given: argparse.Namespace) -> Report:
     if given.serve and given.gcode is not None:
         raise UsageError("--serve does not print by itself; leave out --gcode or --serve")
     if given.web is not None and (given.no_web or not given.serve):
@@ -94,9 +93,8 @@ def _make_job(given: argparse.Namespace) -> Callable[[], Report]:
         )
     options = options_from(DemoOptions, given, gcode=given.gcode or DEMO_GCODE)
     if given.serve:
-        serving = serving_options(given, given.machine, announce=False)
-        return lambda: serve_demo(options, serving)
-    return lambda: run_demo(options)
+        return serve_demo(options, serving_options(given, given.machine, announce=False))
+    return run_demo(options)
 
 
 def _bus_interface(text: str) -> tuple[str, str]:

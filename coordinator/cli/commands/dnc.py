@@ -1,8 +1,6 @@
 """``canductor dnc``: receive, send, serve, list and drip over a serial line."""
 
 import argparse
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,10 +15,10 @@ from nodes.support.option_values import (
     UsageError,
     add_command,
     add_group,
+    decimal,
     existing_file,
+    integer,
     options_from,
-    parse_float,
-    parse_int,
 )
 
 CONTROL: Final = "control"
@@ -28,14 +26,13 @@ PERIPHERAL: Final = "peripheral"
 PACED: Final = {"auto": None, "yes": True, "no": False}
 ANSWER_S: Final = 8.0
 DRIP_ANSWER_S: Final = 600.0
-Job = Callable[[], Report]
 
 
 def add_to(commands: Any) -> None:
     """Add the commands."""
     summary = "exchange programs and tables with machine-shop peripherals over a serial line"
     actions = add_group(commands, "dnc", summary, "ACTION")
-    for name, text, declare, make_job in (
+    for name, text, declare, run in (
         (
             "receive",
             "receive a file from a control, or request one from a peripheral",
@@ -47,12 +44,12 @@ def add_to(commands: Any) -> None:
         ("list", "print the directory of a peripheral", _declare_line, _list),
         ("drip", "feed a job of any length, line by line", _declare_drip, _drip),
     ):
-        add_command(actions, name, text, declare, make_job)
+        add_command(actions, name, text, declare, run)
 
 
 def _declare_line(command: argparse.ArgumentParser) -> None:
     add = command.add_argument_group("serial line").add_argument
-    seconds = partial(parse_float, low=0.01, high=86_400, unit="s")
+    seconds = decimal(0.01, 86_400, "s")
     add(
         "-p",
         "--port",
@@ -60,13 +57,7 @@ def _declare_line(command: argparse.ArgumentParser) -> None:
         metavar="PORT",
         help="serial device, socket://HOST:PORT or rfc2217://HOST:PORT",
     )
-    add(
-        "--baud",
-        type=partial(parse_int, low=50, high=4_000_000),
-        default=9600,
-        metavar="N",
-        help="baud rate (default: %(default)s)",
-    )
+    add("--baud", type=integer(50, 4_000_000), default=9600, metavar="N", help="baud rate")
     add(
         "--frame",
         type=read_frame,
@@ -79,17 +70,17 @@ def _declare_line(command: argparse.ArgumentParser) -> None:
     add("--avoid-control", action="store_true", help="do not send check characters below 20 hex")
     add(
         "--transmissions",
-        type=partial(parse_int, low=1, high=100),
+        type=integer(1, 100),
         default=TRANSMISSIONS_MAX,
         metavar="N",
-        help="maximum transmissions of one block; old controls: 3 (default: %(default)s)",
+        help="maximum transmissions of one block; old controls: 3",
     )
     add(
         "--block-max",
-        type=partial(parse_int, low=16, high=65_536),
+        type=integer(16, 65_536),
         default=BLOCK_MAX,
         metavar="N",
-        help="maximum characters of a block (default: %(default)s)",
+        help="maximum characters of a block",
     )
     add(
         "--answer-timeout",
@@ -104,22 +95,17 @@ def _declare_line(command: argparse.ArgumentParser) -> None:
         type=seconds,
         default=30.0,
         metavar="S",
-        help="how long to wait for the answer to a header (default: 30)",
+        help="how long to wait for the answer to a header",
     )
     add(
         "--silence",
         dest="character_s",
-        type=partial(parse_float, low=0.001, high=60, unit="s"),
+        type=decimal(0.001, 60, "s"),
         default=0.25,
         metavar="S",
-        help="silence that ends a damaged block (default: 0.25)",
+        help="silence that ends a damaged block",
     )
-    add(
-        "--paced",
-        choices=tuple(PACED),
-        default="auto",
-        help="whether the port keeps to the baud rate (default: auto)",
-    )
+    add("--paced", choices=tuple(PACED), default="auto", help="whether the port keeps to the baud rate")
 
 
 def _declare_code(command: argparse.ArgumentParser, default: str | None, note: str) -> None:
@@ -171,7 +157,7 @@ def _declare_send(command: argparse.ArgumentParser) -> None:
         dest="role",
         choices=(CONTROL, PERIPHERAL),
         default=CONTROL,
-        help="role of this side; a peripheral waits for a request (default: control)",
+        help="role of this side; a peripheral waits for a request",
     )
     _declare_verify(command, "request the file again afterwards")
     _declare_line(command)
@@ -240,29 +226,30 @@ def _machine(given: argparse.Namespace, *, prints: bool, hint: str) -> Target:
     return Target()
 
 
-def _receive(given: argparse.Namespace) -> Job:
+def _receive(given: argparse.Namespace) -> Report:
     machine = _machine(given, prints=given.start, hint="give --start as well")
-    name = given.name or ""
-    return partial(work.receive, _job(given, peripheral=given.name is None, name=name, machine=machine))
+    job = _job(given, peripheral=given.name is None, name=given.name or "", machine=machine)
+    return work.receive(job, around=given.surroundings)
 
 
-def _send(given: argparse.Namespace) -> Job:
+def _send(given: argparse.Namespace) -> Report:
     peripheral = given.role == PERIPHERAL
     if given.verify and peripheral:
         raise UsageError("--verify requests the file again, which a peripheral cannot; leave it out")
     name = given.name or given.file.stem
-    return partial(work.send, _job(given, peripheral=peripheral, name=name, code=given.code or ""))
+    job = _job(given, peripheral=peripheral, name=name, code=given.code or "")
+    return work.send(job, around=given.surroundings)
 
 
-def _serve(given: argparse.Namespace) -> Job:
-    return partial(work.serve, _job(given, peripheral=True))
+def _serve(given: argparse.Namespace) -> Report:
+    return work.serve(_job(given, peripheral=True), around=given.surroundings)
 
 
-def _list(given: argparse.Namespace) -> Job:
-    return partial(work.list_files, _job(given))
+def _list(given: argparse.Namespace) -> Report:
+    return work.list_files(_job(given), around=given.surroundings)
 
 
-def _drip(given: argparse.Namespace) -> Job:
+def _drip(given: argparse.Namespace) -> Report:
     if (given.file is not None) + (given.source is not None) + given.from_control != 1:
         raise UsageError(
             "drip takes either a FILE to feed to a control, --from NAME to print from a peripheral,"
@@ -282,4 +269,4 @@ def _drip(given: argparse.Namespace) -> Job:
         start=prints,
         machine=machine,
     )
-    return partial(work.drip, job)
+    return work.drip(job, around=given.surroundings)

@@ -1,7 +1,6 @@
 """``canductor plan``: plans a program without hardware."""
 
 import argparse
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,9 @@ from nodes.support.option_values import (
     Assignments,
     add_command,
     existing_file,
+    integer,
     options_from,
     parse_assignment,
-    parse_int,
     parse_path,
 )
 
@@ -23,7 +22,7 @@ from nodes.support.option_values import (
 def add_to(commands: Any) -> None:
     """Add the command."""
     summary = "plan a file without hardware: report time, steps, bus load and warnings"
-    add_command(commands, "plan", summary, _declare, _make_job)
+    add_command(commands, "plan", summary, _declare, _run)
 
 
 def _declare(command: argparse.ArgumentParser) -> None:
@@ -37,12 +36,7 @@ def _declare(command: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="write command streams, report and plot to this folder",
     )
-    add(
-        "--plot",
-        type=_svg_file,
-        metavar="FILE.svg",
-        help="draw velocity, flow and bus load over print time",
-    )
+    add("--plot", type=_svg_file, metavar="FILE.svg", help="draw velocity, flow and bus load over print time")
     add(
         "--dictionary",
         dest="dictionaries",
@@ -54,10 +48,10 @@ def _declare(command: argparse.ArgumentParser) -> None:
     add(
         "--bitrate",
         dest="can_bitrate",
-        type=partial(parse_int, low=10_000, high=8_000_000),
+        type=integer(10_000, 8_000_000),
         default=1_000_000,
         metavar="BIT/S",
-        help="bit rate of the CAN buses (default: %(default)s)",
+        help="bit rate of the CAN buses",
     )
     add(
         "--table",
@@ -69,9 +63,8 @@ def _declare(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _make_job(given: argparse.Namespace) -> Callable[[], Report]:
-    options = options_from(PlanOptions, given)
-    return lambda: plan_file(options)
+def _run(given: argparse.Namespace) -> Report:
+    return plan_file(options_from(PlanOptions, given))
 
 
 def _program(text: str) -> Path:

@@ -38,7 +38,7 @@ class RunOptions:
 
 def add_to(commands: Any) -> None:
     """Add the command."""
-    add_command(commands, "run", "bring up the machine of a configuration file", _declare, _make_job)
+    add_command(commands, "run", "bring up the machine of a configuration file", _declare, _run)
 
 
 def _declare(command: argparse.ArgumentParser) -> None:
@@ -49,15 +49,13 @@ def _declare(command: argparse.ArgumentParser) -> None:
     declare_serving(command)
 
 
-def _make_job(given: argparse.Namespace) -> Callable[[], Report]:
+def _run(given: argparse.Namespace) -> Report:
     asked = is_asked_to_serve(given)
     if asked and given.gcode is not None:
         raise UsageError("--gcode prints a file and exits; leave it out to serve front ends")
     if asked or (given.gcode is None and sys.stdin is not None and sys.stdin.isatty()):
-        serving = serving_options(given, given.config)
-        return lambda: serve_machine(serving)
-    options = options_from(RunOptions, given)
-    return lambda: run_machine(options)
+        return serve_machine(serving_options(given, given.config))
+    return run_machine(options_from(RunOptions, given))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """``canductor table``: compensation tables in files, on a running machine, or on devices without one."""
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -9,7 +9,7 @@ from typing import Any, Final
 from canbus_tools.tables.table_device import carry_out
 from coordinator.assembly.load import load_machine
 from coordinator.cli.arguments.target import declare_target, target_of
-from coordinator.cli.commands.remote import Answer, call
+from coordinator.cli.commands.remote import Answer
 from coordinator.cli.commands.table_device import declare_device, device_job
 from coordinator.ipc.client.target import Target
 from coordinator.streaming.compensation import corrected_axes, why_not_corrected
@@ -22,14 +22,46 @@ from nodes.support.option_values import UsageError, add_command, add_group, exis
 UNITS: Final = ("mm", "um", "nm", "inch", "deg", "arcmin", "arcsec")
 DOWNLOAD_TIMEOUT_S: Final = 120.0
 """A long table on a busy serial line takes that long."""
-Job = Callable[[], Report]
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """A table that is sound."""
+
+    figures: Mapping[str, float | int | str]
+    notes: tuple[str, ...]
+    output: Path | None = None
+
+    @property
+    def ok(self) -> bool:
+        """It is, or it would not be here."""
+        return True
+
+    def to_json(self) -> Mapping[str, object]:
+        """Return the figures by name."""
+        written = {} if self.output is None else {"output": str(self.output)}
+        return {**self.figures, "notes": list(self.notes), **written}
+
+    def to_text(self) -> str:
+        """Return them for a reader."""
+        f, unit = self.figures, self.figures["unit"]
+        lines = [
+            f"axis {f['axis']}: {f['points']} points from {f['first']:g} to {f['last']:g} {unit}",
+            f"  corrections from {f['least_correction']:g} to {f['greatest_correction']:g} {unit}",
+            f"  greatest slope {f['greatest_slope']:.3g}, backlash up to {f['greatest_backlash']:g} {unit}",
+            f"  between its points it may miss up to {f['between_points']:.2g} {unit}",
+            *(f"  note: {note}" for note in self.notes),
+        ]
+        if self.output is not None:
+            lines.append(f"  drawn in {self.output}")
+        return "\n".join(lines)
 
 
 def add_to(commands: Any) -> None:
     """Add the commands."""
     summary = "check compensation tables of axes, and send them to a machine or to drives"
     actions = add_group(commands, "table", summary, "ACTION")
-    for name, text, declare, make_job in (
+    for name, text, declare, run in (
         ("check", "read a table and report its content, without a machine", _declare_check, _check),
         ("plot", "draw a table as an SVG file", _declare_plot, _plot),
         ("send", "send a table to an axis of a running machine, or to drives", _declare_send, _send),
@@ -41,18 +73,14 @@ def add_to(commands: Any) -> None:
             _remove,
         ),
     ):
-        add_command(actions, name, text, declare, make_job)
+        add_command(actions, name, text, declare, run)
 
 
 def _declare_file(command: argparse.ArgumentParser, axis: str | None) -> None:
     add = command.add_argument
     add("file", type=existing_file, help="LinuxCNC COMP_FILE, or CSV (.csv) with units in its first line")
     add(
-        "--type",
-        type=int,
-        default=0,
-        choices=(0, 1),
-        help="type of a COMP_FILE: 0 actual positions, 1 trims (default: 0)",
+        "--type", type=int, default=0, choices=(0, 1), help="type of a COMP_FILE: 0 actual positions, 1 trims"
     )
     add("--unit", default="mm", choices=UNITS, help="unit of all numbers of a COMP_FILE (default: mm)")
     default = "" if axis is None else f" (default: {axis})"
@@ -98,42 +126,61 @@ def _declare_remove(command: argparse.ArgumentParser) -> None:
     declare_device(command, sends=True, has_file=False)
 
 
-def _check(given: argparse.Namespace) -> Job:
-    return lambda: check(_read(given), given.machine)
+def _check(given: argparse.Namespace) -> Checked:
+    table = _read(given)
+    return Checked(figures(table), tuple(_notes(table, given.machine)))
 
 
-def _plot(given: argparse.Namespace) -> Job:
-    return lambda: plot(_read(given), given.output)
+def _plot(given: argparse.Namespace) -> Checked:
+    table = _read(given)
+    try:
+        given.output.write_text(draw(table), encoding="utf-8")
+    except OSError as error:
+        raise TableError(f"{given.output} cannot be written: {error.strerror or error}") from None
+    return Checked(figures(table), (), given.output)
 
 
-def _send(given: argparse.Namespace) -> Job:
+def _send(given: argparse.Namespace) -> Report:
+    """Send a table; not ok if a node did not take it."""
     if given.device is not None:
         return _on_device(given, _read(given), sends=True)
     _check_axis("send", given)
-    target = _patient(target_of(given))
-    return lambda: send(_read(given), target)
+    table = _read(given)
+    params: dict[str, Any] = {
+        "axis": table.axis,
+        "unit": str(table.unit),
+        "positions": list(table.positions),
+        "forward": list(table.forward),
+        "reverse": list(table.reverse),
+    }
+    result = _patient_target(given).call("table.send", params)
+    return _answer(result, [f"note: {note}" for note in result["notes"]], result["downloads"])
 
 
-def _status(given: argparse.Namespace) -> Job:
+def _status(given: argparse.Namespace) -> Report:
     if given.device is not None:
         return _on_device(given, None, sends=False)
-    target = target_of(given)
-    return lambda: status(given.axis, target)
+    result = target_of(given).call("table.status")
+    if given.axis is not None:
+        result = {"axes": [axis for axis in result["axes"] if axis["axis"] == given.axis]}
+        if not result["axes"]:
+            raise TableError(f"the machine has no tables for an axis {given.axis}")
+    return _answer(result, [])
 
 
-def _remove(given: argparse.Namespace) -> Job:
+def _remove(given: argparse.Namespace) -> Report:
+    """Remove a table; not ok if a node keeps it."""
     if given.device is not None:
         return _on_device(given, None, sends=True)
     _check_axis("remove", given)
-    target = _patient(target_of(given))
-    return lambda: remove(given.axis, target)
+    result = _patient_target(given).call("table.remove", {"axis": given.axis})
+    return _answer(result, [], result["downloads"])
 
 
-def _on_device(given: argparse.Namespace, table: AxisTable | None, *, sends: bool) -> Job:
+def _on_device(given: argparse.Namespace, table: AxisTable | None, *, sends: bool) -> Report:
     if given.address is not None:
         raise UsageError("--at selects a running machine, --device drives without one; give one of them")
-    job = device_job(given, table, sends=sends)
-    return lambda: carry_out(given.computer, job)
+    return carry_out(given.computer, device_job(given, table, sends=sends))
 
 
 def _check_axis(name: str, given: argparse.Namespace) -> None:
@@ -150,91 +197,13 @@ def _check_axis(name: str, given: argparse.Namespace) -> None:
         raise UsageError(f"'{name}' needs --axis of a running machine, or --device")
 
 
-def _patient(target: Target) -> Target:
+def _patient_target(given: argparse.Namespace) -> Target:
+    target = target_of(given)
     return replace(target, timeout_s=max(target.timeout_s, DOWNLOAD_TIMEOUT_S))
 
 
 def _read(given: argparse.Namespace) -> AxisTable:
     return read_table(given.file, axis=given.axis or "x", comp_type=given.type, unit=given.unit)
-
-
-# ---------------------------------------------------------------------------------------------------- work
-
-
-@dataclass(frozen=True, slots=True)
-class Checked:
-    """A table that is sound."""
-
-    figures: Mapping[str, float | int | str]
-    notes: tuple[str, ...]
-    output: Path | None = None
-
-    @property
-    def ok(self) -> bool:
-        """It is, or it would not be here."""
-        return True
-
-    def to_json(self) -> Mapping[str, object]:
-        """Return the figures by name."""
-        written = {} if self.output is None else {"output": str(self.output)}
-        return {**self.figures, "notes": list(self.notes), **written}
-
-    def to_text(self) -> str:
-        """Return them for a reader."""
-        f, unit = self.figures, self.figures["unit"]
-        lines = [
-            f"axis {f['axis']}: {f['points']} points from {f['first']:g} to {f['last']:g} {unit}",
-            f"  corrections from {f['least_correction']:g} to {f['greatest_correction']:g} {unit}",
-            f"  greatest slope {f['greatest_slope']:.3g}, backlash up to {f['greatest_backlash']:g} {unit}",
-            f"  between its points it may miss up to {f['between_points']:.2g} {unit}",
-            *(f"  note: {note}" for note in self.notes),
-        ]
-        if self.output is not None:
-            lines.append(f"  drawn in {self.output}")
-        return "\n".join(lines)
-
-
-def check(table: AxisTable, config: Path | None) -> Checked:
-    """Report TABLE, compared with the machine of CONFIG; raises TableError."""
-    return Checked(figures(table), tuple(_notes(table, config)))
-
-
-def plot(table: AxisTable, output: Path) -> Checked:
-    """Draw TABLE; raises TableError."""
-    try:
-        output.write_text(draw(table), encoding="utf-8")
-    except OSError as error:
-        raise TableError(f"{output} cannot be written: {error.strerror or error}") from None
-    return Checked(figures(table), (), output)
-
-
-def send(table: AxisTable, target: Target) -> Answer:
-    """Send TABLE to a running machine; not ok if a node did not take it. Raises CanductorError."""
-    params = {
-        "axis": table.axis,
-        "unit": str(table.unit),
-        "positions": list(table.positions),
-        "forward": list(table.forward),
-        "reverse": list(table.reverse),
-    }
-    result = call(target, "table.send", params).result
-    return _answer(result, [f"note: {note}" for note in result["notes"]], result["downloads"])
-
-
-def remove(axis: str, target: Target) -> Answer:
-    """Remove the table of AXIS; not ok if a node keeps it. Raises CanductorError."""
-    result = call(target, "table.remove", {"axis": axis}).result
-    return _answer(result, [], result["downloads"])
-
-
-def status(axis: str | None, target: Target) -> Answer:
-    """Report the tables of AXIS, or of all axes; raises CanductorError."""
-    result = call(target, "table.status", {}).result
-    if axis is not None:
-        result = {"axes": [one for one in result["axes"] if one["axis"] == axis]}
-        if not result["axes"]:
-            raise TableError(f"the machine has no tables for an axis {axis}")
-    return _answer(result, [])
 
 
 def _notes(table: AxisTable, config: Path | None) -> list[str]:

@@ -11,6 +11,7 @@ from nodes.mt.mt import AXLES
 from nodes.support.can_protocol import MT_CAN_ID
 from nodes.support.option_values import (
     UsageError,
+    integer,
     options_from,
     parse_float,
     parse_hex,
@@ -62,7 +63,7 @@ def declare_device(action: argparse.ArgumentParser, *, sends: bool, has_file: bo
             type=partial(parse_ratio, high=1.0),
             default=SHARE,
             metavar="RATIO",
-            help="ratio of the CAN bus to use (default: 20%%)",
+            help="ratio of the CAN bus to use",
         )
         add(
             "--can-id",
@@ -82,14 +83,14 @@ def declare_device(action: argparse.ArgumentParser, *, sends: bool, has_file: bo
     add("--link", action="store_true", help="a node that keeps tables is at the other end of the serial line")
     add(
         "--baud",
-        type=partial(parse_int, low=50, high=4_000_000),
+        type=integer(50, 4_000_000),
         default=BAUD,
         metavar="BIT/S",
-        help="baud rate of the serial line (default: %(default)s)",
+        help="baud rate of the serial line",
     )
     add(
         "--bitrate",
-        type=partial(parse_int, low=10_000, high=8_000_000),
+        type=integer(10_000, 8_000_000),
         metavar="BIT/S",
         help="bit rate of the CAN bus, if the interface does not know it",
     )

@@ -1,13 +1,14 @@
 """Which machine a program talks to, and how it gets in."""
 
 import ssl
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from coordinator.ipc.client.client import Client
 from coordinator.support.interrupts import run_to_end
+from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
 T = TypeVar("T")
@@ -35,6 +36,10 @@ class Target:
             return ssl.create_default_context(cafile=self.certificate)
         except (OSError, ssl.SSLError) as error:
             raise CanductorError(f"{self.certificate} is no certificate: {error}") from None
+
+    def call(self, method: str, params: Mapping[str, Value] | None = None) -> Any:
+        """Call METHOD with PARAMS and return its result; raises CanductorError."""
+        return self.run(lambda client: client.call(method, params))
 
     def run(self, body: Callable[[Client], Awaitable[T]]) -> T:
         """Run BODY with a connected client, on its own loop; Ctrl-C cancels it. Raises CanductorError."""

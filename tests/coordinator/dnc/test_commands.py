@@ -1,7 +1,6 @@
 """The commands at both ends of a cable, in virtual time; and over TCP, by pyserial's ways."""
 
 import contextlib
-import functools
 import math
 import os
 import queue
@@ -180,10 +179,10 @@ def test_over_tcp(folders: tuple[Path, Path], scheme: str, capsys: pytest.Captur
 
 
 def _serve(url: str, folder: Path, say: Callable[[str], None]) -> None:
-    command = parse_command_line(["dnc", "serve", str(folder), "-p", url, *FAST])
-    assert isinstance(command, functools.partial)
+    words = ["dnc", "serve", str(folder), "-p", url, *FAST]
+    serve = parse_command_line(words, surroundings=Surroundings(say=say))
     with contextlib.suppress(PortError):  # the other side has gone
-        command(around=Surroundings(say=say))
+        serve()
 
 
 def _join(ours_at: socket.socket, theirs_at: socket.socket, speaks_rfc2217: bool) -> None:

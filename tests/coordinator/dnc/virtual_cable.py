@@ -5,7 +5,6 @@ same every time.
 """
 
 import contextlib
-import functools
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -120,14 +119,12 @@ class _Command:
     """A command, and what it says."""
 
     def __init__(self, cable: VirtualCable, words: tuple[str, ...], typed: IO[bytes] | None) -> None:
-        command = parse_command_line(["dnc", *words])
-        assert isinstance(command, functools.partial)
         self.cable = cable
         self.said: list[str] = []
         self.stopping = False
         self.stopped = False
-        self._command = command
-        self._around = Surroundings(self._open, lambda: cable.time.now_s, self.said.append, typed)
+        around = Surroundings(self._open, lambda: cable.time.now_s, self.said.append, typed)
+        self._job = parse_command_line(["dnc", *words], surroundings=around)
         self._thread: Thread[Ended]
 
     def _open(self, name: str, options: DncOptions, rtscts: bool) -> _Port:
@@ -136,13 +133,13 @@ class _Command:
 
     def run(self) -> Ended:
         try:
-            report = self._command(around=self._around)
+            report = self._job()
         except CanductorError as error:
             return Ended(1, "", [*self.said, str(error)], {})
         except Terminated:
             return Ended(143, "", self.said, {})
         assert report.ok
-        return Ended(0, report.to_text(), self.said, report.to_json())
+        return Ended(0, report.to_text(), self.said, dict(report.to_json()))
 
     def start(self) -> None:
         time = self.cable.time
