@@ -7,7 +7,7 @@ from typing import Any
 import can
 
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, whole
+from nodes.support.option_values import UsageError, integer
 
 BITRATE_MIN, BITRATE_MAX = 10_000, 1_000_000
 
@@ -38,22 +38,22 @@ class BusOptions:
 def declare_bus(command: argparse.ArgumentParser) -> None:
     """Add the options that say which bus."""
     add = command.add_argument
-    add("-i", "--interface", default="socketcan", help="backend of python-can; socketcan if not given")
-    add("-c", "--channel", help="the backend's channel; can0 if not given")
-    add("-b", "--bitrate", metavar="BIT/S", help="set the adapter to this bit rate, where the backend can")
-
-
-def bus_options(given: argparse.Namespace, *, listen_only: bool = False) -> BusOptions:
-    """Read what ``declare_bus`` declared; raises UsageError."""
-    if given.channel is None and given.interface != "socketcan":
-        raise UsageError(f"--channel is missing: python-can's backend '{given.interface}' needs to know it")
-    bitrate = None if given.bitrate is None else whole("--bitrate", given.bitrate, BITRATE_MIN, BITRATE_MAX)
-    return BusOptions(
-        interface=given.interface,
-        channel=given.channel or "can0",
-        bitrate=bitrate,
-        listen_only=listen_only,
+    add("-i", "--interface", default="socketcan", help="backend of python-can (default: %(default)s)")
+    add("-c", "--channel", help="channel of the backend (default: can0)")
+    add(
+        "-b",
+        "--bitrate",
+        type=integer(BITRATE_MIN, BITRATE_MAX),
+        metavar="BIT/S",
+        help="set the adapter to this bit rate, if the backend can",
     )
+
+
+def bus_options(given: argparse.Namespace) -> BusOptions:
+    """Return what ``declare_bus`` declared; raises UsageError."""
+    if given.channel is None and given.interface != "socketcan":
+        raise UsageError(f"--channel is missing: python-can's backend '{given.interface}' requires it")
+    return BusOptions(interface=given.interface, channel=given.channel or "can0", bitrate=given.bitrate)
 
 
 def open_bus(options: BusOptions) -> can.BusABC:

@@ -8,7 +8,7 @@ from canbus_tools.bus.talk import LISTEN_S, BusTalk
 from canbus_tools.discovery.node_discovery import ROUNDS, DiscoveredNodes, NodeDiscovery
 from nodes.link import Frame
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import number
+from nodes.support.option_values import decimal
 from nodes.transport.frame import BUS_OFF
 
 _CAUSE_S: Final = 0.2
@@ -60,18 +60,14 @@ def bus_off(bus: str) -> CanductorError:
 
 
 def declare_listen(command: argparse.ArgumentParser) -> None:
-    """Add the option that says how long to listen for other hosts."""
+    """Add the option ``listen``: how long to listen for other hosts, in seconds."""
     command.add_argument(
         "--listen",
+        type=decimal(_LISTEN_MIN_S, _LISTEN_MAX_S, "s"),
         metavar="S",
-        default=str(LISTEN_S),
-        help=f"listen so many seconds for other hosts first, {LISTEN_S:g} if not given",
+        default=LISTEN_S,
+        help="how long to listen for other hosts first, in seconds",
     )
-
-
-def listen_option(given: argparse.Namespace) -> float:
-    """Read what ``declare_listen`` declared; raises UsageError."""
-    return number("--listen", given.listen, _LISTEN_MIN_S, _LISTEN_MAX_S, "s")
 
 
 def where(options: BusOptions) -> str:

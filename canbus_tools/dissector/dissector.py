@@ -23,7 +23,7 @@ from nodes.dictionary.message_format import CODES, MessageFormat
 from nodes.dictionary.parts import OutputFormat
 from nodes.support.can_protocol import DATA_NODEID_MAX, FIRST_DATA_ID
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, whole
+from nodes.support.option_values import Assignments, UsageError, options_from, parse_int
 
 WIDTHS: Final = {"%u": 32, "%i": 32, "%hu": 16, "%hi": 16, "%c": 8}
 """Bits of a number with this code."""
@@ -58,32 +58,32 @@ class DissectorOptions:
 def declare(command: argparse.ArgumentParser) -> None:
     """Add the options of this tool."""
     add = command.add_argument
-    add("-o", "--output", type=Path, metavar="FILE", help="where it goes; standard output if not given")
+    add("-o", "--output", type=Path, metavar="FILE", help="file to write (default: standard output)")
     add(
         "--dictionary",
-        action="append",
-        default=[],
+        dest="dictionaries",
+        type=_node_file,
+        action=Assignments,
+        everything="all nodes",
         metavar="[NODE=]FILE",
-        help="decode the messages of node NODE, or of all other nodes, by this dictionary (JSON, or as it is"
-        " downloaded); without one, only the dictionary's download is decoded",
+        help="decode the messages of node NODE, or of all other nodes, by this dictionary (JSON, or as"
+        " downloaded); without one, only dictionary downloads are decoded",
     )
+
+
+def _node_file(text: str) -> tuple[int | str, Path]:
+    node, equals, name = text.partition("=")
+    if equals and node.isdecimal():
+        return parse_int(node, 1, DATA_NODEID_MAX, name="NODE"), Path(name)
+    return "", Path(text)
 
 
 def make_job(given: argparse.Namespace) -> Callable[[object], "DissectorReport"]:
     """Check what was given; raises UsageError."""
-    paths: dict[int | str, Path] = {}
-    for text in given.dictionary:
-        node, equals, name = text.partition("=")
-        key: int | str = ANY
-        if equals and node.isdecimal():
-            key, text = whole("--dictionary NODE", node, 1, DATA_NODEID_MAX), name  # noqa: PLW2901
-        if key in paths:
-            what = "all nodes" if key == ANY else f"node {key}"
-            raise UsageError(f"--dictionary is given twice for {what}")
-        paths[key] = Path(text)
     if given.json and given.output is None:
         raise UsageError("--json needs --output, as both would go to standard output")
-    options = DissectorOptions(output=given.output, dictionaries=paths, json=given.json)
+    dictionaries = {node or ANY: path for node, path in given.dictionaries.items()}
+    options = options_from(DissectorOptions, given, dictionaries=dictionaries)
     return lambda _: write_dissector(options)
 
 

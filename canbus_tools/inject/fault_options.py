@@ -10,36 +10,40 @@ from dataclasses import replace
 from typing import Any, Final
 
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, number, share, whole
+from nodes.support.option_values import Help, UsageError, parse_float, parse_hex, parse_int, parse_ratio
 from nodes.virtual.faults import CLIENTS, ID_MAX, TIME_S_MAX, BusFault, BusFaultKind
 
 _KINDS: Final = {
     "loss": (
         BusFaultKind.LOSE,
         "SHARE",
-        "frames reach nobody, or not the receiver, and the sender believes they did",
+        "frames do not arrive, or not at the receiver, though the sender sees them acknowledged",
     ),
-    "corrupt": (BusFaultKind.CORRUPT, "SHARE", "receivers get frames with one bit of their data changed"),
-    "duplicate": (BusFaultKind.DUPLICATE, "SHARE", "frames come twice, as when an acknowledgement is lost"),
+    "corrupt": (BusFaultKind.CORRUPT, "SHARE", "receivers get frames with one bit of the data changed"),
+    "duplicate": (BusFaultKind.DUPLICATE, "SHARE", "frames arrive twice, as when an acknowledgement is lost"),
     "error": (BusFaultKind.ERROR, "SHARE", "frames are destroyed by an error frame and sent again"),
-    "delay": (BusFaultKind.DELAY, "TIME", "frames come later, the order of each sender's kept"),
-    "bus-off": (BusFaultKind.BUS_OFF, "TIME", "a client is off the bus for so long: at a time, or by share"),
+    "delay": (BusFaultKind.DELAY, "TIME", "frames arrive later, in the order of each sender"),
+    "bus-off": (BusFaultKind.BUS_OFF, "TIME", "a client goes bus-off for this long, at a time or by share"),
 }
 UNITS_S: Final = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0}
 EXPLAINED: Final = """faults:
-  Each may be given several times, up to 32 in all. SHARE is a share or percentage of the frames that the
-  fault picks (0.01, 1%), TIME a number with its unit (300us, 5ms, 2s; without one: seconds). Behind it may
-  come, separated by commas:
-    id=ID[/MASK]   picks frames with this id; with a mask only its bits count (id=0x101/0x701: all from nodes)
-    sender=CLIENT  picks frames of one client: a node started here by its name, or a number: clients count
-                   from 0 in the order in which they connect, nodes started here come first
-    receiver=CLIENT  only this client is hit (loss, corrupt)
-    frame=N        instead of a share: hits of each sender the N-th frame picked
-    from=S until=S   picks frames in this time, in seconds since the bus was ready
-    share=SHARE    delay, bus-off: of the frames picked (a delay hits all, if not given)
-    jitter=TIME    delay: up to this much more, evenly spread
-    at=S           bus-off: at this time; sender= says who, else everybody
-  The same --seed hits the same frames of every sender."""
+  Each may be given several times, up to 32 in all. SHARE is a ratio or percentage of the frames that the
+  fault selects (0.01, 1%), TIME a number with a unit (300us, 5ms, 2s; without one: seconds). These may
+  follow, separated by commas:
+    id=ID[/MASK]   selects frames with this id; a mask says which bits count (id=0x101/0x701: all from nodes)
+    sender=CLIENT  selects frames of one client: the name of a node started here, or a number: clients count
+                   from 0 in the order in which they connect, nodes started here first
+    receiver=CLIENT  affects only this client (loss, corrupt)
+    frame=N        instead of a share: affects the N-th selected frame of each sender
+    from=S until=S   selects frames in this time, in seconds since the bus was ready
+    share=SHARE    delay, bus-off: of the selected frames (a delay affects all by default)
+    jitter=TIME    delay: up to this much more, evenly distributed
+    at=S           bus-off: at this time; sender= says which client (default: all)
+  The same --seed affects the same frames of every sender."""
+
+
+class _RawHelp(Help, argparse.RawDescriptionHelpFormatter):
+    """Keeps the lines of the explanation."""
 
 
 def declare_faults(command: argparse.ArgumentParser) -> None:
@@ -47,12 +51,12 @@ def declare_faults(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group("faults (explained below)")
     for name, (_, metavar, meaning) in _KINDS.items():
         group.add_argument(f"--{name}", action="append", default=[], metavar=f"{metavar},…", help=meaning)
-    command.formatter_class = argparse.RawDescriptionHelpFormatter
+    command.formatter_class = _RawHelp
     command.epilog = EXPLAINED
 
 
 def read_faults(given: argparse.Namespace, names: Mapping[str, int]) -> list[tuple[str, BusFault]]:
-    """Return the faults with the words that asked for them; NAMES: places of clients. Raises UsageError."""
+    """Return the faults with their text on the command line; NAMES: places of clients. Raises UsageError."""
     return [
         (f"{name} {text}", read_fault(name, text, names))
         for name in _KINDS
@@ -61,7 +65,7 @@ def read_faults(given: argparse.Namespace, names: Mapping[str, int]) -> list[tup
 
 
 def read_fault(name: str, text: str, names: Mapping[str, int]) -> BusFault:
-    """Read what stands behind --NAME; raises UsageError."""
+    """Return the fault of ``--NAME TEXT``; raises UsageError."""
     option = f"--{name}"
     first, *rest = text.split(",")
     if "=" in first:
@@ -122,20 +126,20 @@ class _Reader:
             raise UsageError(f"{self.option} needs at=SECONDS, share= or frame= to know when")
 
     def share(self, text: str) -> float:
-        return share(self.option, text, 1.0)
+        return parse_ratio(text, 1.0, name=self.option)
 
     def seconds(self, text: str) -> float:
-        return number(self.option, text, 0, TIME_S_MAX, "s")
+        return parse_float(text, 0, TIME_S_MAX, "s", name=self.option)
 
     def time(self, text: str) -> float:
         digits = text.rstrip("abcdefghijklmnopqrstuvwxyz")
         unit = text[len(digits) :]
         if unit not in UNITS_S:
-            raise UsageError(f"{self.option} is '{text}', must be a number with us, ms or s behind it")
-        return number(self.option, digits, 0, TIME_S_MAX, unit) * UNITS_S[unit]
+            raise UsageError(f"{self.option} is '{text}', must be a number with the unit us, ms or s")
+        return parse_float(digits, 0, TIME_S_MAX, unit, name=self.option) * UNITS_S[unit]
 
     def frame(self, text: str) -> int:
-        return whole(f"{self.option}'s frame", text, 1)
+        return parse_int(text, 1, name=f"{self.option}'s frame")
 
     def place(self, text: str) -> int:
         if text in self._names:
@@ -144,22 +148,14 @@ class _Reader:
             raise UsageError(
                 f"{self.option}: no node '{text}' is started here, only {', '.join(self._names)}"
             )
-        return whole(f"{self.option}'s client", text, 0, CLIENTS - 1)
+        return parse_int(text, 0, CLIENTS - 1, name=f"{self.option}'s client")
 
     def id(self, text: str) -> tuple[int, int]:
         can_id, slash, mask = text.partition("/")
         return self._id(can_id), self._id(mask) if slash else ID_MAX
 
     def _id(self, text: str) -> int:
-        try:
-            value = int(text, 0)
-        except ValueError:
-            value = -1
-        if not 0 <= value <= ID_MAX:
-            raise UsageError(
-                f"{self.option}'s id is '{text}', must be a number from 0 to 0x7ff such as 0x109"
-            )
-        return value
+        return parse_hex(text, ID_MAX, name=f"{self.option}'s id")
 
 
 _KEYS: Final[dict[str, Callable[[_Reader, str], Any]]] = {

@@ -15,7 +15,7 @@ from canbus_tools.protocol.decoded import Decoded, Kind
 from canbus_tools.protocol.filters import ALL, Filter
 from canbus_tools.protocol.protocol import Direction
 from nodes.support.can_protocol import DATA_NODEID_MAX
-from nodes.support.option_values import UsageError, whole
+from nodes.support.option_values import UsageError, parse_int
 
 BUSY, FULL = 0.5, 0.8
 """Loads from which the bar is yellow, and red."""
@@ -182,7 +182,7 @@ def read_filter(text: str) -> Filter:
         if not equals:
             messages.append(word)
         elif key == "node":
-            nodes += [whole("node", part, 1, DATA_NODEID_MAX) for part in value.split(",")]
+            nodes += [parse_int(part, 1, DATA_NODEID_MAX, name="node") for part in value.split(",")]
         elif key == "kind":
             kinds |= _kinds(value)
         elif key in ("dir", "direction") and value in ("to", "from"):

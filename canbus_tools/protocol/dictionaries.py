@@ -19,7 +19,7 @@ from nodes.dictionary.dictionary import MAX_COMPRESSED_BYTES, MAX_INFLATED_BYTES
 from nodes.dictionary.parts import DictionaryError
 from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import assignments, existing_file, whole
+from nodes.support.option_values import Assignments, existing_file, parse_assignment, parse_int
 
 GIVEN: Final = "given"
 LEARNT: Final = "learnt from the bus"
@@ -178,22 +178,20 @@ class _Download:
 
 
 def declare_dictionaries(command: argparse.ArgumentParser) -> None:
-    """Add the option that gives dictionaries in files."""
+    """Add the option ``dictionaries``: by node id, read from files."""
     command.add_argument(
         "--dictionary",
+        dest="dictionaries",
+        type=_node_dictionary,
+        action=Assignments,
         metavar="NODE=FILE",
-        action="append",
-        help="the dictionary of node NODE, as JSON or as it is downloaded; else it is learnt from traffic",
+        help="dictionary of node NODE, as JSON or as downloaded (default: learnt from traffic)",
     )
 
 
-def given_dictionaries(given: argparse.Namespace) -> dict[int, Dictionary]:
-    """Read what ``declare_dictionaries`` declared; raises UsageError, CanductorError."""
-    files = assignments("--dictionary", given.dictionary, Path)
-    return {
-        whole("--dictionary NODE", node, 1, DATA_NODEID_MAX): read_dictionary(path)
-        for node, path in files.items()
-    }
+def _node_dictionary(text: str) -> tuple[int, Dictionary]:
+    node, path = parse_assignment(text, Path)
+    return parse_int(node, 1, DATA_NODEID_MAX, name="NODE"), read_dictionary(path)
 
 
 def read_dictionary(path: Path) -> Dictionary:

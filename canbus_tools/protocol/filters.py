@@ -9,7 +9,7 @@ from typing import Final
 from canbus_tools.protocol.decoded import Decoded, Kind
 from canbus_tools.protocol.protocol import Direction
 from nodes.support.can_protocol import DATA_NODEID_MAX
-from nodes.support.option_values import UsageError, whole
+from nodes.support.option_values import UsageError, integer
 
 ALL: Final = "all"
 DEFAULT_KINDS: Final = frozenset(Kind) - {Kind.ACK}
@@ -44,27 +44,32 @@ class Filter:
 def declare_filter(command: argparse.ArgumentParser) -> None:
     """Add the options that say what to show."""
     add = command.add_argument
-    add("--node", metavar="NODE", action="append", help="only of this node id; may be repeated")
+    add(
+        "--node",
+        type=integer(1, DATA_NODEID_MAX),
+        metavar="NODE",
+        action="append",
+        help="show only this node id; may be repeated",
+    )
     add(
         "--message",
         metavar="NAME",
         action="append",
-        help="only messages and frames of this name, * stands for anything; may be repeated",
+        help="show only messages and frames of this name; * matches any characters; may be repeated",
     )
-    add("--direction", choices=("to", "from"), help="only to nodes, or only from them")
+    add("--direction", choices=("to", "from"), help="show only what is sent to nodes, or only what they send")
     add(
         "--kind",
         choices=(*(kind.value for kind in Kind), ALL),
         action="append",
-        help="only of this kind; may be repeated; if not given, all but ack",
+        help="show only this kind; may be repeated (default: all but ack)",
     )
 
 
 def given_filter(given: argparse.Namespace) -> Filter:
-    """Read what ``declare_filter`` declared; raises UsageError."""
-    nodes = given.node and [whole("--node", node, 1, DATA_NODEID_MAX) for node in given.node]
+    """Return what ``declare_filter`` declared; raises UsageError."""
     if given.message and not all(given.message):
         raise UsageError("--message is empty; give a name as a dictionary has it, such as get_clock")
     kinds = given.kind and (set(Kind) if ALL in given.kind else {Kind(kind) for kind in given.kind})
     direction = Direction(given.direction) if given.direction else None
-    return Filter(nodes, given.message, direction, kinds)
+    return Filter(given.node, given.message, direction, kinds)

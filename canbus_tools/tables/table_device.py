@@ -1,6 +1,6 @@
 """Tables to drives and nodes at a device, without a coordinator: sends them, and tells who confirmed.
 
-``canductor table send --device`` and its kin; coordinator/cli/arguments/table_device.py has the words.
+``canductor table send --device`` and its kin; coordinator/cli/commands/table_device.py has the options.
 """
 
 import asyncio

@@ -8,12 +8,12 @@ from typing import Final
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import LISTEN_S, BusTalk
-from canbus_tools.discovery.ask_bus import declare_listen, discover_nodes, listen_option, where
+from canbus_tools.discovery.ask_bus import declare_listen, discover_nodes, where
 from canbus_tools.discovery.inventory import PROBED, Inventory, NodePresence, take_inventory
 from canbus_tools.discovery.node_info import NodeInfo, read_node_info
 from nodes.bus.assign import AssignError, Uuid
 from nodes.support.can_protocol import ADMIN_ID, FIRST_NODEID, LAST_NODEID, SET_NODEID
-from nodes.support.option_values import UsageError, whole
+from nodes.support.option_values import UsageError, integer
 
 TRIES: Final = 3
 """Nobody acknowledges an id, and frames get lost."""
@@ -21,8 +21,14 @@ TRIES: Final = 3
 
 def declare(command: argparse.ArgumentParser) -> None:
     """Add the options."""
-    command.add_argument("uuid", metavar="UUID", help="12 hex digits, as 'canductor can query' prints them")
-    command.add_argument("nodeid", metavar="NODEID", help=f"{FIRST_NODEID} to {LAST_NODEID}")
+    add = command.add_argument
+    add("uuid", type=parse_uuid, metavar="UUID", help="12 hex digits, as printed by 'canductor can query'")
+    add(
+        "nodeid",
+        type=integer(FIRST_NODEID, LAST_NODEID),
+        metavar="NODEID",
+        help=f"id to assign, {FIRST_NODEID} to {LAST_NODEID}",
+    )
     declare_bus(command)
     declare_listen(command)
 
@@ -30,19 +36,16 @@ def declare(command: argparse.ArgumentParser) -> None:
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "AssignReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
-    uuid = uuid_option("UUID", given.uuid)
-    nodeid = whole("NODEID", given.nodeid, FIRST_NODEID, LAST_NODEID)
-    listen_s = listen_option(given)
-    return lambda computer: assign(computer, bus, uuid, nodeid, listen_s=listen_s)
+    return lambda computer: assign(computer, bus, given.uuid, given.nodeid, listen_s=given.listen)
 
 
-def uuid_option(option: str, text: str) -> Uuid:
-    """Read a uuid; raises UsageError."""
+def parse_uuid(text: str) -> Uuid:
+    """Return the uuid of an option; raises UsageError."""
     try:
         return Uuid.parse(text)
     except AssignError:
         raise UsageError(
-            f"{option} is '{text}', must be the 12 hex digits that 'canductor can query' prints"
+            f"is '{text}', must be the 12 hex digits that 'canductor can query' prints"
         ) from None
 
 

@@ -18,7 +18,7 @@ from canbus_tools.console.session import Quit, Session
 from canbus_tools.discovery.inventory import take_inventory
 from nodes.bus.assign import Uuid
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, existing_file, whole
+from nodes.support.option_values import UsageError, existing_file, integer, options_from, parse_int
 from nodes.transport import BAUD_DEFAULT
 
 NODEID_MAX = 255
@@ -45,12 +45,29 @@ def declare(command: argparse.ArgumentParser) -> None:
     """Add the options."""
     declare_bus(command)
     add = command.add_argument
-    add("--node", metavar="ID|UUID", help="the node on the CAN bus: its id, or its uuid of 12 hex digits")
-    add("--uart", type=Path, metavar="PATH", help="the node is at this serial device")
-    add("--baud", metavar="BIT/S", help=f"rate of the serial device; {BAUD_DEFAULT} if not given")
-    add("--force", action="store_true", help="talk even if another host may talk to the node: it loses it")
-    add("-e", "--execute", metavar="LINE", action="append", help="run this line; may be given repeatedly")
-    add("--script", type=Path, metavar="FILE", help="run the lines of a file; an error ends it")
+    add(
+        "--node",
+        type=_node,
+        metavar="ID|UUID",
+        help="node on the CAN bus: its id, or its uuid of 12 hex digits",
+    )
+    add("--uart", type=Path, metavar="PATH", help="serial device of the node")
+    add(
+        "--baud",
+        type=integer(BAUD_MIN, BAUD_MAX),
+        metavar="BIT/S",
+        help=f"baud rate of the serial device (default: {BAUD_DEFAULT})",
+    )
+    add("--force", action="store_true", help="use the node even if another host uses it; that host loses it")
+    add(
+        "-e",
+        "--execute",
+        dest="commands",
+        metavar="LINE",
+        action="append",
+        help="run this line; may be repeated",
+    )
+    add("--script", type=existing_file, metavar="FILE", help="run the lines of this file; stop at an error")
 
 
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "ConsoleReport"]:
@@ -61,25 +78,26 @@ def make_job(given: argparse.Namespace) -> Callable[[Computer], "ConsoleReport"]
         raise UsageError("--uart does not go with --channel")
     if given.baud is not None and given.uart is None:
         raise UsageError("--baud goes with --uart; a CAN bus takes --bitrate")
-    if given.execute and given.script:
+    if given.commands and given.script:
         raise UsageError("console takes either --execute or --script")
-    if given.node is not None and not _UUID.match(given.node):
-        if not given.node.isdecimal():
-            raise UsageError(
-                f"--node is '{given.node}', must be an id from 1 to 255, or a uuid of 12 hex digits"
-            )
-        whole("--node", given.node, 1, NODEID_MAX)
-    options = ConsoleOptions(
+    options = options_from(
+        ConsoleOptions,
+        given,
         bus=None if given.uart is not None else bus_options(given),
         node=given.node or "",
-        uart=given.uart,
-        baud=BAUD_DEFAULT if given.baud is None else whole("--baud", given.baud, BAUD_MIN, BAUD_MAX),
-        force=given.force,
-        commands=tuple(given.execute or ()),
-        script=existing_file(given.script),
+        baud=given.baud or BAUD_DEFAULT,
+        commands=tuple(given.commands or ()),
         as_json=given.json,
     )
     return lambda computer: run_console(computer, options)
+
+
+def _node(text: str) -> str:
+    if _UUID.match(text):
+        return text
+    if not text.isdecimal():
+        raise UsageError(f"is '{text}', must be an id from 1 to 255, or a uuid of 12 hex digits")
+    return str(parse_int(text, 1, NODEID_MAX))
 
 
 def run_console(computer: Computer, options: ConsoleOptions) -> "ConsoleReport":

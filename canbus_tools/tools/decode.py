@@ -13,7 +13,7 @@ from typing import BinaryIO, Final
 from canbus_tools.bus.until_stopped import StopFlag, stop_flag
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
-from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
+from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries
 from canbus_tools.protocol.filters import Filter, declare_filter, given_filter
 from canbus_tools.protocol.frame import Frame
 from canbus_tools.protocol.lines import line_of, printable, table_of
@@ -50,43 +50,41 @@ def declare(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add(
         "files",
+        type=_recording,
         metavar="FILE",
         nargs="+",
-        help="candump log, BLF, ASC, pcap, pcapng or MCAP; -: a log piped in",
+        help="candump log, BLF, ASC, pcap, pcapng or MCAP; - reads a candump log from standard input",
     )
     declare_dictionaries(command)
     declare_filter(command)
-    moment = "seconds as the recording counts them, or +SECONDS after its first frame"
-    add("--since", metavar="TIME", help=f"show from then on: {moment}")
-    add("--until", metavar="TIME", help="stop there")
-    add("--summary", action="store_true", help="show no lines, only each node's counters")
+    moment = "in seconds as the recording counts them, or +SECONDS after its first frame"
+    add("--since", type=_moment, metavar="TIME", help=f"start at this time, {moment}")
+    add("--until", type=_moment, metavar="TIME", help="stop at this time")
+    add("--summary", action="store_true", help="show only the counters of each node")
 
 
 def make_job(given: argparse.Namespace) -> "Callable[[object], DecodeReport]":
     """Check what was given and return the job."""
-    files = [Path(file) for file in given.files]
-    for file in files:
-        if file != STANDARD_INPUT:
-            existing_file(file)
     job = Decoding(
         filter_=given_filter(given),
-        dictionaries=given_dictionaries(given),
-        since=_moment("--since", given.since),
-        until=_moment("--until", given.until),
+        dictionaries=given.dictionaries,
+        since=given.since,
+        until=given.until,
         lines=not given.summary,
         as_json=given.json,
     )
-    return lambda _: job.run(files)
+    return lambda _: job.run(given.files)
 
 
-def _moment(option: str, text: str | None) -> Moment | None:
-    if text is None:
-        return None
+def _recording(text: str) -> Path:
+    path = Path(text)
+    return path if path == STANDARD_INPUT else existing_file(path)
+
+
+def _moment(text: str) -> Moment:
     match = _MOMENT.match(text)
     if match is None:
-        raise UsageError(
-            f"{option} is '{text}', must be seconds such as 1700000000.5, or +2.5 after the start"
-        )
+        raise UsageError(f"is '{text}', must be seconds such as 1700000000.5, or +2.5 after the start")
     return Moment(float(match[2]), bool(match[1]))
 
 

@@ -17,7 +17,7 @@ from canbus_tools.doctor.population import check_nodes
 from canbus_tools.doctor.traffic import check_traffic
 from canbus_tools.support.text_table import count, paragraph
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, number
+from nodes.support.option_values import UsageError, decimal
 
 LISTEN_S: Final = 3.0
 LISTEN_S_MIN, LISTEN_S_MAX = 0.2, 600.0
@@ -29,19 +29,28 @@ def declare(command: argparse.ArgumentParser) -> None:
     """Add the options."""
     declare_bus(command)
     add = command.add_argument
-    add("--listen", metavar="S", default=f"{LISTEN_S:g}", help=f"how long to listen first; {LISTEN_S:g} s")
-    add("--quiet-bus", action="store_true", help="send nothing: only look and listen")
-    add("--try-bitrates", action="store_true", help="without a node: listen at other bit rates (listen-only)")
+    add(
+        "--listen",
+        type=decimal(LISTEN_S_MIN, LISTEN_S_MAX, "s"),
+        default=LISTEN_S,
+        metavar="S",
+        help="how long to listen first, in seconds",
+    )
+    add("--quiet-bus", action="store_true", help="send nothing: only listen and read the interface's state")
+    add(
+        "--try-bitrates",
+        action="store_true",
+        help="if no node is found, listen at other bit rates, listen-only",
+    )
 
 
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "Diagnosis"]:
     """Check what was given; raises UsageError."""
-    listen_s = number("--listen", given.listen, LISTEN_S_MIN, LISTEN_S_MAX, "s")
     options = bus_options(given)
     if given.try_bitrates and given.quiet_bus:
         raise UsageError("--try-bitrates is for a bus without nodes, which --quiet-bus does not look for")
     return lambda computer: examine(
-        computer, options, listen_s, quiet=given.quiet_bus, try_others=given.try_bitrates
+        computer, options, given.listen, quiet=given.quiet_bus, try_others=given.try_bitrates
     )
 
 

@@ -22,7 +22,7 @@ from typing import Final, cast
 from canbus_tools.inject.fault_options import declare_faults, read_faults
 from canbus_tools.inject.inject_report import InjectReport, StatusLine
 from canbus_tools.inject.socketcand_server import PORT, SocketcandServer
-from nodes.support.option_values import UsageError, number, whole
+from nodes.support.option_values import UsageError, decimal, integer, options_from, parse_int
 from nodes.virtual.faults import BusFault
 from nodes.virtual.hub import BITRATE_MAX, BusStats, VirtualBus
 from nodes.virtual.processes import Flavour, NodeProcess
@@ -61,60 +61,78 @@ def declare(command: argparse.ArgumentParser) -> None:
     add(
         "-c",
         "--channel",
+        dest="path",
         type=Path,
         default=DEFAULT_PATH,
         metavar="PATH",
-        help=f"where the bus's socket goes; other tools take it as -i canductor -c PATH ({DEFAULT_PATH})",
+        help="socket of the bus; other tools use it with -i canductor -c PATH",
     )
-    add("-b", "--bitrate", metavar="BIT/S", default="1000000", help="1000000 if not given; 0: no limit")
-    add("--seed", metavar="N", default="0", help="decides which frames the faults hit; 0 if not given")
-    add("--duration", "--for", metavar="S", help="end after so long; else at Ctrl-C")
+    add(
+        "-b",
+        "--bitrate",
+        type=integer(0, BITRATE_MAX),
+        default=1_000_000,
+        metavar="BIT/S",
+        help="bit rate; 0: unlimited",
+    )
+    add(
+        "--seed",
+        type=integer(0, 2**64 - 1),
+        default=0,
+        metavar="N",
+        help="selects the frames that the faults affect",
+    )
+    add(
+        "--duration",
+        "--for",
+        dest="duration_s",
+        type=decimal(0, 1e8, "s"),
+        metavar="S",
+        help="stop after this many seconds (default: at Ctrl-C)",
+    )
     add(
         "--nodes",
+        type=_nodes,
+        default={},
         metavar="BOARD,…",
-        help=f"run nodes with canductor's firmware on the bus: {' or '.join(FLAVOURS)}, also several of one",
+        help=f"run nodes with canductor's firmware: {' or '.join(FLAVOURS)}; a board may be repeated",
     )
     add(
         "--socketcand",
+        type=_address,
         metavar="[HOST:]PORT",
-        help=f"serve the socketcand protocol there; HOST: 127.0.0.1 if not given; PORT: often {PORT}, 0: any",
+        help=f"serve the socketcand protocol (default host: 127.0.0.1; usual port: {PORT}; 0: any port)",
     )
     add(
         "--socketcand-bus",
+        type=_bus_name,
         metavar="NAME",
         default="can0",
-        help="how its clients call the bus; can0 if not given",
+        help="name of the bus for socketcand clients",
     )
     declare_faults(command)
 
 
 def make_job(given: argparse.Namespace) -> Callable[[object], InjectReport]:
     """Check what was given; raises UsageError."""
-    nodes = _nodes(given.nodes)
-    name = given.socketcand_bus
-    if not 1 <= len(name) <= 16 or not name.isascii() or not name.replace("-", "").replace("_", "").isalnum():
-        raise UsageError(f"--socketcand-bus is '{name}', must be 1 to 16 letters and digits")
-    options = InjectOptions(
-        path=given.channel,
-        bitrate=whole("--bitrate", given.bitrate, 0, BITRATE_MAX),
-        seed=whole("--seed", given.seed, 0, 2**64 - 1),
-        faults=tuple(read_faults(given, {node: place for place, node in enumerate(nodes)})),
-        nodes=nodes,
-        socketcand=None if given.socketcand is None else _address(given.socketcand),
-        socketcand_bus=name,
-        duration_s=None if given.duration is None else number("--duration", given.duration, 0, 1e8, "s"),
-        json=given.json,
-    )
+    places = {node: place for place, node in enumerate(given.nodes)}
+    options = options_from(InjectOptions, given, faults=tuple(read_faults(given, places)))
     return lambda _: Injection(options).run()
 
 
-def _nodes(text: str | None) -> dict[str, Flavour]:
-    words = [] if text is None else text.split(",")
+def _bus_name(text: str) -> str:
+    if not 1 <= len(text) <= 16 or not text.isascii() or not text.replace("-", "").replace("_", "").isalnum():
+        raise UsageError(f"is '{text}', must be 1 to 16 letters and digits")
+    return text
+
+
+def _nodes(text: str) -> dict[str, Flavour]:
+    words = text.split(",")
     for word in words:
         if word not in FLAVOURS:
-            raise UsageError(f"--nodes has '{word}', must be {' or '.join(FLAVOURS)}, separated by commas")
+            raise UsageError(f"has '{word}', must be {' or '.join(FLAVOURS)}, separated by commas")
     if len(words) > NODES_MAX:
-        raise UsageError(f"--nodes has {len(words)} nodes, must be at most {NODES_MAX}")
+        raise UsageError(f"has {len(words)} nodes, must be at most {NODES_MAX}")
     names: dict[str, Flavour] = {}
     seen: Counter[str] = Counter()
     for word in words:
@@ -126,8 +144,8 @@ def _nodes(text: str | None) -> dict[str, Flavour]:
 def _address(text: str) -> tuple[str, int]:
     host, colon, port = text.rpartition(":")
     if colon and not host:
-        raise UsageError(f"--socketcand is '{text}', must be a port, or HOST:PORT")
-    return host.strip("[]") or "127.0.0.1", whole("--socketcand's port", port, 0, 65535)
+        raise UsageError(f"is '{text}', must be a port, or HOST:PORT")
+    return host.strip("[]") or "127.0.0.1", parse_int(port, 0, 65535, name="port")
 
 
 def uuid_of(index: int) -> str:

@@ -12,8 +12,6 @@ from typing import Any, Final
 
 from canbus_tools.bus import load_plot
 from canbus_tools.bus.bus_load import (
-    BITRATE_MAX,
-    BITRATE_MIN,
     EXTENDED,
     OTHER_IDS,
     WINDOW_S,
@@ -30,7 +28,7 @@ from canbus_tools.protocol.protocol import Direction, frame_format, owner_of
 from canbus_tools.recordings.recordings import read_frames
 from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, number, whole
+from nodes.support.option_values import UsageError, decimal, parse_path
 
 DURATION_S: Final = 10.0
 DURATION_S_MAX: Final = 86_400.0
@@ -44,33 +42,46 @@ def declare(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add("recording", nargs="?", type=Path, metavar="FILE", help="measure a recording instead of a live bus")
     declare_bus(command)
-    add("--duration", metavar="S", help=f"how long to measure; {DURATION_S:g} if not given")
-    add("--watch", action="store_true", help="show it as it goes, until Ctrl-C")
-    add("--window", metavar="S", default=f"{WINDOW_S:g}", help="length of what peak and plot show (1)")
-    add("--plot", type=Path, metavar="FILE", help="draw load over time: .svg, or .png by rsvg-convert")
+    add(
+        "--duration",
+        type=decimal(0.1, DURATION_S_MAX, "s"),
+        metavar="S",
+        help=f"how long to measure, in seconds (default: {DURATION_S:g})",
+    )
+    add("--watch", action="store_true", help="show the load continuously, until Ctrl-C")
+    add(
+        "--window",
+        type=decimal(WINDOW_S_MIN, WINDOW_S_MAX, "s"),
+        default=WINDOW_S,
+        metavar="S",
+        help="averaging window of peak and plot, in seconds",
+    )
+    add("--plot", type=_plot, metavar="FILE", help="draw the load over time: .svg, or .png by rsvg-convert")
 
 
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "LoadReport"]:
     """Check what was given; raises UsageError."""
-    window_s = number("--window", given.window, WINDOW_S_MIN, WINDOW_S_MAX, "s")
-    if given.plot is not None and given.plot.suffix.lower() not in (".svg", ".png"):
-        raise UsageError(f"--plot is '{given.plot}', must end in .svg or .png")
+    window_s: float = given.window
     if given.recording is not None:
         if given.watch or given.duration is not None or given.channel is not None:
-            raise UsageError("a recording is measured whole: --watch, --duration and --channel do not fit")
+            raise UsageError(
+                "a recording is measured from start to end: --watch, --duration and --channel do not apply"
+            )
         if given.bitrate is None:
-            raise UsageError("--bitrate is missing: no recording says at which bit rate its bus ran")
-        bitrate = whole("--bitrate", given.bitrate, BITRATE_MIN, BITRATE_MAX)
+            raise UsageError("--bitrate is missing: a recording does not contain the bit rate of its bus")
+        bitrate: int = given.bitrate
         recording: Path = given.recording
         return lambda _: _finish(measure_recording(recording, bitrate, window_s), str(recording), given.plot)
-    duration_s = None if given.watch else DURATION_S
-    if given.duration is not None:
-        duration_s = number("--duration", given.duration, 0.1, DURATION_S_MAX, "s")
+    duration_s = given.duration or (None if given.watch else DURATION_S)
     options = bus_options(given)
     shown = _Screen() if given.watch and not given.json else None
     return lambda computer: _finish(
         measure(computer, options, duration_s, window_s, shown), options.name, given.plot
     )
+
+
+def _plot(text: str) -> Path:
+    return parse_path(text, ".svg", ".png")
 
 
 def find_bitrate(options: BusOptions) -> int:

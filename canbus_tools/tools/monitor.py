@@ -19,7 +19,7 @@ from canbus_tools.monitor.options import MonitorOptions
 from canbus_tools.monitor.screen import MonitorScreen
 from canbus_tools.protocol.decoded import Decoded
 from canbus_tools.protocol.decoder import BusDecoder
-from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
+from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries
 from canbus_tools.protocol.filters import declare_filter, given_filter
 from canbus_tools.protocol.lines import line_of
 from canbus_tools.recordings.mcap_file import json_of
@@ -28,7 +28,7 @@ from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.can_protocol import DATA_NODEID_MAX
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, number, whole
+from nodes.support.option_values import UsageError, decimal, options_from, parse_int
 
 FETCHED: Final = "fetched from the node"
 EVERY_NODE: Final = "all"
@@ -42,38 +42,46 @@ def declare(command: argparse.ArgumentParser) -> None:
     declare_dictionaries(command)
     command.add_argument(
         "--fetch",
+        type=_fetched,
         metavar="NODE",
         action="append",
-        help="ask this node for its dictionary first, or all nodes that no host uses; it talks on the bus",
+        help="first download the dictionary of this node, or of 'all' that no host uses; sends frames",
     )
     declare_filter(command)
     add = command.add_argument
-    add("--lines", action="store_true", help="plain lines; so it is anyway when the output is no terminal")
-    add("--duration", metavar="S", help="end after so long; else at Ctrl-C")
+    add("--lines", action="store_true", help="print lines; the default if the output is no terminal")
+    add(
+        "--duration",
+        dest="duration_s",
+        type=decimal(0.1, DURATION_MAX_S, "s"),
+        metavar="S",
+        help="stop after this many seconds (default: at Ctrl-C)",
+    )
 
 
 def make_job(given: argparse.Namespace) -> "Callable[[Computer], MonitorReport]":
     """Check what was given; raises UsageError, CanductorError."""
-    for node in given.fetch or ():
-        if node != EVERY_NODE:
-            whole("--fetch NODE", node, 1, DATA_NODEID_MAX)
     bus = bus_options(given)
     bitrate, is_known = _bitrate(bus)
-    options = MonitorOptions(
+    options = options_from(
+        MonitorOptions,
+        given,
         bus=bus,
         bitrate=bitrate,
         bitrate_is_known=is_known,
         filter_=given_filter(given),
         filter_text=_filter_text(given),
-        dictionaries=given_dictionaries(given),
         fetch=tuple(given.fetch or ()),
         lines=given.lines or given.json or not sys.stdout.isatty(),
         as_json=given.json,
-        duration_s=given.duration and number("--duration", given.duration, 0.1, DURATION_MAX_S, "s"),
     )
     if not options.lines and not sys.stdin.isatty():
-        raise UsageError("the screen takes keys, and standard input is no terminal; give --lines")
+        raise UsageError("the screen is operated by keys, but standard input is no terminal; give --lines")
     return lambda computer: run_monitor(computer, options)
+
+
+def _fetched(text: str) -> str:
+    return text if text == EVERY_NODE else str(parse_int(text, 1, DATA_NODEID_MAX, name="NODE"))
 
 
 def run_monitor(computer: Computer, options: MonitorOptions) -> "MonitorReport":
@@ -220,7 +228,7 @@ class MonitorReport:
 
 def _filter_text(given: argparse.Namespace) -> str:
     """Return what ``declare_filter`` declared in the words that the screen's filter takes."""
-    words = [f"node={','.join(given.node)}"] if given.node else []
+    words = [f"node={','.join(map(str, given.node))}"] if given.node else []
     words += [f"kind={','.join(given.kind)}"] if given.kind else []
     words += [f"dir={given.direction}"] if given.direction else []
     return " ".join([*words, *(given.message or ())]) or "none"

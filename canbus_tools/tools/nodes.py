@@ -8,7 +8,7 @@ from typing import Final
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import LISTEN_S, BusTalk
-from canbus_tools.discovery.ask_bus import declare_listen, listen_option, where
+from canbus_tools.discovery.ask_bus import declare_listen, where
 from canbus_tools.discovery.inventory import (
     PROBED,
     Inventory,
@@ -19,7 +19,7 @@ from canbus_tools.discovery.inventory import (
 from canbus_tools.discovery.node_discovery import Application
 from canbus_tools.support.text_table import count, paragraph, table
 from nodes.support.can_protocol import LAST_NODEID
-from nodes.support.option_values import UsageError, whole
+from nodes.support.option_values import UsageError, parse_int
 
 HEADINGS: Final = (
     "id",
@@ -57,10 +57,11 @@ def declare(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     add(
         "--probe",
+        type=_ids,
         metavar="IDS",
-        default=f"{PROBED.start}-{PROBED[-1]}",
-        help=f"node ids to try, {PROBED.start}-{PROBED[-1]} if not given; 'none' only listens and asks by"
-        " uuid, for a bus that devices of other protocols share",
+        default=PROBED,
+        help=f"node ids to query, such as 4 or 4-12; 'none' only listens and queries by uuid, for a bus"
+        f" shared with other protocols (default: {PROBED.start}-{PROBED[-1]})",
     )
     declare_listen(command)
 
@@ -68,19 +69,17 @@ def declare(command: argparse.ArgumentParser) -> None:
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "NodesReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
-    probed = _ids("--probe", given.probe)
-    listen_s = listen_option(given)
-    return lambda computer: list_nodes(computer, bus, probed=probed, listen_s=listen_s)
+    return lambda computer: list_nodes(computer, bus, probed=given.probe, listen_s=given.listen)
 
 
-def _ids(option: str, text: str) -> range:
+def _ids(text: str) -> range:
     if text.strip() == "none":
         return range(0)
     first, dash, last = text.partition("-")
-    low = whole(option, first, 1, LAST_NODEID)
-    high = whole(option, last, 1, LAST_NODEID) if dash else low
+    low = parse_int(first, 1, LAST_NODEID)
+    high = parse_int(last, 1, LAST_NODEID) if dash else low
     if low > high:
-        raise UsageError(f"{option} is '{text}', must go from the lower id to the higher")
+        raise UsageError(f"is '{text}', must go from the lower id to the higher")
     return range(low, high + 1)
 
 

@@ -1,16 +1,15 @@
-"""The command line of ``canductor can`` and ``canductor console``: the tools and their options.
+"""The commands ``canductor can TOOL`` and ``canductor console``: the list of tools.
 
 A tool is a module with ``declare(command)``, which adds its options, and ``make_job(given)``, which checks
-the options and returns the job: a callable that takes the computer (bus/computer.py) and returns a report
-with ``ok``, ``to_json()`` and ``to_text()``.
+them and returns the job: a callable that takes the computer (bus/computer.py) and returns a report with
+``ok``, ``to_json()`` and ``to_text()``.
 """
 
 import argparse
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, Final, Protocol
 
-from canbus_tools.bus.computer import Computer, ThisComputer
+from canbus_tools.bus.computer import Computer
 from canbus_tools.dissector import dissector
 from canbus_tools.tools import (
     assign_id,
@@ -25,6 +24,7 @@ from canbus_tools.tools import (
     record,
     release_id,
 )
+from nodes.support.option_values import add_command, add_group
 
 
 class Tool(Protocol):
@@ -39,40 +39,30 @@ class Tool(Protocol):
 
 TOOLS: Final[Mapping[str, tuple[Tool, str]]] = {
     "query": (query, "find the nodes that wait for an id"),
-    "nodes": (nodes, "list every node that is alive, and what it is"),
-    "assign": (assign_id, "give a node its id"),
-    "release": (release_id, "take a node's id back: it waits for one again"),
-    "monitor": (monitor, "show live traffic, decoded, with figures of every node"),
+    "nodes": (nodes, "list all nodes that respond, and what they are"),
+    "assign": (assign_id, "assign an id to a node"),
+    "release": (release_id, "release the id of a node, so that it waits for one again"),
+    "monitor": (monitor, "show live traffic, decoded, with statistics of every node"),
     "decode": (decode, "show a recording, decoded"),
-    "record": (record, "record a bus to MCAP or a candump log"),
-    "load": (load, "measure how busy a bus is, and with what"),
+    "record": (record, "record a bus to an MCAP file or a candump log"),
+    "load": (load, "measure the load of a bus, and what causes it"),
     "doctor": (doctor, "check a bus, and explain what is wrong and what to do"),
     "inject": (inject, "run a virtual bus with faults, also for other CAN programs"),
     "dissector": (dissector, "write a Wireshark dissector of the protocol"),
 }
 """Of ``canductor can``, by name: its module, and what it does."""
-CONSOLE: Final[tuple[Tool, str]] = (console, "talk to one node in its own words")
 
 
-def add_tools(can: argparse.ArgumentParser, computer: Computer | None = None) -> None:
-    """Add all tools to the parser of ``canductor can``; they will run on COMPUTER, this one if None."""
-    tools = can.add_subparsers(title="tools", metavar="TOOL")
-    for name in TOOLS:
-        declare_tool(tools, name, computer)
+def add_to(commands: Any) -> None:
+    """Add ``can`` with all tools, and ``console``; they run on ``given.computer``."""
+    tools = add_group(commands, "can", "find, watch and debug nodes on a CAN bus", "TOOL")
+    for name, (module, summary) in TOOLS.items():
+        _add(tools, name, module, summary)
+    _add(commands, "console", console, "send commands to one node and show its messages")
 
 
-def declare_tool(tools: Any, name: str, computer: Computer | None = None) -> None:
-    """Add the tool NAME, which will run on COMPUTER, with its options to the subparsers TOOLS."""
-    module, summary = TOOLS.get(name, CONSOLE)
-    command = tools.add_parser(name, help=summary, description=f"{summary}.", allow_abbrev=False)
-    module.declare(command)
-    command.add_argument("--json", action="store_true", help="print one JSON object as the last line")
-    command.set_defaults(make_job=partial(_make_job, module.make_job, computer or ThisComputer()))
+def _add(commands: Any, name: str, tool: Tool, summary: str) -> None:
+    def run(given: argparse.Namespace) -> Any:
+        return tool.make_job(given)(given.computer)
 
-
-def _make_job(
-    make: Callable[[argparse.Namespace], Callable[[Computer], Any]],
-    computer: Computer,
-    given: argparse.Namespace,
-) -> Callable[[], Any]:
-    return partial(make(given), computer)
+    add_command(commands, name, summary, tool.declare, run)

@@ -11,7 +11,7 @@ from canbus_tools.bus.talk import BusTalk
 from canbus_tools.discovery.ask_bus import discover_nodes, where
 from canbus_tools.discovery.node_discovery import ROUNDS, Application, DiscoveredNodes, WaitingNode
 from canbus_tools.support.text_table import count, paragraph, table
-from nodes.support.option_values import whole
+from nodes.support.option_values import integer
 
 NAMES: Final[Mapping[Application, str]] = {
     Application.KLIPPER: "Klipper-type firmware",
@@ -27,17 +27,17 @@ def declare(command: argparse.ArgumentParser) -> None:
     declare_bus(command)
     command.add_argument(
         "--rounds",
+        type=integer(1, _ROUNDS_MAX),
         metavar="N",
-        default=str(ROUNDS),
-        help=f"ask so many times, {ROUNDS} if not given: answers can collide or get lost",
+        default=ROUNDS,
+        help="number of queries; answers can collide or get lost",
     )
 
 
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "QueryReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
-    rounds = whole("--rounds", given.rounds, 1, _ROUNDS_MAX)
-    return lambda computer: query(computer, bus, rounds)
+    return lambda computer: query(computer, bus, given.rounds)
 
 
 def query(computer: Computer, options: BusOptions, rounds: int = ROUNDS) -> "QueryReport":

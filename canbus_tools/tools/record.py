@@ -12,14 +12,14 @@ from canbus_tools.bus.computer import Computer, Listener, now_s
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.until_stopped import StopFlag, stop_flag
 from canbus_tools.protocol.decoder import BusDecoder
-from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries, given_dictionaries
+from canbus_tools.protocol.dictionaries import DictionarySource, declare_dictionaries
 from canbus_tools.protocol.frame import Frame
 from canbus_tools.recordings.candump import candump_line
 from canbus_tools.recordings.mcap_file import McapWriter
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.dictionary import Dictionary
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError, number
+from nodes.support.option_values import UsageError, decimal, parse_path
 
 LOOK_S: Final = 0.1
 """How soon Ctrl-C and the end of the time are noticed on a silent bus."""
@@ -45,25 +45,35 @@ def declare(command: argparse.ArgumentParser) -> None:
     """Add the options of the tool."""
     declare_bus(command)
     add = command.add_argument
-    add("-o", "--output", metavar="FILE", required=True, help="FILE.mcap, or FILE.log for a candump log")
-    add("--duration", metavar="S", help="end after that many seconds; else Ctrl-C ends it")
-    add("--force", action="store_true", help="overwrite the file if it is there")
+    add(
+        "-o",
+        "--output",
+        type=_output,
+        metavar="FILE",
+        required=True,
+        help="file to write: FILE.mcap, or FILE.log for a candump log",
+    )
+    add(
+        "--duration",
+        type=decimal(0.1, DURATION_MAX_S, "s"),
+        metavar="S",
+        help="stop after this many seconds (default: at Ctrl-C)",
+    )
+    add("--force", action="store_true", help="overwrite an existing file")
     declare_dictionaries(command)
 
 
 def make_job(given: argparse.Namespace) -> "Callable[[Computer], RecordReport]":
     """Check what was given and return the job."""
-    path = Path(given.output)
-    if path.suffix.lower() not in (".mcap", ".log"):
-        raise UsageError(f"--output is '{path}', must end in .mcap (for Foxglove) or .log (a candump log)")
+    path: Path = given.output
     if path.exists() and not given.force:
-        raise UsageError(f"'{path}' is there already; --force overwrites it")
-    duration_s = (
-        None if given.duration is None else number("--duration", given.duration, 0.1, DURATION_MAX_S, "s")
-    )
+        raise UsageError(f"'{path}' exists already; --force overwrites it")
     options = bus_options(given)
-    dictionaries = given_dictionaries(given)
-    return lambda computer: record_bus(computer, options, path, duration_s, dictionaries)
+    return lambda computer: record_bus(computer, options, path, given.duration, given.dictionaries)
+
+
+def _output(text: str) -> Path:
+    return parse_path(text, ".mcap", ".log")
 
 
 def record_bus(

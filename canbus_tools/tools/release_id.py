@@ -10,15 +10,15 @@ from typing import Final
 from canbus_tools.bus.computer import Computer
 from canbus_tools.bus.open_bus import BusOptions, bus_options, declare_bus
 from canbus_tools.bus.talk import LISTEN_S, BusTalk, TalkError, in_use, refuse_if_in_use
-from canbus_tools.discovery.ask_bus import declare_listen, discover_nodes, listen_option, where
+from canbus_tools.discovery.ask_bus import declare_listen, discover_nodes, where
 from canbus_tools.discovery.inventory import NodePresence, take_inventory
 from canbus_tools.discovery.node_discovery import Application, DiscoveredNodes, WaitingNode
-from canbus_tools.tools.assign_id import uuid_option
+from canbus_tools.tools.assign_id import parse_uuid
 from canbus_tools.tools.query import application_name
 from nodes.bus.assign import AssignError, Uuid
 from nodes.support.can_protocol import LAST_NODEID, UUID_SIZE
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import whole
+from nodes.support.option_values import parse_int
 
 RESET: Final = "reset"
 LEAVE_S: Final = 0.3
@@ -29,25 +29,28 @@ RETURN_S: Final = 6.0
 
 def declare(command: argparse.ArgumentParser) -> None:
     """Add the options."""
-    command.add_argument("node", metavar="UUID|NODEID", help="the node's uuid, or the id that it has")
+    command.add_argument("node", type=_node, metavar="UUID|NODEID", help="uuid of the node, or its id")
     declare_bus(command)
     declare_listen(command)
     command.add_argument(
-        "--force", action="store_true", help="even if another program talks to the node, which will lose it"
+        "--force",
+        action="store_true",
+        help="release the node even if another program uses it; that program loses it",
     )
 
 
 def make_job(given: argparse.Namespace) -> Callable[[Computer], "ReleaseReport"]:
     """Return the job; raises UsageError."""
     bus = bus_options(given)
-    listen_s = listen_option(given)
-    text = given.node.strip()
+    return lambda computer: release(computer, bus, given.node, force=given.force, listen_s=given.listen)
+
+
+def _node(given: str) -> Uuid | int:
+    text = given.strip()
     # A uuid has 12 digits, an id at most 3; what is neither is most likely a uuid with a digit amiss.
     if text.isascii() and text.isdecimal() and len(text) < 2 * UUID_SIZE:
-        nodeid = whole("NODEID", text, 1, LAST_NODEID)
-        return lambda computer: release(computer, bus, nodeid, force=given.force, listen_s=listen_s)
-    uuid = uuid_option("UUID", text)
-    return lambda computer: release(computer, bus, uuid, force=given.force, listen_s=listen_s)
+        return parse_int(text, 1, LAST_NODEID)
+    return parse_uuid(text)
 
 
 def release(

@@ -1,7 +1,7 @@
-"""The command ``canductor``: reads the command line, starts the part that does the work, tells the end.
+"""The command ``canductor``: parses the command line, runs the job, reports the result.
 
-``read_words`` only turns words into a job. ``main`` runs the job, so that every failure ends in one place:
-one sentence on stderr, with --json also one object on stdout.
+``parse_command_line`` only makes a job of the command line. ``main`` runs it, so that every failure ends in
+one place: one sentence on stderr, with --json also one object on stdout.
 """
 
 import json
@@ -13,10 +13,12 @@ import tempfile
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 
-from coordinator.cli.parser import Answered, Job, help_of, print_help, read_words, version
-from coordinator.support.command_options import Report, Terminated
+from coordinator.cli.parser import Job, build_parser, parse_command_line
+from coordinator.support.interrupts import Terminated
+from coordinator.support.report import Report
+from coordinator.support.version import version
 from nodes.support.errors import CanductorError
-from nodes.support.option_values import UsageError
+from nodes.support.option_values import ParserExit, UsageError
 
 EXIT_OK = 0
 EXIT_FAILED = 1
@@ -27,16 +29,18 @@ EXIT_BROKEN_PIPE = 141
 EXIT_TERMINATED = 143
 
 
-def main(arguments: Sequence[str] | None = None, read: Callable[[Sequence[str]], Job] = read_words) -> int:
-    """Run one command and return the exit status; never raises but for SystemExit.
+def main(
+    arguments: Sequence[str] | None = None, parse: Callable[[Sequence[str]], Job] = parse_command_line
+) -> int:
+    """Run one command and return the exit status; never raises.
 
-    READ makes a job of the words of the command line.
+    PARSE makes a job of the command line.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     as_json = "--json" in words
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
-        status = _run(words, as_json, read) if words else _no_words()
+        status = _run(words, as_json, parse) if words else _print_help()
         sys.stdout.flush()
     except BrokenPipeError:
         if not _stdout_is_gone():
@@ -52,20 +56,21 @@ def _terminate(*_: object) -> None:
     raise Terminated
 
 
-def _no_words() -> int:
-    print_help()
+def _print_help() -> int:
+    build_parser().print_help()
     return EXIT_USAGE
 
 
-def _run(words: list[str], as_json: bool, read: Callable[[Sequence[str]], Job]) -> int:
+def _run(words: list[str], as_json: bool, parse: Callable[[Sequence[str]], Job]) -> int:
     try:
-        return _show(read(words)(), as_json)
-    except Answered:
+        return _show(parse(words)(), as_json)
+    except ParserExit:
         return EXIT_OK
     except CanductorError as error:
         return _fail(str(error), EXIT_FAILED, as_json)
     except UsageError as error:
-        return _fail(f"{' '.join(str(error).split())} (see '{help_of(words)}')", EXIT_USAGE, as_json)
+        sentence = " ".join(str(error).split())
+        return _fail(f"{sentence} (see '{error.command or 'canductor'} --help')", EXIT_USAGE, as_json)
     except KeyboardInterrupt as error:
         terminated = isinstance(error, Terminated)
         return _fail(
@@ -75,30 +80,30 @@ def _run(words: list[str], as_json: bool, read: Callable[[Sequence[str]], Job]) 
         )
     except BrokenPipeError:
         raise
-    except Exception:  # noqa: BLE001 (the last line of defence: whatever comes here is a bug, and is told so)
+    except Exception:  # noqa: BLE001 (the last line of defence: whatever arrives here is a bug and reported as one)
         return _report_bug(as_json)
 
 
 def _show(report: Report, as_json: bool) -> int:
     if as_json:
-        _say_json({"ok": report.ok, **report.to_json()})
+        _print_json({"ok": report.ok, **report.to_json()})
     elif text := report.to_text():
-        _say(text)
+        _print(text)
     return EXIT_OK if report.ok else EXIT_FAILED
 
 
 def _fail(sentence: str, status: int, as_json: bool) -> int:
     sys.stderr.write(f"canductor: {sentence}\n")
     if as_json:
-        _say_json({"ok": False, "error": sentence})
+        _print_json({"ok": False, "error": sentence})
     return status
 
 
-def _say_json(values: Mapping[str, object]) -> None:
-    _say(json.dumps(values, allow_nan=False))
+def _print_json(values: Mapping[str, object]) -> None:
+    _print(json.dumps(values, allow_nan=False))
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     sys.stdout.write(line + "\n")
 
 
@@ -115,7 +120,7 @@ def _report_bug(as_json: bool) -> int:
 
 
 def _stdout_is_gone() -> bool:
-    """Tell a closed reader of our output from a broken pipe elsewhere, which would be a bug."""
+    """Return whether the reader of our output is gone; a broken pipe elsewhere would be a bug."""
     try:
         poll = select.poll()
         poll.register(sys.stdout.fileno(), select.POLLOUT)
@@ -125,7 +130,7 @@ def _stdout_is_gone() -> bool:
 
 
 def _drop_stdout() -> None:
-    """Let what is still buffered go nowhere, or the interpreter complains when it ends."""
+    """Discard what is still buffered, or the interpreter complains when it exits."""
     devnull = os.open(os.devnull, os.O_WRONLY)
     os.dup2(devnull, sys.stdout.fileno())
     os.close(devnull)

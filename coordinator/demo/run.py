@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from coordinator.assembly.load import load_machine
@@ -12,13 +13,26 @@ from coordinator.runtime.host import Computer, LinuxHost
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.job_runner import OnProgress, run_job
 from coordinator.streaming.pipeline import PlanRecord
-from coordinator.support.command_options import DEMO_GCODE, DemoOptions
+from coordinator.support.examples import DEMO_GCODE, DEMO_MACHINE
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.progress import ProgressDisplay
 from coordinator.verification.hardware import Hardware
 from coordinator.verification.heat_proof import HeatWatch, not_steady, prove_heat
 from coordinator.verification.prover import Prover
-from coordinator.virtual_machine.virtual_machine import VirtualMachine
+from coordinator.virtual_machine.virtual_machine import VirtualMachine, VirtualMachineOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DemoOptions(VirtualMachineOptions):
+    """``canductor demo``."""
+
+    machine: Path = DEMO_MACHINE
+    """Configuration file whose nodes are played by virtual ones."""
+    gcode: Path = DEMO_GCODE
+    keep: Path | None = None
+    """Folder that keeps step logs and captures; None: they are removed at the end."""
+    json: bool = False
+    """Show no progress."""
 
 
 def run_demo(options: DemoOptions) -> DemoReport:
@@ -26,7 +40,7 @@ def run_demo(options: DemoOptions) -> DemoReport:
     description = load_machine(str(options.machine))
     with ExitStack() as stack:
         folder = stack.enter_context(_folder(options.keep))
-        program = stack.enter_context(Program.open(options.gcode or DEMO_GCODE))
+        program = stack.enter_context(Program.open(options.gcode))
         stage = stack.enter_context(VirtualMachine(description, options, folder))
         display = stack.enter_context(ProgressDisplay(f"printing {program.name}", quiet=options.json))
         return print_and_prove(stage, program, LinuxHost(), display.update)

@@ -7,20 +7,20 @@ from pathlib import Path
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
-from coordinator.front_ends.serve import ServeReport, serve
-from coordinator.support.command_options import DEMO_GCODE, DemoOptions, ServeOptions
+from coordinator.demo.run import DemoOptions
+from coordinator.front_ends.serve import ServeOptions, ServeReport, serve
+from coordinator.support.examples import DEMO_GCODE
 from coordinator.virtual_machine.virtual_machine import VirtualMachine
 
 
-def serve_demo(options: DemoOptions) -> ServeReport:
+def serve_demo(options: DemoOptions, serving: ServeOptions) -> ServeReport:
     """Serve until Ctrl-C or SIGTERM; raises CanductorError."""
-    assert options.serve is not None
     description = load_machine(str(options.machine))
     with (
         tempfile.TemporaryDirectory(prefix="canductor-demo-") as folder,
-        VirtualMachine(description, options, Path(folder)) as stage,
+        VirtualMachine(description, dataclasses.replace(options, logs=False), Path(folder)) as stage,
     ):
-        return serve(lambda: stage.description, with_jobs(options.serve, description, Path(folder)))
+        return serve(lambda: stage.description, with_jobs(serving, description, Path(folder)))
 
 
 def with_jobs(options: ServeOptions, description: MachineDescription, folder: Path) -> ServeOptions:

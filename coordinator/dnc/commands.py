@@ -1,4 +1,4 @@
-"""What ``canductor dnc`` does, once its words are read."""
+"""What the commands of ``canductor dnc`` do."""
 
 import contextlib
 import sys
@@ -8,15 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Final, Protocol
 
-from coordinator.cli.commands.dnc import DncJob
-from coordinator.cli.commands.front_ends import send as send_to_machine
-from coordinator.cli.commands.front_ends import tls_of
 from coordinator.dnc.blocks import INPUT, OUTPUT, Header
 from coordinator.dnc.driver import Driver, Line
 from coordinator.dnc.endpoint import Endpoint, FileSource, Library, Outcome, Sink, Source, Take
 from coordinator.dnc.engine import Engine
 from coordinator.dnc.feeds import SlowSource
 from coordinator.dnc.files import Check, Entry, Folder, check_lines, check_name
+from coordinator.dnc.job import DncJob
 from coordinator.dnc.machine import MachineSink
 from coordinator.dnc.numbers import numbered
 from coordinator.dnc.options import DncOptions
@@ -24,6 +22,7 @@ from coordinator.dnc.port import Port
 from coordinator.dnc.tables import check_table
 from coordinator.dnc.verify import Compare, Twice
 from coordinator.ipc.client.blocking import BlockingClient
+from coordinator.ipc.client.upload import send_program, show_progress
 from nodes.support.errors import CanductorError
 
 NOT_YET_S: Final = 0.02
@@ -292,9 +291,8 @@ def _open_stream(file: Path, stack: contextlib.ExitStack, around: Surroundings) 
 
 def _drip_to_machine(job: DncJob, around: Surroundings) -> DncReport:
     at = job.machine
-    options = {"token": at.token, "tls": tls_of(at), "timeout_s": at.timeout_s, "name": "canductor dnc"}
     sinks: list[MachineSink] = []
-    with BlockingClient(at.address, **options) as client:
+    with BlockingClient(at.address, **at.settings("canductor dnc")) as client:
 
         def print_as_it_comes(header: Header) -> Sink:
             sinks.append(MachineSink(client, check_name(header.name or "NONAME")))
@@ -315,7 +313,8 @@ def _drip_to_machine(job: DncJob, around: Surroundings) -> DncReport:
 
 
 def _print(job: DncJob, file: Path) -> None:
-    send_to_machine(job.machine, file, file.name, replace=job.overwrite, start=True, quiet=job.json)
+    on_progress = None if job.json else show_progress
+    send_program(job.machine, file, file.name, replace=job.overwrite, start=True, on_progress=on_progress)
 
 
 def _once(outcome: Outcome) -> str:

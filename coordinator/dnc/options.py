@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from nodes.support.errors import CanductorError
+from nodes.support.option_values import UsageError
 
 BAUD_RATES: Final = (110, 150, 300, 600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400)
 TRANSMISSIONS_MAX: Final = 15
@@ -29,12 +30,10 @@ class SerialFrame:
 
 
 def read_frame(text: str) -> SerialFrame:
-    """Read 7E1, 8N1 and the like; raises CanductorError."""
+    """Return the frame of 7E1, 8N1 and the like; raises UsageError."""
     word = text.strip().upper()
     if len(word) != 3 or word[0] not in "78" or word[1] not in PARITIES or word[2] not in "12":
-        raise CanductorError(
-            f"the character frame is '{text}', must be like 7E1 or 8N1: bits, parity, stop bits"
-        )
+        raise UsageError(f"is '{text}', must be like 7E1 or 8N1: bits, parity, stop bits")
     return SerialFrame(int(word[0]), word[1], int(word[2]))
 
 

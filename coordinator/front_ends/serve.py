@@ -8,7 +8,6 @@ from ipaddress import ip_address
 from pathlib import Path
 
 from coordinator.assembly.load import load_machine
-from coordinator.cli.parser import version
 from coordinator.config.model import MachineDescription
 from coordinator.ipc.discovery.announcement import Announcement, bracketed, host_word
 from coordinator.ipc.discovery.announcer_process import AnnouncerProcess
@@ -26,9 +25,9 @@ from coordinator.service.api.methods import add_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.core.typed import Typed
 from coordinator.service.state.log_ring import Entry
-from coordinator.support.command_options import RunOptions, ServeOptions
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.values import Value
+from coordinator.support.version import version
 from coordinator.tables.store import table_folder
 from coordinator.web.access import LINK_S
 from coordinator.web.methods import add_page_methods
@@ -39,16 +38,52 @@ from nodes.support.host_sockets import socket_folder
 from nodes.support.state_folder import state_folder
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServeOptions:
+    """How a machine is served to front ends."""
+
+    name: str
+    """What front ends show; also the socket's name unless PATH says otherwise."""
+    path: Path | None = None
+    """The Unix socket; None: NAME.sock where this user's machines have theirs."""
+    jobs: Path | None = None
+    """Folder of the files that may be printed; None: there are no jobs."""
+    node_commands: bool = False
+    """Whether clients may send raw commands to nodes."""
+    tcp: tuple[str, int] | None = None
+    """Host and port."""
+    tokens: Path | None = None
+    certificate: Path | None = None
+    private_key: Path | None = None
+    plain_on_loopback: bool = False
+    web: tuple[str, int] | None = None
+    """Address and port of the live page."""
+    web_without_tls: bool = False
+    """Serve the page without TLS beyond loopback, too."""
+    web_names: tuple[str, ...] = ()
+    """Host names, in lower case, that the page answers to."""
+    announce: bool | None = None
+    """Announce the machine on the network; None: if its TCP port can be reached from there."""
+    metrics: tuple[str, int] | None = None
+    """IP address and port of the figures for Prometheus."""
+    config: Path = Path()
+    """The configuration file, for clients that show where it is."""
+    klippy_api: Path | None = None
+    """The Unix socket for Moonraker (docs/klippy-api.md); None: there is none."""
+    metrics_open: bool = False
+    """Whether others than this computer may read them."""
+
+
 @dataclass(frozen=True, slots=True)
 class ServeReport:
-    """How a service ended that was asked to."""
+    """How a service ended that was asked to stop."""
 
     address: str
     state: str
 
     @property
     def ok(self) -> bool:
-        """It did what it was to do."""
+        """Always: failures raise."""
         return True
 
     def to_json(self) -> Mapping[str, object]:
@@ -60,13 +95,12 @@ class ServeReport:
         return f"served at {self.address} until asked to end; the machine was in {self.state}"
 
 
-def serve_machine(options: RunOptions) -> ServeReport:
+def serve_machine(options: ServeOptions) -> ServeReport:
     """Serve the machine of OPTIONS.config. Raises CanductorError, KeyboardInterrupt if motion was cut off."""
-    assert options.serve is not None
     path = str(options.config)
-    if options.serve.klippy_api is None:
+    if options.klippy_api is None:
         load_machine(path)  # a mistake in it ends here, not in a service without a machine
-    return serve(lambda: load_machine(path), options.serve, cache=DictionaryCache.of_user())
+    return serve(lambda: load_machine(path), options, cache=DictionaryCache.of_user())
 
 
 def serve(
@@ -115,7 +149,7 @@ class _ServiceProcess:
             tree,
             settings,
             cache=self._cache,
-            on_line=lambda entry: self._tell(service, entry),
+            on_line=lambda entry: self._on_entry(service, entry),
         )
         add_methods(service, registry)
         if settings.jobs is not None:
@@ -129,19 +163,19 @@ class _ServiceProcess:
         page = self._page(registry, service)
         await self._server.start()
         await self._open_page(page)
-        _say(f"serving at {self.path}")
+        _print(f"serving at {self.path}")
         if self._options.tcp is not None:
-            _say(f"serving at {_address(self._options, self._server.tcp_port)}")
+            _print(f"serving at {_address(self._options, self._server.tcp_port)}")
         if page is not None:
-            _say(f"the live page is at {page.url}")
-            _say(
+            _print(f"the live page is at {page.url}")
+            _print(
                 f"to get in, open {page.new_link(Scope.OPERATE)} within {LINK_S / 60:.0f} minutes;"
                 " it works once, 'canductor page' prints another"
             )
         metrics = await self._open_metrics(tree)
         await self._open_klippy_api(service)
         self._announcer = self._announce(service)
-        typed = Typed(service, _say) if sys.stdin is not None and sys.stdin.isatty() else None
+        typed = Typed(service, _print) if sys.stdin is not None and sys.stdin.isatty() else None
         try:
             await service.run()
         finally:
@@ -160,7 +194,7 @@ class _ServiceProcess:
                 await page.close()
 
     async def _open_klippy_api(self, service: MachineService) -> None:
-        """Serve Moonraker if asked for; raises CanductorError with the server closed."""
+        """Serve Moonraker if asked for; raises CanductorError, the server being closed."""
         path = self._options.klippy_api
         if path is None:
             return
@@ -172,7 +206,7 @@ class _ServiceProcess:
         except BaseException:
             await self._server.close()
             raise
-        _say(f"serving Moonraker at {path}")
+        _print(f"serving Moonraker at {path}")
 
     def _page(self, registry: Registry, service: MachineService) -> WebServer | None:
         """Return the live page if it is asked for, with its methods in REGISTRY."""
@@ -214,7 +248,7 @@ class _ServiceProcess:
         except BaseException:
             await self._server.close()
             raise
-        _say(f"metrics are at http://{bracketed(host)}:{metrics.port}/metrics")
+        _print(f"metrics are at http://{bracketed(host)}:{metrics.port}/metrics")
         return metrics
 
     def _announce(self, service: MachineService) -> AnnouncerProcess | None:
@@ -240,9 +274,9 @@ class _ServiceProcess:
         announcer.start()
         return announcer
 
-    def _tell(self, service: MachineService, entry: Entry) -> None:
+    def _on_entry(self, service: MachineService, entry: Entry) -> None:
         self._server.notify("log", dict(entry))
-        _say(str(entry["text"]))
+        _print(str(entry["text"]))
         if self._gateway is not None:
             self._gateway.note(entry)
         if self._announcer is not None and entry["kind"] == "state":
@@ -271,6 +305,6 @@ def _address(options: ServeOptions, port: int | None) -> str:
     return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     sys.stdout.write(line + "\n")
     sys.stdout.flush()

@@ -8,7 +8,6 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.cli.parser import version
 from coordinator.gcode.commands import AtOnce, Call
 from coordinator.gcode.parser import WordError, parse
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
@@ -23,6 +22,7 @@ from coordinator.service.api.motion import RESTARTS, run_script
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.work import LINES_MAX
 from coordinator.streaming.move_source import ProgramOutput
+from coordinator.support.version import version
 from nodes.support.errors import CanductorError
 
 Result = Mapping[str, Any]

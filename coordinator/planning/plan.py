@@ -24,13 +24,13 @@ from coordinator.modules.module_set import build_modules
 from coordinator.motion.planner.planner import Planner
 from coordinator.motion.steps.steps import StepError, StepGenerator
 from coordinator.planning.figures import PlanFigures
+from coordinator.planning.options import PlanOptions
 from coordinator.planning.report import PlanReport
 from coordinator.planning.summary import Made, watched_nodes, write_files
 from coordinator.runtime.devices import MachineDevices, stream_specs
 from coordinator.streaming.compensation import Compensation, why_not_corrected
 from coordinator.streaming.pipeline import Pipeline
 from coordinator.streaming.program_machine import machine_state
-from coordinator.support.command_options import PlanOptions
 from coordinator.support.progress import Progress as Shown
 from coordinator.support.progress import ProgressDisplay
 from coordinator.tables.axis_table import TableError

@@ -10,6 +10,7 @@ from pathlib import Path
 from coordinator.config.model import CanConnection, MachineDescription
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.planning.figures import Bus, Peak, PlanFigures, WatchedNode
+from coordinator.planning.options import PlanOptions
 from coordinator.planning.plot import draw
 from coordinator.planning.report import AxisReport, BusReport, NodeReport, PlanReport, StepperReport, Timeline
 from coordinator.planning.warnings import (
@@ -21,7 +22,6 @@ from coordinator.planning.warnings import (
     step_rate_warnings,
 )
 from coordinator.streaming.pipeline import Pipeline
-from coordinator.support.command_options import PlanOptions
 from nodes.support.errors import CanductorError
 
 

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final
 
@@ -17,8 +18,8 @@ from coordinator.simulate.checker import Violation
 from coordinator.simulate.play import play
 from coordinator.simulate.result import Result, ScenarioList, SimulationReport
 from coordinator.simulate.scenario import Scenario
-from coordinator.support.command_options import Report, SimulateOptions
 from coordinator.support.progress import Progress, ProgressDisplay
+from coordinator.support.report import Report
 from coordinator.support.toml_values import ScenarioError
 from nodes.support.errors import CanductorError
 
@@ -28,6 +29,21 @@ WAITING_PER_JOB: Final = 4
 """Seeds handed to the pool ahead of need."""
 
 Task = tuple[Scenario, int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulateOptions:
+    """``canductor simulate``."""
+
+    scenarios: tuple[str, ...] = ()
+    """Names or files, each run with every seed; none: all, and several seeds are spread over them."""
+    seeds: range = range(1, 2)
+    jobs: int = 0
+    """Processes; 0: one per processor."""
+    list: bool = False
+    """Only list the scenarios."""
+    json: bool = False
+    """Show no progress."""
 
 
 class _Hangs(BaseException):

@@ -6,9 +6,11 @@ from collections.abc import Callable, Coroutine
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from coordinator.support.command_options import Terminated
-
 T = TypeVar("T")
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM ended a command, as Ctrl-C does."""
 
 
 def run_to_end(

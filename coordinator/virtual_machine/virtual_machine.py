@@ -6,12 +6,12 @@ Their pins are connected with a plant of that machine: endstops switch where the
 import dataclasses
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from coordinator.config.model import CanConnection, MachineDescription, NodeDescription, UartConnection
-from coordinator.support.command_options import DemoOptions
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants, start_point
 from coordinator.virtual_machine.plant_heat import HeatSettings
 from nodes.support.errors import CanductorError
@@ -35,7 +35,28 @@ START_MM = 8.0
 """How far from where homing leaves it the head begins."""
 
 
-def _plant_settings(description: MachineDescription, options: DemoOptions) -> PlantSettings:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VirtualMachineOptions:
+    """How the virtual hardware behaves."""
+
+    loss: float = 0.0
+    """Ratio of frames that virtual buses lose, 0 <= loss <= 0.5."""
+    seed: int = 1
+    """Decides which frames are lost."""
+    rate_ppm: Mapping[str, float] = field(default_factory=dict)
+    """By node: how much faster than nominal its clock runs."""
+    start_clock: Mapping[str, int] = field(default_factory=dict)
+    """By node: ticks its clock shows when the node starts."""
+    cold: bool = False
+    """The heaters start cold; else as warm as a few minutes after a print."""
+    socketcan: Mapping[str, str] = field(default_factory=dict)
+    """By CAN bus of the configuration: the SocketCAN interface that carries it, instead of a virtual bus.
+    The empty name stands for all buses that are not named."""
+    logs: bool = True
+    """Nodes log their pins and plants, for a proof."""
+
+
+def _plant_settings(description: MachineDescription, options: VirtualMachineOptions) -> PlantSettings:
     return PlantSettings(
         seed=options.seed + 1,
         start=start_point(description, START_MM),
@@ -50,7 +71,7 @@ class VirtualMachine:
     options name for it; every UART becomes a pseudo-terminal. The nodes' pins are connected with a plant.
     """
 
-    def __init__(self, description: MachineDescription, options: DemoOptions, folder: Path) -> None:
+    def __init__(self, description: MachineDescription, options: VirtualMachineOptions, folder: Path) -> None:
         self._options = options
         self._folder = folder
         self._check_names(description)
@@ -154,9 +175,9 @@ class VirtualMachine:
             % 2**47,
             jitter_us=JITTER_US,
             seed=self._options.seed + index,
-            edge_log=None if self._options.serve is not None else self.edge_log_path(node.name),
+            edge_log=self.edge_log_path(node.name) if self._options.logs else None,
             plant=self._plants[node.name].write(self._folder),
-            plant_log=self._options.serve is None,
+            plant_log=self._options.logs,
         )
 
     @property

@@ -9,6 +9,8 @@ from nodes.support.can_protocol import MT_CAN_ID
 from nodes.support.errors import CanductorError
 
 BAUD: Final = 250_000
+SHARE: Final = 0.2
+"""Of a CAN bus: as much as a coordinator uses for tables."""
 
 
 class DeviceKind(StrEnum):
@@ -45,7 +47,7 @@ class DeviceJob:
     baud: int = BAUD
     bitrate: int | None = None
     """Of the CAN bus; None: as the interface knows."""
-    share: float
+    share: float = SHARE
     can_id: int = MT_CAN_ID
 
     @property

@@ -10,7 +10,7 @@ import pytest
 
 from canbus_tools.bus.computer import Computer
 from coordinator.cli.main import main
-from coordinator.cli.parser import read_words
+from coordinator.cli.parser import parse_command_line
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,6 @@ class Command:
     def run(self, *words: object) -> Said:
         """Run ``canductor WORDS``."""
         self._captured.readouterr()
-        status = main(list(map(str, words)), partial(read_words, computer=self._computer))
+        status = main(list(map(str, words)), partial(parse_command_line, computer=self._computer))
         said = self._captured.readouterr()
         return Said(status, said.out, said.err)

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.support.command_options import DEMO_MACHINE
+from coordinator.support.examples import DEMO_MACHINE
 
 START_S: Final = 60.0
 STEP_S: Final = 60.0

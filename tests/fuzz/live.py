@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.ipc.client.client import Client
-from coordinator.support.command_options import DEMO_GCODE
+from coordinator.support.examples import DEMO_GCODE
 from nodes.support.errors import CanductorError
 from tests.fuzz.proved_service import ADMIN_TOKEN, WATCH_TOKEN
 

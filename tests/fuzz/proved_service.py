@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from coordinator.assembly.load import load_machine
 from coordinator.demo.report import report_of
+from coordinator.demo.run import DemoOptions
 from coordinator.ipc.protocol.limits import Limits
 from coordinator.ipc.protocol.methods import Registry, Scope
 from coordinator.ipc.server.server import IpcServer
@@ -34,7 +35,7 @@ from coordinator.service.core.motion_lead import MotionLead
 from coordinator.service.jobs.outcome import Outcome, outcome_of
 from coordinator.service.state.log_ring import Entry
 from coordinator.streaming.pipeline import PlanRecord
-from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
+from coordinator.support.examples import DEMO_MACHINE
 from coordinator.verification.prover import Prover
 from coordinator.virtual_machine.virtual_machine import VirtualMachine
 

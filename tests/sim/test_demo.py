@@ -3,7 +3,7 @@
 import pytest
 
 from coordinator.simulate.scenario import BusSetting, NodeSetting
-from coordinator.support.command_options import EXAMPLES
+from coordinator.support.examples import EXAMPLES
 from coordinator.support.toml_values import Range
 from coordinator.verification.proof import EDGE_TOLERANCE_S
 from tests.stages.demo_machine import SQUARE

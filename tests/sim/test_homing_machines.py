@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.simulate.scenario import NodeSetting
-from coordinator.support.command_options import EXAMPLES
+from coordinator.support.examples import EXAMPLES
 from tests.stages.plant_stage import STEP_MM, PlantStage
 from tests.stages.printer_text import MCU, TOOLHEAD, printer_section, stepper_section
 from tests.stages.served import running

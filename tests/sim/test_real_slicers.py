@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.planning.options import PlanOptions
 from coordinator.planning.plan import plan_file
-from coordinator.support.command_options import PlanOptions
 from tests.stages.printer import PRINTING, Printer
 from tests.stages.served import Served
 

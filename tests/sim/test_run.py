@@ -10,7 +10,7 @@ from coordinator.cli import main as cli
 from coordinator.simulate import run, scenario
 from coordinator.simulate.checker import Violation
 from coordinator.simulate.result import Result, SimulationReport
-from coordinator.support.command_options import SimulateOptions
+from coordinator.simulate.run import SimulateOptions
 
 ALL = [scenario.find(name) for name in scenario.names()]
 

@@ -11,7 +11,7 @@ from coordinator.gcode.errors import GCodeError
 from coordinator.runtime.machine import MachineStopped
 from coordinator.service.jobs.outcome import Outcome
 from coordinator.streaming.move_source import ProgramOutput
-from coordinator.support.command_options import Terminated
+from coordinator.support.interrupts import Terminated
 from nodes.support.errors import CanductorError
 from tests.stages.demo_machine import NODES, SQUARE, DemoMachine, TypedRun
 

@@ -8,12 +8,11 @@ from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
 
-from coordinator.cli.commands.run import RunReport, run_machine
+from coordinator.cli.commands.run import RunOptions, RunReport, run_machine
 from coordinator.gcode.program import Program
 from coordinator.service.core.job_runner import run_job
 from coordinator.service.jobs.outcome import Outcome
 from coordinator.simulate.scenario import BusSetting, NodeSetting
-from coordinator.support.command_options import RunOptions
 from tests.stages.machine_stage import MachineStage
 from tests.stages.printer_text import without_endstops
 from tests.stages.served import Served, running

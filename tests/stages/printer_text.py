@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from coordinator.support.command_options import DEMO_MACHINE, EXAMPLES
+from coordinator.support.examples import DEMO_MACHINE, EXAMPLES
 
 PRINTER_CFG = """\
 [mcu]

@@ -6,7 +6,8 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import CanConnection, UartConnection
-from coordinator.support.command_options import DEMO_MACHINE, DemoOptions
+from coordinator.demo.run import DemoOptions
+from coordinator.support.examples import DEMO_MACHINE
 from coordinator.virtual_machine.virtual_machine import VirtualMachine
 from tests.canbus_tools.command import Command
 from tests.vcan.kernel import INTERFACE, SECOND_INTERFACE, why_no_socketcan

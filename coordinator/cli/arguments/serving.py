@@ -1,4 +1,4 @@
-"""The words of the command line about serving front ends: sockets, tokens, the live page."""
+"""The options that serve a machine to front ends: sockets, tokens, the live page, the network, metrics."""
 
 import argparse
 import re
@@ -6,112 +6,191 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Final
 
-from coordinator.cli.arguments.network import declare_network, read_announce, read_metrics
-from coordinator.support.command_options import ServeOptions
-from nodes.support.option_values import UsageError, existing_file
+from coordinator.front_ends.serve import ServeOptions
+from coordinator.support.examples import machine_name
+from nodes.support.option_values import UsageError, existing_file, options_from
 
 HOST_NAME_MAX: Final = 253
 _LABEL: Final = re.compile(r"[a-z0-9_]([a-z0-9_-]{0,61}[a-z0-9_])?", re.ASCII)
 
 
 def declare_serving(command: argparse.ArgumentParser) -> None:
-    """Add the words to COMMAND."""
+    """Add the options to COMMAND."""
     add = command.add_argument_group("serving front ends").add_argument
-    add("--ipc", type=Path, metavar="PATH", help="serve at this Unix socket; see docs/run.md")
-    add("--klippy-api", type=Path, metavar="PATH", help="serve Moonraker at this Unix socket, too")
-    add("--name", metavar="NAME", help="of the machine; the configuration file's name if not given")
-    add("--jobs", type=Path, metavar="DIR", help="folder of the files that front ends may print")
+    add(
+        "--ipc",
+        dest="path",
+        type=Path,
+        metavar="PATH",
+        help="serve programs at this Unix socket; see docs/run.md",
+    )
+    add("--klippy-api", type=Path, metavar="PATH", help="serve Moonraker at this Unix socket")
+    add("--name", help="name of the machine (default: that of the configuration file)")
+    add("--jobs", type=_folder, metavar="DIR", help="folder of the files that front ends may print")
     add("--node-commands", action="store_true", help="let administrators send raw commands to nodes")
-    add("--tcp", metavar="HOST:PORT", help="serve there, too; needs --tokens, and TLS but on loopback")
-    add("--tokens", type=Path, metavar="FILE", help="tokens of TCP clients; see docs/security.md")
-    add("--tls-certificate", type=Path, metavar="FILE", help="certificate chain, PEM")
-    add("--tls-key", type=Path, metavar="FILE", help="private key, PEM")
-    add("--no-tls-on-loopback", action="store_true", help="TCP without TLS, on a loopback address only")
+    add(
+        "--tcp",
+        type=_tcp_address,
+        metavar="HOST:PORT",
+        help="serve programs at this address; needs --tokens and, beyond loopback, TLS",
+    )
+    add(
+        "--tokens",
+        type=Path,
+        metavar="FILE",
+        help="access tokens for clients on the network; see docs/security.md",
+    )
+    add(
+        "--tls-certificate",
+        dest="certificate",
+        type=existing_file,
+        metavar="FILE",
+        help="certificate chain (PEM)",
+    )
+    add("--tls-key", dest="private_key", type=existing_file, metavar="FILE", help="private key (PEM)")
+    add(
+        "--no-tls-on-loopback",
+        dest="plain_on_loopback",
+        action="store_true",
+        help="allow TCP without TLS on a loopback address",
+    )
     add(
         "--web",
+        type=_web_address,
         metavar="[HOST:]PORT",
-        help="serve the live page; beyond this computer (0.0.0.0:PORT) it needs --tokens, and TLS",
+        help="serve the live page; beyond this computer (0.0.0.0:PORT) needs --tokens and TLS",
     )
-    add("--web-without-tls", action="store_true", help="the page beyond this computer, readable on the way")
+    add("--web-without-tls", action="store_true", help="serve the live page unencrypted beyond this computer")
     add(
         "--web-name",
+        dest="web_names",
+        type=_host_name,
         action="append",
         metavar="NAME",
-        help="host name under which the page is opened; without, only IP addresses and localhost are",
+        help="accept this host name for the live page; IP addresses and localhost are always accepted",
     )
-    declare_network(add)
+    add(
+        "--announce",
+        action=argparse.BooleanOptionalAction,
+        help="announce the TCP port to 'canductor discover' (default: only 'run', beyond loopback)",
+    )
+    add(
+        "--metrics",
+        type=_metrics_address,
+        metavar="[ADDRESS:]PORT",
+        help="serve metrics for Prometheus at http://ADDRESS:PORT/metrics (default address: 127.0.0.1)",
+    )
+    add(
+        "--metrics-open",
+        action="store_true",
+        help="let other computers read the metrics, without authentication",
+    )
 
 
 def is_asked_to_serve(given: argparse.Namespace) -> bool:
-    """Tell whether the words ask for a service that stays."""
+    """Return whether the options ask for a service that stays."""
     return any(
-        word is not None for word in (given.ipc, given.klippy_api, given.tcp, given.web, given.metrics)
+        address is not None for address in (given.path, given.klippy_api, given.tcp, given.web, given.metrics)
     )
 
 
-def read_serving(given: argparse.Namespace, config: Path, announce: bool | None = None) -> ServeOptions:
-    """Return what the words ask for, ANNOUNCE unless they say so; raises UsageError."""
-    name = given.name or (config.parent.name if config.stem == "machine" else config.stem)
-    if not re.fullmatch(r"[A-Za-z0-9_-]{1,48}", name):
-        raise UsageError(f"--name is '{name}', must be 1 to 48 letters, digits, - and _")
-    if given.jobs is not None and not given.jobs.is_dir():
-        raise UsageError(f"--jobs is '{given.jobs}', must be a folder; make it")
-    if given.tcp is not None and given.tokens is None:
-        raise UsageError("--tcp needs --tokens FILE: who comes over the network has to show one")
-    return ServeOptions(
-        name=name,
-        path=given.ipc,
+def serving_options(given: argparse.Namespace, config: Path, announce: bool | None = None) -> ServeOptions:
+    """Return the options of the machine of CONFIG, ANNOUNCE being the default; raises UsageError."""
+    options = options_from(
+        ServeOptions,
+        given,
+        name=given.name or machine_name(config),
         config=config,
-        klippy_api=given.klippy_api,
-        jobs=given.jobs,
-        node_commands=given.node_commands,
-        tcp=None if given.tcp is None else _host_port("--tcp", given.tcp),
-        tokens=given.tokens,
-        certificate=existing_file(given.tls_certificate),
-        private_key=existing_file(given.tls_key),
-        plain_on_loopback=given.no_tls_on_loopback,
-        announce=read_announce(given, announce),
-        metrics=read_metrics(given),
-        metrics_open=given.metrics_open,
-        web=_web_address(given),
-        web_without_tls=given.web_without_tls,
-        web_names=_web_names(given),
+        announce=announce if given.announce is None else given.announce,
+        web_names=tuple(given.web_names or ()),
     )
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,48}", options.name):
+        raise UsageError(f"--name is '{options.name}', must be 1 to 48 letters, digits, - and _")
+    if options.tcp is not None and options.tokens is None:
+        raise UsageError("--tcp needs --tokens FILE: clients on the network have to authenticate")
+    if options.announce and options.tcp is None:
+        raise UsageError("--announce needs --tcp HOST:PORT: others cannot reach a Unix socket")
+    _check_metrics(options)
+    _check_web(options)
+    return options
 
 
-def _web_names(given: argparse.Namespace) -> tuple[str, ...]:
-    """Return the host names that the page answers to, in lower case."""
-    names = tuple(str(name).lower() for name in given.web_name or ())
-    if names and given.web is None:
-        raise UsageError("--web-name goes with --web [HOST:]PORT")
-    for name in names:
-        if len(name) > HOST_NAME_MAX or not all(_LABEL.fullmatch(label) for label in name.split(".")):
-            raise UsageError(f"--web-name is '{name}', must be a host name such as printer.example")
-    return names
-
-
-def _web_address(given: argparse.Namespace) -> tuple[str, int] | None:
-    """Return where the live page is to be; beyond loopback only with what protects it."""
-    if given.web is None:
-        return None
-    text = given.web if ":" in given.web else f"127.0.0.1:{given.web}"
-    host, port = _host_port("--web", text, "[ADDRESS:]PORT such as 8080 or 0.0.0.0:8080")
-    host = "127.0.0.1" if host == "localhost" else host
-    try:
-        beyond = not ip_address(host).is_loopback
-    except ValueError:
-        raise UsageError(f"--web is '{given.web}', must be an IP address and a port, or a port") from None
-    if beyond and given.tokens is None:
-        raise UsageError(f"--web at {host} needs --tokens FILE: who comes over the network has to show one")
-    if beyond and not given.web_without_tls and (given.tls_certificate is None or given.tls_key is None):
+def _check_metrics(options: ServeOptions) -> None:
+    if options.metrics is None:
+        if options.metrics_open:
+            raise UsageError("--metrics-open goes with --metrics [ADDRESS:]PORT")
+    elif _is_beyond_loopback(options.metrics) and not options.metrics_open:
         raise UsageError(
-            f"--web at {host} needs --tls-certificate and --tls-key; or --web-without-tls, if nobody listens"
+            f"--metrics at {options.metrics[0]} needs --metrics-open: readers are not authenticated"
+            " (see docs/security.md)"
         )
+
+
+def _check_web(options: ServeOptions) -> None:
+    if options.web is None:
+        if options.web_names:
+            raise UsageError("--web-name goes with --web [HOST:]PORT")
+        return
+    if not _is_beyond_loopback(options.web):
+        return
+    host = options.web[0]
+    if options.tokens is None:
+        raise UsageError(f"--web at {host} needs --tokens FILE: clients on the network have to authenticate")
+    if not options.web_without_tls and (options.certificate is None or options.private_key is None):
+        raise UsageError(
+            f"--web at {host} needs --tls-certificate and --tls-key; or, on a network that you trust,"
+            " --web-without-tls"
+        )
+
+
+def _is_beyond_loopback(address: tuple[str, int]) -> bool:
+    return not ip_address(address[0]).is_loopback
+
+
+def _folder(text: str) -> Path:
+    path = Path(text)
+    if not path.is_dir():
+        raise UsageError(f"is '{text}', must be a folder; create it")
+    return path
+
+
+def _host_name(text: str) -> str:
+    name = text.lower()
+    if len(name) > HOST_NAME_MAX or not all(_LABEL.fullmatch(label) for label in name.split(".")):
+        raise UsageError(f"is '{name}', must be a host name such as printer.example")
+    return name
+
+
+def _tcp_address(text: str) -> tuple[str, int]:
+    host, port = _host_port(text)
+    if not host or not port:
+        raise UsageError(f"is '{text}', must be HOST:PORT such as 127.0.0.1:7125")
     return host, port
 
 
-def _host_port(option: str, text: str, form: str = "HOST:PORT such as 127.0.0.1:7125") -> tuple[str, int]:
-    host, colon, port = text.rpartition(":")
-    if not (colon and host and port.isascii() and port.isdecimal() and 0 < int(port[:6]) < 65536):
-        raise UsageError(f"{option} is '{text}', must be {form}")
-    return host.strip("[]"), int(port)
+def _web_address(text: str) -> tuple[str, int]:
+    return _ip_address(text, "8080 or 0.0.0.0:8080")
+
+
+def _metrics_address(text: str) -> tuple[str, int]:
+    return _ip_address(text, "9100 or 10.0.0.2:9100")
+
+
+def _ip_address(text: str, examples: str) -> tuple[str, int]:
+    """Read [ADDRESS:]PORT; the address is that of loopback if there is none."""
+    host, port = _host_port(text if ":" in text else f"127.0.0.1:{text}")
+    host = "127.0.0.1" if host == "localhost" else host
+    try:
+        ip_address(host)
+    except ValueError:
+        port = 0
+    if not port:
+        raise UsageError(f"is '{text}', must be a port, or an IP address and a port, such as {examples}")
+    return host, port
+
+
+def _host_port(text: str) -> tuple[str, int]:
+    """Split HOST:PORT; the port is 0 if it is none."""
+    host, _, port = text.rpartition(":")
+    number = int(port) if port.isascii() and port.isdecimal() and len(port) <= 5 else 0
+    return host.removeprefix("[").removesuffix("]"), number if number < 65536 else 0

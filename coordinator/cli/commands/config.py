@@ -1,5 +1,6 @@
-"""What ``canductor config`` does."""
+"""``canductor config``: checks a configuration without hardware, or prints what one may contain."""
 
+import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +11,33 @@ from coordinator.assembly.consequences import meaning
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import NotYetActing
+from coordinator.support.report import Report
 from nodes.support.errors import CanductorError
+from nodes.support.option_values import add_command, add_group, existing_file
+
+
+def add_to(commands: Any) -> None:
+    """Add the commands."""
+    summary = "check a configuration, or print the sections and options that one may contain"
+    actions = add_group(commands, "config", summary, "ACTION")
+    add_command(actions, "check", "list every mistake in a configuration file", _declare_check, _check)
+    add_command(actions, "reference", "print all sections and options", _declare_reference, _reference)
+
+
+def _declare_check(command: argparse.ArgumentParser) -> None:
+    command.add_argument("file", type=existing_file, help="configuration file")
+
+
+def _check(given: argparse.Namespace) -> Report:
+    return check(str(given.file))
+
+
+def _declare_reference(command: argparse.ArgumentParser) -> None:
+    command.add_argument("section", nargs="*", help="print only sections whose names begin with this")
+
+
+def _reference(given: argparse.Namespace) -> Report:
+    return reference(given.section)
 
 
 @dataclass(frozen=True, slots=True)

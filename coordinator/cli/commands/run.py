@@ -1,21 +1,61 @@
-"""``canductor run``: start a configured machine and print a file, or what comes on standard input."""
+"""``canductor run``: start a machine; serve it, or print a file or what comes on standard input."""
 
+import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from coordinator.assembly.load import load_machine
+from coordinator.cli.arguments.serving import declare_serving, is_asked_to_serve, serving_options
 from coordinator.config.model import MachineDescription
+from coordinator.front_ends.serve import serve_machine
 from coordinator.gcode.program import Program
 from coordinator.runtime.host import Computer, LinuxHost
 from coordinator.service.core.job_runner import run_job
 from coordinator.service.jobs.outcome import NodeOutcome, Outcome
-from coordinator.support.command_options import RunOptions, machine_name
+from coordinator.support.examples import machine_name
 from coordinator.support.interrupts import run_to_end
 from coordinator.support.progress import Progress, ProgressDisplay
+from coordinator.support.report import Report
 from coordinator.tables.store import table_folder
 from nodes.dictionary.cache import DictionaryCache
+from nodes.support.option_values import UsageError, add_command, existing_file, options_from
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOptions:
+    """``canductor run`` of one program."""
+
+    config: Path
+    gcode: Path | None = None
+    """Printed once the machine is ready; None: commands come from standard input."""
+    json: bool = False
+    """Show no progress."""
+
+
+def add_to(commands: Any) -> None:
+    """Add the command."""
+    add_command(commands, "run", "bring up the machine of a configuration file", _declare, _run)
+
+
+def _declare(command: argparse.ArgumentParser) -> None:
+    command.add_argument("config", type=existing_file, help="configuration file")
+    command.add_argument(
+        "--gcode", type=existing_file, metavar="FILE", help="print this G-code file and exit"
+    )
+    declare_serving(command)
+
+
+def _run(given: argparse.Namespace) -> Report:
+    asked = is_asked_to_serve(given)
+    if asked and given.gcode is not None:
+        raise UsageError("--gcode prints a file and exits; leave it out to serve front ends")
+    if asked or (given.gcode is None and sys.stdin is not None and sys.stdin.isatty()):
+        return serve_machine(serving_options(given, given.config))
+    return run_machine(options_from(RunOptions, given))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,21 +1,27 @@
-"""``canductor table``: what its actions do. On a machine that runs, through its interface."""
+"""``canductor table``: compensation tables in files, on a running machine, or on devices without one."""
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+from canbus_tools.tables.table_device import carry_out
 from coordinator.assembly.load import load_machine
-from coordinator.cli.arguments.front_ends import Target
-from coordinator.cli.commands.front_ends import Answer, call
+from coordinator.cli.arguments.target import declare_target, target_of
+from coordinator.cli.commands.remote import Answer
+from coordinator.cli.commands.table_device import declare_device, device_job
+from coordinator.ipc.client.target import Target
 from coordinator.streaming.compensation import corrected_axes, why_not_corrected
+from coordinator.support.report import Report
 from coordinator.tables.axis_table import AxisTable, TableError, figures, notes
 from coordinator.tables.files import read_table
 from coordinator.tables.plot import draw
+from nodes.support.option_values import UsageError, add_command, add_group, existing_file, parse_path
 
-DOWNLOAD_TIMEOUT_S = 120.0
-"""A long table on a busy serial line takes its time."""
+UNITS: Final = ("mm", "um", "nm", "inch", "deg", "arcmin", "arcsec")
+DOWNLOAD_TIMEOUT_S: Final = 120.0
+"""A long table on a busy serial line takes that long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +57,81 @@ class Checked:
         return "\n".join(lines)
 
 
-def check(given: argparse.Namespace, _target: None) -> Checked:
-    """Read a table; raises TableError."""
+def add_to(commands: Any) -> None:
+    """Add the commands."""
+    summary = "check compensation tables of axes, and send them to a machine or to drives"
+    actions = add_group(commands, "table", summary, "ACTION")
+    for name, text, declare, run in (
+        ("check", "read a table and report its content, without a machine", _declare_check, _check),
+        ("plot", "draw a table as an SVG file", _declare_plot, _plot),
+        ("send", "send a table to an axis of a running machine, or to drives", _declare_send, _send),
+        ("status", "list the axes with tables, and the tables that nodes keep", _declare_status, _status),
+        (
+            "remove",
+            "remove the table of an axis of a running machine, or of drives",
+            _declare_remove,
+            _remove,
+        ),
+    ):
+        add_command(actions, name, text, declare, run)
+
+
+def _declare_file(command: argparse.ArgumentParser, axis: str | None) -> None:
+    add = command.add_argument
+    add("file", type=existing_file, help="LinuxCNC COMP_FILE, or CSV (.csv) with units in its first line")
+    add(
+        "--type", type=int, default=0, choices=(0, 1), help="type of a COMP_FILE: 0 actual positions, 1 trims"
+    )
+    add("--unit", default="mm", choices=UNITS, help="unit of all numbers of a COMP_FILE (default: mm)")
+    default = "" if axis is None else f" (default: {axis})"
+    add("--axis", type=str.lower, default=axis, help=f"axis that the table is for{default}")
+
+
+def _declare_check(command: argparse.ArgumentParser) -> None:
+    _declare_file(command, "x")
+    command.add_argument(
+        "--machine",
+        type=existing_file,
+        metavar="CONFIG",
+        help="compare the table with the axis's travel in this configuration",
+    )
+
+
+def _declare_plot(command: argparse.ArgumentParser) -> None:
+    _declare_file(command, "x")
+    command.add_argument(
+        "-o", "--output", type=_svg_file, required=True, metavar="SVG", help="file to be written"
+    )
+
+
+def _svg_file(text: str) -> Path:
+    return parse_path(text, ".svg")
+
+
+def _declare_send(command: argparse.ArgumentParser) -> None:
+    _declare_file(command, None)
+    declare_target(command)
+    declare_device(command, sends=True, has_file=True)
+
+
+def _declare_status(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--axis", type=str.lower, help="axis of the machine (default: all)")
+    declare_target(command)
+    declare_device(command, sends=False, has_file=False)
+
+
+def _declare_remove(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--axis", type=str.lower, help="axis of the machine")
+    declare_target(command)
+    declare_device(command, sends=True, has_file=False)
+
+
+def _check(given: argparse.Namespace) -> Checked:
     table = _read(given)
     return Checked(figures(table), tuple(_notes(table, given.machine)))
 
 
-def plot(given: argparse.Namespace, _target: None) -> Checked:
-    """Draw a table; raises TableError."""
+def _plot(given: argparse.Namespace) -> Checked:
     table = _read(given)
     try:
         given.output.write_text(draw(table), encoding="utf-8")
@@ -67,29 +140,27 @@ def plot(given: argparse.Namespace, _target: None) -> Checked:
     return Checked(figures(table), (), given.output)
 
 
-def send(given: argparse.Namespace, target: Target) -> Answer:
-    """Give a table to a machine that runs; not ok when a node did not take it. Raises CanductorError."""
+def _send(given: argparse.Namespace) -> Report:
+    """Send a table; not ok if a node did not take it."""
+    if given.device is not None:
+        return _on_device(given, _read(given), sends=True)
+    _check_axis("send", given)
     table = _read(given)
-    params = {
+    params: dict[str, Any] = {
         "axis": table.axis,
         "unit": str(table.unit),
         "positions": list(table.positions),
         "forward": list(table.forward),
         "reverse": list(table.reverse),
     }
-    result = call(_patient(target), "table.send", params).result
+    result = _patient_target(given).call("table.send", params)
     return _answer(result, [f"note: {note}" for note in result["notes"]], result["downloads"])
 
 
-def remove(given: argparse.Namespace, target: Target) -> Answer:
-    """Take a table away; not ok when a node keeps it. Raises CanductorError."""
-    result = call(_patient(target), "table.remove", {"axis": given.axis}).result
-    return _answer(result, [], result["downloads"])
-
-
-def status(given: argparse.Namespace, target: Target) -> Answer:
-    """Tell what there is; raises CanductorError."""
-    result = call(target, "table.status", {}).result
+def _status(given: argparse.Namespace) -> Report:
+    if given.device is not None:
+        return _on_device(given, None, sends=False)
+    result = target_of(given).call("table.status")
     if given.axis is not None:
         result = {"axes": [axis for axis in result["axes"] if axis["axis"] == given.axis]}
         if not result["axes"]:
@@ -97,17 +168,42 @@ def status(given: argparse.Namespace, target: Target) -> Answer:
     return _answer(result, [])
 
 
-def _patient(target: Target) -> Target:
-    return Target(
-        address=target.address,
-        token=target.token,
-        certificate=target.certificate,
-        timeout_s=max(target.timeout_s, DOWNLOAD_TIMEOUT_S),
-    )
+def _remove(given: argparse.Namespace) -> Report:
+    """Remove a table; not ok if a node keeps it."""
+    if given.device is not None:
+        return _on_device(given, None, sends=True)
+    _check_axis("remove", given)
+    result = _patient_target(given).call("table.remove", {"axis": given.axis})
+    return _answer(result, [], result["downloads"])
+
+
+def _on_device(given: argparse.Namespace, table: AxisTable | None, *, sends: bool) -> Report:
+    if given.address is not None:
+        raise UsageError("--at selects a running machine, --device drives without one; give one of them")
+    return carry_out(given.computer, device_job(given, table, sends=sends))
+
+
+def _check_axis(name: str, given: argparse.Namespace) -> None:
+    for option, value in (
+        ("axles", given.axles),
+        ("stepper", given.steppers),
+        ("node", given.nodes),
+        ("link", given.link),
+        ("delay", given.delay_s),
+    ):
+        if value:
+            raise UsageError(f"--{option} goes with --device: it selects drives or nodes")
+    if given.axis is None:
+        raise UsageError(f"'{name}' needs --axis of a running machine, or --device")
+
+
+def _patient_target(given: argparse.Namespace) -> Target:
+    target = target_of(given)
+    return replace(target, timeout_s=max(target.timeout_s, DOWNLOAD_TIMEOUT_S))
 
 
 def _read(given: argparse.Namespace) -> AxisTable:
-    return read_table(given.file, axis=given.axis, comp_type=int(given.type), unit=given.unit)
+    return read_table(given.file, axis=given.axis or "x", comp_type=given.type, unit=given.unit)
 
 
 def _notes(table: AxisTable, config: Path | None) -> list[str]:

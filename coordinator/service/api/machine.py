@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.cli.parser import version
 from coordinator.config.file import ConfigFile, parse_config
 from coordinator.config.model import MachineDescription
 from coordinator.ipc.protocol.methods import Caller, Kind, Method, Param, Scope, shown
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.state.log_ring import KEEP
 from coordinator.support.values import Value
+from coordinator.support.version import version
 
 _CAUSE_MAX: Final = 200
 _STATES: Final = (

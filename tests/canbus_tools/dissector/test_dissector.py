@@ -229,7 +229,7 @@ def messages_of(dictionary: Dictionary) -> int:
         (["--dictionary", "/no/such.json"], 1, "there is no file '/no/such.json'"),
         (["--dictionary", "256=x"], 2, "--dictionary NODE is '256', must be a whole number from 1 to 255"),
         (["--dictionary", "a", "--dictionary", "b"], 2, "--dictionary is given twice for all nodes"),
-        (["--dictionary", "4=a", "--dictionary", "4=b"], 2, "--dictionary is given twice for node 4"),
+        (["--dictionary", "4=a", "--dictionary", "4=b"], 2, "--dictionary is given twice for '4'"),
         (
             ["-o", "/no/such/folder/x.lua"],
             1,

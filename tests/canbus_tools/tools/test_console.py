@@ -189,7 +189,7 @@ def test_nobody_on_a_uart(can_tool: Command) -> None:
         (["--node", "4", "--baud", "9600"], "--baud goes with --uart"),
         (["--node", "256"], "--node is '256'"),
         (["--node", "90a4"], "--node is '90a4'"),
-        (["--node", "4", "-e", "x", "--script", "y"], "either --execute or --script"),
+        (["--node", "4", "-e", "x", "--script", __file__], "either --execute or --script"),
         (["--uart", "/dev/x", "--baud", "0"], "--baud is '0'"),
     ],
 )

@@ -123,10 +123,10 @@ def test_recordings_of_several_buses_are_refused(tmp_path: Path, capsys: pytest.
     [
         (["x.log"], "--bitrate is missing"),
         (["x.log", "-b", "5"], "--bitrate is '5'"),
-        (["x.log", "-b", BITRATE, "--watch"], "do not fit"),
+        (["x.log", "-b", BITRATE, "--watch"], "do not apply"),
         (["--window", "0"], "--window is '0'"),
         (["--duration", "0"], "--duration is '0'"),
-        (["--plot", "x.pdf"], "must end in .svg or .png"),
+        (["--plot", "x.pdf"], "must be a file that ends in .svg or .png"),
     ],
 )
 def test_usage(words: list[str], complaint: str, capsys: pytest.CaptureFixture[str]) -> None:

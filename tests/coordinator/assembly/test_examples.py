@@ -11,8 +11,9 @@ from coordinator.config.model import MachineDescription
 from coordinator.kinematics.base import Point
 from coordinator.modules.homing.homing_override import HomingOverride
 from coordinator.modules.module_set import build_modules
+from coordinator.planning.options import PlanOptions
 from coordinator.planning.plan import plan_file
-from coordinator.support.command_options import EXAMPLES, PlanOptions
+from coordinator.support.examples import EXAMPLES
 
 SAMPLES = 2000
 EXAMPLE_FILES = sorted(path for path in EXAMPLES.glob("*.cfg") if path.stem != "none")  # whose head stands

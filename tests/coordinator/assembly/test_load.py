@@ -8,7 +8,7 @@ from coordinator.assembly.reference import SECTIONS
 from coordinator.config.model import CanConnection, MachineDescription, UartConnection
 from coordinator.config.options import Option, SectionSpec
 from coordinator.config.unsupported import LATER_SECTIONS
-from coordinator.support.command_options import EXAMPLES
+from coordinator.support.examples import EXAMPLES
 from tests.stages.printer_text import PRINTER_CFG, changed, write
 
 SHARED = Path(__file__).parents[3] / ".." / "shared" / "data" / "config"

@@ -8,12 +8,14 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 from coordinator.cli import main as cli
-from coordinator.support.command_options import DEMO_MACHINE, DemoOptions, PlanOptions, RunOptions
+from coordinator.cli.commands.run import RunOptions
+from coordinator.demo.run import DemoOptions
+from coordinator.planning.options import PlanOptions
+from coordinator.support.examples import DEMO_MACHINE
 from nodes.support.errors import CanductorError
 
 
@@ -35,10 +37,8 @@ class Runners:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.asked: list[object] = []
         self.answer: Callable[[], PlainReport] = PlainReport
-        for module, function in (("demo", "run_demo"), ("run", "run_machine"), ("plan", "plan_file")):
-            stand_in = ModuleType(f"coordinator.{module}")
-            setattr(stand_in, function, self._run)
-            monkeypatch.setitem(sys.modules, f"coordinator.{module}", stand_in)
+        for function in ("demo.run_demo", "run.run_machine", "plan.plan_file"):
+            monkeypatch.setattr(f"coordinator.cli.commands.{function}", self._run)
 
     def _run(self, options: object) -> PlainReport:
         self.asked.append(options)
@@ -70,7 +70,6 @@ def test_demo_options(runners: Runners, files: Path) -> None:
             machine=Path("my.cfg"),
             gcode=Path("part.gcode"),
             json=True,
-            web=False,
             loss=0.01,
             seed=7,
             rate_ppm={"toolhead": 200.0, "zboard": -3.5},
@@ -187,7 +186,7 @@ def test_a_bug_leaves_its_traceback_in_a_file(
 
 
 USAGE = {
-    "plam": "invalid choice: 'plam' (choose from 'can', 'console', 'call', 'watch', ",
+    "plam": "invalid choice: 'plam' (choose from 'demo', 'run', 'plan', 'simulate', 'config', ",
     "plan": "the following arguments are required: config, gcode",
     "demo --sed 1": "unrecognized arguments: --sed 1",
     "demo --seed x": "--seed is 'x', must be a whole number of at least 0",
@@ -195,13 +194,13 @@ USAGE = {
     "plan my.cfg - --bitrate 5": "--bitrate is '5', must be a whole number from 10000 to 8000000",
     "simulate --seed 1 --seeds 1:2": "--seed and --seeds exclude each other",
     "simulate --jobs 257": "--jobs is '257', must be a whole number from 0 to 256",
-    "demo --loss 60%": "--loss is '60%', must be a share from 0 to 0.5, or a percentage such as 1%",
-    "demo --loss nan": "--loss is 'nan', must be a share from 0 to 0.5, or a percentage such as 1%",
-    "demo --loss much": "--loss is 'much', must be a share from 0 to 0.5, or a percentage such as 1%",
-    "demo --socketcan vcan0 --socketcan vcan1": "--socketcan names two interfaces for every bus",
+    "demo --loss 60%": "--loss is '60%', must be a ratio from 0 to 0.5, or a percentage such as 1%",
+    "demo --loss nan": "--loss is 'nan', must be a ratio from 0 to 0.5, or a percentage such as 1%",
+    "demo --loss much": "--loss is 'much', must be a ratio from 0 to 0.5, or a percentage such as 1%",
+    "demo --socketcan vcan0 --socketcan vcan1": "--socketcan is given twice for all buses",
     "demo --socketcan can0=a --socketcan can0=b": "--socketcan is given twice for 'can0'",
     "demo --socketcan =vcan0": "--socketcan takes NAME=VALUE, not '=vcan0'",
-    "demo --socketcan vcan0 --loss 1%": "--loss is of virtual buses; an interface loses frames by 'tc",
+    "demo --socketcan vcan0 --loss 1%": "--loss is for virtual buses; to lose frames of an interface, use",
     "demo --rate-ppm 5": "--rate-ppm takes NAME=VALUE, not '5'",
     "demo --rate-ppm a=b": "--rate-ppm for 'a' is 'b', must be a number in ppm, from -10000 to 10000",
     "demo --rate-ppm a=nan": "--rate-ppm for 'a' is 'nan', must be a number in ppm, from -10000 to 10000",
@@ -209,6 +208,11 @@ USAGE = {
     "demo --start-clock a=-1": "--start-clock for 'a' is '-1', must be a whole number of ticks",
     "demo --start-clock a=18446744073709551616": "must be a whole number of ticks, from 0 to 2^64 - 1",
 }
+
+
+def help_of(words: str) -> str:
+    command = words.split(maxsplit=1)[0]
+    return "canductor --help" if command == "plam" else f"canductor {command} --help"
 
 
 @pytest.mark.parametrize("words", USAGE)
@@ -219,7 +223,7 @@ def test_a_mistaken_command_line(
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("canductor: ")
-    assert err.endswith(" (see 'canductor --help')\n")
+    assert err.endswith(f" (see '{help_of(words)}')\n")
     assert err.count("\n") == 1
     assert USAGE[words] in err
     assert runners.asked == []
@@ -255,17 +259,17 @@ def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 LONG_REPORT = """
-import sys, types
+import sys
 from coordinator.cli import main as cli
+from coordinator.cli.commands import run
 
 class Report:
     ok = True
     def to_text(self):
         return "line\\n" * 100_000
 
-sys.modules["coordinator.cli.commands.run"] = types.ModuleType("coordinator.cli.commands.run")
-sys.modules["coordinator.cli.commands.run"].run_machine = lambda options: Report()
-sys.exit(cli.main(["run", __file__]))
+run.run_machine = lambda options: Report()
+sys.exit(cli.main(["run", __file__, "--gcode", __file__]))
 """
 
 

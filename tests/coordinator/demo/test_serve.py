@@ -4,7 +4,8 @@ from pathlib import Path
 
 from coordinator.assembly.load import load_machine
 from coordinator.demo.serve import with_jobs
-from coordinator.support.command_options import DEMO_GCODE, DEMO_MACHINE, ServeOptions
+from coordinator.front_ends.serve import ServeOptions
+from coordinator.support.examples import DEMO_GCODE, DEMO_MACHINE
 from tests.stages.printer_text import DEMO_CFG, write
 
 

@@ -14,10 +14,8 @@ from typing import Any
 import pytest
 from serial import rfc2217
 
-from coordinator.cli.commands.dnc import DncCommand
 from coordinator.cli.main import main
-from coordinator.cli.parser import read_words
-from coordinator.dnc import commands
+from coordinator.cli.parser import parse_command_line
 from coordinator.dnc.commands import Surroundings
 from coordinator.dnc.options import DncOptions
 from coordinator.dnc.port import Port, PortError
@@ -181,10 +179,10 @@ def test_over_tcp(folders: tuple[Path, Path], scheme: str, capsys: pytest.Captur
 
 
 def _serve(url: str, folder: Path, say: Callable[[str], None]) -> None:
-    command = read_words(["dnc", "serve", str(folder), "-p", url, *FAST])
-    assert isinstance(command, DncCommand)
+    words = ["dnc", "serve", str(folder), "-p", url, *FAST]
+    serve = parse_command_line(words, surroundings=Surroundings(say=say))
     with contextlib.suppress(PortError):  # the other side has gone
-        commands.serve(command.job, around=Surroundings(say=say))
+        serve()
 
 
 def _join(ours_at: socket.socket, theirs_at: socket.socket, speaks_rfc2217: bool) -> None:
@@ -252,7 +250,7 @@ class _SerialLine:
         (("list", "-p", "/dev/null"), 1, "/dev/null is no serial port; name a device such as /dev/ttyUSB0"),
         (("list", "-p", "."), 1, ". is no serial port; name a device"),
         (("list", "-p", ""), 1, "there is no serial port ''; check its plug"),
-        (("list", "-p", "X", "--frame", "9Z1"), 2, "the character frame is '9Z1', must be like 7E1"),
+        (("list", "-p", "X", "--frame", "9Z1"), 2, "--frame is '9Z1', must be like 7E1"),
         (("list", "-p", "X", "--baud", "fast"), 2, "--baud is 'fast', must be a whole number"),
         (("list", "-p", "X", "--silence", "9"), 2, "an answer may take 8 s, must be longer"),
         (("send", "none.nc", "-p", "X"), 1, "there is no file 'none.nc'"),
@@ -262,16 +260,20 @@ class _SerialLine:
             "line 2 of tab.nc has the character 09 hex, which no block can carry",
         ),
         (("send", "ok.nc", "-p", "X", "--code", "77"), 2, "--code is '77', must be one letter"),
-        (("receive", "A", "-p", "X", "--at", "Y"), 2, "--at says where to print; give --start, too"),
+        (
+            ("receive", "A", "-p", "X", "--at", "Y"),
+            2,
+            "--at selects the machine that prints; give --start as well",
+        ),
         (("drip", "-p", "X"), 2, "drip takes either a FILE"),
         (("drip", "ok.nc", "--from", "A", "-p", "X"), 2, "drip takes either a FILE"),
         (("drip", "--from", "A", "--from-control", "-p", "X"), 2, "drip takes either a FILE"),
-        (("drip", "ok.nc", "-p", "X", "--at", "Y"), 2, "--at says where to print; it goes with --from"),
+        (("drip", "ok.nc", "-p", "X", "--at", "Y"), 2, "--at selects the machine that prints; give --from"),
         (("send", "ok.nc", "--as", "peripheral", "--verify", "-p", "X"), 2, "which a peripheral cannot"),
         (("receive", "A", "-p", "X", "--start", "--token-file", "no"), 1, "there is no file 'no'"),
         (("serve", "nowhere", "-p", "X"), 1, "the folder nowhere cannot be opened"),
         (("drip", "--from", "JOB", "-p", "X", "--at", "/none.sock"), 1, "/none.sock"),
-        ((), 2, "COMMAND"),
+        ((), 2, "ACTION"),
     ],
 )
 def test_sentences(

@@ -11,12 +11,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import IO, Any, Final
 
-from coordinator.cli.commands.dnc import DncCommand
-from coordinator.cli.parser import read_words
-from coordinator.dnc import commands
+from coordinator.cli.parser import parse_command_line
 from coordinator.dnc.commands import Surroundings
 from coordinator.dnc.options import DncOptions
-from coordinator.support.command_options import Terminated
+from coordinator.support.interrupts import Terminated
 from nodes.support.errors import CanductorError
 from tests.stages.lockstep import Lockstep, Thread
 
@@ -121,14 +119,12 @@ class _Command:
     """A command, and what it says."""
 
     def __init__(self, cable: VirtualCable, words: tuple[str, ...], typed: IO[bytes] | None) -> None:
-        command = read_words(["dnc", *words])
-        assert isinstance(command, DncCommand)
         self.cable = cable
         self.said: list[str] = []
         self.stopping = False
         self.stopped = False
-        self._name, self._job = command.name, command.job
-        self._around = Surroundings(self._open, lambda: cable.time.now_s, self.said.append, typed)
+        around = Surroundings(self._open, lambda: cable.time.now_s, self.said.append, typed)
+        self._job = parse_command_line(["dnc", *words], surroundings=around)
         self._thread: Thread[Ended]
 
     def _open(self, name: str, options: DncOptions, rtscts: bool) -> _Port:
@@ -137,13 +133,13 @@ class _Command:
 
     def run(self) -> Ended:
         try:
-            report = getattr(commands, self._name)(self._job, around=self._around)
+            report = self._job()
         except CanductorError as error:
             return Ended(1, "", [*self.said, str(error)], {})
         except Terminated:
             return Ended(143, "", self.said, {})
         assert report.ok
-        return Ended(0, report.to_text(), self.said, report.to_json())
+        return Ended(0, report.to_text(), self.said, dict(report.to_json()))
 
     def start(self) -> None:
         time = self.cable.time

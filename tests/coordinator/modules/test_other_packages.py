@@ -12,7 +12,7 @@ import pytest
 from coordinator.assembly.check import check_config
 from coordinator.gcode.errors import GCodeError
 from coordinator.modules import registry
-from coordinator.support.command_options import EXAMPLES
+from coordinator.support.examples import EXAMPLES
 from tests.stages.program_stage import ProgramStage
 
 ROOT = EXAMPLES.parent

@@ -4,7 +4,7 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.motion.planner.planner import FeedStatus, Planner
-from coordinator.support.command_options import DEMO_MACHINE
+from coordinator.support.examples import DEMO_MACHINE
 
 
 @pytest.mark.parametrize(("speed_mm_min", "most"), [(600, 3), (1200, 3), (12000, 6)])

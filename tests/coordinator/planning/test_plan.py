@@ -16,11 +16,12 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.planning.figures import Peak
+from coordinator.planning.options import PlanOptions
 from coordinator.planning.plan import plan_file
 from coordinator.planning.plot import draw
 from coordinator.planning.report import PlanReport, Timeline
 from coordinator.planning.warnings import NodeClock, step_rate_warnings, ticks_per_step
-from coordinator.support.command_options import DEMO_MACHINE, PlanOptions
+from coordinator.support.examples import DEMO_MACHINE
 from nodes.support.errors import CanductorError
 from nodes.virtual.firmware import MAINBOARD, firmware_dictionary
 
@@ -288,13 +289,6 @@ def test_an_empty_program_has_a_report(tmp_path: Path) -> None:
     assert report.moves == 0
     assert [bus.peak_load for bus in report.buses] == [0, 0]
     assert "0 moves in 0:00.0 min" in report.to_text()
-
-
-CONFIG = Path(__file__).parents[3] / "config" / "cartesian_uart.cfg"
-SLOW = {
-    *("numpy", "can", "serial", "rich", "asyncio", "nodes.link"),
-    *("importlib.metadata", "email", "hashlib", "shutil"),
-}
 
 
 @pytest.mark.skipif(not DATA.exists(), reason="the shared real-world data is not here")

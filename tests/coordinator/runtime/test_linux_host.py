@@ -4,8 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.cli.commands.run import run_machine
-from coordinator.support.command_options import RunOptions
+from coordinator.cli.commands.run import RunOptions, run_machine
 from nodes.support.errors import CanductorError
 from tests.stages.printer_text import changed, without_endstops, write
 

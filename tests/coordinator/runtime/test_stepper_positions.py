@@ -9,7 +9,7 @@ from coordinator.config.model import MachineDescription
 from coordinator.kinematics.dual_carriage import CarriageMode
 from coordinator.motion.planner.planner import Position
 from coordinator.runtime.stepper_positions import StepperPositions
-from coordinator.support.command_options import EXAMPLES
+from coordinator.support.examples import EXAMPLES
 from coordinator.virtual_machine.plant import start_point
 
 CONFIGS = sorted(path for path in EXAMPLES.glob("*.cfg") if path.stem != "none")  # whose head stands

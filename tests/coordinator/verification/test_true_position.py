@@ -6,7 +6,7 @@ import pytest
 from coordinator.assembly.load import load_machine
 from coordinator.motion.trapezoid_array import TRAPEZOID
 from coordinator.streaming.pipeline import PlanRecord
-from coordinator.support.command_options import DEMO_MACHINE
+from coordinator.support.examples import DEMO_MACHINE
 from coordinator.verification.true_position import prove_places
 from coordinator.virtual_machine.plant import machine_plants
 from nodes.virtual.plant import Axis

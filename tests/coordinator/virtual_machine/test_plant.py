@@ -9,8 +9,9 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
+from coordinator.demo.run import DemoOptions
 from coordinator.kinematics.base import Point
-from coordinator.support.command_options import EXAMPLES, DemoOptions
+from coordinator.support.examples import EXAMPLES
 from coordinator.virtual_machine.plant import START_MM, PlantSettings, machine_plants, start_point
 from coordinator.virtual_machine.plant_heat import HeatSettings, steinhart, table_of
 from coordinator.virtual_machine.virtual_machine import VirtualMachine

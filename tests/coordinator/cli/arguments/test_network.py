@@ -1,38 +1,38 @@
-"""The words for announcing and for metrics."""
+"""The options that announce a machine and serve its metrics."""
 
-import argparse
+from pathlib import Path
 
 import pytest
 
-from coordinator.cli.arguments.network import declare_network, read_announce, read_metrics
-from nodes.support.option_values import UsageError
+from coordinator.cli.arguments.serving import declare_serving, serving_options
+from coordinator.front_ends.serve import ServeOptions
+from nodes.support.option_values import Parser, UsageError
 
 
-def given(*words: str) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--tcp")
-    declare_network(parser.add_argument)
-    return parser.parse_args(words)
+def served(*words: str, announce: bool | None = None) -> ServeOptions:
+    parser = Parser()
+    declare_serving(parser)
+    return serving_options(parser.parse_args(words), Path("demo.cfg"), announce)
 
 
 @pytest.mark.parametrize(
     ("words", "of_run", "of_demo"),
     [
         ((), None, False),
-        (("--tcp", "x:1"), None, False),
-        (("--tcp", "x:1", "--announce"), True, True),
-        (("--tcp", "x:1", "--no-announce"), False, False),
+        (("--tcp", "x:1", "--tokens", "t"), None, False),
+        (("--tcp", "x:1", "--tokens", "t", "--announce"), True, True),
+        (("--tcp", "x:1", "--tokens", "t", "--no-announce"), False, False),
         (("--no-announce",), False, False),
     ],
 )
 def test_announcing(words: tuple[str, ...], of_run: bool | None, of_demo: bool) -> None:
-    assert read_announce(given(*words), unless_said=None) is of_run
-    assert read_announce(given(*words), unless_said=False) is of_demo
+    assert served(*words).announce is of_run
+    assert served(*words, announce=False).announce is of_demo
 
 
 def test_a_unix_socket_is_not_announced() -> None:
     with pytest.raises(UsageError, match="--announce needs --tcp"):
-        read_announce(given("--announce"), unless_said=None)
+        served("--announce")
 
 
 @pytest.mark.parametrize(
@@ -48,7 +48,7 @@ def test_a_unix_socket_is_not_announced() -> None:
     ],
 )
 def test_where_the_metrics_are(words: tuple[str, ...], address: tuple[str, int] | None) -> None:
-    assert read_metrics(given(*words)) == address
+    assert served(*words).metrics == address
 
 
 @pytest.mark.parametrize(
@@ -67,14 +67,14 @@ def test_where_the_metrics_are(words: tuple[str, ...], address: tuple[str, int] 
         ":",
     ],
 )
-def test_words_that_make_no_endpoint(word: str) -> None:
-    with pytest.raises(UsageError, match="must be a port, or an IP address and one"):
-        read_metrics(given(f"--metrics={word}", "--metrics-open"))
+def test_what_is_no_metrics_address(word: str) -> None:
+    with pytest.raises(UsageError, match="must be a port, or an IP address and a port"):
+        served(f"--metrics={word}", "--metrics-open")
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "10.0.0.2", "[::]", "[fe80::1%eth0]"])  # noqa: S104
 def test_others_read_the_metrics_only_if_they_are_to(host: str) -> None:
     with pytest.raises(UsageError, match="needs --metrics-open"):
-        read_metrics(given("--metrics", f"{host}:9177"))
+        served("--metrics", f"{host}:9177")
     with pytest.raises(UsageError, match="goes with --metrics"):
-        read_metrics(given("--metrics-open"))
+        served("--metrics-open")

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from coordinator.cli import main as cli
-from coordinator.support.command_options import DEMO_GCODE, DEMO_MACHINE
+from coordinator.support.examples import DEMO_GCODE, DEMO_MACHINE
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -50,7 +50,7 @@ def test_without_serve_there_is_no_page(capsys: pytest.CaptureFixture[str]) -> N
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("--gcode", "FILE", "--ipc", "sock"), "--gcode prints a file and ends; leave it out"),
+        (("--gcode", "FILE", "--ipc", "sock"), "--gcode prints a file and exits; leave it out"),
         (("--tcp", "127.0.0.1:7125"), "--tokens"),
         (("--ipc", "sock", "--jobs", "none"), "must be a folder"),
     ],

@@ -91,13 +91,13 @@ def test_plot_draws(comp: Path, tmp_path: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ((), "the action is missing: check, plot, send, status, remove"),
+        ((), "the following arguments are required: ACTION"),
         (("check",), "the following arguments are required: file"),
         (("check", "none"), "none"),
         (("plot", MACHINE, "-o", "x.png"), "must be a file that ends in .svg"),
         (("check", MACHINE, "--unit", "ell"), "invalid choice: 'ell'"),
-        (("send", MACHINE), "what 'send' is for is missing: --axis of a machine that runs, or --device"),
-        (("remove",), "what 'remove' is for is missing: --axis of a machine that runs, or --device"),
+        (("send", MACHINE), "'send' needs --axis of a running machine, or --device"),
+        (("remove",), "'remove' needs --axis of a running machine, or --device"),
     ],
 )
 def test_words_that_do_not_do(

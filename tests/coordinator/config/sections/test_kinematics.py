@@ -14,7 +14,7 @@ from coordinator.kinematics.dual_carriage import CarriageMode
 from coordinator.kinematics.polar import Polar
 from coordinator.kinematics.rotary_delta import RotaryDelta
 from coordinator.kinematics.winch import Winch
-from coordinator.support.command_options import EXAMPLES
+from coordinator.support.examples import EXAMPLES
 from tests.stages.printer_text import PRINTER_CFG, changed, example_text, write
 
 

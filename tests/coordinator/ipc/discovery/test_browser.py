@@ -13,12 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from zeroconf import ServiceInfo
 
-from coordinator.cli.commands.discover import Found, find_machines
 from coordinator.ipc.discovery.announcement import ADDRESSES_MAX, SERVICE_TYPE, Announcement, usable_addresses
 from coordinator.ipc.discovery.announcer import RESCAN_S, UPDATE_SPACING_S, Announcer
 from coordinator.ipc.discovery.announcer_process import RESTART_S, AnnouncerProcess
 from coordinator.ipc.discovery.browser import INSTANCES_MAX, Browser
-from coordinator.ipc.discovery.multicast import InterfaceAddress, mdns_addresses, reachable_addresses
+from coordinator.ipc.discovery.find import Found, find_machines
+from coordinator.ipc.discovery.multicast import (
+    InterfaceAddress,
+    mdns_addresses,
+    reachable_addresses,
+)
 from tests.coordinator.ipc.memory_network import MemoryNetwork, MemoryProcess
 from tests.coordinator.ipc.served import serving
 from tests.profiles import examples

@@ -9,7 +9,7 @@ from coordinator.gcode.program import Program
 from coordinator.motion.planner.planner import Planner
 from coordinator.service.core.feeder import INTERJECTIONS_MAX, WAITING_MAX, Feeder, FeederFull, QueuedWork
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Rest, WorkError, commands_in
-from coordinator.support.command_options import DEMO_MACHINE
+from coordinator.support.examples import DEMO_MACHINE
 
 LIMITS = load_machine(str(DEMO_MACHINE)).limits
 

@@ -6,7 +6,7 @@ import pytest
 from coordinator.assembly.load import load_machine
 from coordinator.motion.planner.planner import Planner
 from coordinator.service.state.trace import BATCH_BYTES_MAX, MOVES_MAX, MotionTrace
-from coordinator.support.command_options import DEMO_MACHINE
+from coordinator.support.examples import DEMO_MACHINE
 
 
 def planned(lines: bytes) -> tuple[Planner, MotionTrace]:
