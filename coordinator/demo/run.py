@@ -80,7 +80,7 @@ def print_and_prove(
         for node in description.nodes
         for proof in prove_heat(warmth.states, node.name, hardware.plant_log(node.name))
     ]
-    notices = [*map(str, description.not_yet_acting), *description.notes, *told]
+    notices = [*map(str, description.unsupported), *description.notes, *told]
     if (sentence := not_steady(warmth.heaters, heat)) is not None:
         notices.append(sentence)
     return report_of(prover, hardware, figures, outcome, notices, heat=heat)
@@ -168,7 +168,7 @@ class Prover:
         )
 
     def _expected(self, stepper: StepperDescription) -> Iterator[ExpectedSteps]:
-        legs = program_legs(self._spec(stepper), self._record.stretches())
+        legs = program_legs(self._spec(stepper), self._record.segments())
         if not all(leg.is_plain and leg.spec.weights == legs[0].spec.weights for leg in legs):
             yield from expected_curved(legs, self._outcome.maps[stepper.node].clock_freq)
             return

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.cli.parser import version
-from coordinator.gcode.commands import AtOnce, Call
+from coordinator.gcode.commands import Call, Immediate
 from coordinator.gcode.parser import WordError, parse
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.klippy_api.client import REMOTE_METHODS_MAX, Client
@@ -22,7 +22,7 @@ from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.service.api.motion import RESTARTS, run_script
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.work import LINES_MAX
-from coordinator.streaming.move_source import Told
+from coordinator.streaming.move_source import ProgramOutput
 from nodes.support.errors import CanductorError
 
 Result = Mapping[str, Any]
@@ -144,8 +144,8 @@ class Endpoints:
 
     def _help(self, _client: Client, _request: Request) -> Result:
         machine = self._service.machine
-        helps = {} if machine is None else machine.modules.helps
-        return {name: text for name, text in helps.items() if text}
+        command_help = {} if machine is None else machine.modules.command_help
+        return {name: text for name, text in command_help.items() if text}
 
     def _script(self, _client: Client, request: Request) -> Awaitable[Result] | Result:
         script = text_of(request, "script")
@@ -191,7 +191,7 @@ class Endpoints:
             if command is None or reader is None:
                 raise WordError(f"this machine does not know {line.strip()[:40]}")
             reading = reader.read(Call(command, 0, (0.0,) * 4, ""))
-            if isinstance(reading, AtOnce):
+            if isinstance(reading, Immediate):
                 for text in reading.replies:
                     self._say(line_of(reading.kind, text))
 
@@ -213,7 +213,7 @@ class Endpoints:
         return {}
 
 
-def kind_of(told: Told) -> ReplyKind:
+def kind_of(told: ProgramOutput) -> ReplyKind:
     """Return how TOLD reads: notices are information."""
     kind = getattr(told, "kind", ReplyKind.INFORMATION)
     assert isinstance(kind, ReplyKind)

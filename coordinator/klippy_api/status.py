@@ -52,12 +52,12 @@ class _Fixed:
         view = ConfigView(modules.config, modules.settings, {})
         described = machine.description
         warnings = [
-            *({"type": "unsupported", "message": str(found)} for found in described.not_yet_acting),
+            *({"type": "unsupported", "message": str(found)} for found in described.unsupported),
             *({"type": "note", "message": note} for note in (*described.notes, *modules.notes)),
         ]
         self.machine = machine
         self.config = {"config": view["config"], "settings": view["settings"], "warnings": warnings}
-        self.commands = {name: {"help": text} if text else {} for name, text in modules.helps.items()}
+        self.commands = {name: {"help": text} if text else {} for name, text in modules.command_help.items()}
         self.macros = modules.names(GCodeMacro)
         self.heaters = next(modules.of(Heaters), None)
         self.order = modules.names(Module)

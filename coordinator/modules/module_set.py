@@ -6,14 +6,14 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
-from coordinator.config.errors import ConfigError, NotActing, Place
+from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawSection
 from coordinator.config.model import MachineDescription, ModuleSection
 from coordinator.config.pins import PinRegistry
-from coordinator.config.unsupported import LATER_SECTIONS
+from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
 from coordinator.gcode.absent_commands import ABSENT
-from coordinator.gcode.builtins.basic import BESIDE, HANDLERS
-from coordinator.gcode.builtins.command_help import HELPS
+from coordinator.gcode.builtins.basic import HANDLERS, WHILE_PRINTING
+from coordinator.gcode.builtins.command_help import BUILTIN_HELP
 from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
 from coordinator.modules.base import Build, Device, Module
 from coordinator.modules.drivers.motor_power import MotorPower
@@ -67,7 +67,7 @@ def build_modules(machine: MachineDescription) -> "ModuleSet":
     """Build the modules of MACHINE, linked with each other; raises ConfigError."""
     given = machine.modules
     sources = [source for section in given.sections for source in _sources(section)]
-    without: dict[str, NotActing] = {}
+    without: dict[str, NotSupported] = {}
     while True:
         built = ModuleSet(machine, given.pins.copy(), given.config, given.settings)
         for source in sources:
@@ -75,7 +75,7 @@ def build_modules(machine: MachineDescription) -> "ModuleSet":
         built.add_always()
         try:
             built.link()
-        except _LinkNotActing as found:
+        except _LinkNotSupported as found:
             # What depends on it may have to be left out, too: all are built again.
             without[found.module] = found.error
         else:
@@ -90,10 +90,10 @@ def _sources(given: ModuleSection) -> Iterator[ModuleSource]:
         yield ModuleSource(section, own, whole=True)
 
 
-class _LinkNotActing(Exception):  # noqa: N818 (no mistake)
+class _LinkNotSupported(Exception):  # noqa: N818 (no mistake)
     """A module turned out, when it looked for others, not to act yet."""
 
-    def __init__(self, module: str, error: NotActing) -> None:
+    def __init__(self, module: str, error: NotSupported) -> None:
         super().__init__(str(error))
         self.module = module
         self.error = error
@@ -161,7 +161,7 @@ class ModuleSet:
             self._machine,
             whole=source.whole,
             share=self._share,
-            later=[name for name in self.config if name.partition(" ")[0] in LATER_SECTIONS],
+            later=[name for name in self.config if name.partition(" ")[0] in UNSUPPORTED_SECTIONS],
         )
         with _blamed(source.kind, source.section.place):
             module = source.kind(build)
@@ -169,7 +169,7 @@ class ModuleSet:
         self._add(module, build)
         return module
 
-    def build_or_leave_out(self, source: ModuleSource, without: Mapping[str, NotActing]) -> None:
+    def build_or_leave_out(self, source: ModuleSource, without: Mapping[str, NotSupported]) -> None:
         """Make the module of SOURCE, unless it is among those to be left out or turns out to be one.
 
         Raises ConfigError for a mistake.
@@ -179,7 +179,7 @@ class ModuleSet:
         if found is None:
             try:
                 self.build(source)
-            except NotActing as error:
+            except NotSupported as error:
                 found = error
         if found is not None:
             self.left_out[name] = LeftOut(name, source.section.place, source.kind, found.reason)
@@ -229,14 +229,14 @@ class ModuleSet:
             try:
                 with _blamed(type(module), self._places[module]):
                     module.link(self)
-            except NotActing as error:
-                raise _LinkNotActing(module.name, error) from None
+            except NotSupported as error:
+                raise _LinkNotSupported(module.name, error) from None
 
     def _replace(self, command: GCodeCommand, rename: str, build: Build) -> None:
         """Let COMMAND have its name, and whoever had it before the name RENAME."""
         name = command.name
         before = self._commands.get(name)
-        if not rename and name not in FREE_NAMES and (before is not None or name in HELPS):
+        if not rename and name not in FREE_NAMES and (before is not None or name in BUILTIN_HELP):
             # What has no help does nothing by itself: M106 without a fan is a name that is free.
             section = build.reader.section
             if section.misspelt or "rename_existing" in section.set_aside:
@@ -248,7 +248,7 @@ class ModuleSet:
                 f" with another name for that one, such as {name}{'.1' if name[1:].isdigit() else '_BASE'}",
             )
         if rename:
-            if not self.knows(name) and name not in self.not_acting:
+            if not self.knows(name) and name not in self.unsupported:
                 raise ConfigError(
                     build.place,
                     f"[{build.name}] has rename_existing, but there is no command {name}; remove that option",
@@ -259,7 +259,7 @@ class ModuleSet:
                     f"rename_existing of [{build.name}] is {rename}, which is a command already; choose a"
                     " name that none has",
                 )
-            self._commands[rename] = renamed(before, name, rename, beside=name in BESIDE)
+            self._commands[rename] = renamed(before, name, rename, while_printing=name in WHILE_PRINTING)
             self._owners[rename] = self._owners.get(name, build.name)
         self._commands[name] = command
         self._owners[name] = build.name
@@ -276,7 +276,7 @@ class ModuleSet:
         return command in self._commands or command in HANDLERS
 
     @property
-    def not_acting(self) -> Mapping[str, str]:
+    def unsupported(self) -> Mapping[str, str]:
         """Why nothing acts on commands that sections of the configuration should bring, by their names."""
         kinds = {name.partition(" ")[0]: name for name in reversed(tuple(self.config))}
         found: dict[str, str] = {}
@@ -292,9 +292,9 @@ class ModuleSet:
         return found
 
     @property
-    def helps(self) -> Mapping[str, str]:
+    def command_help(self) -> Mapping[str, str]:
         """What each command of programs does, by its name."""
-        return {**HELPS, **{name: command.help for name, command in self._commands.items()}}
+        return {**BUILTIN_HELP, **{name: command.help for name, command in self._commands.items()}}
 
     def find(self, name: str, kind: type[K]) -> K | None:
         """Return the module of section NAME, or None when there is none of KIND."""
@@ -325,14 +325,14 @@ class ModuleSet:
             self._too_cold,
             self._containing(INTERRUPTING & self._commands.keys()),
             self._containing(self._disturbing()),
-            self.not_acting,
+            self.unsupported,
             set_ups=tuple(self._set_ups),
         )
 
     def _disturbing(self) -> set[str]:
         """Return the commands that move or wait, so that they cannot run while a job prints."""
-        own = {name for name in HANDLERS if name not in BESIDE and name not in self._commands}
-        return own | {name for name, command in self._commands.items() if not command.beside}
+        own = {name for name in HANDLERS if name not in WHILE_PRINTING and name not in self._commands}
+        return own | {name for name, command in self._commands.items() if not command.while_printing}
 
     def _containing(self, commands: AbstractSet[str]) -> frozenset[str]:
         """Return COMMANDS, and macros in whose lines they come, directly or by way of others."""

@@ -14,7 +14,7 @@ from coordinator.runtime.host import Host, LinuxHost
 from coordinator.runtime.machine import Machine, MachineStopped, link_of
 from coordinator.runtime.timebase import ClockMap
 from coordinator.streaming.compensation import Compensation
-from coordinator.streaming.move_source import JobState, Told
+from coordinator.streaming.move_source import JobState, ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.program_machine import machine_state
 from coordinator.streaming.streamer import Streamer
@@ -62,7 +62,7 @@ async def run_job(
     on_progress: OnProgress,
     *,
     record: PlanRecord | None = None,
-    on_told: Callable[[Told], None],
+    on_told: Callable[[ProgramOutput], None],
     on_ready: Callable[[Machine], None] | None = None,
     host: Host | None = None,
     cache: DictionaryCache | None = None,
@@ -112,7 +112,7 @@ async def _print(
     on_progress: OnProgress,
     record: PlanRecord | None,
     *,
-    on_told: Callable[[Told], None],
+    on_told: Callable[[ProgramOutput], None],
     compensation: "Compensation | None",
 ) -> Outcome:
     began_ns = machine.host.now()

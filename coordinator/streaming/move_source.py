@@ -8,7 +8,7 @@ from coordinator.gcode.events import Event, Notice, Reply
 from coordinator.gcode.machine_state import MachineState
 from coordinator.motion.planner.planner import Planner, Position
 
-Told = Reply | Notice
+ProgramOutput = Reply | Notice
 
 
 class MoveSource(Protocol):

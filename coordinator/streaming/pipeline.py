@@ -40,7 +40,7 @@ BATCH_ROOM = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class Acting:
+class MotionSettings:
     """What acts between trapezoids and steppers."""
 
     shapers: Mapping[str, Shaper]
@@ -52,7 +52,7 @@ class Acting:
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
+class Segment:
     """Trapezoids between which nothing is declared or changed."""
 
     start: Position
@@ -60,7 +60,7 @@ class Stretch:
     declared: bool
     """Whether they were declared to stand there; else they came there, and every stepper goes on as it is."""
     moves: "NDArray[np.void]"
-    acting: Acting
+    acting: MotionSettings
 
 
 @dataclass(slots=True)
@@ -72,7 +72,7 @@ class PlanRecord:
     declared: list[tuple[int, Position]] = field(default_factory=list)
     """Before trapezoid number N the machine was declared to stand at a position."""
     count: int = 0
-    acting: list[tuple[int, Acting]] = field(default_factory=list)
+    acting: list[tuple[int, MotionSettings]] = field(default_factory=list)
     """What acts from trapezoid number N on."""
 
     def restart(self) -> None:
@@ -92,17 +92,17 @@ class PlanRecord:
         return np.concatenate(self.pieces) if self.pieces else np.empty(0, TRAPEZOID)
 
     def epochs(self) -> "list[tuple[Position, NDArray[np.void]]]":
-        """Return the stretches between declarations: where each begins, and its trapezoids."""
+        """Return the segments between declarations: where each begins, and its trapezoids."""
         every = self.every()
         cuts = [(0, self.start), *self.declared]
         ends = [at for at, _ in cuts[1:]] + [len(every)]
         return [(position, every[at:end]) for (at, position), end in zip(cuts, ends, strict=True)]
 
-    def stretches(self) -> list[Stretch]:
-        """Return the stretches between declarations and changes, those with trapezoids, in order."""
-        found: list[Stretch] = []
+    def segments(self) -> list[Segment]:
+        """Return the segments between declarations and changes, those with trapezoids, in order."""
+        found: list[Segment] = []
         at, changes = 0, [*self.acting]
-        acting = Acting({}, {}, {})
+        acting = MotionSettings({}, {}, {})
         for position, moves in self.epochs():
             begin, epoch_end = at, at + len(moves)
             while at < epoch_end:
@@ -110,7 +110,7 @@ class PlanRecord:
                     acting = changes.pop(0)[1]
                 end = min([epoch_end, *(n for n, _ in changes[:1])])
                 start = _four(moves[at - begin]["start"].tolist()) if at > begin else position
-                found.append(Stretch(start, at == begin, moves[at - begin : end - begin], acting))
+                found.append(Segment(start, at == begin, moves[at - begin : end - begin], acting))
                 at = end
         return found
 
@@ -203,7 +203,7 @@ class Pipeline:
         if self._record is None:
             return
         shapers = {axis: shaper for axis, shaper in self._shapers.items() if shaper.frequency_hz}
-        acting = Acting(shapers, dict(self._weights), dict(self._windows_s))
+        acting = MotionSettings(shapers, dict(self._weights), dict(self._windows_s))
         self._record.acting.append((self._record.count, acting))
 
     def _shape(self, axis: str, shaper: Shaper) -> None:

@@ -13,7 +13,7 @@ from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import Emergency, End, Event, Notice, Resting
 from coordinator.runtime.machine import Machine, MachineStopped, link_of
 from coordinator.streaming.compensation import Compensation
-from coordinator.streaming.move_source import JobState, MoveSource, Planned, Told, Witness
+from coordinator.streaming.move_source import JobState, MoveSource, Planned, ProgramOutput, Witness
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.standstill_task import RestTask
 from coordinator.streaming.timed_events import Due, DueEvents
@@ -45,7 +45,7 @@ class Streamer:
         record: PlanRecord | None = None,
         witness: Witness | None = None,
         compensation: "Compensation | None" = None,
-        on_told: Callable[[Told], None],
+        on_told: Callable[[ProgramOutput], None],
         on_state: Callable[[JobState], None],
         on_cycle: Callable[[], None] = lambda: None,
     ) -> None:

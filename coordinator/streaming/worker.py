@@ -29,7 +29,7 @@ from coordinator.motion.steps.steps import StepGenerator
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.timebase import ClockMap
 from coordinator.streaming.compensation import Compensation
-from coordinator.streaming.move_source import MoveSource, Planned, Told, Witness
+from coordinator.streaming.move_source import MoveSource, Planned, ProgramOutput, Witness
 from coordinator.streaming.pipeline import Pipeline, PlanRecord
 from coordinator.streaming.timed_events import Due
 
@@ -52,7 +52,7 @@ class Cycle:
     """What one visit to the worker brought."""
 
     batches: list[tuple[int, bytes]]
-    told: list[Told]
+    told: list[ProgramOutput]
     event: Event | None
     """What the job waits for; None: it has more."""
     planned: Planned
@@ -144,7 +144,7 @@ class MotionWorker:
     def work(self, waiting_for: Event | None) -> Cycle:
         """Let the job go on as far as it should by now, and make the commands that are due."""
         now = self.print_time_now()
-        told: list[Told] = []
+        told: list[ProgramOutput] = []
         event = waiting_for
         if self.pipeline.compensation_due and self._all_generated():
             self.pipeline.compensate()
@@ -166,7 +166,7 @@ class MotionWorker:
         self._generate(now)
         return self._cycle(told, event)
 
-    def _beside(self, resting: Resting, told: list[Told]) -> Event:
+    def _beside(self, resting: Resting, told: list[ProgramOutput]) -> Event:
         """Let others be answered while the job waits, a heater may take minutes; return what to wait for."""
         while (event := self._job.attend_others()) is not None:
             if isinstance(event, Reply | Notice):
@@ -185,7 +185,7 @@ class MotionWorker:
         self._generate(self.print_time_now())
         return self._cycle([], None)
 
-    def _cycle(self, told: Sequence[Told], event: Event | None) -> Cycle:
+    def _cycle(self, told: Sequence[ProgramOutput], event: Event | None) -> Cycle:
         batches, self._batches = self._batches, []
         due, self.pipeline.due = self.pipeline.due, []
         if self._compensation is not None:
@@ -252,7 +252,7 @@ class MotionWorker:
             and self.steps.generated_until >= self.pipeline.appended_until + self.steps.lag_s
         )
 
-    def _advance(self, told: list[Told]) -> Event | None:
+    def _advance(self, told: list[ProgramOutput]) -> Event | None:
         """Step the job until it has to wait for something, or LINES_AT_ONCE are done."""
         for _ in range(LINES_AT_ONCE):
             event = self._job.step()

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from coordinator.motion.specs import StepperSpec
-from coordinator.streaming.pipeline import Acting, Stretch
+from coordinator.streaming.pipeline import MotionSettings, Segment
 from coordinator.verification.exact_path import Leg, Setting
 from coordinator.verification.exact_shapers import impulses
 
 
-def program_legs(spec: StepperSpec, stretches: Sequence[Stretch]) -> list[Leg]:
+def program_legs(spec: StepperSpec, segments: Sequence[Segment]) -> list[Leg]:
     """Return the legs of the stepper SPEC, whose weights hold as long as STRETCHES tell no others."""
     return [
         Leg(
@@ -19,11 +19,11 @@ def program_legs(spec: StepperSpec, stretches: Sequence[Stretch]) -> list[Leg]:
             _setting(stretch.acting, spec.name),
             declared=stretch.declared,
         )
-        for stretch in stretches
+        for stretch in segments
     ]
 
 
-def _setting(acting: Acting, stepper: str) -> Setting:
+def _setting(acting: MotionSettings, stepper: str) -> Setting:
     shapers = {
         axis: impulses(shaper.kind, shaper.frequency_hz, shaper.damping_ratio)
         for axis, shaper in acting.shapers.items()

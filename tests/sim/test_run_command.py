@@ -10,7 +10,7 @@ from coordinator.cli.commands.run import RunReport
 from coordinator.gcode.errors import GCodeError
 from coordinator.runtime.machine import MachineStopped
 from coordinator.streaming.job_runner import Outcome
-from coordinator.streaming.move_source import Told
+from coordinator.streaming.move_source import ProgramOutput
 from coordinator.support.command_options import Terminated
 from nodes.support.errors import CanductorError
 from tests.stages.demo_machine import NODES, SQUARE, DemoMachine, TypedRun
@@ -139,7 +139,7 @@ def test_a_dwell_before_the_first_move_outlasts_links_that_stand_still(tmp_path:
     """Its commands are sent 1.2 s ahead, those of a move at once 0.25 s; tests/smoke relies on this."""
     machine = DemoMachine(tmp_path)
 
-    def told(event: Told) -> None:
+    def told(event: ProgramOutput) -> None:
         if "already home" in event.text:
             machine.stage._world.stall(0.9, python=False)  # the threads of its links get no turn
 

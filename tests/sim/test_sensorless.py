@@ -12,7 +12,7 @@ from coordinator.modules.drivers.tmc_driver import TmcDriver
 from coordinator.runtime.machine import Machine, MachineStopped
 from coordinator.simulate.scenario import BusSetting
 from coordinator.streaming.job_runner import Outcome
-from coordinator.streaming.move_source import Told
+from coordinator.streaming.move_source import ProgramOutput
 from coordinator.support.toml_values import Range
 from coordinator.virtual_machine.plant import PlantSettings
 from nodes.support.errors import CanductorError
@@ -52,7 +52,7 @@ class Printer(MachineStage):
             lines, on_told=self._tell, on_ready=lambda machine: self._on_ready(self, machine)
         )
 
-    def _tell(self, told: Told) -> None:
+    def _tell(self, told: ProgramOutput) -> None:
         self.told.append(told.text)
         if told.text.startswith("x:"):  # M119: it stands
             self.places.append((self.true_mm("x"), self.true_mm("y")))

@@ -10,7 +10,7 @@ from coordinator.runtime.machine import Machine
 from coordinator.simulate.scenario import BusSetting, NodeSetting, Scenario
 from coordinator.simulate.stage import Stage
 from coordinator.streaming.job_runner import Outcome, run_job
-from coordinator.streaming.move_source import Told
+from coordinator.streaming.move_source import ProgramOutput
 from coordinator.virtual_machine.plant import PlantSettings, machine_plants
 from nodes.virtual.plant_page import Kind, PlantPage
 from nodes.virtual.world import WorldNode
@@ -72,7 +72,7 @@ class MachineStage:
         self,
         lines: Iterable[str],
         *,
-        on_told: Callable[[Told], None] = lambda _: None,
+        on_told: Callable[[ProgramOutput], None] = lambda _: None,
         on_ready: Callable[[Machine], None] | None = None,
     ) -> Outcome:
         """Run a program to its end, as a job; ON_TOLD gets what it says, ON_READY the connected machine."""

@@ -8,7 +8,7 @@ from coordinator.gcode.program import Program
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
 from coordinator.streaming.job_runner import Outcome, run_job
-from coordinator.streaming.move_source import Told
+from coordinator.streaming.move_source import ProgramOutput
 from tests.stages.printer_text import SWITCHES_CFG
 
 STEPS_PER_MM = {"x": 80, "y": 80, "z": 400}
@@ -57,7 +57,7 @@ class SwitchPrinter:
             host=self.stage.host,
         )
 
-    def _tell(self, told: Told) -> None:
+    def _tell(self, told: ProgramOutput) -> None:
         self.told.append(told.text)
 
     def true_mm(self, axis: str, endstop_mm: float) -> float:

@@ -9,7 +9,7 @@ from coordinator.assembly.check import check_config
 from coordinator.assembly.consequences import meaning
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
-from coordinator.config.model import NotYetActing
+from coordinator.config.model import Unsupported
 from nodes.support.errors import CanductorError
 
 
@@ -21,7 +21,7 @@ class CheckReport:
     problems: Sequence[CanductorError]
     notices: Sequence[str]
     """What is worth knowing, when nothing is wrong."""
-    not_acting: Sequence[NotYetActing] = ()
+    unsupported: Sequence[Unsupported] = ()
     """What is right but does not act, when nothing is wrong."""
 
     @property
@@ -39,7 +39,7 @@ class CheckReport:
                 for problem in self.problems
             ],
             "notices": list(self.notices),
-            "not_acting": [
+            "unsupported": [
                 {
                     "section": entry.section,
                     "options": list(entry.options),
@@ -48,7 +48,7 @@ class CheckReport:
                     "reason": entry.reason,
                     "meaning": meaning(entry),
                 }
-                for entry in self.not_acting
+                for entry in self.unsupported
             ],
         }
 
@@ -60,12 +60,12 @@ class CheckReport:
 
     def _not_acting_lines(self) -> list[str]:
         """Return the list of what will not act, and what that means for a print."""
-        if not self.not_acting:
+        if not self.unsupported:
             return []
         return [
             "",
             "What will not act, and what that means for a print:",
-            *(f"  {entry}: {meaning(entry)}" for entry in self.not_acting),
+            *(f"  {entry}: {meaning(entry)}" for entry in self.unsupported),
         ]
 
 
@@ -75,7 +75,7 @@ def check(path: str) -> CheckReport:
     if problems:
         return CheckReport(path, problems, ())
     described = load_machine(path)
-    return CheckReport(path, problems, described.notes, described.not_yet_acting)
+    return CheckReport(path, problems, described.notes, described.unsupported)
 
 
 @dataclass(frozen=True, slots=True)

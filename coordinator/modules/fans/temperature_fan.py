@@ -13,7 +13,7 @@ from coordinator.config.sections.sensor_options import (
     LATER_SENSOR_OPTIONS,
     SENSOR_OPTIONS,
 )
-from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
 from coordinator.gcode.parser import WordError
 from coordinator.heat.controller import Controller
 from coordinator.heat.pid import Pid, PidGains
@@ -70,7 +70,7 @@ class TemperatureFans(Module):
                 "SET_TEMPERATURE_FAN_TARGET",
                 "Set what a temperature_fan holds: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
                 self._set,
-                beside=True,
+                while_printing=True,
             )
         )
 
@@ -92,7 +92,7 @@ class TemperatureFans(Module):
         def act(_: float) -> None:
             fan.target_c, fan.min_speed, fan.max_speed = target, low, high
 
-        return InTime(act)
+        return Synchronized(act)
 
 
 class TemperatureFan(FanModule):

@@ -4,7 +4,8 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import ClassVar, Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, InTime, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading, Synchronized
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module
@@ -34,7 +35,7 @@ class Heaters(Module):
             ("TURN_OFF_HEATERS", "Let all heaters cool down", self._turn_off),
             ("SET_HEATER_TEMPERATURE", "Set a heater's target: HEATER= TARGET=", self._set),
         ):
-            build.add_command(GCodeCommand(name, help_, read, beside=True))
+            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
         for name, help_, read in (
             (
                 "TEMPERATURE_WAIT",
@@ -90,12 +91,12 @@ class Heaters(Module):
             parts.append(f"{tag}:{celsius:.1f} /{target:.1f}")
         return " ".join(parts) or "T:0"
 
-    def set_in_time(self, unit: HeaterUnit, celsius: float) -> InTime:
+    def set_in_time(self, unit: HeaterUnit, celsius: float) -> Synchronized:
         """Return what sets a target without waiting; WordError for one it cannot have."""
         unit.check_target(celsius)
-        return InTime(lambda _: unit.set_target(celsius))
+        return Synchronized(lambda _: unit.set_target(celsius))
 
-    def set_and_wait(self, unit: HeaterUnit, celsius: float) -> AtRest:
+    def set_and_wait(self, unit: HeaterUnit, celsius: float) -> AtStandstill:
         """Return what sets a target and waits for it; WordError for one it cannot have."""
         unit.check_target(celsius)
 
@@ -105,11 +106,11 @@ class Heaters(Module):
                 await unit.reach()
             return Done((self.temperatures(),), kind=ReplyKind.PLAIN)
 
-        return AtRest(perform)
+        return AtStandstill(perform)
 
     def _tell(self, call: Call) -> Reading:
         numbers(call.command, "T")
-        return AtOnce((self.temperatures(),), kind=ReplyKind.PLAIN)
+        return Immediate((self.temperatures(),), kind=ReplyKind.PLAIN)
 
     def _turn_off(self, call: Call) -> Reading:
         parameters(call.command, ())
@@ -118,7 +119,7 @@ class Heaters(Module):
             for unit in self.units.values():
                 unit.set_target(0.0)
 
-        return InTime(act)
+        return Synchronized(act)
 
     def _unit(self, call: Call, given: Mapping[str, str]) -> HeaterUnit:
         names = {name: unit for unit in self.units.values() for name in (unit.key, unit.name)}
@@ -144,13 +145,15 @@ class Heaters(Module):
             while source.celsius is None or not (source.is_sound and low <= source.celsius <= high):
                 await source.next()
 
-        return AtRest(perform)
+        return AtStandstill(perform)
 
     def _query(self, call: Call) -> Reading:
         given = parameters(call.command, ("NAME", "PULLUP"))
         names = [name for name, source in self.sensors.items() if source.ratio is not None]
         if "NAME" not in given:
-            return AtOnce((f"sensors with a converter: {', '.join(names) or 'none has read anything yet'}",))
+            return Immediate(
+                (f"sensors with a converter: {', '.join(names) or 'none has read anything yet'}",)
+            )
         name = one(call.command, given, "NAME", names)
         ratio = self.sensors[name].ratio or 0.0
         told = f"{name}: {ratio:.6f} of full scale"
@@ -158,7 +161,7 @@ class Heaters(Module):
             ohms = value(call.command, given, "PULLUP")
             below = f"{ohms * ratio / (1 - ratio):.1f} Ω" if ratio < 1 else "no resistor"
             told += f", with {ohms:g} Ω above it {below}"
-        return AtOnce((told,))
+        return Immediate((told,))
 
     def _pid(self, call: Call) -> Reading:
         given = parameters(call.command, ("HEATER", "TARGET", "WRITE_FILE", "TOLERANCE"))
@@ -182,4 +185,4 @@ class Heaters(Module):
                 f"TARGET={target:g} is outside what [{unit.name}] allows, {unit.input.min_c:g} to"
                 f" {unit.input.max_c:g} °C"
             )
-        return AtRest(run)
+        return AtStandstill(run)

@@ -6,7 +6,7 @@ from typing import ClassVar, Final
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.config.sections.heater_options import PID_KD, PID_KI, PID_KP
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading, Synchronized
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.heat.pid import Pid, PidGains
 from coordinator.modules.base import Build, Module, Modules
@@ -80,7 +80,7 @@ class PidProfiles(Module):
         (action,) = actions
         name = given[action]
         if action == "GET_VALUES":
-            return AtOnce((self._told(unit),))
+            return Immediate((self._told(unit),))
         if action == "REMOVE":
             raise WordError("a profile is removed by hand: delete its section from the configuration")
         if unit.settings.kind != "pid":
@@ -110,7 +110,7 @@ class PidProfiles(Module):
 
     def _use(
         self, call: Call, given: Mapping[str, str], unit: HeaterUnit, name: str, gains: PidGains
-    ) -> InTime:
+    ) -> Synchronized:
         keep = value(call.command, given, "KEEP_TARGET", 0.0) > 0
         self._check_room(unit, name)
 
@@ -125,9 +125,9 @@ class PidProfiles(Module):
                 self.add(unit.key, name, gains)
             self._loaded[unit.key] = name
 
-        return InTime(act)
+        return Synchronized(act)
 
-    def _save(self, unit: HeaterUnit, name: str) -> InTime:
+    def _save(self, unit: HeaterUnit, name: str) -> Synchronized:
         if name == DEFAULT:
             raise WordError(f"'{DEFAULT}' is the section [{unit.name}] itself; choose another name")
         if " ".join(name.split()) != name or not name:
@@ -144,7 +144,7 @@ class PidProfiles(Module):
                 live.save(f"{KIND} {unit.key} {name}", option, text)
             live.say(f"profile {name} of {unit.key} is there from now on; SAVE_CONFIG writes it")
 
-        return InTime(act)
+        return Synchronized(act)
 
     def _check_room(self, unit: HeaterUnit, name: str) -> None:
         own = self._of.get(unit.key, {})

@@ -8,8 +8,8 @@ from coordinator.config.sections.heater_options import (
     EXTRUDER_HEATER_OPTIONS,
     HEATER_OPTIONS,
     HEATER_PIN,
-    LATER_HEATER_OPTIONS,
     MIN_EXTRUDE_TEMP,
+    UNSUPPORTED_HEATER_OPTIONS,
 )
 from coordinator.gcode.commands import Call, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError
@@ -57,11 +57,13 @@ class HeaterModule(Module):
 class HeaterBed(HeaterModule):
     """The heater of the bed."""
 
-    SPEC: ClassVar = SectionSpec(help="The heated bed", options=HEATER_OPTIONS, later=LATER_HEATER_OPTIONS)
+    SPEC: ClassVar = SectionSpec(
+        help="The heated bed", options=HEATER_OPTIONS, later=UNSUPPORTED_HEATER_OPTIONS
+    )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build, "heater_bed", "B")
-        build.add_command(GCodeCommand("M140", "Set the bed's target: S", self._set, beside=True))
+        build.add_command(GCodeCommand("M140", "Set the bed's target: S", self._set, while_printing=True))
         build.add_command(GCodeCommand("M190", "Set the bed's target and wait for it: S or R", self._wait))
 
     def _set(self, call: Call) -> Reading:
@@ -78,7 +80,7 @@ class HeaterGeneric(HeaterModule):
     SPEC: ClassVar = SectionSpec(
         help="A heater for anything else; programs call it by NAME",
         options=(*HEATER_OPTIONS, GCODE_ID),
-        later=LATER_HEATER_OPTIONS,
+        later=UNSUPPORTED_HEATER_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:
@@ -96,7 +98,9 @@ class ExtruderHeaters(Module):
         self.by_extruder: dict[str, ExtruderHeater] = {}
         self._extruders = [extruder.name for extruder in build.machine.extruders]
         self.heaters = build.shared(Heaters)
-        build.add_command(GCodeCommand("M104", "Set an extruder's target: S, T", self._set, beside=True))
+        build.add_command(
+            GCodeCommand("M104", "Set an extruder's target: S, T", self._set, while_printing=True)
+        )
         build.add_command(
             GCodeCommand("M109", "Set an extruder's target and wait for it: S or R, T", self._wait)
         )
@@ -132,7 +136,7 @@ class ExtruderHeater(Module):
     SPEC: ClassVar = SectionSpec(
         help="The heater of an extruder",
         options=EXTRUDER_HEATER_OPTIONS,
-        later=LATER_HEATER_OPTIONS,
+        later=UNSUPPORTED_HEATER_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:

@@ -1,6 +1,6 @@
 """Calibrates a heater: runs the tuning, uses what was found, and says what to write down."""
 
-from coordinator.gcode.commands import Done
+from coordinator.gcode.events import Done
 from coordinator.heat.mpc_tune import MpcTune
 from coordinator.heat.pid_tune import RelayTune
 from coordinator.modules.heaters.heater import HeaterUnit

@@ -2,7 +2,7 @@
 
 from typing import ClassVar, Final
 
-from coordinator.config.errors import ConfigError, NotActing
+from coordinator.config.errors import ConfigError, NotSupported
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.heat.verify import VerifyOptions
 from coordinator.modules.base import Build, Module, Modules
@@ -78,6 +78,6 @@ class VerifyHeater(Module):
         known = () if heaters is None else tuple(heaters.units)
         if self.heater not in known:
             if modules.is_left_out(self.heater):
-                raise NotActing(self.place, f"the heater {self.heater} does not act yet")
+                raise NotSupported(self.place, f"the heater {self.heater} does not act yet")
             hint = nearest(self.heater, known) or f"; there is {', '.join(known) or 'none'}"
             raise ConfigError(self.place, f"[{self.name}] is for no heater{hint}")

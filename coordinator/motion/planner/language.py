@@ -57,7 +57,7 @@ _ARC_FAULTS: Final[Mapping[ArcFault, str]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Aside:
+class SuspendedProgram:
     """How far the line at hand was, while other lines come between."""
 
     lines: int
@@ -152,7 +152,7 @@ class Language:
         """Plan what is left of the arc; NEED_DATA says that it was done."""
         return FeedStatus(lib.gcode_arc_go_on(self._state, self._core))
 
-    def put_aside(self, *, moving: bool = True) -> Aside:
+    def suspend_program(self, *, moving: bool = True) -> SuspendedProgram:
         """Let other lines come before the one at hand goes on; MOVING: they may move.
 
         Then moves are made again where they are left out, until it goes on.
@@ -162,21 +162,23 @@ class Language:
         x, y, z, e = state.position
         excluded = moving and self.excluded
         real_e = self._core.position[3]
-        aside = Aside(state.lines, state.left_out, arc, excluded, (x, y, z, e), state.base[3], real_e)
+        suspended = SuspendedProgram(
+            state.lines, state.left_out, arc, excluded, (x, y, z, e), state.base[3], real_e
+        )
         self.forget_line()
         if excluded:
             self.drop_exclusion()
-        return aside
+        return suspended
 
-    def take_up(self, aside: Aside) -> None:
-        """Go on with the line that was put aside."""
-        self._state.lines, self._state.left_out = aside.lines, aside.left_out
-        if aside.excluded:
+    def resume_program(self, suspended: SuspendedProgram) -> None:
+        """Go on with the line that was suspended."""
+        self._state.lines, self._state.left_out = suspended.lines, suspended.left_out
+        if suspended.excluded:
             self.excluded = True
-            self._state.position, self._state.base[3] = aside.position, aside.base_e
-        ffi.buffer(ffi.addressof(self._state, "arc"))[:] = aside.arc
-        if not aside.excluded:  # filament that others moved meanwhile is none of the arc's
-            moved_e = self._core.position[3] - aside.real_e
+            self._state.position, self._state.base[3] = suspended.position, suspended.base_e
+        ffi.buffer(ffi.addressof(self._state, "arc"))[:] = suspended.arc
+        if not suspended.excluded:  # filament that others moved meanwhile is none of the arc's
+            moved_e = self._core.position[3] - suspended.real_e
             self._state.arc.start[3] += moved_e
             self._state.arc.target[3] += moved_e
 

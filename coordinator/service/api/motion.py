@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from coordinator.gcode.builtins.basic import BESIDE, HANDLERS
+from coordinator.gcode.builtins.basic import HANDLERS, WHILE_PRINTING
 from coordinator.gcode.builtins.machine import is_tool
 from coordinator.gcode.errors import GCodeError
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
 from coordinator.modules.module_set import INTERRUPTING
 from coordinator.runtime.machine import Machine
-from coordinator.service.core.feeder import FeederFull, Ticket
+from coordinator.service.core.feeder import FeederFull, QueuedWork
 from coordinator.service.core.machine_service import MachineService, ServiceState
 from coordinator.service.core.motion import Motion, MotionOver, texts
 from coordinator.service.core.work import (
@@ -27,7 +27,7 @@ from coordinator.service.core.work import (
     commands_in,
 )
 from coordinator.service.state.figures import axes, position_figures
-from coordinator.streaming.move_source import Told
+from coordinator.streaming.move_source import ProgramOutput
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
 
@@ -66,7 +66,7 @@ _TOLD: Final = (
 class ScriptOutcome:
     """What lines of a client answered."""
 
-    told: Sequence[Told] = ()
+    told: Sequence[ProgramOutput] = ()
     logged: bool = True
     """Whether the log has it already: not what is answered beside a job."""
 
@@ -93,8 +93,8 @@ async def run_script(service: MachineService, script: str, *, wait: bool) -> Scr
     with paused:
         if job is None or job.gives_way:  # they come between two lines of it, and may move
             return ScriptOutcome((await _done(service, motion, work)).told)
-        work.beside = True
-        _check_beside(motion, names)
+        work.while_printing = True
+        _check_while_printing(motion, names)
         return ScriptOutcome((await _done(service, motion, work, aside=True)).told, logged=False)
 
 
@@ -143,7 +143,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         "gcode.run",
         Scope.OPERATE,
         "Run lines of g-code. While a job prints, those that neither move nor wait act at once: "
-        + " ".join(sorted(BESIDE))
+        + " ".join(sorted(WHILE_PRINTING))
         + ", and those of modules that say so; for others the job stands still between two of its lines, but"
         " never for " + ", ".join(sorted(NEVER_BETWEEN)) + ". While a job is paused any.",
         run,
@@ -202,11 +202,11 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
 # ------------------------------------------------------------------------------------------------ doing
 
 
-async def _done(service: MachineService, motion: Motion, work: Work, *, aside: bool = False) -> Ticket:
+async def _done(service: MachineService, motion: Motion, work: Work, *, aside: bool = False) -> QueuedWork:
     """Have WORK done; raises ApiError where it was not, for whatever reason."""
     try:
         if aside and isinstance(work, LinesWork):
-            ticket = await motion.do_aside(work)
+            ticket = await motion.do_interjection(work)
         else:
             ticket = await motion.do(work)
     except FeederFull as error:
@@ -220,7 +220,7 @@ async def _done(service: MachineService, motion: Motion, work: Work, *, aside: b
     return ticket
 
 
-def _answer(told: Sequence[Told]) -> Value:
+def _answer(told: Sequence[ProgramOutput]) -> Value:
     replies, notices = texts(told)
     return {"replies": list(replies), "notices": list(notices)}
 
@@ -261,13 +261,13 @@ def _disturbs(motion: Motion, names: list[str]) -> bool:
     return any(name in disturbing or is_tool(name) for name in names)
 
 
-def _check_beside(motion: Motion, names: list[str]) -> None:
+def _check_while_printing(motion: Motion, names: list[str]) -> None:
     """Refuse commands that would disturb the job."""
     known = motion.feeder.vocabulary.commands
     for name in names:
         if name not in known and name not in HANDLERS and not is_tool(name):
             continue  # nobody knows it: that is said where it stands, not that the machine is busy
-        if not (known[name].beside if name in known else name in BESIDE):
+        if not (known[name].while_printing if name in known else name in WHILE_PRINTING):
             raise ApiError(
                 "busy",
                 f"{name} cannot run while a job prints; pause it with job.pause, or wait for its end",

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from coordinator.gcode.builtins.state import come_back, present_state
-from coordinator.gcode.commands import NO_WORDS, Vocabulary
+from coordinator.gcode.commands import NO_WORDS, ProgramContext, Recovering, Vocabulary
 from coordinator.gcode.events import (
     AS_SOON_AS_POSSIBLE,
     Emergency,
@@ -26,21 +26,19 @@ from coordinator.gcode.events import (
     Resting,
     Timed,
 )
-from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import MachineState, SavedState
 from coordinator.gcode.parser import WordError
-from coordinator.gcode.print_control import Recovering
-from coordinator.motion.planner.language import Aside
+from coordinator.motion.planner.language import SuspendedProgram
 from coordinator.motion.planner.planner import Planner
 from coordinator.service.core.work import NO_PROGRESS, LinesWork, Rest, Setting, Work
 from nodes.support.errors import CanductorError
 
 WAITING_MAX: Final = 64
 """Works that may wait; more are refused."""
-ASIDES_MAX: Final = 16
+INTERJECTIONS_MAX: Final = 16
 COME_BACK_MM_S: Final = 50.0
 """At which a job goes back to where it was paused."""
-TOLD_MAX: Final = 1000
+OUTPUT_MAX: Final = 1000
 """Replies and notices that are kept of one work."""
 
 
@@ -49,7 +47,7 @@ class FeederFull(CanductorError):  # noqa: N818
 
 
 @dataclass(eq=False)
-class Ticket:
+class QueuedWork:
     """A work on its way."""
 
     work: Work
@@ -85,13 +83,13 @@ class Feeder:
         self.planner = planner
         self.machine = machine
         self._setting = Setting(planner, machine, dict(homed_position), vocabulary, self)
-        self._waiting: deque[Ticket] = deque()
-        self._asides: deque[Ticket] = deque()
-        self._aside: Ticket | None = None
+        self._waiting: deque[QueuedWork] = deque()
+        self._interjections: deque[QueuedWork] = deque()
+        self._interjection: QueuedWork | None = None
         """That is being done, and has to wait for room."""
-        self._aside_events: deque[Event] = deque()
-        self._now: Ticket | None = None
-        self._held: tuple[Ticket, Aside] | None = None
+        self._interjection_events: deque[Event] = deque()
+        self._now: QueuedWork | None = None
+        self._held: tuple[QueuedWork, SuspendedProgram] | None = None
         """A paused job that others have come between."""
         self._come_back: SavedState | None = None
         """Where the paused job has to go on, if something may have moved since."""
@@ -103,7 +101,7 @@ class Feeder:
         """For the control loop to take: a program wants the interrupted job to go on."""
         self.to_print: deque[str] = deque(maxlen=WAITING_MAX)
         """For the control loop to take: files that programs want to have printed."""
-        self.finished: deque[Ticket] = deque(maxlen=WAITING_MAX + ASIDES_MAX + 1)
+        self.finished: deque[QueuedWork] = deque(maxlen=WAITING_MAX + INTERJECTIONS_MAX + 1)
         """For the control loop to take: tickets of which everything is read, oldest first."""
 
     # --------------------------------------------------------------------------- for the control loop
@@ -145,20 +143,20 @@ class Feeder:
         """What programs know through modules."""
         return self._setting.vocabulary
 
-    def submit(self, work: Work, *, is_job: bool = False) -> Ticket:
+    def submit(self, work: Work, *, is_job: bool = False) -> QueuedWork:
         """Have WORK done after all that was submitted before; raises FeederFull."""
         if len(self._waiting) >= WAITING_MAX:
             raise FeederFull(f"{WAITING_MAX} requests wait for the machine already; wait for their answers")
-        ticket = Ticket(work, is_job)
+        ticket = QueuedWork(work, is_job)
         self._waiting.append(ticket)
         return ticket
 
-    def submit_aside(self, lines: LinesWork) -> Ticket:
+    def submit_interjection(self, lines: LinesWork) -> QueuedWork:
         """Have LINES, none of which moves anything, done between two lines of the work; raises FeederFull."""
-        if len(self._asides) >= ASIDES_MAX:
-            raise FeederFull(f"{ASIDES_MAX} requests wait already; wait for their answers")
-        ticket = Ticket(lines)
-        self._asides.append(ticket)
+        if len(self._interjections) >= INTERJECTIONS_MAX:
+            raise FeederFull(f"{INTERJECTIONS_MAX} requests wait already; wait for their answers")
+        ticket = QueuedWork(lines)
+        self._interjections.append(ticket)
         return ticket
 
     def pause(self) -> None:
@@ -169,7 +167,7 @@ class Feeder:
         """Go on with the next line."""
         self._paused = False
 
-    def cancel(self, ticket: Ticket) -> None:
+    def cancel(self, ticket: QueuedWork) -> None:
         """End TICKET before its next line, also while it waits; what is planned of it is carried out."""
         ticket.cancelled = True
         if (resting := ticket.resting) is not None:
@@ -190,7 +188,7 @@ class Feeder:
         left = [*self._waiting, *([self._now] if self._now is not None else [])]
         left += [self._held[0]] if self._held is not None else []
         self._waiting.clear()
-        self._asides.clear()
+        self._interjections.clear()
         self._now = self._held = None
         for ticket in left:
             ticket.work.close()
@@ -199,7 +197,7 @@ class Feeder:
 
     def step(self) -> Event:
         """Go on with the work at hand, or the next one."""
-        if (event := self._do_asides()) is not None:
+        if (event := self._do_interjections()) is not None:
             return event
         if self._now is None and (event := self._take_next()) is not None:
             return event
@@ -208,7 +206,7 @@ class Feeder:
         if ticket.read or ticket.cancelled:
             return self._finish(ticket)
         if self._gives_way(ticket):
-            self._held = (ticket, self.planner.put_aside())
+            self._held = (ticket, self.planner.suspend_program())
             self._now = None
             return ticket.progress
         try:
@@ -222,7 +220,7 @@ class Feeder:
     def attend_others(self) -> Event | None:
         """Act on lines of clients while the work at hand waits for something that is done at rest."""
         until_s, self.planner.plan_until_s = self.planner.plan_until_s, float("-inf")
-        event = self._do_asides()
+        event = self._do_interjections()
         self.planner.plan_until_s = until_s
         return None if isinstance(event, Full) else event
 
@@ -231,14 +229,14 @@ class Feeder:
             self._now = self._waiting.popleft()
         elif self._held is not None and (not self._paused or self._held[0].cancelled):
             (self._now, aside), self._held = self._held, None
-            self.planner.take_up(aside)
+            self.planner.resume_program(aside)
         elif self._held is None and self._closed:
             return End(0, self.planner.print_time_end_s) if self.planner.flush() else Full()
         else:
             return Idle()
         return None
 
-    def _gives_way(self, ticket: Ticket) -> bool:
+    def _gives_way(self, ticket: QueuedWork) -> bool:
         """Whether TICKET is a paused job that others may come between now; remember where it stands."""
         if not (self._paused and ticket.is_job and self._waiting) or not ticket.work.settled:
             return False
@@ -246,7 +244,7 @@ class Feeder:
             self._come_back = present_state(self.planner)
         return True
 
-    def _step_job(self, ticket: Ticket) -> Event:
+    def _step_job(self, ticket: QueuedWork) -> Event:
         """Go on with a job, unless it is paused; raises CanductorError."""
         if not self._paused:
             if self._come_back is not None and (event := self._go_back(self._come_back)) is not None:
@@ -260,12 +258,12 @@ class Feeder:
         """Go where the job was when it was paused; None when that is done."""
         lost = [axis for axis in saved.homed if axis not in self.planner.homed]
         problem, done = "", False
-        aside = self.planner.put_aside()
+        aside = self.planner.suspend_program()
         try:
             done = not lost and come_back(self.planner, saved, COME_BACK_MM_S)
         except WordError as error:
             problem = str(error)
-        self.planner.take_up(aside)
+        self.planner.resume_program(aside)
         if lost:
             problem = f"{' and '.join(lost)} must be homed with G28 before it can go on"
         if problem:
@@ -276,14 +274,14 @@ class Feeder:
         self._come_back = None
         return None
 
-    def _begin_or_step(self, ticket: Ticket) -> Event:
+    def _begin_or_step(self, ticket: QueuedWork) -> Event:
         if ticket.begun_at_s is None:
             ticket.begun_at_s = self.planner.print_time_end_s
             ticket.work.begin(self._setting)
         ticket.resting = None
         return ticket.work.step()
 
-    def _pass_on(self, ticket: Ticket, event: Event) -> Event:
+    def _pass_on(self, ticket: QueuedWork, event: Event) -> Event:
         """Keep what is the client's, hand on what is the streamer's."""
         if isinstance(event, End):
             ticket.read = True
@@ -299,7 +297,7 @@ class Feeder:
             _keep(ticket, event)
         return event
 
-    def _finish(self, ticket: Ticket) -> Event:
+    def _finish(self, ticket: QueuedWork) -> Event:
         """Let TICKET go once its moves are planned as far as they have to be."""
         early = ticket.cancelled or ticket.error is not None
         if ticket.resting is not None and ticket.resting.moved:
@@ -317,19 +315,19 @@ class Feeder:
         self.finished.append(ticket)
         return ticket.progress
 
-    def _do_asides(self) -> Event | None:
+    def _do_interjections(self) -> Event | None:
         """Act on all lines that neither move nor wait, and tell what comes of it; Full: one needs room."""
-        while self._aside is not None or self._asides:
-            ticket = self._aside = self._aside or self._asides.popleft()
-            aside = self.planner.put_aside(moving=False)
-            done = self._do_aside(ticket)
-            self.planner.take_up(aside)
+        while self._interjection is not None or self._interjections:
+            ticket = self._interjection = self._interjection or self._interjections.popleft()
+            aside = self.planner.suspend_program(moving=False)
+            done = self._do_interjection(ticket)
+            self.planner.resume_program(aside)
             if not done:
                 return Full()
-            self._aside = None
-        return self._aside_events.popleft() if self._aside_events else None
+            self._interjection = None
+        return self._interjection_events.popleft() if self._interjection_events else None
 
-    def _do_aside(self, ticket: Ticket) -> bool:
+    def _do_interjection(self, ticket: QueuedWork) -> bool:
         """Go on with lines of a client; False: there is no room."""
         try:
             if ticket.begun_at_s is None:
@@ -341,9 +339,9 @@ class Feeder:
                 if isinstance(event, Reply | Notice):
                     _keep(ticket, event)
                 elif isinstance(event, Timed):  # it does not belong to any place among the work's moves
-                    self._aside_events.append(replace(event, after_moves=AS_SOON_AS_POSSIBLE))
+                    self._interjection_events.append(replace(event, after_moves=AS_SOON_AS_POSSIBLE))
             if isinstance(event, Emergency):
-                self._aside_events.appendleft(event)
+                self._interjection_events.appendleft(event)
         except CanductorError as error:
             ticket.error = error
         ticket.read = True
@@ -351,7 +349,7 @@ class Feeder:
         self.finished.append(ticket)
         return True
 
-    # ------------------------------------------------- for programs (coordinator/gcode/print_control.py)
+    # ------------------------------------------------- for programs (PrintControl)
 
     @property
     def job_is_active(self) -> bool:
@@ -359,7 +357,7 @@ class Feeder:
         tickets = (self._now, self._held[0] if self._held is not None else None)
         return any(ticket is not None and ticket.is_job and not ticket.cancelled for ticket in tickets)
 
-    def pause_job(self, program: Job) -> None:
+    def pause_job(self, program: ProgramContext) -> None:
         """Let the job read no further, by a line of PROGRAM."""
         if not self.job_is_active:
             return
@@ -371,7 +369,7 @@ class Feeder:
         else:
             self._paused = True
 
-    def come_back(self, program: Job, speed_mm_s: float) -> bool:  # noqa: ARG002 (whose moves it is)
+    def come_back(self, program: ProgramContext, speed_mm_s: float) -> bool:  # noqa: ARG002 (whose moves it is)
         """Go to where the job was paused."""
         return self._come_back is None or come_back(self.planner, self._come_back, speed_mm_s)
 
@@ -379,7 +377,7 @@ class Feeder:
         """Let the job go on when the program at hand has ended."""
         self._paused = self._pause_wanted = False
 
-    def cancel_job(self, program: Job) -> None:
+    def cancel_job(self, program: ProgramContext) -> None:
         """End the job, by a line of PROGRAM."""
         if self._is_job(program):
             self._cancel_wanted = True
@@ -397,11 +395,11 @@ class Feeder:
         """Have the interrupted job go on."""
         self.to_recover.append(how)
 
-    def _is_job(self, program: Job) -> bool:
+    def _is_job(self, program: ProgramContext) -> bool:
         now = self._now
-        return now is not None and now.is_job and not program.beside and self._aside is None
+        return now is not None and now.is_job and not program.while_printing and self._interjection is None
 
 
-def _keep(ticket: Ticket, event: Reply | Notice) -> None:
-    if len(ticket.told) < TOLD_MAX:
+def _keep(ticket: QueuedWork, event: Reply | Notice) -> None:
+    if len(ticket.told) < OUTPUT_MAX:
         ticket.told.append(event)

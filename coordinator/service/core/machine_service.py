@@ -31,7 +31,7 @@ from coordinator.service.jobs.jobs import JobPhase, JobRun
 from coordinator.service.jobs.recovery import Recovery
 from coordinator.service.state.figures import Figures
 from coordinator.service.state.log_ring import Entry, LogRing
-from coordinator.streaming.move_source import Told
+from coordinator.streaming.move_source import ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.tables.store import TableStore
 from nodes.dictionary.cache import DictionaryCache
@@ -365,7 +365,7 @@ class MachineService:
         self.log.add("state", f"{state}: {cause}" if cause else str(state))
         self._figures.show(self)
 
-    def tell(self, told: Told) -> None:
+    def tell(self, told: ProgramOutput) -> None:
         """Log what a line of g-code answered."""
         if isinstance(told, Notice):
             self.log.add("notice", told.text, ReplyKind.INFORMATION)

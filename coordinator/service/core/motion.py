@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from coordinator.gcode.events import Notice
 from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.machine import Machine
-from coordinator.service.core.feeder import Feeder, Ticket
+from coordinator.service.core.feeder import Feeder, QueuedWork
 from coordinator.service.core.motion_lead import MotionLead
 from coordinator.service.core.work import LinesWork, Work
 from coordinator.service.state.toolpath import Toolpath
 from coordinator.service.state.trace import KEEP_S, Moment, MotionTrace
 from coordinator.streaming.compensation import Compensation
-from coordinator.streaming.move_source import JobState, Planned, Told
+from coordinator.streaming.move_source import JobState, Planned, ProgramOutput
 from coordinator.streaming.pipeline import PlanRecord
 from coordinator.streaming.program_machine import machine_state
 from coordinator.streaming.streamer import Streamer
@@ -32,7 +32,7 @@ class Motion:
         self,
         machine: Machine,
         *,
-        on_told: Callable[[Told], None],
+        on_told: Callable[[ProgramOutput], None],
         on_cycle: Callable[[], None],
         record: PlanRecord | None = None,
         compensation: Compensation | None = None,
@@ -60,8 +60,8 @@ class Motion:
         )
         self.works = 0
         """Done so far."""
-        self._ending: list[Ticket] = []
-        self._waited_for: dict[Ticket, asyncio.Future[None]] = {}
+        self._ending: list[QueuedWork] = []
+        self._waited_for: dict[QueuedWork, asyncio.Future[None]] = {}
 
     async def run(self) -> None:
         """Move until ``finish``, or until the machine stops; raises as the streamer does."""
@@ -84,18 +84,18 @@ class Motion:
 
     # ------------------------------------------------------------------------------------------- doing
 
-    async def do(self, work: Work) -> Ticket:
+    async def do(self, work: Work) -> QueuedWork:
         """Have WORK done and wait until it is, moves and all; its ``error`` is not raised.
 
         Cancelled, it ends the work before its next line. Raises FeederFull, MotionOver.
         """
         return await self._wait_for(self.feeder.submit(work))
 
-    async def do_aside(self, lines: LinesWork) -> Ticket:
+    async def do_interjection(self, lines: LinesWork) -> QueuedWork:
         """Do the same for lines that may run beside a job."""
-        return await self._wait_for(self.feeder.submit_aside(lines))
+        return await self._wait_for(self.feeder.submit_interjection(lines))
 
-    async def _wait_for(self, ticket: Ticket) -> Ticket:
+    async def _wait_for(self, ticket: QueuedWork) -> QueuedWork:
         done = self._waited_for[ticket] = asyncio.get_running_loop().create_future()
         try:
             await asyncio.wait((done,))
@@ -144,7 +144,7 @@ class Motion:
                 self._ending.append(self.feeder.finished.popleft())
         self._ending = [ticket for ticket in self._ending if not self._settle(ticket, now_s)]
 
-    def _settle(self, ticket: Ticket, now_s: float) -> bool:
+    def _settle(self, ticket: QueuedWork, now_s: float) -> bool:
         """Tell that TICKET is done once its last move is executed; return whether it is."""
         assert ticket.ends_at_s is not None
         if now_s < ticket.ends_at_s + self.streamer.worker.steps.lag_s and ticket.ends_at_s:
@@ -161,7 +161,7 @@ class MotionOver(Exception):  # noqa: N818 (it ended, for whatever reason; its o
     """The machine no longer moves."""
 
 
-def texts(told: Sequence[Told]) -> tuple[list[str], list[str]]:
+def texts(told: Sequence[ProgramOutput]) -> tuple[list[str], list[str]]:
     """Return the texts of replies and of notices."""
     notices = [event.text for event in told if isinstance(event, Notice)]
     return [event.text for event in told if not isinstance(event, Notice)], notices

@@ -5,7 +5,7 @@ import contextlib
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from coordinator.gcode.print_control import Recovering
+from coordinator.gcode.commands import Recovering
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.gcode_macro import words_in
@@ -126,8 +126,8 @@ class Programs:
         log = self._service.log
         try:
             if job is not None and not job.gives_way:
-                work.beside = True
-                ticket = await motion.do_aside(work)
+                work.while_printing = True
+                ticket = await motion.do_interjection(work)
                 for told in ticket.told:
                     self._service.tell(told)
             else:

@@ -4,7 +4,7 @@ from collections import deque
 from enum import StrEnum
 from typing import Final
 
-from coordinator.service.core.feeder import Feeder, Ticket
+from coordinator.service.core.feeder import Feeder, QueuedWork
 from coordinator.service.core.motion import Motion
 from coordinator.service.core.work import FileWork
 
@@ -58,7 +58,7 @@ class JobRun:
         self._looked_s = now_s
         self._began_e = motion.moment().position[3]
         self._motion = motion
-        self._ticket: Ticket = motion.feeder.submit(work, is_job=True)
+        self._ticket: QueuedWork = motion.feeder.submit(work, is_job=True)
 
     @property
     def active(self) -> bool:
@@ -147,7 +147,7 @@ class JobRun:
         elif not self._feeder.paused and self.phase in (JobPhase.PAUSING, JobPhase.PAUSED):
             self.phase = JobPhase.PRINTING
 
-    def _ended(self, ticket: Ticket, now_s: float) -> None:
+    def _ended(self, ticket: QueuedWork, now_s: float) -> None:
         self._feeder.resume()  # a pause that came too late must not hold what comes next
         if ticket.error is not None:
             self._end(JobPhase.FAILED, str(ticket.error), now_s)

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.commands import AtRest, Done, GCodeCommand, Vocabulary
-from coordinator.gcode.events import End, Event, Full, Idle, Notice, Reply, Resting
+from coordinator.gcode.commands import AtStandstill, GCodeCommand, Vocabulary
+from coordinator.gcode.events import Done, End, Event, Full, Idle, Notice, Reply, Resting
 from coordinator.gcode.program import Program
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.modules.status.print_stats import PrintStats
-from coordinator.service.core.feeder import Feeder, Ticket
+from coordinator.service.core.feeder import Feeder, QueuedWork
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork
 from tests.stages.program_stage import ProgramStage
 
@@ -61,13 +61,13 @@ class Fed:
         )
         self.told: list[str] = []
 
-    def job(self, *lines: str) -> Ticket:
+    def job(self, *lines: str) -> QueuedWork:
         work = FileWork(Program.from_lines(["\n".join(lines) + "\n"], "job.gcode"))
         return self.feeder.submit(work, is_job=True)
 
-    def lines(self, *lines: str, beside: bool = False) -> Ticket:
-        work = LinesWork(lines, beside=beside)
-        return self.feeder.submit_aside(work) if beside else self.feeder.submit(work)
+    def lines(self, *lines: str, while_printing: bool = False) -> QueuedWork:
+        work = LinesWork(lines, while_printing=while_printing)
+        return self.feeder.submit_interjection(work) if while_printing else self.feeder.submit(work)
 
     def step(self, *, room: bool = True) -> Event:
         event = self.feeder.step()
@@ -100,7 +100,7 @@ def finding(folder: Path) -> Fed:
     async def perform() -> None:
         return None
 
-    command = GCodeCommand("FIND", "for the test", lambda _: AtRest(perform))
+    command = GCodeCommand("FIND", "for the test", lambda _: AtStandstill(perform))
     vocabulary = Vocabulary({**fed.feeder.vocabulary.commands, "FIND": command})
     fed.feeder = Feeder(fed.planner, fed.stage.description.homed_position, fed.stage.machine, vocabulary)
     return fed
@@ -240,9 +240,9 @@ def test_beside_a_job_macros_may_speak_but_not_move(fed: Fed) -> None:
     fed.planner.plan_until_s = 1.0
     fed.job(*BEGIN, *(f"G1 X{70 + n}" for n in range(40)))
     fed.fill()
-    good = fed.lines("HELLO NAME=you", beside=True)
-    bad = fed.lines("JUMP", beside=True)
-    moved = fed.lines("G1 X5", beside=True)
+    good = fed.lines("HELLO NAME=you", while_printing=True)
+    bad = fed.lines("JUMP", while_printing=True)
+    moved = fed.lines("G1 X5", while_printing=True)
     moves = fed.planner.moves
     fed.step(room=False)
     assert fed.planner.moves == moves
@@ -262,7 +262,7 @@ def test_an_object_is_left_out_from_beside_and_the_pause_within_it_moves(fed: Fe
         "EXCLUDE_OBJECT_END NAME=a", "G1 X20 Y20", "M114",
     )  # fmt: skip
     fed.fill()
-    fed.lines("EXCLUDE_OBJECT CURRENT=1", beside=True)
+    fed.lines("EXCLUDE_OBJECT CURRENT=1", while_printing=True)
     fed.step(room=False)
     assert fed.planner.excluded
     stood = fed.at
@@ -325,8 +325,8 @@ def test_clients_are_answered_while_a_job_waits_at_rest_but_nothing_is_planned(t
         *BEGIN, "EXCLUDE_OBJECT_START NAME=a", "EXCLUDE_OBJECT NAME=a", "G1 E0.1 F600", "FIND", "G1 X70 E0.3"
     )  # fmt: skip
     event = next(event for event in (fed.step() for _ in range(99)) if isinstance(event, Resting))
-    asked = fed.lines("M114", "M220 S50", "HELLO NAME=you", beside=True)
-    back = fed.lines("EXCLUDE_OBJECT RESET=1", beside=True)
+    asked = fed.lines("M114", "M220 S50", "HELLO NAME=you", while_printing=True)
+    back = fed.lines("EXCLUDE_OBJECT RESET=1", while_printing=True)
     moves = fed.planner.moves
     assert fed.feeder.attend_others() is None
     assert [told.text for told in asked.told if isinstance(told, Reply)] == [
@@ -386,12 +386,12 @@ def test_a_pause_that_is_cleared_has_nowhere_to_go_back_to(fed: Fed) -> None:
 def test_what_a_console_asks(fed: Fed) -> None:
     fed.lines("STATUS", "M115", "HELP")
     fed.drive()
-    status, firmware, *helps = fed.told
+    status, firmware, *command_help = fed.told
     assert status == "ready"
     assert firmware.startswith("FIRMWARE_NAME:canductor FIRMWARE_VERSION:")
-    assert "M24: Print the chosen file, or let the paused job go on" in helps
-    assert "G28: Home X, Y, Z, or all axes" in helps
-    assert not [line for line in helps if line.startswith("_")]
+    assert "M24: Print the chosen file, or let the paused job go on" in command_help
+    assert "G28: Home X, Y, Z, or all axes" in command_help
+    assert not [line for line in command_help if line.startswith("_")]
     fed.job("STATUS")
     stats = next(fed.stage.modules.of(PrintStats))
     stats.told = {"state": "printing", "filename": "job.gcode"}

@@ -4,8 +4,7 @@ import asyncio
 
 import pytest
 
-from coordinator.gcode.commands import Done
-from coordinator.gcode.events import Resting
+from coordinator.gcode.events import Done, Resting
 from coordinator.streaming.standstill_task import RestTask
 from nodes.support.errors import CanductorError
 

@@ -6,7 +6,7 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
-from coordinator.gcode.commands import Call, InTime
+from coordinator.gcode.commands import Call, Synchronized
 from coordinator.gcode.parser import WordError, parse
 from coordinator.heat.known_sensors import PT1000, THERMISTORS
 from coordinator.modules.heaters.sections import ExtruderHeater, HeaterBed
@@ -64,7 +64,7 @@ def test_targets_are_for_the_extruder_that_is_meant(tmp_path: Path) -> None:
         reading = modules.vocabulary.commands["M104"].read(
             Call(command, 1, (0, 0, 0, 0), "", extruder=active)
         )
-        assert isinstance(reading, InTime)
+        assert isinstance(reading, Synchronized)
         reading.act(0.0)
         unit = heaters[name].unit
         assert unit is not None

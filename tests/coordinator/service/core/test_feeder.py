@@ -7,7 +7,7 @@ from coordinator.gcode.events import Emergency, End, Event, Full, Idle, Position
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.program import Program
 from coordinator.motion.planner.planner import Planner
-from coordinator.service.core.feeder import ASIDES_MAX, WAITING_MAX, Feeder, FeederFull, Ticket
+from coordinator.service.core.feeder import INTERJECTIONS_MAX, WAITING_MAX, Feeder, FeederFull, QueuedWork
 from coordinator.service.core.work import FileWork, LinesWork, MoveWork, Rest, WorkError, commands_in
 from coordinator.support.command_options import DEMO_MACHINE
 
@@ -32,7 +32,7 @@ def drive(feeder: Feeder, most: int = 1000) -> list[Event]:
     raise AssertionError("the feeder does not come to an end")
 
 
-def finished(feeder: Feeder) -> list[Ticket]:
+def finished(feeder: Feeder) -> list[QueuedWork]:
     tickets = list(feeder.finished)
     feeder.finished.clear()
     return tickets
@@ -100,7 +100,7 @@ def test_pause_reads_no_line_and_resume_the_next_one(feeder: Feeder) -> None:
     feeder.pause()
     read = feeder.planner.moves
     assert isinstance(feeder.step(), Idle)
-    feeder.submit_aside(LinesWork(["M114", "M220 S50"]))
+    feeder.submit_interjection(LinesWork(["M114", "M220 S50"]))
     lines = feeder.planner.lines
     assert isinstance(feeder.step(), Idle)
     (aside,) = finished(feeder)
@@ -172,10 +172,10 @@ def test_queues_are_bounded(feeder: Feeder) -> None:
         feeder.submit(LinesWork(["M114"]))
     with pytest.raises(FeederFull):
         feeder.submit(LinesWork(["M114"]))
-    for _ in range(ASIDES_MAX):
-        feeder.submit_aside(LinesWork(["M114"]))
+    for _ in range(INTERJECTIONS_MAX):
+        feeder.submit_interjection(LinesWork(["M114"]))
     with pytest.raises(FeederFull):
-        feeder.submit_aside(LinesWork(["M114"]))
+        feeder.submit_interjection(LinesWork(["M114"]))
 
 
 def test_close_ends_at_rest(feeder: Feeder) -> None:
