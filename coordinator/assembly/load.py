@@ -29,7 +29,7 @@ from coordinator.config.sections.steppers import is_extra_stepper
 from coordinator.config.sections.tables import read_axis_tables
 from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
 from coordinator.modules.module_set import build_modules
-from coordinator.modules.registry import known_kinds, module_for, modules_beside, own_kinds
+from coordinator.modules.registry import known_kinds, module_for, option_readers, own_kinds
 from coordinator.motion.specs import MotionLimits
 from coordinator.support.quoting import nearest
 
@@ -120,7 +120,7 @@ def _module_sections(reading: Reading) -> ModuleSections:
     """Return what the modules are built from; raises ConfigError."""
     sections: list[ModuleSection] = []
     for section in reading.config.sections.values():
-        if any(modules_beside(section.name)):
+        if any(option_readers(section.name)):
             sections.append(ModuleSection(section, whole=False))
         if not _is_acting(section) and (kind := module_for(section.kind, section.place)) is not None:
             if kind.NAMED and not (kind.NAMELESS or section.instance):

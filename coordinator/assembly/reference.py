@@ -18,7 +18,7 @@ from coordinator.config.sections import tables as read_tables
 from coordinator.config.sections.kinematics import dual_carriage as read_dual
 from coordinator.config.sections.kinematics.registry import KINDS, PRINTER_SPECS
 from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
-from coordinator.modules.registry import own_beside, own_modules
+from coordinator.modules.registry import own_modules, own_option_readers
 
 _BEGIN: Final = "<!-- The tables below"
 _END: Final = "## Sections that do not act yet\n"
@@ -47,7 +47,7 @@ def sections() -> list[str]:
 
 
 def _module_sections() -> dict[str, SectionSpec]:
-    beside = {f"{title}, further options": module.SPEC for title, module in own_beside()}
+    beside = {f"{title}, further options": module.SPEC for title, module in own_option_readers()}
     return beside | {title: module.SPEC for title, module in own_modules()}
 
 

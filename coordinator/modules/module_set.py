@@ -18,12 +18,12 @@ from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
 from coordinator.modules.base import Build, Device, Module
 from coordinator.modules.drivers.motor_power import MotorPower
 from coordinator.modules.drivers.stepper_buzz import StepperBuzz
-from coordinator.modules.heaters.sections import ExtruderHeater
+from coordinator.modules.heaters.sections import ExtruderHeaterSection
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.programs.idle_timeout import IdleTimeout
 from coordinator.modules.programs.save_config import SaveConfig
-from coordinator.modules.registry import module_for, modules_beside
+from coordinator.modules.registry import module_for, option_readers
 from coordinator.modules.status.console import Console
 from coordinator.modules.status.positions import Positions
 from coordinator.motion.planner.planner import Planner
@@ -85,7 +85,7 @@ def build_modules(machine: MachineDescription) -> "ModuleSet":
 def _sources(given: ModuleSection) -> Iterator[ModuleSource]:
     section = given.section
     if not given.whole:
-        yield from (ModuleSource(section, kind, whole=False) for kind in modules_beside(section.name))
+        yield from (ModuleSource(section, kind, whole=False) for kind in option_readers(section.name))
     elif (own := module_for(section.kind, section.place)) is not None:
         yield ModuleSource(section, own, whole=True)
 
@@ -345,7 +345,7 @@ class ModuleSet:
     def _too_cold(self, extruder: str) -> bool:
         if extruder in self.left_out:
             return self._live is not None  # nobody knows how hot it is; a plan takes it for granted
-        found = self.find(extruder, ExtruderHeater)
+        found = self.find(extruder, ExtruderHeaterSection)
         return found is not None and found.too_cold
 
     @property

@@ -27,7 +27,7 @@ from coordinator.modules.fans.fan_unit import (
     shutdown_speed,
 )
 from coordinator.modules.heaters.heater import LOOK_S, SILENT_LOOKS
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.modules.words import one, parameters, value
@@ -130,7 +130,7 @@ class TemperatureFan(FanModule):
         if self.min_speed > self.max_speed:
             raise build.reader.bad(MIN_SPEED, f"more than max_speed ({self.max_speed:g})")
         self._controller = _controller(build)
-        build.shared(Heaters).add_sensor(self.input, build.find(GCODE_ID) or "")
+        build.shared(HeaterRegistry).add_sensor(self.input, build.find(GCODE_ID) or "")
         build.shared(TemperatureFans).by_name[build.instance] = self
 
     def link(self, modules: Modules) -> None:

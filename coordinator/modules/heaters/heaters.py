@@ -9,7 +9,7 @@ from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module
-from coordinator.modules.heaters.heater import HeaterUnit
+from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.tuning import calibrate_mpc, calibrate_pid
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.modules.words import numbers, one, parameters, value
@@ -18,18 +18,19 @@ from coordinator.support.values import Value
 FAN_STEPS_MAX: Final = 12
 
 
-class Heaters(Module):
-    """The heaters and sensors of the machine."""
+class HeaterRegistry(Module):
+    """The heaters and temperature sensors of the machine, and the commands for any of them."""
 
     SPEC: ClassVar = SectionSpec(help="What all heaters have in common", options=())
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self.units: dict[str, HeaterUnit] = {}
+        self.name = "heaters"
+        self.units: dict[str, Heater] = {}
         """By what programs call them: extruder, heater_bed, NAME of heater_generic."""
         self.sensors: dict[str, TemperatureSource] = {}
         """By what programs call them: heaters and the sections of sensors."""
-        self._tags: dict[str, HeaterUnit | TemperatureSource] = {}
+        self._tags: dict[str, Heater | TemperatureSource] = {}
         for name, help_, read in (
             ("M105", "Tell all temperatures", self._tell),
             ("TURN_OFF_HEATERS", "Let all heaters cool down", self._turn_off),
@@ -52,7 +53,7 @@ class Heaters(Module):
         ):
             build.add_command(GCodeCommand(name, help_, read))
 
-    def add(self, unit: HeaterUnit, tag: str = "") -> None:
+    def add(self, unit: Heater, tag: str = "") -> None:
         """Take a heater on; TAG is what M105 calls it."""
         self.units[unit.key] = unit
         self.sensors[unit.key] = unit.input
@@ -85,18 +86,18 @@ class Heaters(Module):
         parts = []
         for tag in sorted(self._tags):
             found = self._tags[tag]
-            source = found.input if isinstance(found, HeaterUnit) else found
+            source = found.input if isinstance(found, Heater) else found
             celsius = 0.0 if source.celsius is None else source.celsius
-            target = found.target_c if isinstance(found, HeaterUnit) else 0.0
+            target = found.target_c if isinstance(found, Heater) else 0.0
             parts.append(f"{tag}:{celsius:.1f} /{target:.1f}")
         return " ".join(parts) or "T:0"
 
-    def set_in_time(self, unit: HeaterUnit, celsius: float) -> Synchronized:
+    def set_in_time(self, unit: Heater, celsius: float) -> Synchronized:
         """Return what sets a target without waiting; WordError for one it cannot have."""
         unit.check_target(celsius)
         return Synchronized(lambda _: unit.set_target(celsius))
 
-    def set_and_wait(self, unit: HeaterUnit, celsius: float) -> AtStandstill:
+    def set_and_wait(self, unit: Heater, celsius: float) -> AtStandstill:
         """Return what sets a target and waits for it; WordError for one it cannot have."""
         unit.check_target(celsius)
 
@@ -121,7 +122,7 @@ class Heaters(Module):
 
         return Synchronized(act)
 
-    def _unit(self, call: Call, given: Mapping[str, str]) -> HeaterUnit:
+    def _unit(self, call: Call, given: Mapping[str, str]) -> Heater:
         names = {name: unit for unit in self.units.values() for name in (unit.key, unit.name)}
         return names[one(call.command, given, "HEATER", names)]
 
@@ -179,7 +180,7 @@ class Heaters(Module):
         return self._calibration(unit, target, lambda: calibrate_mpc(unit, target, steps))
 
     @staticmethod
-    def _calibration(unit: HeaterUnit, target: float, run: Callable[[], Awaitable[Done]]) -> Reading:
+    def _calibration(unit: Heater, target: float, run: Callable[[], Awaitable[Done]]) -> Reading:
         if not unit.input.min_c < target <= unit.input.max_c:
             raise WordError(
                 f"TARGET={target:g} is outside what [{unit.name}] allows, {unit.input.min_c:g} to"

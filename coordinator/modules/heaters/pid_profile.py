@@ -10,8 +10,8 @@ from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading, S
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.heat.pid import Pid, PidGains
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.heaters.heater import HeaterUnit
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heater import Heater
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.words import one, parameters, value
 from coordinator.runtime.module_context import Live
 from coordinator.support.quoting import nearest, shown
@@ -40,7 +40,7 @@ class PidProfiles(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "pid_profile"
-        self._heaters = build.shared(Heaters)
+        self._heaters = build.shared(HeaterRegistry)
         self._of: dict[str, dict[str, PidGains]] = {}
         self._loaded: dict[str, str] = {}
         self._live: Live | None = None
@@ -56,7 +56,7 @@ class PidProfiles(Module):
         """Take a profile on; HEATER is what programs call it."""
         self._of.setdefault(heater, {})[name] = gains
 
-    def heater(self, name: str) -> HeaterUnit | None:
+    def heater(self, name: str) -> Heater | None:
         """Return the heater that programs or sections call NAME."""
         units = self._heaters.units.values()
         return next((unit for unit in units if name in (unit.key, unit.name)), None)
@@ -94,7 +94,7 @@ class PidProfiles(Module):
             return self._use(call, given, unit, name, gains)
         return self._save(unit, name)
 
-    def _load(self, call: Call, given: Mapping[str, str], unit: HeaterUnit, name: str) -> Reading:
+    def _load(self, call: Call, given: Mapping[str, str], unit: Heater, name: str) -> Reading:
         gains = self._find(unit, name)
         if gains is None and "DEFAULT" in given:
             name = given["DEFAULT"]
@@ -105,11 +105,11 @@ class PidProfiles(Module):
             raise WordError(f"PID_PROFILE: {unit.key} has no profile {quoted(name)}{hint}")
         return self._use(call, given, unit, name, gains)
 
-    def _find(self, unit: HeaterUnit, name: str) -> PidGains | None:
+    def _find(self, unit: Heater, name: str) -> PidGains | None:
         return unit.settings.gains if name == DEFAULT else self._of.get(unit.key, {}).get(name)
 
     def _use(
-        self, call: Call, given: Mapping[str, str], unit: HeaterUnit, name: str, gains: PidGains
+        self, call: Call, given: Mapping[str, str], unit: Heater, name: str, gains: PidGains
     ) -> Synchronized:
         keep = value(call.command, given, "KEEP_TARGET", 0.0) > 0
         self._check_room(unit, name)
@@ -127,7 +127,7 @@ class PidProfiles(Module):
 
         return Synchronized(act)
 
-    def _save(self, unit: HeaterUnit, name: str) -> Synchronized:
+    def _save(self, unit: Heater, name: str) -> Synchronized:
         if name == DEFAULT:
             raise WordError(f"'{DEFAULT}' is the section [{unit.name}] itself; choose another name")
         if " ".join(name.split()) != name or not name:
@@ -146,12 +146,12 @@ class PidProfiles(Module):
 
         return Synchronized(act)
 
-    def _check_room(self, unit: HeaterUnit, name: str) -> None:
+    def _check_room(self, unit: Heater, name: str) -> None:
         own = self._of.get(unit.key, {})
         if name not in own and len(own) >= PROFILES_MAX:
             raise WordError(f"{unit.key} has {PROFILES_MAX} profiles already; load one of them")
 
-    def _told(self, unit: HeaterUnit) -> str:
+    def _told(self, unit: Heater) -> str:
         if not isinstance(unit.controller, Pid):
             return f"{unit.key} is not controlled by PID"
         values = " ".join(f"{option}: {text}" for option, text in _texts(unit.controller.gains).items())

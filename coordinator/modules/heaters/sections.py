@@ -14,8 +14,8 @@ from coordinator.config.sections.heater_options import (
 from coordinator.gcode.commands import Call, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.heaters.heater import HeaterUnit
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heater import Heater
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.heaters.pid_profile import PidProfiles
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.modules.words import numbers
@@ -23,13 +23,13 @@ from coordinator.runtime.module_context import Live
 from coordinator.support.values import Value
 
 
-class HeaterModule(Module):
+class HeaterSection(Module):
     """A section with a heater."""
 
     def __init__(self, build: Build, key: str, tag: str = "") -> None:
         super().__init__(build)
-        self.unit = HeaterUnit(build, key)
-        self.heaters = build.shared(Heaters)
+        self.unit = Heater(build, key)
+        self.heaters = build.shared(HeaterRegistry)
         build.shared(PidProfiles)
         self.heaters.add(self.unit, tag)
 
@@ -54,7 +54,7 @@ class HeaterModule(Module):
         return self.unit.status()
 
 
-class HeaterBed(HeaterModule):
+class HeaterBed(HeaterSection):
     """The heater of the bed."""
 
     SPEC: ClassVar = SectionSpec(
@@ -73,7 +73,7 @@ class HeaterBed(HeaterModule):
         return self.heaters.set_and_wait(self.unit, _target(call, "SR"))
 
 
-class HeaterGeneric(HeaterModule):
+class HeaterGeneric(HeaterSection):
     """A heater of any kind."""
 
     NAMED: ClassVar = True
@@ -87,7 +87,7 @@ class HeaterGeneric(HeaterModule):
         super().__init__(build, build.instance, build.find(GCODE_ID) or "")
 
 
-class ExtruderHeaters(Module):
+class ExtruderHeaterCommands(Module):
     """The heaters of all extruders, and the commands for them."""
 
     SPEC: ClassVar = SectionSpec(help="What the heaters of extruders have in common", options=())
@@ -95,9 +95,9 @@ class ExtruderHeaters(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         build.shared(PidProfiles)
-        self.by_extruder: dict[str, ExtruderHeater] = {}
+        self.by_extruder: dict[str, ExtruderHeaterSection] = {}
         self._extruders = [extruder.name for extruder in build.machine.extruders]
-        self.heaters = build.shared(Heaters)
+        self.heaters = build.shared(HeaterRegistry)
         build.add_command(
             GCodeCommand("M104", "Set an extruder's target: S, T", self._set, while_printing=True)
         )
@@ -111,7 +111,7 @@ class ExtruderHeaters(Module):
     def _wait(self, call: Call) -> Reading:
         return self.heaters.set_and_wait(self._unit(call), _target(call, "SRT"))
 
-    def _unit(self, call: Call) -> HeaterUnit:
+    def _unit(self, call: Call) -> Heater:
         words = numbers(call.command, "SRT")
         name = call.extruder or "extruder"
         if "T" in words:
@@ -129,7 +129,7 @@ class ExtruderHeaters(Module):
         return found.unit
 
 
-class ExtruderHeater(Module):
+class ExtruderHeaterSection(Module):
     """The heater of an extruder; an extruder without heater_pin has none."""
 
     TITLE: ClassVar = "[extruder], [extruder1] …"
@@ -141,13 +141,13 @@ class ExtruderHeater(Module):
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self.unit: HeaterUnit | None = None
+        self.unit: Heater | None = None
         self._connected = False
         self.min_extrude_c = build.get(MIN_EXTRUDE_TEMP)
         if build.find(HEATER_PIN) is None:
             return
-        self.unit = HeaterUnit(build, build.name)
-        shared = build.shared(ExtruderHeaters)
+        self.unit = Heater(build, build.name)
+        shared = build.shared(ExtruderHeaterCommands)
         shared.by_extruder[build.name] = self
         shared.heaters.add(self.unit, f"T{build.name.removeprefix('extruder') or 0}")
 
