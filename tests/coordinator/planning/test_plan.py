@@ -290,28 +290,6 @@ def test_an_empty_program_has_a_report(tmp_path: Path) -> None:
     assert "0 moves in 0:00.0 min" in report.to_text()
 
 
-CONFIG = Path(__file__).parents[3] / "config" / "cartesian_uart.cfg"
-SLOW = {
-    *("numpy", "can", "serial", "rich", "asyncio", "nodes.link"),
-    *("importlib.metadata", "email", "hashlib", "shutil"),
-}
-
-
-def test_planning_imports_nothing_slow(tmp_path: Path) -> None:
-    """Nor do the modules of a machine with all that a printer has."""
-    gcode = tmp_path / "short.gcode"
-    gcode.write_text("G28\nG1 X10 F3000\n")
-    script = (
-        "import sys; from coordinator.cli.main import main; "
-        f"assert main(['plan', {str(CONFIG)!r}, {str(gcode)!r}]) == 0; print(*sys.modules, sep=chr(10))"
-    )
-    out = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True
-    ).stdout
-    assert "coordinator.modules.heaters.heater" in out.splitlines()
-    assert not SLOW & set(out.splitlines())
-
-
 @pytest.mark.skipif(not DATA.exists(), reason="the shared real-world data is not here")
 def test_a_real_file_is_planned_with_all_figures(tmp_path: Path) -> None:
     options = PlanOptions(
