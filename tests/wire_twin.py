@@ -59,7 +59,7 @@ class Block:
 
 
 def blocks(stream: bytes) -> tuple[list[Block], int, bytes]:
-    """Cut STREAM into (blocks, number of damaged stretches, what is not yet a whole block)."""
+    """Cut STREAM into (blocks, number of damaged segments, what is not yet a whole block)."""
     found: list[Block] = []
     losses = 0
     while True:

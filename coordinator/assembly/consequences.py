@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Final
 
-from coordinator.config.model import NotYetActing
+from coordinator.config.model import Unsupported
 
 _NO_PROBE: Final = "nothing is probed; an axis that it homes is refused by G28, lines that probe end a job"
 _NO_LEVEL: Final = "the bed or the gantry stays as it is; lines that ask for this end a job"
@@ -90,7 +90,7 @@ _OPTIONS: Final[Mapping[str, str]] = {
 USUAL: Final = "it has no effect; a print is as it would be without it"
 
 
-def meaning(entry: NotYetActing) -> str:
+def meaning(entry: Unsupported) -> str:
     """Return what ENTRY means for a print, without a full stop."""
     if not entry.options:
         kind = entry.section.partition(" ")[0]

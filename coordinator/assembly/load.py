@@ -9,8 +9,8 @@ from coordinator.config.model import (
     MachineDescription,
     ModuleSection,
     ModuleSections,
-    NotYetActing,
     StepperDescription,
+    Unsupported,
 )
 from coordinator.config.saved import ConfigSource
 from coordinator.config.sections.extruder import (
@@ -27,9 +27,9 @@ from coordinator.config.sections.second_endstops import with_second_endstops
 from coordinator.config.sections.shaper import read_shapers
 from coordinator.config.sections.steppers import is_extra_stepper
 from coordinator.config.sections.tables import read_axis_tables
-from coordinator.config.unsupported import LATER_SECTIONS
+from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
 from coordinator.modules.module_set import build_modules
-from coordinator.modules.registry import known_kinds, module_for, modules_beside, own_kinds
+from coordinator.modules.registry import known_kinds, module_for, option_readers, own_kinds
 from coordinator.motion.specs import MotionLimits
 from coordinator.support.quoting import nearest
 
@@ -62,7 +62,7 @@ def describe(config: ConfigFile) -> MachineDescription:
 
     Where the file collects mistakes it is raised only for those that leave nothing to go on with.
     """
-    later: list[NotYetActing] = []
+    later: list[Unsupported] = []
     _check_section_names(config)
     nodes = read_nodes(config, later)
     reading = Reading(config, make_pin_registry(config, nodes), later)
@@ -91,13 +91,13 @@ def describe(config: ConfigFile) -> MachineDescription:
         extruder_steppers=followers,
         shapers=shapers,
         modules=_module_sections(reading),
-        not_yet_acting=(),
+        unsupported=(),
         notes=(),
         axis_tables=axis_tables,
         source=ConfigSource(config.path, config.data, saved_values(config)),
     )
     later += [
-        NotYetActing(_section_of(stepper), stepper.place, ("enable_pin",), stepper.unpowered)
+        Unsupported(_section_of(stepper), stepper.place, ("enable_pin",), stepper.unpowered)
         for stepper in description.steppers
         if stepper.unpowered
     ]
@@ -107,10 +107,10 @@ def describe(config: ConfigFile) -> MachineDescription:
     reading.pins = built.pins
     return replace(
         description,
-        not_yet_acting=(
+        unsupported=(
             *later,
-            *(NotYetActing(one.name, one.place, (), one.reason) for one in built.left_out.values()),
-            *_later_sections(reading, kinematics),
+            *(Unsupported(one.name, one.place, (), one.reason) for one in built.left_out.values()),
+            *_unsupported_sections(reading, kinematics),
         ),
         notes=(*config.notes, *built.notes),
     )
@@ -120,7 +120,7 @@ def _module_sections(reading: Reading) -> ModuleSections:
     """Return what the modules are built from; raises ConfigError."""
     sections: list[ModuleSection] = []
     for section in reading.config.sections.values():
-        if any(modules_beside(section.name)):
+        if any(option_readers(section.name)):
             sections.append(ModuleSection(section, whole=False))
         if not _is_acting(section) and (kind := module_for(section.kind, section.place)) is not None:
             if kind.NAMED and not (kind.NAMELESS or section.instance):
@@ -175,7 +175,7 @@ def _is_acting(section: RawSection) -> bool:
 
 def _check_section_names(config: ConfigFile) -> None:
     for section in config.sections.values():
-        if _is_acting(section) or section.kind in LATER_SECTIONS or section.kind in own_kinds():
+        if _is_acting(section) or section.kind in UNSUPPORTED_SECTIONS or section.kind in own_kinds():
             continue
         if section.kind in known_kinds():  # asked for last: it looks through all packages
             continue
@@ -183,12 +183,12 @@ def _check_section_names(config: ConfigFile) -> None:
             error = f"[{section.name}] must be [{section.kind}]: there is only one of it"
             section.report(ConfigError(section.place, error))
             continue
-        valid = (*_SINGLE_SECTIONS, *_NAMED_SECTIONS, *known_kinds(), *sorted(LATER_SECTIONS))
+        valid = (*_SINGLE_SECTIONS, *_NAMED_SECTIONS, *known_kinds(), *sorted(UNSUPPORTED_SECTIONS))
         hint = nearest(section.kind, valid, pattern="[{}]") or "; remove it or correct its name"
         section.report(ConfigError(section.place, f"there is no section [{section.name}]{hint}"))
 
 
-def _later_sections(reading: Reading, kinematics: str) -> list[NotYetActing]:
+def _unsupported_sections(reading: Reading, kinematics: str) -> list[Unsupported]:
     """Return the sections without a module; raises ConfigError when one takes a stepper's pin.
 
     So it does for a motion section that has no place in this machine.
@@ -200,11 +200,9 @@ def _later_sections(reading: Reading, kinematics: str) -> list[NotYetActing]:
             continue
         if not _is_acting(section):
             if section.kind != SHELL_COMMAND:
-                result.append(NotYetActing(section.name, section.place, ()))
+                result.append(Unsupported(section.name, section.place, ()))
             elif not any(entry.section == SHELL_COMMAND for entry in result):
-                result.append(
-                    NotYetActing(SHELL_COMMAND, section.place, (), "no section of that kind is run")
-                )
+                result.append(Unsupported(SHELL_COMMAND, section.place, (), "no section of that kind is run"))
             reading.pins.check_unclaimed(section.options.values(), section.name)
             continue
         if section.name not in reading.used and section.kind not in ("printer", *_NAMED_SECTIONS):

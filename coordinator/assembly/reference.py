@@ -17,8 +17,8 @@ from coordinator.config.sections import shaper as read_shaper
 from coordinator.config.sections import tables as read_tables
 from coordinator.config.sections.kinematics import dual_carriage as read_dual
 from coordinator.config.sections.kinematics.registry import KINDS, PRINTER_SPECS
-from coordinator.config.unsupported import LATER_SECTIONS
-from coordinator.modules.registry import own_beside, own_modules
+from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
+from coordinator.modules.registry import own_modules, own_option_readers
 
 _BEGIN: Final = "<!-- The tables below"
 _END: Final = "## Sections that do not act yet\n"
@@ -47,7 +47,7 @@ def sections() -> list[str]:
 
 
 def _module_sections() -> dict[str, SectionSpec]:
-    beside = {f"{title}, further options": module.SPEC for title, module in own_beside()}
+    beside = {f"{title}, further options": module.SPEC for title, module in own_option_readers()}
     return beside | {title: module.SPEC for title, module in own_modules()}
 
 
@@ -93,9 +93,9 @@ def section_table(title: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def later_sections() -> str:
+def unsupported_sections() -> str:
     """Return the first words of all sections that do not act yet."""
-    return ", ".join(f"`{name}`" for name in sorted(LATER_SECTIONS)) + ".\n"
+    return ", ".join(f"`{name}`" for name in sorted(UNSUPPORTED_SECTIONS)) + ".\n"
 
 
 def _is_one_of_many(option: Option[object]) -> bool:
@@ -119,13 +119,15 @@ def with_tables(page: str) -> str:
     _, _, rest = rest.partition(_END)
     told = rest[: rest.index("\n`")]
     tables = "\n".join(section_table(title) for title in sections())
-    return f"{head}{_BEGIN}{mark}\n\n{tables}\n{_END}{told}\n{later_sections()}"
+    return f"{head}{_BEGIN}{mark}\n\n{tables}\n{_END}{told}\n{unsupported_sections()}"
 
 
 def main() -> None:
     """Print all tables, or put them into the pages that are named."""
     if len(sys.argv) == 1:
-        sys.stdout.write("\n".join(section_table(title) for title in sections()) + "\n" + later_sections())
+        sys.stdout.write(
+            "\n".join(section_table(title) for title in sections()) + "\n" + unsupported_sections()
+        )
     for path in map(Path, sys.argv[1:]):
         path.write_text(with_tables(path.read_text(encoding="utf-8")), encoding="utf-8")
 

@@ -27,7 +27,7 @@ class ConfigError(CanductorError):
         """Where the mistake stands, for front ends that mark the line."""
 
 
-class NotActing(ConfigError):  # noqa: N818 (no mistake: the configuration is right)
+class NotSupported(ConfigError):  # noqa: N818 (no mistake: the configuration is right)
     """What an option asks for is known, but nothing acts on it yet; its reader leaves it out and lists it."""
 
     def __init__(self, place: Place, reason: str) -> None:

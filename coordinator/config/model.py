@@ -257,7 +257,7 @@ class ModuleSections:
 
 
 @dataclass(frozen=True, slots=True)
-class NotYetActing:
+class Unsupported:
     """What was recognised but belongs to a module that is not built yet."""
 
     section: str
@@ -294,7 +294,7 @@ class MachineDescription:
     extruder_steppers: tuple[ExtruderStepperDescription, ...]
     shapers: tuple[ShaperDescription, ...]
     modules: ModuleSections
-    not_yet_acting: tuple[NotYetActing, ...]
+    unsupported: tuple[Unsupported, ...]
     notes: tuple[str, ...]
     """Sentences about what has no effect."""
     axis_tables: AxisTablesDescription | None = None

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-from coordinator.config.errors import ConfigError, NotActing, Place
+from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawOption, RawSection
 from coordinator.support.quoting import nearest, shown
 
@@ -376,7 +376,7 @@ class SectionReader:
             value = option.parse(raw.value)
             self.section.used[option.name] = option.setting(raw.value, value)
         except NotBuilt:
-            raise NotActing(
+            raise NotSupported(
                 raw.place,
                 f"option '{option.name}' of [{self.name}] is {shown(raw.value)}, which is recognised but not"
                 " built yet",

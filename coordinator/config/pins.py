@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from coordinator.config.errors import ConfigError, NotActing, Place
+from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawOption, RawSection
 from coordinator.config.options import BadValue, Option
 from coordinator.support.quoting import nearest, shown
@@ -153,7 +153,7 @@ class PinRegistry:
             return claimed
         try:
             return self._claim(pin, claimed, option.share)
-        except NotActing:
+        except NotSupported:
             raise
         except ConfigError as error:
             section.report(error)
@@ -163,7 +163,7 @@ class PinRegistry:
     def _claim(self, pin: PinName, wanted: PinDescription, share: str) -> PinDescription:
         if pin.node not in self.nodes:
             if pin.node in self.chips:
-                raise NotActing(wanted.place, self._of_chip(pin, wanted))
+                raise NotSupported(wanted.place, self._of_chip(pin, wanted))
             hint = nearest(pin.node, self.nodes, pattern="'{}'") or f"; add a section [mcu {pin.node}]"
             raise ConfigError(wanted.place, f"{wanted.purpose}: there is no node {shown(pin.node)}{hint}")
         claimed = replace(wanted, name=self._resolve(pin, wanted.purpose, wanted.place))

@@ -9,7 +9,7 @@ def _words(text: str) -> tuple[str, ...]:
     return tuple(text.split())
 
 
-LATER_SECTIONS = frozenset(
+UNSUPPORTED_SECTIONS = frozenset(
     (
         *_words("manual_stepper delta_calibrate"),
         *_words("homing_heaters temperature_probe adc_scaled ads1x1x ads1118"),
@@ -35,4 +35,4 @@ LATER_SECTIONS = frozenset(
 LATER_EXTRUDER_OPTIONS = _words("per_move_pressure_advance shared_heater")
 """Those of its heater and sensor that do not act yet: coordinator/config/sections/heater_options.py."""
 LATER_MCU_OPTIONS = _words("is_non_critical reconnect_interval max_stepper_error")
-LATER_STEPPER_OPTIONS = _words("homing_current min_home_dist use_sensorless_homing")
+UNSUPPORTED_STEPPER_OPTIONS = _words("homing_current min_home_dist use_sensorless_homing")

@@ -52,7 +52,7 @@ def print_and_prove(
     """Print PROGRAM on HARDWARE, which HOST reaches, and prove every step; raises CanductorError."""
     description = hardware.description
     record = PlanRecord((0.0, 0.0, 0.0, 0.0))
-    told: list[str] = []
+    output: list[str] = []
     both_edges: dict[str, bool] = {}
     claimed: dict[str, list[str]] = {}
     warmth = HeatWatch()
@@ -68,7 +68,7 @@ def print_and_prove(
             program,
             on_progress,
             record=record,
-            on_output=lambda event: told.append(event.text),
+            on_output=lambda event: output.append(event.text),
             on_ready=ready,
             host=host,
         ),
@@ -81,7 +81,7 @@ def print_and_prove(
         for node in description.nodes
         for proof in prove_heat(warmth.states, node.name, hardware.plant_log(node.name))
     ]
-    notices = [*map(str, description.not_yet_acting), *description.notes, *told]
+    notices = [*map(str, description.unsupported), *description.notes, *output]
     if (sentence := not_steady(warmth.heaters, heat)) is not None:
         notices.append(sentence)
     return report_of(prover, hardware, figures, outcome, notices, heat=heat)

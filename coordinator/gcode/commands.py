@@ -1,28 +1,29 @@
-"""Commands that modules add to the language of programs, and what comes of reading one.
+"""Commands that modules add to the language of programs, what reading one returns, and what they act on.
 
 ``read`` runs as soon as the line is read, in the reader's thread, also when a program is only planned: it
 checks the parameters (WordError) and returns what is to be done and when. It changes nothing itself.
 
-===========  ================================================================================================
-AtOnce       is done when it is read: an answer, or a value for the lines to come
-InTime       is done when the moves before it are carried out, without stopping them: a fan
-ToProgram    acts on the program that reads it: on its modes, on where its moves go
-AtRest       is done when the machine stands, and the program waits for it: a heater to become hot, homing
-Lines        is replaced by other lines: a macro
-BuiltIn      is what the interpreter makes of another name: a command that a macro has taken the name of
-===========  ================================================================================================
+============  ===============================================================================================
+Immediate     is done when it is read: an answer, or a value for the lines to come
+Synchronized  is done when the moves before it are carried out, without stopping them: a fan
+ToProgram     acts on the program that reads it: on its modes, on where its moves go
+AtStandstill  is done at standstill, and the program waits for it: a heater to become hot, homing
+Lines         is replaced by other lines: a macro
+BuiltIn       is what the interpreter makes of another name: a command whose name a macro has taken
+============  ===============================================================================================
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
+from coordinator.gcode.events import Done, Event
+from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.parser import Command
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.motion.planner.planner import Planner
 
-if TYPE_CHECKING:
-    from coordinator.gcode.interpreter import Job
 Position = tuple[float, float, float, float]
 
 
@@ -43,7 +44,7 @@ class Call:
     """The active extruder; empty where there is none."""
     figures: Callable[[], Mapping[str, Mapping[str, object]]] = dict
     """Tells ``toolhead`` and ``gcode_move`` as they are there (gcode/figures.py)."""
-    beside: bool = False
+    while_printing: bool = False
     """Whether a client gives it while a job prints, which must not wait for it."""
 
     def parameters(self, *known: str) -> dict[str, str]:
@@ -52,26 +53,7 @@ class Call:
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
-    """What came of something that was done at rest."""
-
-    replies: tuple[str, ...] = ()
-    position: Position | None = None
-    """Where the machine stands now, if that is new; X Y Z E, mm."""
-    homed: str = ""
-    """Letters of the axes that ``position`` makes known."""
-    unhomed: str = ""
-    """Letters of the axes whose place is not known any more."""
-    moved: bool = False
-    """Whether steppers were moved past the program's own moves."""
-    second_carriage_mm: float | None = None
-    """Where the second carriage was homed; None: where the configuration says."""
-    kind: ReplyKind = ReplyKind.INFORMATION
-    """Of the replies."""
-
-
-@dataclass(frozen=True, slots=True)
-class AtOnce:
+class Immediate:
     """Act now, if there is anything to do, and answer REPLIES."""
 
     replies: tuple[str, ...] = ()
@@ -82,14 +64,14 @@ class AtOnce:
 
 
 @dataclass(frozen=True, slots=True)
-class InTime:
+class Synchronized:
     """ACT is called on the control loop, ahead of the print time (s) at which it is to take effect."""
 
     act: Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True)
-class AtRest:
+class AtStandstill:
     """PERFORM runs on the control loop while the machine stands; it may be cancelled."""
 
     perform: Callable[[], Awaitable[Done | None]]
@@ -114,7 +96,7 @@ class ToProgram:
     It is called in the reader's thread, also when a program is only planned; raises WordError.
     """
 
-    act: "Callable[[Job], bool]"
+    act: "Callable[[ProgramContext], bool]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +106,7 @@ class BuiltIn:
     name: str
 
 
-Reading = AtOnce | InTime | AtRest | Lines | ToProgram | BuiltIn
+Reading = Immediate | Synchronized | AtStandstill | Lines | ToProgram | BuiltIn
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,23 +117,25 @@ class GCodeCommand:
     help: str
     """One sentence, without a full stop."""
     read: Callable[[Call], Reading]
-    beside: bool = False
+    while_printing: bool = False
     """Whether a client may give it while a job prints, between two lines of the job: it neither moves nor
     waits."""
 
 
-def renamed(command: GCodeCommand | None, name: str, rename: str, *, beside: bool) -> GCodeCommand:
+def renamed(command: GCodeCommand | None, name: str, rename: str, *, while_printing: bool) -> GCodeCommand:
     """Return what NAME was, under another name: COMMAND, or without one the interpreter's own.
 
-    BESIDE: whether that one may be given beside a job.
+    WHILE_PRINTING: whether that one may be given beside a job.
     """
     if command is None:
-        return GCodeCommand(rename, f"What {name} is by itself", lambda _: BuiltIn(name), beside=beside)
+        return GCodeCommand(
+            rename, f"What {name} is by itself", lambda _: BuiltIn(name), while_printing=while_printing
+        )
 
     def read(call: Call) -> Reading:
         return command.read(replace(call, command=call.command.called(name)))
 
-    return GCodeCommand(rename, command.help, read, beside=command.beside)
+    return GCodeCommand(rename, command.help, read, while_printing=command.while_printing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +153,7 @@ class Vocabulary:
     """Commands that may pause or cancel a job: PAUSE, CANCEL_PRINT, and macros in which they come."""
     disturbing: frozenset[str] = frozenset()
     """Commands that a job has to stand still for between two of its lines, and macros in which they come."""
-    not_acting: Mapping[str, str] = field(default_factory=dict)
+    unsupported: Mapping[str, str] = field(default_factory=dict)
     """Why, by the name of a command that a section of the configuration should bring, nothing acts on it:
     ``[bed_mesh] does not act yet``."""
     set_ups: "tuple[Callable[[Planner], None], ...]" = ()
@@ -177,3 +161,116 @@ class Vocabulary:
 
 
 NO_WORDS = Vocabulary({})
+
+
+# ---- What commands act on ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Recovering:
+    """How an interrupted job is to go on."""
+
+    line: int | None = None
+    """None: where it was."""
+    home: bool = False
+    """Whether to home what is not homed, as far as the part is not in the way."""
+    z_mm: float | None = None
+    """Where the head stands in Z, in the machine's frame; None: as it was written down."""
+
+
+class PrintControl(Protocol):
+    """Has at most one job at a time. All is called in the reader's thread and never waits."""
+
+    @property
+    def job_is_active(self) -> bool:
+        """Whether there is a job that is neither done nor cancelled."""
+        ...
+
+    @property
+    def paused(self) -> bool:
+        """Whether the job is to read no further."""
+        ...
+
+    def pause_job(self, program: "ProgramContext") -> None:
+        """Let the job read no further, by a line of PROGRAM; that goes on to the end of the line.
+
+        Where the program stands is where the job will go on.
+        """
+
+    def come_back(self, program: "ProgramContext", speed_mm_s: float) -> bool:
+        """Go to where the job was paused, as PROGRAM's next moves; False: with the planner emptied, again.
+
+        Raises WordError when that is not possible.
+        """
+        ...
+
+    def resume_job(self) -> None:
+        """Let the job go on when the program at hand has ended."""
+
+    def cancel_job(self, program: "ProgramContext") -> None:
+        """End the job, by a line of PROGRAM; that goes on to the end of the line."""
+
+    def start_job(self, name: str) -> None:
+        """Print the file NAME of the job folder when the program at hand has ended."""
+
+    def recover_job(self, how: Recovering) -> None:
+        """Go on with the interrupted job when the program at hand has ended."""
+
+
+class ProgramContext(ABC):
+    """The program that is being read, as its commands see it; the interpreter's Job."""
+
+    planner: Planner
+    machine: MachineState
+    """What the program may change; it is changed in place."""
+    vocabulary: Vocabulary
+    homed_position: Mapping[str, float]
+    """Where each axis (letter) stands after G28, mm; these are the axes that exist."""
+    while_printing: bool
+    """Whether its lines come between those of a job that prints: then only some are carried out."""
+    prints: PrintControl | None
+    """Controls the jobs; None: there are none, this program is all there is."""
+
+    @property
+    @abstractmethod
+    def line(self) -> int:
+        """Number of the line that comes next, or is being carried out."""
+
+    @abstractmethod
+    def emit(self, event: Event) -> None:
+        """Return EVENT from the next ``step``."""
+
+    @abstractmethod
+    def notice(self, what: str, remark: str) -> None:
+        """Report WHAT with a remark, once per program."""
+
+    @abstractmethod
+    def record(self, command: Command) -> None:
+        """Count COMMAND; only its last parameters are kept, so memory stays flat."""
+
+    @abstractmethod
+    def refuse_skipping(self, command: Command, why: str) -> None:
+        """Raise WordError for a COMMAND that a job must not go without; a plan only reports it.
+
+        WHY: what it does, and why nothing does it here.
+        """
+
+    @abstractmethod
+    def call(self, command: Command) -> Call:
+        """Return COMMAND with what holds where it stands."""
+
+    @abstractmethod
+    def follow(self, command: Command, reading: Reading) -> bool:
+        """Do what READING says; False: the planner has to be emptied first."""
+
+    @abstractmethod
+    def take(self, done: Done) -> None:
+        """Take over what was done at standstill."""
+
+    @abstractmethod
+    def break_after_line(self) -> None:
+        """Let ``step`` return as soon as the line at hand is done, with all that it stands for."""
+
+    @abstractmethod
+    def end_with(self, event: Event) -> None:
+        """End the program with EVENT."""

@@ -24,8 +24,26 @@ End             takes all trapezoids; the job is over
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
-from coordinator.gcode.commands import Done
 from coordinator.gcode.reply_kinds import ReplyKind
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What came of something that was done at rest."""
+
+    replies: tuple[str, ...] = ()
+    position: tuple[float, float, float, float] | None = None
+    """Where the machine stands now, if that is new; X Y Z E, mm."""
+    homed: str = ""
+    """Letters of the axes that ``position`` makes known."""
+    unhomed: str = ""
+    """Letters of the axes whose place is not known any more."""
+    moved: bool = False
+    """Whether steppers were moved past the program's own moves."""
+    second_carriage_mm: float | None = None
+    """Where the second carriage was homed; None: where the configuration says."""
+    kind: ReplyKind = ReplyKind.INFORMATION
+    """Of the replies."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,19 +14,21 @@ from coordinator.gcode.builtins import basic as basic_commands
 from coordinator.gcode.builtins import machine as machine_commands
 from coordinator.gcode.commands import (
     NO_WORDS,
-    AtOnce,
-    AtRest,
+    AtStandstill,
     BuiltIn,
     Call,
-    Done,
-    InTime,
+    Immediate,
     Lines,
+    PrintControl,
+    ProgramContext,
     Reading,
+    Synchronized,
     ToProgram,
     Vocabulary,
 )
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import (
+    Done,
     End,
     Event,
     Full,
@@ -40,10 +42,9 @@ from coordinator.gcode.events import (
 )
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.parser import Command, WordError, parse, quoted
-from coordinator.gcode.print_control import PrintControl
 from coordinator.gcode.program import Program
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.gcode.status import gcode_figures
+from coordinator.gcode.status import motion_figures
 from coordinator.motion.planner.language import READ_IN_C
 from coordinator.motion.planner.planner import Feed, FeedStatus, Planner
 
@@ -90,7 +91,7 @@ class _Inner:
         return len(self.data) if end < 0 else end
 
 
-class Job:
+class Job(ProgramContext):
     """One run of PROGRAM through PLANNER.
 
     HOMED_POSITION: where each axis (letter) stands after G28, mm; these are the axes that exist. VOCABULARY:
@@ -107,7 +108,7 @@ class Job:
         machine: MachineState | None = None,
         vocabulary: Vocabulary = NO_WORDS,
         *,
-        beside: bool = False,
+        while_printing: bool = False,
         prints: PrintControl | None = None,
         strict: bool = False,
     ) -> None:
@@ -117,7 +118,7 @@ class Job:
         """What the program may change; it is changed in place."""
         self.vocabulary = vocabulary
         self.homed_position = dict(homed_position)
-        self.beside = beside
+        self.while_printing = while_printing
         """Whether its lines come between those of a job that prints: then only some are carried out."""
         self.prints = prints
         """Has the jobs; None: there are none, this program is all there is."""
@@ -132,7 +133,7 @@ class Job:
         self._over: Event | GCodeError | None = None
         self._told: set[str] = set()
         planner.forget_line()
-        planner.leave_out(READ_IN_C if beside else vocabulary.commands)
+        planner.leave_out(READ_IN_C if while_printing else vocabulary.commands)
         for set_up in vocabulary.set_ups:
             set_up(planner)
         machine_commands.begin(self)
@@ -289,17 +290,17 @@ class Job:
         known = self.vocabulary.commands.get(command.written) if command.written else None
         known = known or self.vocabulary.commands.get(command.name)
         if known is not None:
-            self._check_beside(command, allowed=known.beside)
+            self._check_while_printing(command, allowed=known.while_printing)
             return self.follow(command, known.read(self.call(command)))
         return self._act_built_in(command)
 
     def _act_built_in(self, command: Command) -> bool:
         handler = basic_commands.HANDLERS.get(command.name)
         if handler:
-            self._check_beside(command, allowed=command.name in basic_commands.BESIDE)
+            self._check_while_printing(command, allowed=command.name in basic_commands.WHILE_PRINTING)
             return handler(self, command)
         if machine_commands.is_tool(command.name):
-            self._check_beside(command, allowed=False)
+            self._check_while_printing(command, allowed=False)
             return machine_commands.select_tool(self, command)
         self._skip(command)
         return True
@@ -307,7 +308,7 @@ class Job:
     def _skip(self, command: Command) -> None:
         """Tell about a command that nobody knows; raises WordError for one that a job must not go without."""
         what = quoted(command.name).strip(QUOTE)
-        why = self.vocabulary.not_acting.get(command.name, "")
+        why = self.vocabulary.unsupported.get(command.name, "")
         absent = ABSENT.get(command.name)
         if absent is None or absent.harmless or not why:
             self.notice(f"unknown command {what}", why or "unknown commands are skipped")
@@ -320,8 +321,8 @@ class Job:
             raise WordError(f"{command.name} {why}; remove the line, or what asks for it")
         self.notice(f"{quoted(command.name).strip(QUOTE)} {why}", "a job would end here")
 
-    def _check_beside(self, command: Command, *, allowed: bool) -> None:
-        if self.beside and not allowed:
+    def _check_while_printing(self, command: Command, *, allowed: bool) -> None:
+        if self.while_printing and not allowed:
             raise WordError(
                 f"{command.name} cannot run while a job prints; pause it first, or wait for its end"
             )
@@ -334,20 +335,22 @@ class Job:
         callers = tuple(inner.name for inner in self._inner)
         active = self.machine.active
         extruder = active.name if active is not None else ""
-        position, figures = planner.toolhead_position, partial(gcode_figures, self)
-        return Call(command, self.line, position, planner.homed, callers, extruder, figures, self.beside)
+        position, figures = planner.toolhead_position, partial(motion_figures, planner, self.machine)
+        return Call(
+            command, self.line, position, planner.homed, callers, extruder, figures, self.while_printing
+        )
 
     def follow(self, command: Command, reading: Reading) -> bool:
         """Do what READING says; False: the planner has to be emptied first."""
         match reading:
-            case AtOnce():
+            case Immediate():
                 if reading.act is not None:
                     reading.act()
                 self._reply(reading.replies, reading.kind)
-            case InTime():
+            case Synchronized():
                 self._events.append(Timed(self.line, self.planner.moves, reading.act))
-            case AtRest():
-                if not machine_commands.come_to_rest(self):
+            case AtStandstill():
+                if not machine_commands.come_to_standstill(self):
                     return False
                 end_s = self.planner.print_time_end_s
                 self._resting = StandstillAction(self.line, end_s, reading.perform, reading.planned)

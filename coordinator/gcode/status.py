@@ -1,13 +1,10 @@
 """How a program's moves stand while it is read, for macros: ``printer.toolhead``, ``printer.gcode_move``."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import NamedTuple, cast
 
 from coordinator.gcode.machine_state import MachineState
 from coordinator.motion.planner.planner import Planner
-
-if TYPE_CHECKING:
-    from coordinator.gcode.interpreter import Job
 
 
 class Place(NamedTuple):
@@ -19,13 +16,11 @@ class Place(NamedTuple):
     e: float
 
 
-def gcode_figures(job: "Job") -> Mapping[str, Mapping[str, object]]:
-    """Return where the moves read so far lead to, and what holds for those to come; mm, mm/s, mm/s²."""
-    return motion_figures(job.planner, job.machine)
+def motion_figures(planner: Planner, machine: MachineState) -> Mapping[str, Mapping[str, object]]:
+    """Return where the moves read so far lead to, and what holds for those to come; mm, mm/s, mm/s².
 
-
-def motion_figures(planner: "Planner", machine: "MachineState") -> Mapping[str, Mapping[str, object]]:
-    """Return the same of PLANNER and MACHINE; in the thread that reads programs."""
+    To be called in the thread that reads programs.
+    """
     limits = planner.limits
     active = machine.active
     toolhead = {
@@ -58,7 +53,7 @@ def motion_figures(planner: "Planner", machine: "MachineState") -> Mapping[str, 
     return {"toolhead": toolhead, "gcode_move": gcode_move, **_extruders(machine), **_carriages(machine)}
 
 
-def _extruders(machine: "MachineState") -> Mapping[str, Mapping[str, object]]:
+def _extruders(machine: MachineState) -> Mapping[str, Mapping[str, object]]:
     followed = {} if machine.filament is None else machine.filament.followed
     told: dict[str, dict[str, object]] = {}
     for stepper, queue in followed.items():
@@ -69,7 +64,7 @@ def _extruders(machine: "MachineState") -> Mapping[str, Mapping[str, object]]:
     return told
 
 
-def _carriages(machine: "MachineState") -> Mapping[str, Mapping[str, object]]:
+def _carriages(machine: MachineState) -> Mapping[str, Mapping[str, object]]:
     state = machine.carriage_state
     if state is None:
         return {}

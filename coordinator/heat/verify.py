@@ -30,6 +30,15 @@ class VerifyOptions:
     heating_gain_k: float = 2.0
 
 
+GAIN_TIME_S: Final = 20.0
+BED_GAIN_TIME_S: Final = 60.0
+
+
+def default_options(heater: str) -> VerifyOptions:
+    """Return the options of a heater that has no [verify_heater] section."""
+    return VerifyOptions(check_gain_s=BED_GAIN_TIME_S if heater == "heater_bed" else GAIN_TIME_S)
+
+
 class HeaterCheck:
     """Watches one heater; call ``check`` with every measurement, or at least every second."""
 

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.gcode.commands import AtOnce, Call
+from coordinator.gcode.commands import Call, Immediate
 from coordinator.gcode.parser import WordError, parse
 from coordinator.gcode.reply_kinds import ReplyKind, line_of
 from coordinator.klippy_api.client import REMOTE_METHODS_MAX, Client
@@ -144,8 +144,8 @@ class Endpoints:
 
     def _help(self, _client: Client, _request: Request) -> Result:
         machine = self._service.machine
-        helps = {} if machine is None else machine.modules.helps
-        return {name: text for name, text in helps.items() if text}
+        command_help = {} if machine is None else machine.modules.command_help
+        return {name: text for name, text in command_help.items() if text}
 
     def _script(self, _client: Client, request: Request) -> Awaitable[Result] | Result:
         script = text_param(request, "script")
@@ -178,8 +178,8 @@ class Endpoints:
             lines = lines[:1]
         outcome = await run_script(service, "\n".join(lines), wait=False)
         if not outcome.logged:
-            for told in outcome.told:
-                self._say(line_of(kind_of(told), told.text))
+            for output in outcome.output:
+                self._say(line_of(kind_of(output), output.text))
 
     def _answer(self, lines: Sequence[str]) -> None:
         """Answer what a machine that stopped still knows."""
@@ -191,7 +191,7 @@ class Endpoints:
             if command is None or reader is None:
                 raise WordError(f"this machine does not know {line.strip()[:40]}")
             reading = reader.read(Call(command, 0, (0.0,) * 4, ""))
-            if isinstance(reading, AtOnce):
+            if isinstance(reading, Immediate):
                 for text in reading.replies:
                     self._say(line_of(reading.kind, text))
 
@@ -213,8 +213,8 @@ class Endpoints:
         return {}
 
 
-def kind_of(told: ProgramOutput) -> ReplyKind:
+def kind_of(output: ProgramOutput) -> ReplyKind:
     """Return how TOLD reads: notices are information."""
-    kind = getattr(told, "kind", ReplyKind.INFORMATION)
+    kind = getattr(output, "kind", ReplyKind.INFORMATION)
     assert isinstance(kind, ReplyKind)
     return kind

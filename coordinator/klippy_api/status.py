@@ -9,7 +9,7 @@ from coordinator.klippy_api.motion_objects import idle_objects, motion_objects
 from coordinator.klippy_api.node_objects import firmware_of, node_objects
 from coordinator.klippy_api.subscription import Status
 from coordinator.modules.base import Module
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.modules.status.config_view import ConfigView
 from coordinator.modules.status.machine_view import available_kb
@@ -52,14 +52,14 @@ class _Fixed:
         view = ConfigView(modules.config, modules.settings, {})
         described = machine.description
         warnings = [
-            *({"type": "unsupported", "message": str(found)} for found in described.not_yet_acting),
+            *({"type": "unsupported", "message": str(found)} for found in described.unsupported),
             *({"type": "note", "message": note} for note in (*described.notes, *modules.notes)),
         ]
         self.machine = machine
         self.config = {"config": view["config"], "settings": view["settings"], "warnings": warnings}
-        self.commands = {name: {"help": text} if text else {} for name, text in modules.helps.items()}
+        self.commands = {name: {"help": text} if text else {} for name, text in modules.command_help.items()}
         self.macros = modules.names(GCodeMacro)
-        self.heaters = next(modules.of(Heaters), None)
+        self.heaters = next(modules.of(HeaterRegistry), None)
         self.order = modules.names(Module)
         self.firmware: dict[str, Mapping[str, Any]] = {}
 
@@ -159,7 +159,7 @@ class StatusBuilder:
             objects["manual_probe"] = {**heights, **probe}
 
 
-def _heaters(heaters: Heaters) -> dict[str, Any]:
+def _heaters(heaters: HeaterRegistry) -> dict[str, Any]:
     """Return the full names of sections, where programs also know short ones."""
     units = heaters.units
     short = {key for key, unit in units.items() if unit.name != key}

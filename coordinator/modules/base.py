@@ -17,7 +17,7 @@ A restart makes new modules: all state is in the object. Everything happens on t
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from coordinator.config.errors import ConfigError, NotActing, Place
+from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawSection
 from coordinator.config.model import MachineDescription
 from coordinator.config.options import BadValue, ListOption, Option, SectionReader, SectionSpec
@@ -57,7 +57,7 @@ class Modules(Protocol):
         """Tell whether programs know COMMAND, by a module or anyway."""
 
     @property
-    def helps(self) -> "Mapping[str, str]":
+    def command_help(self) -> "Mapping[str, str]":
         """What each command of programs does, by its name: a sentence without a full stop."""
 
     def status(self) -> "Mapping[str, Mapping[str, Value]]":
@@ -190,9 +190,9 @@ class Build:
         return found
 
     def needs_acting(self, section: str) -> None:
-        """Raise NotActing if SECTION stands in the configuration and nothing acts on its kind yet."""
+        """Raise NotSupported if SECTION stands in the configuration and nothing acts on its kind yet."""
         if section in self.later:
-            raise NotActing(self.place, f"it is for [{section}], which does not act yet")
+            raise NotSupported(self.place, f"it is for [{section}], which does not act yet")
 
     def note(self, option: Option[Any], sentence: str) -> None:
         """Tell the user something about an option that is no mistake; SENTENCE goes on after its name."""
@@ -231,7 +231,7 @@ class Build:
             found = modules.find(name, kind)
             if found is None:
                 if modules.is_left_out(name):
-                    raise NotActing(
+                    raise NotSupported(
                         self.reader.place_of(option), f"it needs [{name}], which does not act yet"
                     )
                 others = modules.names(kind)

@@ -6,24 +6,24 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
-from coordinator.config.errors import ConfigError, NotActing, Place
+from coordinator.config.errors import ConfigError, NotSupported, Place
 from coordinator.config.file import RawSection
 from coordinator.config.model import MachineDescription, ModuleSection
 from coordinator.config.pins import PinRegistry
-from coordinator.config.unsupported import LATER_SECTIONS
+from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
 from coordinator.gcode.absent_commands import ABSENT
-from coordinator.gcode.builtins.basic import BESIDE, HANDLERS
-from coordinator.gcode.builtins.command_help import HELPS
+from coordinator.gcode.builtins.basic import HANDLERS, WHILE_PRINTING
+from coordinator.gcode.builtins.command_help import BUILTIN_HELP
 from coordinator.gcode.commands import GCodeCommand, Vocabulary, renamed
 from coordinator.modules.base import Build, Device, Module
 from coordinator.modules.drivers.motor_power import MotorPower
 from coordinator.modules.drivers.stepper_buzz import StepperBuzz
-from coordinator.modules.heaters.sections import ExtruderHeater
+from coordinator.modules.heaters.sections import ExtruderHeaterSection
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.probes.manual_probe import ManualProbe
 from coordinator.modules.programs.idle_timeout import IdleTimeout
 from coordinator.modules.programs.save_config import SaveConfig
-from coordinator.modules.registry import module_for, modules_beside
+from coordinator.modules.registry import module_for, option_readers
 from coordinator.modules.status.console import Console
 from coordinator.modules.status.positions import Positions
 from coordinator.motion.planner.planner import Planner
@@ -68,7 +68,7 @@ def build_modules(machine: MachineDescription) -> "ModuleSet":
     """Build the modules of MACHINE, linked with each other; raises ConfigError."""
     given = machine.modules
     sources = [source for section in given.sections for source in _sources(section)]
-    without: dict[str, NotActing] = {}
+    without: dict[str, NotSupported] = {}
     while True:
         built = ModuleSet(machine, given.pins.copy(), given.config, given.settings)
         for source in sources:
@@ -76,7 +76,7 @@ def build_modules(machine: MachineDescription) -> "ModuleSet":
         built.add_always()
         try:
             built.link()
-        except _LinkNotActing as found:
+        except _LinkNotSupported as found:
             # What depends on it may have to be left out, too: all are built again.
             without[found.module] = found.error
         else:
@@ -86,15 +86,15 @@ def build_modules(machine: MachineDescription) -> "ModuleSet":
 def _sources(given: ModuleSection) -> Iterator[ModuleSource]:
     section = given.section
     if not given.whole:
-        yield from (ModuleSource(section, kind, whole=False) for kind in modules_beside(section.name))
+        yield from (ModuleSource(section, kind, whole=False) for kind in option_readers(section.name))
     elif (own := module_for(section.kind, section.place)) is not None:
         yield ModuleSource(section, own, whole=True)
 
 
-class _LinkNotActing(Exception):  # noqa: N818 (no mistake)
+class _LinkNotSupported(Exception):  # noqa: N818 (no mistake)
     """A module turned out, when it looked for others, not to act yet."""
 
-    def __init__(self, module: str, error: NotActing) -> None:
+    def __init__(self, module: str, error: NotSupported) -> None:
         super().__init__(str(error))
         self.module = module
         self.error = error
@@ -162,7 +162,7 @@ class ModuleSet:
             self._machine,
             whole=source.whole,
             share=self._share,
-            later=[name for name in self.config if name.partition(" ")[0] in LATER_SECTIONS],
+            later=[name for name in self.config if name.partition(" ")[0] in UNSUPPORTED_SECTIONS],
         )
         with _blamed(source.kind, source.section.place):
             module = source.kind(build)
@@ -170,7 +170,7 @@ class ModuleSet:
         self._add(module, build)
         return module
 
-    def build_or_leave_out(self, source: ModuleSource, without: Mapping[str, NotActing]) -> None:
+    def build_or_leave_out(self, source: ModuleSource, without: Mapping[str, NotSupported]) -> None:
         """Make the module of SOURCE, unless it is among those to be left out or turns out to be one.
 
         Raises ConfigError for a mistake.
@@ -180,7 +180,7 @@ class ModuleSet:
         if found is None:
             try:
                 self.build(source)
-            except NotActing as error:
+            except NotSupported as error:
                 found = error
         if found is not None:
             self.left_out[name] = LeftOut(name, source.section.place, source.kind, found.reason)
@@ -230,14 +230,14 @@ class ModuleSet:
             try:
                 with _blamed(type(module), self._places[module]):
                     module.link(self)
-            except NotActing as error:
-                raise _LinkNotActing(module.name, error) from None
+            except NotSupported as error:
+                raise _LinkNotSupported(module.name, error) from None
 
     def _replace(self, command: GCodeCommand, rename: str, build: Build) -> None:
         """Let COMMAND have its name, and whoever had it before the name RENAME."""
         name = command.name
         before = self._commands.get(name)
-        if not rename and name not in FREE_NAMES and (before is not None or name in HELPS):
+        if not rename and name not in FREE_NAMES and (before is not None or name in BUILTIN_HELP):
             # What has no help does nothing by itself: M106 without a fan is a name that is free.
             section = build.reader.section
             if section.misspelt or "rename_existing" in section.set_aside:
@@ -249,7 +249,7 @@ class ModuleSet:
                 f" with another name for that one, such as {name}{'.1' if name[1:].isdigit() else '_BASE'}",
             )
         if rename:
-            if not self.knows(name) and name not in self.not_acting:
+            if not self.knows(name) and name not in self.unsupported:
                 raise ConfigError(
                     build.place,
                     f"[{build.name}] has rename_existing, but there is no command {name}; remove that option",
@@ -260,7 +260,7 @@ class ModuleSet:
                     f"rename_existing of [{build.name}] is {rename}, which is a command already; choose a"
                     " name that none has",
                 )
-            self._commands[rename] = renamed(before, name, rename, beside=name in BESIDE)
+            self._commands[rename] = renamed(before, name, rename, while_printing=name in WHILE_PRINTING)
             self._owners[rename] = self._owners.get(name, build.name)
         self._commands[name] = command
         self._owners[name] = build.name
@@ -277,7 +277,7 @@ class ModuleSet:
         return command in self._commands or command in HANDLERS
 
     @property
-    def not_acting(self) -> Mapping[str, str]:
+    def unsupported(self) -> Mapping[str, str]:
         """Why nothing acts on commands that sections of the configuration should bring, by their names."""
         kinds = {name.partition(" ")[0]: name for name in reversed(tuple(self.config))}
         found: dict[str, str] = {}
@@ -293,9 +293,9 @@ class ModuleSet:
         return found
 
     @property
-    def helps(self) -> Mapping[str, str]:
+    def command_help(self) -> Mapping[str, str]:
         """What each command of programs does, by its name."""
-        return {**HELPS, **{name: command.help for name, command in self._commands.items()}}
+        return {**BUILTIN_HELP, **{name: command.help for name, command in self._commands.items()}}
 
     def find(self, name: str, kind: type[K]) -> K | None:
         """Return the module of section NAME, or None when there is none of KIND."""
@@ -326,14 +326,14 @@ class ModuleSet:
             self._too_cold,
             self._containing(INTERRUPTING & self._commands.keys()),
             self._containing(self._disturbing()),
-            self.not_acting,
+            self.unsupported,
             set_ups=tuple(self._set_ups),
         )
 
     def _disturbing(self) -> set[str]:
         """Return the commands that move or wait, so that they cannot run while a job prints."""
-        own = {name for name in HANDLERS if name not in BESIDE and name not in self._commands}
-        return own | {name for name, command in self._commands.items() if not command.beside}
+        own = {name for name in HANDLERS if name not in WHILE_PRINTING and name not in self._commands}
+        return own | {name for name, command in self._commands.items() if not command.while_printing}
 
     def _containing(self, commands: AbstractSet[str]) -> frozenset[str]:
         """Return COMMANDS, and macros in whose lines they come, directly or by way of others."""
@@ -346,7 +346,7 @@ class ModuleSet:
     def _too_cold(self, extruder: str) -> bool:
         if extruder in self.left_out:
             return self._live is not None  # nobody knows how hot it is; a plan takes it for granted
-        found = self.find(extruder, ExtruderHeater)
+        found = self.find(extruder, ExtruderHeaterSection)
         return found is not None and found.too_cold
 
     @property

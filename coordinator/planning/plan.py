@@ -26,7 +26,7 @@ from coordinator.motion.steps.steps import StepError, StepGenerator
 from coordinator.planning.figures import PlanFigures
 from coordinator.planning.options import PlanOptions
 from coordinator.planning.report import PlanReport
-from coordinator.planning.summary import Made, watched_nodes, write_files
+from coordinator.planning.summary import PlanResult, watched_nodes, write_files
 from coordinator.runtime.devices import MachineDevices, stream_specs
 from coordinator.streaming.compensation import Compensation, why_not_corrected
 from coordinator.streaming.pipeline import Pipeline
@@ -83,7 +83,7 @@ def plan_file(options: PlanOptions) -> PlanReport:
             f"{figures.bad_records} emitted commands make no sense; this is a bug of step generation"
         )
     chips = {name: dictionary.str_constant("MCU", "") for name, dictionary in dictionaries.items()}
-    made = Made(description, pipeline, figures, streams, specs, chips, notices, end.print_time_s)
+    made = PlanResult(description, pipeline, figures, streams, specs, chips, notices, end.print_time_s)
     return write_files(options, made.report())
 
 

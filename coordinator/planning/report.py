@@ -108,7 +108,7 @@ class PlanReport:
     warnings: tuple[str, ...]
     """What would go wrong or be lost, with g-code file and line."""
     notices: tuple[str, ...]
-    not_yet_acting: tuple[str, ...]
+    unsupported: tuple[str, ...]
     written: tuple[str, ...]
     """Files this plan wrote."""
 
@@ -125,7 +125,7 @@ class PlanReport:
         """Return the figures for a reader."""
         return "\n".join(
             [
-                *self.not_yet_acting,
+                *self.unsupported,
                 *self.notices,
                 (
                     f"{self.gcode}: {self.moves:,} moves in {_duration(self.print_time_s)}, "

@@ -48,7 +48,7 @@ def watched_nodes(
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class PlanResult:
     """A plan that is finished."""
 
     description: MachineDescription
@@ -95,7 +95,7 @@ class Made:
             ),
             warnings=tuple(self._warnings(steppers, nodes, bus_reports)),
             notices=tuple(self.notices),
-            not_yet_acting=tuple(str(entry) for entry in self.description.not_yet_acting),
+            unsupported=tuple(str(entry) for entry in self.description.unsupported),
             written=(),
         )
 

@@ -72,7 +72,7 @@ class MachineModules(Protocol):
     @property
     def vocabulary(self) -> Vocabulary: ...  # noqa: D102
     @property
-    def helps(self) -> Mapping[str, str]: ...  # noqa: D102
+    def command_help(self) -> Mapping[str, str]: ...  # noqa: D102
     def configure(self, config: NodeConfig) -> None: ...  # noqa: D102
     def node_started(self, node: Node) -> None: ...  # noqa: D102
     async def connect(self, machine: "Machine", say: Callable[[str], None]) -> None: ...  # noqa: D102

@@ -3,8 +3,7 @@
 import asyncio
 import contextlib
 
-from coordinator.gcode.commands import Done
-from coordinator.gcode.events import StandstillAction
+from coordinator.gcode.events import Done, StandstillAction
 from coordinator.runtime.machine import MachineStopped
 from nodes.support.errors import CanductorError
 

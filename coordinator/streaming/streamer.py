@@ -177,8 +177,8 @@ class Streamer:
         self._look_at_load()
 
     def _tell(self, cycle: Cycle) -> None:
-        for told in cycle.told:
-            self._on_output(told)
+        for output in cycle.output:
+            self._on_output(output)
         self._act(self._due.take(self.print_time_now(), cycle.due))
 
     async def _tell_on(self, cycle: Cycle) -> None:

@@ -49,7 +49,7 @@ class Cycle:
     """What one visit to the worker brought."""
 
     batches: list[tuple[int, bytes]]
-    told: list[ProgramOutput]
+    output: list[ProgramOutput]
     event: Event | None
     """What the job waits for; None: it has more."""
     planned: Planned
@@ -138,7 +138,7 @@ class MotionWorker:
     def work(self, waiting_for: Event | None) -> Cycle:
         """Let the job go on as far as it should by now, and make the commands that are due."""
         now = self.print_time_now()
-        told: list[ProgramOutput] = []
+        output: list[ProgramOutput] = []
         event = waiting_for
         if self.pipeline.compensation_due and self._all_generated():
             self.pipeline.compensate()
@@ -146,19 +146,19 @@ class MotionWorker:
         if not held and not self._still_waiting(waiting_for, now):
             self._planner.plan_until_s = now + PLAN_AHEAD_S
             self._begin_anew(now)
-            event = self._advance(told)
+            event = self._advance(output)
         elif isinstance(waiting_for, StandstillAction) and not waiting_for.over:
-            event = self._beside(waiting_for, told)
+            event = self._beside(waiting_for, output)
         if held or self._runs_dry(now):
             self._planner.flush()
         self._generate(now)
-        return self._cycle(told, event)
+        return self._cycle(output, event)
 
-    def _beside(self, resting: StandstillAction, told: list[ProgramOutput]) -> Event:
+    def _beside(self, resting: StandstillAction, output: list[ProgramOutput]) -> Event:
         """Let others be answered while the job waits, a heater may take minutes; return what to wait for."""
         while (event := self._job.attend_others()) is not None:
             if isinstance(event, Reply | Notice):
-                told.append(event)
+                output.append(event)
             elif isinstance(event, Timed):
                 self.pipeline.at_next_move(event)
             elif isinstance(event, Emergency):
@@ -170,12 +170,12 @@ class MotionWorker:
         self._generate(self.print_time_now())
         return self._cycle([], None)
 
-    def _cycle(self, told: Sequence[ProgramOutput], event: Event | None) -> Cycle:
+    def _cycle(self, output: Sequence[ProgramOutput], event: Event | None) -> Cycle:
         batches, self._batches = self._batches, []
         due, self.pipeline.due = self.pipeline.due, []
         if self._compensation is not None:
             self._compensation.note(self.steps)
-        return Cycle(batches, list(told), event, self._planned(), due, self._stepping() if batches else [])
+        return Cycle(batches, list(output), event, self._planned(), due, self._stepping() if batches else [])
 
     def _stepping(self) -> list[str]:
         """Return the steppers for which steps were made since the last time."""
@@ -237,12 +237,12 @@ class MotionWorker:
             and self.steps.generated_until >= self.pipeline.appended_until + self.steps.lag_s
         )
 
-    def _advance(self, told: list[ProgramOutput]) -> Event | None:
+    def _advance(self, output: list[ProgramOutput]) -> Event | None:
         """Step the job until it has to wait for something, or LINES_AT_ONCE are done."""
         for _ in range(LINES_AT_ONCE):
             event = self._job.step()
             if isinstance(event, Reply | Notice):
-                told.append(event)
+                output.append(event)
             elif isinstance(event, Progress):
                 continue
             elif isinstance(event, Timed):

@@ -29,7 +29,7 @@ LONG_AGO_S = -1e6
 REST_S = -1e3
 """A time within that rest, whatever the delays."""
 BLOCK_S = 0.25
-"""Antiderivatives are taken over stretches this long: their rounding grows with the square of it."""
+"""Antiderivatives are taken over segments this long: their rounding grows with the square of it."""
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from typing import Final
 
 from coordinator.heat.controller import NEAR_K
 from coordinator.heat.holding import SETTLING_S, Held
-from coordinator.modules.heaters.heater import HeaterUnit
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heater import Heater
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.runtime.machine import Machine
 from coordinator.virtual_machine.plant_heat import plant_word
 from nodes.virtual.plant_log import PlantEvent
@@ -105,11 +105,11 @@ class HeatWatch:
 
     def attach(self, machine: "Machine") -> None:
         """Watch MACHINE, which has connected."""
-        for heaters in machine.modules.of(Heaters):
+        for heaters in machine.modules.of(HeaterRegistry):
             for unit in heaters.units.values():
                 self._watch(machine, unit)
 
-    def _watch(self, machine: "Machine", unit: "HeaterUnit") -> None:
+    def _watch(self, machine: "Machine", unit: "Heater") -> None:
         time_base = machine.time_base()
 
         def note(held: Held) -> None:

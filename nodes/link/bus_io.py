@@ -20,6 +20,7 @@ from nodes.link.types import (
     Response,
     TransportKind,
 )
+from nodes.support.c_structs import from_struct
 
 _BATCH = 512
 """Events taken from the thread in one call."""
@@ -224,13 +225,6 @@ class LinkIO:
             self._on_closed(text)
 
 
-_COUNTERS = (
-    *("frames_sent", "frames_received", "frames_unclaimed", "frames_dropped", "frames_malformed"),
-    *("responses_dropped", "responses_max", "unclaimed_max", "admin_max", "bytes_sent", "bytes_received"),
-    *("waits", "wakeups", "bitrate", "received_bits", "queue_frames", "queued_max", "queue_waits"),
-)
-
-
 def _load(raw: Any, lib: Any) -> BusLoad:
     bits, rate = raw.recent_bits, raw.bitrate or 1
     return BusLoad(
@@ -244,8 +238,9 @@ def _load(raw: Any, lib: Any) -> BusLoad:
 
 
 def _convert(raw: Any, lib: Any) -> IOStats:
-    return IOStats(
-        **{name: getattr(raw, name) for name in _COUNTERS},
+    return from_struct(
+        IOStats,
+        raw,
         motion_bits=raw.sent_bits[lib.LINK_MOTION],
         control_bits=raw.sent_bits[lib.LINK_CONTROL],
         bulk_bits=raw.sent_bits[lib.LINK_BULK],

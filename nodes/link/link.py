@@ -9,6 +9,7 @@ from typing_extensions import Buffer
 
 from nodes.link.handle import BusHandle
 from nodes.link.types import Flow, LinkError, LinkSettings, LinkStats, Response
+from nodes.support.c_structs import from_struct
 
 _S_PER_NS = 1e-9
 
@@ -192,16 +193,8 @@ class Link:
         self._check(status)
 
 
-_COUNTERS = (
-    *("blocks_sent", "bytes_sent", "commands_sent", "commands_dropped", "blocks_repeated", "bytes_repeated"),
-    *("naks", "timeouts", "blocks_received", "bytes_received", "bytes_invalid", "acks_duplicate"),
-    *("acks_never_sent", "lead_count"),
-)
-_DEPTHS = ("pending", "flying_bytes", "flying_blocks")
-
-
 def _flow(raw: Any) -> Flow:
-    return Flow(raw.frames, raw.bits, raw.blocks)
+    return from_struct(Flow, raw)
 
 
 def _convert(raw: Any, lib: Any) -> LinkStats:
@@ -215,9 +208,12 @@ def _convert(raw: Any, lib: Any) -> LinkStats:
             f"{kind}_bytes": depth.bytes,
             f"{kind}_bytes_max": depth.bytes_max,
         }
-    return LinkStats(
-        **{name: getattr(link, name) for name in _COUNTERS},
-        **{name: getattr(raw, name) for name in _DEPTHS},
+    return from_struct(
+        LinkStats,
+        link,
+        pending=raw.pending,
+        flying_bytes=raw.flying_bytes,
+        flying_blocks=raw.flying_blocks,
         **depths,
         srtt_s=link.srtt_ns * _S_PER_NS,
         rttvar_s=link.rttvar_ns * _S_PER_NS,

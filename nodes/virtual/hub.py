@@ -22,6 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from nodes.support.c_structs import from_struct
 from nodes.support.errors import CanductorError
 from nodes.virtual._hub import ffi, lib
 from nodes.virtual.faults import RULES_MAX, BusFault
@@ -255,30 +256,16 @@ class VirtualBus:
 def _read_stats(loop: object, fault_count: int) -> BusStats:
     report: Any = ffi.new("struct hub_report *")
     lib.hub_loop_report(loop, report)
-    counters = report.counters
-    return BusStats(
-        frames=counters.frames,
-        bits=counters.bits,
-        lost=counters.lost,
-        busy_ns=counters.busy_ns,
-        rejected=counters.rejected,
-        expelled=counters.expelled,
-        refused=counters.refused,
-        lost_copies=counters.lost_copies,
-        corrupted=counters.corrupted,
-        duplicated=counters.duplicated,
-        errors=counters.errors,
-        delayed=counters.delayed,
-        bus_offs=counters.bus_offs,
-        unsent=counters.unsent,
-        unheard=counters.unheard,
+    return from_struct(
+        BusStats,
+        report.counters,
         late_ns_max=report.late_ns_max,
         realtime=report.realtime,
         clients=tuple(
-            ClientStats(c.place, c.counters.sent, c.counters.received, c.counters.rejected)
-            for c in report.clients[0 : report.client_count]
+            from_struct(ClientStats, client.counters, place=client.place)
+            for client in report.clients[0 : report.client_count]
         ),
-        faults=tuple(FaultStats(rule.picked, rule.hits) for rule in report.rules[0:fault_count]),
+        faults=tuple(from_struct(FaultStats, rule) for rule in report.rules[0:fault_count]),
     )
 
 

@@ -245,8 +245,8 @@ class ProjectCopy:
             os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
             for target in kept:
                 target.unlink(missing_ok=True)
-                if _aside(target).exists():
-                    _aside(target).rename(target)
+                if _interjection(target).exists():
+                    _interjection(target).rename(target)
 
     def _users(self, programs: Sequence[Program], path: Path) -> list[tuple[Program, list[Path]]]:
         """Return which of PROGRAMS contain PATH, each with the objects made of it; they must be built."""
@@ -284,19 +284,19 @@ class ProjectCopy:
             raise BuildError(done.output)
 
 
-def _aside(target: Path) -> Path:
+def _interjection(target: Path) -> Path:
     return target.with_name(target.name + ".base")
 
 
 def _keep(target: Path) -> Path:
     """Set TARGET aside, so that it can be compared and put back."""
     if target.exists():
-        target.rename(_aside(target))
+        target.rename(_interjection(target))
     return target
 
 
 def _same_content(target: Path) -> bool:
-    return _aside(target).exists() and _aside(target).read_bytes() == target.read_bytes()
+    return _interjection(target).exists() and _interjection(target).read_bytes() == target.read_bytes()
 
 
 def _same_code(original: bytes, changed: bytes) -> bool:

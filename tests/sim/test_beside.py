@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.builtins.basic import BESIDE
+from coordinator.gcode.builtins.basic import WHILE_PRINTING
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.module_set import build_modules
 from tests.stages.printer import PRINTING, Printer, gcode
@@ -102,7 +102,7 @@ def test_the_page_names_all_of_them(tmp_path: Path) -> None:
     description = printer.load()
     known = build_modules(description).vocabulary.commands
     own = {name for name in known if not name.startswith("_") and not name.startswith(("KEEP", "M221"))}
-    beside = {name for name in own if known[name].beside} | BESIDE
+    beside = {name for name in own if known[name].while_printing} | WHILE_PRINTING
     page = Path("docs/gcode.md").read_text(encoding="utf-8").partition("## Beside a job")[2]
     rows = " ".join(line for line in page.partition("## ")[0].splitlines() if line.startswith("| "))
     named = set(re.findall(r"\b(?:[A-Z]+(?:_[A-Z]+)+|[GM]\d+|PAUSE|RESUME|RESPOND|HELP|STATUS)\b", rows))

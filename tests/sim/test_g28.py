@@ -12,7 +12,7 @@ from tests.stages.switch_printer import STEPS_PER_MM, SwitchPrinter
 def test_all_axes_are_homed_and_the_program_goes_on(tmp_path: Path) -> None:
     printer = SwitchPrinter(tmp_path, {"x": -20.0, "y": 15.0, "z": -4.0})
     printer.run("G28", "G1 X30 Y200 Z10 F6000", "M114", "G1 X31", "M119")
-    assert printer.told == ["X:30.000 Y:200.000 Z:10.000 E:0.000", "x:open y:open z:open"]
+    assert printer.output == ["X:30.000 Y:200.000 Z:10.000 E:0.000", "x:open y:open z:open"]
     for axis, endstop_mm, wanted in (("x", 0, 31), ("y", 250, 200), ("z", -0.5, 10)):
         assert printer.true_mm(axis, endstop_mm) == pytest.approx(wanted, abs=1.1 / STEPS_PER_MM[axis]), axis
 

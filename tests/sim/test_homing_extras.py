@@ -43,7 +43,7 @@ def check_places(found: SwitchPrinter, x: float, y: float, z: float) -> None:
 
 def check_told(found: SwitchPrinter, x: float, y: float, z: float) -> None:
     """Make sure that the last answer of M114 is this place, but for the rest of a step."""
-    told = [float(word[2:]) for word in found.told[-1].split()[:3]]
+    told = [float(word[2:]) for word in found.output[-1].split()[:3]]
     for axis, at, wanted in zip("xyz", told, (x, y, z), strict=True):
         assert abs(at - wanted) < 1 / STEPS_PER_MM[axis], (axis, at)
 
@@ -87,7 +87,7 @@ def test_lines_stand_in_for_g28_and_g28_among_them_homes(tmp_path: Path) -> None
     override = f"\n[homing_override]\nset_position_z: 0\naxes: z\ngcode:\n{lines}"
     found = printer(tmp_path, override)
     found.run("G28", "G1 X101 Z2 F6000", "M114")
-    assert found.told == ["X:101.000 Y:100.000 Z:2.000 E:0.000"]
+    assert found.output == ["X:101.000 Y:100.000 Z:2.000 E:0.000"]
     check_places(found, 101, 100, 2)
     z, x = track(found, "z"), track(found, "x")
     assert max(place for at, place in z if at < x[0][0]) == pytest.approx(z[0][1] + 5, abs=0.01)
@@ -107,7 +107,7 @@ def test_the_lines_are_a_template_that_sees_what_is_asked_and_where_the_head_is_
     lines = "".join(f"  {line}\n" for line in text)
     found = printer(tmp_path, f"\n[homing_override]\nset_position_z: 2\naxes: xyz\ngcode:\n{lines}")
     found.run("G28 X0 Z", "M114")
-    assert found.told[0].split()[2] == "Z:7.000"
+    assert found.output[0].split()[2] == "Z:7.000"
     z = track(found, "z")
     assert z[-1][1] == pytest.approx(z[0][1] + 5, abs=0.01)
     assert track(found, "x")
@@ -125,7 +125,7 @@ def test_a_bad_template_is_told_with_its_line(tmp_path: Path) -> None:
 def test_g28_of_other_axes_is_not_overridden(tmp_path: Path) -> None:
     found = printer(tmp_path, "\n[homing_override]\naxes: z\ngcode:\n  G28 X\n")
     found.run("G28 Y", "G1 Y200 F6000", "M114")
-    assert found.told[0].split()[1] == "Y:200.000"
+    assert found.output[0].split()[1] == "Y:200.000"
     assert not track(found, "x")
 
 
@@ -162,7 +162,7 @@ def test_one_motor_moves_alone_and_the_place_can_be_said(tmp_path: Path) -> None
         "G1 Z12 F600",
         "M114",
     )
-    assert found.told == ["X:100.000 Y:100.000 Z:12.000 E:0.000"]
+    assert found.output == ["X:100.000 Y:100.000 Z:12.000 E:0.000"]
     z = track(found, "z")
     began = z[0][1] - 1 / 400
     assert z[-1][1] == pytest.approx(began + 4, abs=1.5 / 400)
@@ -205,7 +205,7 @@ def test_axes_can_be_said_to_be_unknown(tmp_path: Path) -> None:
 def test_without_leave_there_are_no_such_commands(tmp_path: Path) -> None:
     found = printer(tmp_path, "\n[force_move]\nenable_force_move: False\n")
     found.run("SET_KINEMATIC_POSITION X=5")
-    assert "unknown command SET_KINEMATIC_POSITION" in found.told[0]
+    assert "unknown command SET_KINEMATIC_POSITION" in found.output[0]
 
 
 # ------------------------------------------------------------------------------------------ homing_accel
@@ -230,7 +230,7 @@ def test_after_g28_the_head_is_within_its_limits_and_can_come_back_there(tmp_pat
     found.run(
         "G28", "M114", "SAVE_GCODE_STATE", "G91", "G1 X5 Y-5 Z3 F3000", "G90", "RESTORE_GCODE_STATE MOVE=1"
     )
-    x, y, z = (float(word[2:]) for word in found.told[-1].split()[:3])
+    x, y, z = (float(word[2:]) for word in found.output[-1].split()[:3])
     assert 0 <= x < 2 / STEPS_PER_MM["x"]
     assert 250 - 2 / STEPS_PER_MM["y"] < y <= 250
     assert z >= -1

@@ -93,11 +93,11 @@ def test_endstops_that_cannot_act_are_told(tmp_path: Path) -> None:
     for kinematics, acts in (("cartesian", True), ("corexy", True), ("corexz", False)):
         path.write_text(two_sides(kinematics))
         machine = load_machine(str(path))
-        waiting = [(entry.section, entry.options) for entry in machine.not_yet_acting]
+        waiting = [(entry.section, entry.options) for entry in machine.unsupported]
         assert waiting == ([] if acts else [("stepper_z1", ("endstop_pin",))])
         assert len(machine.rails[2].pieces) == (2 if acts else 1)
         assert [rail.axis for rail in machine.stops] == (["z", "z1"] if acts else ["z"])
     path.write_text(two_sides("cartesian").replace("^toolhead:PC6", "^PC5"))
     machine = load_machine(str(path))
-    assert not machine.not_yet_acting
+    assert not machine.unsupported
     assert [rail.axis for rail in machine.stops] == ["z"]

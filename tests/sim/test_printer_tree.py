@@ -130,7 +130,7 @@ def test_the_page_that_compares_knows_every_command(tmp_path: Path) -> None:
 
     async def go(stage: Served) -> None:
         assert stage.service.machine is not None
-        known = {name for name in stage.service.machine.modules.helps if not name.startswith("_")}
+        known = {name for name in stage.service.machine.modules.command_help if not name.startswith("_")}
         assert len(known) > 60
         assert sorted(known - rows - macros) == []
 

@@ -42,8 +42,8 @@ def test_a_file_is_printed_and_every_node_counts_what_it_was_sent(tmp_path: Path
     moved = steps(report)
     assert (moved["stepper_x"], moved["stepper_y"], moved["stepper_z"]) == (8000, -1600, 240)
     assert moved["extruder"] > 2000
-    told = report.to_json()
-    assert set(told["nodes"]) == set(NODES)  # type: ignore[call-overload]
+    output = report.to_json()
+    assert set(output["nodes"]) == set(NODES)  # type: ignore[call-overload]
     assert "stepper_x: moved by +8,000 steps, as its node counts them" in report.to_text()
     assert all(node.link.min_lead_s is not None and node.link.min_lead_s > 0 for node in report.outcome.nodes)
     assert machine.shut_down == set()
@@ -139,13 +139,13 @@ def test_a_dwell_before_the_first_move_outlasts_links_that_stand_still(tmp_path:
     """Its commands are sent 1.2 s ahead, those of a move at once 0.25 s; tests/smoke relies on this."""
     machine = DemoMachine(tmp_path)
 
-    def told(event: ProgramOutput) -> None:
+    def output(event: ProgramOutput) -> None:
         if "already home" in event.text:
             machine.stage._world.stall(0.9, python=False)  # the threads of its links get no turn
 
     def go() -> Outcome:
         dwell = ("G4 P1500",) if dwells else ()
-        return machine.print_lines(("G28", *dwell, "G1 X5 F300"), on_output=told)
+        return machine.print_lines(("G28", *dwell, "G1 X5 F300"), on_output=output)
 
     if dwells:
         outcome = go()

@@ -42,7 +42,7 @@ class Printer(MachineStage):
         config = folder / "home.cfg"
         config.write_text(machine)
         super().__init__(config, buses=buses, plant=PlantSettings(start=start))
-        self.told: list[str] = []
+        self.output: list[str] = []
         self.places: list[tuple[float, float]] = []
         """Where the head truly stood at each M119."""
         self._on_ready = on_ready
@@ -52,9 +52,9 @@ class Printer(MachineStage):
             lines, on_output=self._tell, on_ready=lambda machine: self._on_ready(self, machine)
         )
 
-    def _tell(self, told: ProgramOutput) -> None:
-        self.told.append(told.text)
-        if told.text.startswith("x:"):  # M119: it stands
+    def _tell(self, output: ProgramOutput) -> None:
+        self.output.append(output.text)
+        if output.text.startswith("x:"):  # M119: it stands
             self.places.append((self.true_mm("x"), self.true_mm("y")))
 
     @property
@@ -71,7 +71,7 @@ def test_axes_are_homed_by_what_their_drivers_feel_the_same_from_anywhere(tmp_pa
     spot = ("G1 X30 Y200 F9000", "M119")
     others = (("G1 X41.33 Y190.07",), ("G1 X3 Y247.123",))
     printer.print("G28 X Y", *spot, *(line for go in others for line in (*go, "G28 Y X", *spot)), "M114")
-    assert printer.told == ["x:open y:open"] * 3 + ["X:30.000 Y:200.000 Z:0.000 E:0.000"]
+    assert printer.output == ["x:open y:open"] * 3 + ["X:30.000 Y:200.000 Z:0.000 E:0.000"]
     # The motor counts as stalled when its field is up to two full steps ahead: so far from the stop.
     x, y = printer.places[0]
     assert x == pytest.approx(30 - 1.1 * FULL_STEP_MM, abs=0.6 * FULL_STEP_MM)
@@ -92,7 +92,7 @@ def test_towers_go_up_until_each_feels_its_end(tmp_path: Path) -> None:
         text += f"\n[tmc2209 stepper_{tower}]\n{wires}run_current: 0.8\ndriver_SGTHRS: 70\n"
     printer = Printer(tmp_path, (5.0, 3.0, 380.0), text)
     printer.print("G28", "G1 X20 Y10 Z350 F6000", "M114")
-    assert printer.told == ["X:20.000 Y:10.000 Z:350.000 E:0.000"]
+    assert printer.output == ["X:20.000 Y:10.000 Z:350.000 E:0.000"]
     inverse = printer.description.kinematics.inverse
     for tower, end, begin in zip("abc", inverse((20, 10, 350)), inverse((5.0, 3.0, 380.0)), strict=True):
         motor = printer.mcu.motors[f"stepper_{tower}"]
@@ -122,7 +122,7 @@ def test_a_driver_is_set_anew_when_its_node_comes_back(tmp_path: Path) -> None:
 
     printer = Printer(tmp_path, on_ready=come_back)
     printer.print("G4 P3000", "DUMP_TMC STEPPER=stepper_x REGISTER=CHOPCONF")
-    assert printer.told == ["CHOPCONF: 14030053 toff=3 hstrt=5 tbl=2 vsense=1 mres=4 intpol=1"]
+    assert printer.output == ["CHOPCONF: 14030053 toff=3 hstrt=5 tbl=2 vsense=1 mres=4 intpol=1"]
     (found,) = status
     assert (found["run_current"], found["hold_current"]) == (0.8, 0.5)
     assert found["drv_status"] == {"cs_actual": 15, "stst": 1}
@@ -149,7 +149,7 @@ def test_afterwards_the_drivers_are_as_they_were(tmp_path: Path) -> None:
     )
     # The data sheet's formula has 1.77 A for a scale of 31 and vsense 0: 1.2 A is 21, and 0.5 A is 8.
     ofs = "pwm_ofs=36 pwm_grad=33"
-    assert printer.told[:9] == [
+    assert printer.output[:9] == [
         "GCONF: 000001c4 en_spreadcycle=1 pdn_disable=1 mstep_reg_select=1 multistep_filt=1",
         "GCONF: 000001c0 pdn_disable=1 mstep_reg_select=1 multistep_filt=1",
         "CHOPCONF: 14030053 toff=3 hstrt=5 tbl=2 vsense=1 mres=4 intpol=1",
@@ -160,8 +160,8 @@ def test_afterwards_the_drivers_are_as_they_were(tmp_path: Path) -> None:
         f"PWMCONF: c80d2124 {ofs} pwm_freq=1 pwm_autoscale=1 pwm_autograd=1 pwm_reg=8 pwm_lim=12",
         "TPWMTHRS: 00000139 tpwmthrs=313 (as written)",
     ]
-    assert printer.told[9:11] == [printer.told[0], "GSTAT: 00000000"]
-    assert [line.split(":")[0] for line in printer.told[-3:]] == ["PWMCONF", "PWM_SCALE", "PWM_AUTO"]
+    assert printer.output[9:11] == [printer.output[0], "GSTAT: 00000000"]
+    assert [line.split(":")[0] for line in printer.output[-3:]] == ["PWMCONF", "PWM_SCALE", "PWM_AUTO"]
 
 
 @pytest.mark.parametrize(
@@ -210,8 +210,8 @@ def test_a_driver_that_gets_warm_is_told_of_once(tmp_path: Path) -> None:
 
     printer = Printer(tmp_path, on_ready=warm)
     printer.print("G4 P6000")
-    (told,) = printer.told
-    assert told.startswith("the driver of stepper_y ([tmc2209 stepper_y]) is getting too hot; lower")
+    (output,) = printer.output
+    assert output.startswith("the driver of stepper_y ([tmc2209 stepper_y]) is getting too hot; lower")
 
 
 def test_a_driver_that_falls_silent_while_an_axis_homes(tmp_path: Path) -> None:

@@ -5,7 +5,8 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from coordinator.assembly.load import load_machine
-from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, InTime, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading, Synchronized
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import parse
 from coordinator.modules.module_set import ModuleSet, build_modules
 from coordinator.runtime.machine import Machine, MachineStopped
@@ -122,13 +123,13 @@ class HeatMachine(MachineStage):
     async def do(self, line: str) -> tuple[str, ...]:
         """Carry out a line as at rest; return what it answers."""
         reading = self.read(line)
-        if isinstance(reading, AtRest):
+        if isinstance(reading, AtStandstill):
             done: Done | None = await reading.perform()
             return done.replies if done is not None else ()
-        if isinstance(reading, InTime):
+        if isinstance(reading, Synchronized):
             reading.act(0.0)
             return ()
-        assert isinstance(reading, AtOnce)
+        assert isinstance(reading, Immediate)
         return reading.replies
 
     def status(self, section: str) -> dict[str, Value]:

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coordinator.assembly.load import load_machine
-from coordinator.gcode.commands import Done
 from coordinator.gcode.errors import GCodeError
-from coordinator.gcode.events import End, Event, Full, Notice, Progress, Reply, StandstillAction
+from coordinator.gcode.events import Done, End, Event, Full, Notice, Progress, Reply, StandstillAction
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.program import Program
 from coordinator.modules.module_set import build_modules

@@ -26,7 +26,7 @@ class SwitchPrinter:
     machine: str = SWITCHES_CFG
     settings: str = ""
     seed: int = 0
-    told: list[str] = field(default_factory=list)
+    output: list[str] = field(default_factory=list)
 
     def run(self, *lines: str) -> Outcome:
         (self.folder / "home.cfg").write_text(self.machine)
@@ -58,8 +58,8 @@ class SwitchPrinter:
             host=self.stage.host,
         )
 
-    def _tell(self, told: ProgramOutput) -> None:
-        self.told.append(told.text)
+    def _tell(self, output: ProgramOutput) -> None:
+        self.output.append(output.text)
 
     def true_mm(self, axis: str, endstop_mm: float) -> float:
         """Return where an axis is, with its switch at ENDSTOP_MM, by the steps that were made."""

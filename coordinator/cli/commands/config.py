@@ -10,7 +10,7 @@ from coordinator.assembly.check import check_config
 from coordinator.assembly.consequences import meaning
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
-from coordinator.config.model import NotYetActing
+from coordinator.config.model import Unsupported
 from coordinator.support.report import Report
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import add_command, add_group, existing_file
@@ -48,7 +48,7 @@ class CheckReport:
     problems: Sequence[CanductorError]
     notices: Sequence[str]
     """What is worth knowing, when nothing is wrong."""
-    not_acting: Sequence[NotYetActing] = ()
+    unsupported: Sequence[Unsupported] = ()
     """What is right but does not act, when nothing is wrong."""
 
     @property
@@ -66,7 +66,7 @@ class CheckReport:
                 for problem in self.problems
             ],
             "notices": list(self.notices),
-            "not_acting": [
+            "unsupported": [
                 {
                     "section": entry.section,
                     "options": list(entry.options),
@@ -75,7 +75,7 @@ class CheckReport:
                     "reason": entry.reason,
                     "meaning": meaning(entry),
                 }
-                for entry in self.not_acting
+                for entry in self.unsupported
             ],
         }
 
@@ -87,12 +87,12 @@ class CheckReport:
 
     def _not_acting_lines(self) -> list[str]:
         """Return the list of what will not act, and what that means for a print."""
-        if not self.not_acting:
+        if not self.unsupported:
             return []
         return [
             "",
             "What will not act, and what that means for a print:",
-            *(f"  {entry}: {meaning(entry)}" for entry in self.not_acting),
+            *(f"  {entry}: {meaning(entry)}" for entry in self.unsupported),
         ]
 
 
@@ -102,7 +102,7 @@ def check(path: str) -> CheckReport:
     if problems:
         return CheckReport(path, problems, ())
     described = load_machine(path)
-    return CheckReport(path, problems, described.notes, described.not_yet_acting)
+    return CheckReport(path, problems, described.notes, described.unsupported)
 
 
 @dataclass(frozen=True, slots=True)

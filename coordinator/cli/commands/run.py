@@ -161,7 +161,7 @@ def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
 
 
 def _announce(description: MachineDescription) -> None:
-    for line in (*description.not_yet_acting, *description.notes):
+    for line in (*description.unsupported, *description.notes):
         _say(str(line))
 
 

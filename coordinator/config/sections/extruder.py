@@ -7,7 +7,7 @@ from coordinator.config.file import RawSection
 from coordinator.config.model import ExtruderDescription, ExtruderStepperDescription
 from coordinator.config.options import FloatOption, SectionReader, SectionSpec, TextOption
 from coordinator.config.sections.bounds import MAX_ACCEL, MAX_SPEED
-from coordinator.config.sections.heater_options import EXTRUDER_HEATER_OPTIONS, LATER_HEATER_OPTIONS
+from coordinator.config.sections.heater_options import EXTRUDER_HEATER_OPTIONS, UNSUPPORTED_HEATER_OPTIONS
 from coordinator.config.sections.printer import PrinterSection
 from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.steppers import MOTOR, read_stepper
@@ -89,7 +89,7 @@ EXTRUDER = SectionSpec(
         PRESSURE_ADVANCE,
         SMOOTH_TIME,
     ),
-    later=LATER_EXTRUDER_OPTIONS + LATER_HEATER_OPTIONS,
+    later=LATER_EXTRUDER_OPTIONS + UNSUPPORTED_HEATER_OPTIONS,
     elsewhere=tuple(option.name for option in EXTRUDER_HEATER_OPTIONS),
 )
 FOLLOWED = TextOption(

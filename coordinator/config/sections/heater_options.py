@@ -148,7 +148,7 @@ HEATER_OPTIONS: Final[tuple[Option[Any], ...]] = (
     CYCLE_TIME,
     MAX_DURATION,
 )
-LATER_HEATER_OPTIONS: Final = (
+UNSUPPORTED_HEATER_OPTIONS: Final = (
     *LATER_SENSOR_OPTIONS,
     "pid_version",
     "pid_tolerance",

@@ -1,6 +1,6 @@
 """How a rail is homed: its endstop, and the speeds towards it."""
 
-from coordinator.config.errors import NotActing
+from coordinator.config.errors import NotSupported
 from coordinator.config.model import HomingDescription
 from coordinator.config.options import BoolOption, FloatOption, SectionReader
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
@@ -76,7 +76,7 @@ def read_endstop(reader: SectionReader, pins: PinRegistry) -> tuple[PinDescripti
         return (None if diag is None else pins.claim(diag, ENDSTOP_PIN, reader.section)), virtual
     try:
         return pins.claim(pin, ENDSTOP_PIN, reader.section), ""
-    except NotActing:
+    except NotSupported:
         return None, f"{pin.node}:{pin.name}"
 
 

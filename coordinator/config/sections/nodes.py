@@ -9,9 +9,9 @@ from coordinator.config.model import (
     CanConnection,
     NodeDescription,
     NodePolicy,
-    NotYetActing,
     StepperDescription,
     UartConnection,
+    Unsupported,
 )
 from coordinator.config.options import (
     BadValue,
@@ -81,7 +81,7 @@ _CHIP_PINS = {"adc_scaled": "", "ads1x1x": "", "ads1118": "", "sx1509": "sx1509_
 _NODE_NAME = re.compile(r"[A-Za-z0-9_.-]+", re.ASCII)
 
 
-def read_nodes(config: ConfigFile, later: list[NotYetActing]) -> tuple[NodeDescription, ...]:
+def read_nodes(config: ConfigFile, later: list[Unsupported]) -> tuple[NodeDescription, ...]:
     """Return all nodes, the primary first; raises ConfigError."""
     if PRIMARY_NODE not in config.sections:
         raise ConfigError(
@@ -95,7 +95,7 @@ def read_nodes(config: ConfigFile, later: list[NotYetActing]) -> tuple[NodeDescr
     return nodes
 
 
-def _read_node(section: RawSection, later: list[NotYetActing]) -> NodeDescription:
+def _read_node(section: RawSection, later: list[Unsupported]) -> NodeDescription:
     name = section.instance or PRIMARY_NODE
     if section.instance == PRIMARY_NODE or not _NODE_NAME.fullmatch(name):
         raise ConfigError(section.place, f"{shown(name)} is not a name for a node; use letters, digits and _")
@@ -119,7 +119,7 @@ def _read_node(section: RawSection, later: list[NotYetActing]) -> NodeDescriptio
     if isinstance(connection, UartConnection) and reader.find(RESTART_METHOD) not in (None, "command"):
         waiting.append(RESTART_METHOD.name)  # so far a node is only reset by its own commands
     if waiting:
-        later.append(NotYetActing(section.name, section.place, tuple(waiting)))
+        later.append(Unsupported(section.name, section.place, tuple(waiting)))
     return NodeDescription(name, connection, section.place, policy, reader.place_of(POLICY))
 
 

@@ -8,7 +8,7 @@ from coordinator.config.sections.bounds import MAX_BELT_POSITION, MAX_POSITION
 from coordinator.config.sections.homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
 from coordinator.config.sections.reading import Reading, SecondEndstop
 from coordinator.config.sections.steppers import MOTOR, TURNING_MOTOR, extra_sections, read_stepper
-from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.base import StepFunction
 
 
@@ -40,7 +40,7 @@ RANGE = (POSITION_MIN, POSITION_MAX)
 RAIL = SectionSpec(
     help="The first stepper of an axis, with the axis' range and its homing",
     options=(*MOTOR, *RANGE, *HOMING),
-    later=LATER_STEPPER_OPTIONS,
+    later=UNSUPPORTED_STEPPER_OPTIONS,
 )
 EXTRA_STEPPER = SectionSpec(
     help="A further stepper of an axis, tower or arm: stepper_z1, …; one of an axis that no other rail moves"

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from coordinator.config.errors import MissingSection, Place
 from coordinator.config.file import ConfigFile, RawSection
-from coordinator.config.model import NotYetActing
+from coordinator.config.model import Unsupported
 from coordinator.config.options import SectionReader
 from coordinator.config.pins import PinDescription, PinRegistry
 
@@ -26,7 +26,7 @@ class Reading:
 
     config: ConfigFile
     pins: PinRegistry
-    later: list[NotYetActing] = field(default_factory=list)
+    later: list[Unsupported] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
     """Names of sections that have a place in this machine."""
     second_endstops: dict[str, SecondEndstop] = field(default_factory=dict)
@@ -58,4 +58,4 @@ class Reading:
         unread = {option.name for option in reader.finish()}
         names = tuple(name for name in reader.section.options if name in unread or name in waiting)
         if names:
-            self.later.append(NotYetActing(reader.name, reader.place, names))
+            self.later.append(Unsupported(reader.name, reader.place, names))

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from coordinator.config.model import NotYetActing, RailDescription
+from coordinator.config.model import RailDescription, Unsupported
 from coordinator.config.sections.kinematics.frame import Frame
 from coordinator.config.sections.reading import Reading
 
@@ -22,7 +22,7 @@ def with_second_endstops(reading: Reading, frame: Frame) -> Frame:
             for rail in frame.rails
         )
         if name not in acting and not shared:
-            reading.later.append(NotYetActing(second.section, second.place, ("endstop_pin",)))
+            reading.later.append(Unsupported(second.section, second.place, ("endstop_pin",)))
     dual = frame.dual_carriage
     if dual is not None:
         same = dict(zip((rail.axis for rail in frame.rails), rails, strict=True))

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Iterator
 
-from coordinator.config.errors import ConfigError, NotActing
+from coordinator.config.errors import ConfigError, NotSupported
 from coordinator.config.file import RawSection
 from coordinator.config.model import StepperDescription
 from coordinator.config.options import FloatOption, GearRatioOption, IntOption, SectionReader
@@ -89,7 +89,7 @@ def _claim_enable(reader: SectionReader, pins: PinRegistry) -> tuple[PinDescript
         return None, ""
     try:
         return claim(reader, ENABLE_PIN, pins), ""
-    except NotActing as error:
+    except NotSupported as error:
         return None, error.reason
 
 

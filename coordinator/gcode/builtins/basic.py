@@ -1,25 +1,19 @@
 """The commands that every machine has: modes, dwells, homing, limits. The hot path of moves is in C."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 from coordinator.gcode.builtins import machine as machine_commands
 from coordinator.gcode.builtins import state as state_commands
-from coordinator.gcode.commands import AtRest, Done
-from coordinator.gcode.events import Emergency, Reply, Wait
+from coordinator.gcode.commands import AtStandstill, ProgramContext
+from coordinator.gcode.events import Done, Emergency, Reply, Wait
 from coordinator.gcode.parser import Command, WordError, number
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.motion.planner.language import ARC_LETTERS, Plane
 from coordinator.motion.planner.planner import AXIS_LETTERS, MOVE_LETTERS, FeedStatus
 
-if TYPE_CHECKING:
-    from coordinator.gcode.interpreter import Job
-
-    Handler = Callable[[Job, Command], bool]
-    """Acts on a command; False when the planner must be emptied first and the line comes again. Before it
-    returns False it changes nothing but the planner's queue."""
+Handler = Callable[[ProgramContext, Command], bool]
+"""Acts on a command; False when the planner must be emptied first and the line comes again. Before it
+returns False it changes nothing but the planner's queue."""
 
 MAX_DWELL_S = 86400.0
 
@@ -36,7 +30,7 @@ def _positive(command: Command, words: Mapping[str, float]) -> None:
             raise WordError(f"{letter} of {command.name} is {value:g}; it must be above 0")
 
 
-def _move(job: Job, command: Command) -> bool:
+def _move(job: ProgramContext, command: Command) -> bool:
     """G0, G1 that the hot path refused: unusual words, or numbers of many digits."""
     words = command.words()
     for letter in words.keys() - set(MOVE_LETTERS):
@@ -48,7 +42,7 @@ def _move(job: Job, command: Command) -> bool:
     return status is not FeedStatus.FULL
 
 
-def _dwell(job: Job, command: Command) -> bool:
+def _dwell(job: ProgramContext, command: Command) -> bool:
     words = _numbers(command, "PS")
     seconds = words.get("P", 0.0) / 1000 + words.get("S", 0.0)
     if not 0 <= seconds <= MAX_DWELL_S:
@@ -60,7 +54,7 @@ def _dwell(job: Job, command: Command) -> bool:
 
 
 def _unit(unit_mm: float) -> Handler:
-    def handle(job: Job, _command: Command) -> bool:
+    def handle(job: ProgramContext, _command: Command) -> bool:
         job.planner.unit_mm = unit_mm
         return True
 
@@ -68,7 +62,7 @@ def _unit(unit_mm: float) -> Handler:
 
 
 def _relative(*, relative: bool) -> Handler:
-    def handle(job: Job, _command: Command) -> bool:
+    def handle(job: ProgramContext, _command: Command) -> bool:
         job.planner.relative = relative
         return True
 
@@ -76,20 +70,20 @@ def _relative(*, relative: bool) -> Handler:
 
 
 def _relative_extrusion(*, relative: bool) -> Handler:
-    def handle(job: Job, _command: Command) -> bool:
+    def handle(job: ProgramContext, _command: Command) -> bool:
         job.planner.relative_extrusion = relative
         return True
 
     return handle
 
 
-def _home(job: Job, command: Command) -> bool:
+def _home(job: ProgramContext, command: Command) -> bool:
     named = [axis for axis in command.words() if axis in "XYZ"]
     axes = "".join(sorted(named or job.homed_position))
     for axis in axes:
         if axis not in job.homed_position:
             raise WordError(f"G28 names the axis {axis}, which this machine does not have")
-    if not machine_commands.come_to_rest(job):
+    if not machine_commands.come_to_standstill(job):
         return False
     x, y, z, e = (
         job.homed_position[letter] if letter in axes else now
@@ -101,10 +95,12 @@ def _home(job: Job, command: Command) -> bool:
         job.take(home)
         return True
     reading = job.vocabulary.home(job.call(command), axes)
-    return job.follow(command, AtRest(reading.perform, home) if isinstance(reading, AtRest) else reading)
+    if isinstance(reading, AtStandstill):
+        reading = AtStandstill(reading.perform, home)
+    return job.follow(command, reading)
 
 
-def _set_origin(job: Job, command: Command) -> bool:
+def _set_origin(job: ProgramContext, command: Command) -> bool:
     words = _numbers(command, AXIS_LETTERS)
     if command.text and not words:
         return True  # only what has no meaning: that is not the bare G92
@@ -112,7 +108,7 @@ def _set_origin(job: Job, command: Command) -> bool:
     return True
 
 
-def _set_accel(job: Job, command: Command) -> bool:
+def _set_accel(job: ProgramContext, command: Command) -> bool:
     """M204 that the hot path refused: above what is configured, or of unusual words."""
     words = _numbers(command, "SPTR")
     words.pop("R", None)
@@ -128,7 +124,7 @@ def _set_accel(job: Job, command: Command) -> bool:
 
 
 def _limit_axes(what: str) -> Handler:
-    def handle(job: Job, command: Command) -> bool:
+    def handle(job: ProgramContext, command: Command) -> bool:
         """M201, M203: what slicers write as the machine's limits; those of the configuration hold, too."""
         words = _numbers(command, AXIS_LETTERS)
         _positive(command, words)
@@ -138,7 +134,7 @@ def _limit_axes(what: str) -> Handler:
     return handle
 
 
-def _set_jerk(job: Job, command: Command) -> bool:
+def _set_jerk(job: ProgramContext, command: Command) -> bool:
     """M205: the lesser of X and Y is the speed at a right-angled corner; the rest means nothing here."""
     words = _numbers(command, "XYZEBSTJ")
     corner = [words[letter] for letter in "XY" if letter in words]
@@ -148,12 +144,12 @@ def _set_jerk(job: Job, command: Command) -> bool:
     return True
 
 
-def _cap(job: Job, what: str, asked: float, limit: float) -> None:
+def _cap(job: ProgramContext, what: str, asked: float, limit: float) -> None:
     if asked > limit:
         job.notice(f"{what} {asked:g} is above the configured {limit:g}", f"{limit:g} is used")
 
 
-def _set_velocity_limit(job: Job, command: Command) -> bool:
+def _set_velocity_limit(job: ProgramContext, command: Command) -> bool:
     planner, limits = job.planner, job.planner.limits
     values = command.only_parameters(("VELOCITY", "ACCEL", "SQUARE_CORNER_VELOCITY", "MINIMUM_CRUISE_RATIO"))
     numbers = {key: number(command.name, values, key) for key in values}
@@ -177,7 +173,7 @@ def _set_velocity_limit(job: Job, command: Command) -> bool:
     return True
 
 
-def _factor(job: Job, command: Command) -> bool:
+def _factor(job: ProgramContext, command: Command) -> bool:
     """M220, M221: percent in S; without it, nothing changes."""
     percent = _numbers(command, "S").get("S")
     if percent is None:
@@ -191,14 +187,14 @@ def _factor(job: Job, command: Command) -> bool:
     return True
 
 
-def _wait_for_moves(job: Job, _command: Command) -> bool:
+def _wait_for_moves(job: ProgramContext, _command: Command) -> bool:
     if not job.planner.flush():
         return False
     job.emit(Wait(job.line, job.planner.print_time_end_s))
     return True
 
 
-def _tell_position(job: Job, _command: Command) -> bool:
+def _tell_position(job: ProgramContext, _command: Command) -> bool:
     position = zip(AXIS_LETTERS, job.planner.gcode_position, strict=True)
     job.emit(
         Reply(job.line, " ".join(f"{letter}:{value:.3f}" for letter, value in position), ReplyKind.PLAIN)
@@ -206,13 +202,13 @@ def _tell_position(job: Job, _command: Command) -> bool:
     return True
 
 
-def _emergency(job: Job, _command: Command) -> bool:
+def _emergency(job: ProgramContext, _command: Command) -> bool:
     job.end_with(Emergency(job.line))
     return True
 
 
 def _without_module(what: str) -> Handler:
-    def handle(job: Job, command: Command) -> bool:
+    def handle(job: ProgramContext, command: Command) -> bool:
         job.record(command)
         job.notice(what, "accepted and recorded, but without effect: no module acts on them yet")
         return True
@@ -220,20 +216,20 @@ def _without_module(what: str) -> Handler:
     return handle
 
 
-def _ignore(_job: Job, _command: Command) -> bool:
+def _ignore(_job: ProgramContext, _command: Command) -> bool:
     return True
 
 
-def _say(job: Job, command: Command) -> bool:
+def _say(job: ProgramContext, command: Command) -> bool:
     job.emit(Reply(job.line, f"echo: {command.text.strip()}", ReplyKind.PLAIN))
     return True
 
 
-def _refuse_spline(_job: Job, command: Command) -> bool:
+def _refuse_spline(_job: ProgramContext, command: Command) -> bool:
     raise WordError(f"{command.name} curves are not supported; have the slicer write straight moves (G1)")
 
 
-def _arc(job: Job, command: Command) -> bool:
+def _arc(job: ProgramContext, command: Command) -> bool:
     """G2, G3 that the hot path refused: unusual words, an impossible arc."""
     planner = job.planner
     if not planner.arc_open:
@@ -251,7 +247,7 @@ def _arc(job: Job, command: Command) -> bool:
 
 
 def _plane(plane: Plane) -> Handler:
-    def handle(job: Job, _command: Command) -> bool:
+    def handle(job: ProgramContext, _command: Command) -> bool:
         job.planner.plane = plane
         return True
 
@@ -262,9 +258,9 @@ _HEATS = ("M104", "M109", "M140", "M190")
 _told_heat = _without_module("heater and fan commands")
 
 
-def _heat(job: Job, command: Command) -> bool:
+def _heat(job: ProgramContext, command: Command) -> bool:
     """Accept what is for a heater or fan that the machine does not have, not for one that does not act."""
-    why = job.vocabulary.not_acting.get(command.name)
+    why = job.vocabulary.unsupported.get(command.name)
     if why is None:
         return _told_heat(job, command)
     words = command.words()
@@ -277,7 +273,7 @@ def _heat(job: Job, command: Command) -> bool:
 
 
 _motors_off = _without_module("motor-off commands")
-BESIDE = frozenset(
+WHILE_PRINTING = frozenset(
     (
         *("M73", "M105", "M112", "M114", "M117", "M118", "M204", "M220", "M221"),
         *("GET_POSITION", "SET_GCODE_OFFSET", "SET_PRESSURE_ADVANCE", "SET_VELOCITY_LIMIT"),

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Final
 
-HELPS: Final[Mapping[str, str]] = {
+BUILTIN_HELP: Final[Mapping[str, str]] = {
     "ACTIVATE_EXTRUDER": "Let E move EXTRUDER",
     "G0": "Move to X Y Z E at F mm/min",
     "G1": "Move to X Y Z E at F mm/min",

@@ -5,21 +5,16 @@ the steps made of them (shapers, windows, who follows whom) comes to a standstil
 generation as an event with its print time.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+from coordinator.gcode.commands import ProgramContext
 from coordinator.gcode.events import PositionSet, Reply, ShaperChange, SmoothTimeChange, WeightsChange
 from coordinator.gcode.machine_state import SHAPER_AXES, Extruder, MachineState, Shaper
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.kinematics.dual_carriage import CarriageMode, CarriageState, DualCarriage
 from coordinator.motion.steps.shapers import split_kind
-
-if TYPE_CHECKING:
-    from coordinator.gcode.interpreter import Job
 
 MAX_FREQUENCY_HZ = 1000.0
 MAX_ADVANCE_S = 10.0
@@ -29,7 +24,7 @@ NO_TOOLS_FROM = 100
 _TOOL = re.compile(r"T\d{1,9}")
 
 
-def come_to_rest(job: Job, settle_s: float = 0.0) -> bool:
+def come_to_standstill(job: ProgramContext, settle_s: float = 0.0) -> bool:
     """Plan to a standstill of at least SETTLE_S, after which no step is left; False: call again."""
     if not job.planner.flush():
         return False
@@ -37,14 +32,14 @@ def come_to_rest(job: Job, settle_s: float = 0.0) -> bool:
     return True
 
 
-def begin(job: Job) -> None:
+def begin(job: ProgramContext) -> None:
     """Let JOB's planner begin as its machine's state says."""
     if job.machine.active is not None:
         _use_extruder(job, job.machine.active)
     _keep_apart(job)
 
 
-def home_carriages(job: Job, axes: str, second_mm: float | None = None) -> None:
+def home_carriages(job: ProgramContext, axes: str, second_mm: float | None = None) -> None:
     """After homing, the first carriage is the head and the second is parked; the machine is at rest.
 
     SECOND_MM: where the second one stands, if that is not exactly its home.
@@ -90,7 +85,7 @@ def _number(command: Command, values: Mapping[str, str], key: str, high: float) 
     return value
 
 
-def _extruder(job: Job, command: Command, name: str | None) -> Extruder:
+def _extruder(job: ProgramContext, command: Command, name: str | None) -> Extruder:
     """Return the extruder NAME, without a name the active one."""
     extruders = job.machine.extruders
     chosen = job.machine.active if name is None else extruders.get(name)
@@ -104,7 +99,7 @@ def _extruder(job: Job, command: Command, name: str | None) -> Extruder:
 # ---- Extruders -------------------------------------------------------------------------------------------
 
 
-def set_pressure_advance(job: Job, command: Command) -> bool:
+def set_pressure_advance(job: ProgramContext, command: Command) -> bool:
     """ADVANCE holds for the moves to come; SMOOTH_TIME, where it changes, from a standstill on.
 
     So does the first ADVANCE above 0, which needs the window.
@@ -124,12 +119,12 @@ def set_pressure_advance(job: Job, command: Command) -> bool:
     needed = smooth if smooth is not None else extruder.smooth_s
     window = needed if advance or extruder.window_s else 0.0
     if window != extruder.window_s:
-        if job.beside:
+        if job.while_printing:
             raise WordError(
                 f"{command.name} needs a standstill for the first ADVANCE, and for another SMOOTH_TIME; pause"
                 " the job first"
             )
-        if not come_to_rest(job, window):
+        if not come_to_standstill(job, window):
             return False
         extruder.window_s = window
         job.emit(SmoothTimeChange(job.line, extruder.name, window, job.planner.print_time_end_s))
@@ -144,7 +139,7 @@ def set_pressure_advance(job: Job, command: Command) -> bool:
     return True
 
 
-def activate_extruder(job: Job, command: Command) -> bool:
+def activate_extruder(job: ProgramContext, command: Command) -> bool:
     """ACTIVATE_EXTRUDER EXTRUDER=name: from now on E moves this one, and reads where this one stands."""
     values = _parameters(command, ("EXTRUDER",))
     return _activate(job, _extruder(job, command, _needed(command, values, "EXTRUDER")))
@@ -155,7 +150,7 @@ def is_tool(name: str) -> bool:
     return _TOOL.fullmatch(name) is not None
 
 
-def select_tool(job: Job, command: Command) -> bool:
+def select_tool(job: ProgramContext, command: Command) -> bool:
     """T0, T1, ...: the extruders in their order."""
     extruders = job.machine.extruders
     if not extruders and command.name == "T0":
@@ -172,11 +167,11 @@ def select_tool(job: Job, command: Command) -> bool:
     return _activate(job, tool)
 
 
-def _activate(job: Job, extruder: Extruder) -> bool:
+def _activate(job: ProgramContext, extruder: Extruder) -> bool:
     motion = job.machine.filament
     if motion is None or motion.active == extruder.name:
         return True
-    if not come_to_rest(job):
+    if not come_to_standstill(job):
         return False
     _change_places(job, job.machine.active, extruder)
     job.machine.filament = motion.activate(extruder.name)
@@ -185,7 +180,7 @@ def _activate(job: Job, extruder: Extruder) -> bool:
     return True
 
 
-def _change_places(job: Job, before: Extruder | None, after: Extruder) -> None:
+def _change_places(job: ProgramContext, before: Extruder | None, after: Extruder) -> None:
     """Let E read where AFTER was left; the machine's E axis goes on from where BEFORE has brought it."""
     planner = job.planner
     if before is not None:
@@ -193,17 +188,17 @@ def _change_places(job: Job, before: Extruder | None, after: Extruder) -> None:
     planner.set_gcode_position({"E": after.place_mm / planner.unit_mm})
 
 
-def _use_extruder(job: Job, extruder: Extruder) -> None:
+def _use_extruder(job: ProgramContext, extruder: Extruder) -> None:
     job.planner.set_extruder_limits(extruder.limits)
     job.planner.pressure_advance = extruder.pressure_advance_s
 
 
-def _follow(job: Job) -> None:
+def _follow(job: ProgramContext) -> None:
     if job.machine.filament is not None:
         job.emit(WeightsChange(job.line, job.machine.filament.weights(), job.planner.print_time_end_s))
 
 
-def sync_extruder_motion(job: Job, command: Command) -> bool:
+def sync_extruder_motion(job: ProgramContext, command: Command) -> bool:
     """EXTRUDER: a filament stepper; MOTION_QUEUE: the extruder it moves with, empty for none."""
     values = _parameters(command, ("EXTRUDER", "MOTION_QUEUE"))
     stepper, queue = (_needed(command, values, key) for key in ("EXTRUDER", "MOTION_QUEUE"))
@@ -213,7 +208,7 @@ def sync_extruder_motion(job: Job, command: Command) -> bool:
     after = motion.sync(stepper, queue)
     if after == motion:
         return True
-    if not come_to_rest(job):
+    if not come_to_standstill(job):
         return False
     job.machine.filament = after
     _follow(job)
@@ -223,7 +218,7 @@ def sync_extruder_motion(job: Job, command: Command) -> bool:
 # ---- Shapers ---------------------------------------------------------------------------------------------
 
 
-def set_input_shaper(job: Job, command: Command) -> bool:
+def set_input_shaper(job: ProgramContext, command: Command) -> bool:
     """SHAPER_TYPE of all axes; SHAPER_TYPE_X, SHAPER_FREQ_X (0: not shaped), DAMPING_RATIO_X of one."""
     words = ("SHAPER_TYPE", "SHAPER_FREQ", "DAMPING_RATIO")
     values = _parameters(command, ("SHAPER_TYPE", *(f"{w}_{axis}" for w in words for axis in SHAPER_AXES)))
@@ -234,7 +229,7 @@ def set_input_shaper(job: Job, command: Command) -> bool:
         return True
     # An axis that is not shaped stays so whatever its kind would be.
     changed = [a for a in SHAPER_AXES if after[a] != before[a] and (before[a].width_s or after[a].width_s)]
-    if changed and not come_to_rest(job, job.machine.settle_s(after)):
+    if changed and not come_to_standstill(job, job.machine.settle_s(after)):
         return False
     job.machine.shapers = after
     for axis in changed:
@@ -271,7 +266,7 @@ def _told(axis: str, shaper: Shaper) -> str:
 # ---- Carriages -------------------------------------------------------------------------------------------
 
 
-def set_dual_carriage(job: Job, command: Command) -> bool:
+def set_dual_carriage(job: ProgramContext, command: Command) -> bool:
     """CARRIAGE 0 or 1; MODE is PRIMARY where it is not given."""
     values = _parameters(command, ("CARRIAGE", "MODE"))
     carriages, state = job.machine.carriages, job.machine.carriage_state
@@ -288,13 +283,13 @@ def set_dual_carriage(job: Job, command: Command) -> bool:
         raise WordError(f"{command.name} comes before {'XYZ'[carriages.axis]} is homed; home with G28 first")
     position = job.planner.toolhead_position[carriages.axis]
     after = carriages.set_mode(state, position, int(which), CarriageMode(word))
-    if not come_to_rest(job):
+    if not come_to_standstill(job):
         return False
     _take_carriages(job, carriages, after)
     return True
 
 
-def save_dual_carriage_state(job: Job, command: Command) -> bool:
+def save_dual_carriage_state(job: ProgramContext, command: Command) -> bool:
     """NAME: keep what both carriages do."""
     carriages, state, name = _dual(job, command)
     position = job.planner.toolhead_position[carriages.axis]
@@ -302,7 +297,7 @@ def save_dual_carriage_state(job: Job, command: Command) -> bool:
     return True
 
 
-def restore_dual_carriage_state(job: Job, command: Command) -> bool:
+def restore_dual_carriage_state(job: ProgramContext, command: Command) -> bool:
     """NAME: let both carriages do what they did then; with MOVE=0 only, they stay where they are."""
     carriages, state, name = _dual(job, command)
     values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
@@ -313,7 +308,7 @@ def restore_dual_carriage_state(job: Job, command: Command) -> bool:
         raise WordError(f"{command.name} cannot move the carriages back; give MOVE=0, and move them by G1")
     if "XYZ"[carriages.axis] not in job.planner.homed:
         raise WordError(f"{command.name} comes before {'XYZ'[carriages.axis]} is homed; home with G28 first")
-    if not come_to_rest(job):
+    if not come_to_standstill(job):
         return False
     position = job.planner.toolhead_position[carriages.axis]
     after = carriages.set_mode(state, position, saved.primary, CarriageMode.PRIMARY)
@@ -324,7 +319,7 @@ def restore_dual_carriage_state(job: Job, command: Command) -> bool:
     return True
 
 
-def _dual(job: Job, command: Command) -> tuple[DualCarriage, CarriageState, str]:
+def _dual(job: ProgramContext, command: Command) -> tuple[DualCarriage, CarriageState, str]:
     values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
     carriages, state = job.machine.carriages, job.machine.carriage_state
     if carriages is None or state is None:
@@ -332,7 +327,7 @@ def _dual(job: Job, command: Command) -> tuple[DualCarriage, CarriageState, str]
     return carriages, state, values.get("NAME", "default")
 
 
-def _take_carriages(job: Job, carriages: DualCarriage, after: CarriageState) -> None:
+def _take_carriages(job: ProgramContext, carriages: DualCarriage, after: CarriageState) -> None:
     planner, axis = job.planner, carriages.axis
     job.machine.carriage_state = after
     job.emit(WeightsChange(job.line, carriages.weights(after), planner.print_time_end_s))
@@ -344,7 +339,7 @@ def _take_carriages(job: Job, carriages: DualCarriage, after: CarriageState) -> 
     _keep_apart(job)
 
 
-def _keep_apart(job: Job) -> None:
+def _keep_apart(job: ProgramContext) -> None:
     machine: MachineState = job.machine
     if machine.carriages is not None and machine.carriage_state is not None:
         job.planner.set_range(machine.carriages.axis, *machine.carriages.limits(machine.carriage_state))

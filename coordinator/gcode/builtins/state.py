@@ -1,18 +1,15 @@
 """Where a program's numbers point: offsets of the origin, states that are saved and restored, all frames."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from coordinator.gcode.commands import ProgramContext
 from coordinator.gcode.events import Reply
 from coordinator.gcode.machine_state import SavedState
 from coordinator.gcode.parser import Command, WordError, number, quoted
-from coordinator.gcode.status import frames, gcode_figures
+from coordinator.gcode.status import frames, motion_figures
 from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus, Planner
 
-if TYPE_CHECKING:
-    from coordinator.gcode.interpreter import Job
 MOVE_SPEED_MM_S: Final = 50.0
 """Of the moves that these commands make, unless they say otherwise."""
 SAVED_MAX: Final = 100
@@ -31,7 +28,7 @@ def _flag(command: Command, values: Mapping[str, str], key: str) -> bool:
     return text == "1"
 
 
-def _speed(job: Job, command: Command, values: Mapping[str, str], otherwise_mm_s: float) -> float:
+def _speed(job: ProgramContext, command: Command, values: Mapping[str, str], otherwise_mm_s: float) -> float:
     if "MOVE_SPEED" not in values:
         return min(otherwise_mm_s, job.planner.max_velocity)
     speed = number(command.name, values, "MOVE_SPEED")
@@ -40,7 +37,7 @@ def _speed(job: Job, command: Command, values: Mapping[str, str], otherwise_mm_s
     return speed
 
 
-def go(job: Job, target: list[float], speed_mm_s: float) -> bool:
+def go(job: ProgramContext, target: list[float], speed_mm_s: float) -> bool:
     """Move to TARGET; False: the planner has to be emptied first."""
     status = job.planner.move_to(target, speed_mm_s)
     if status is FeedStatus.LIMIT:
@@ -51,7 +48,7 @@ def go(job: Job, target: list[float], speed_mm_s: float) -> bool:
 # ---- Offsets ---------------------------------------------------------------------------------------------
 
 
-def set_gcode_offset(job: Job, command: Command) -> bool:
+def set_gcode_offset(job: ProgramContext, command: Command) -> bool:
     """X Y Z E: the offset; X_ADJUST ...: by how much it changes; MOVE=1: go along at once.
 
     Beside a job, MOVE makes the job's next move also make up for the change: it does not stop for it.
@@ -68,7 +65,7 @@ def set_gcode_offset(job: Job, command: Command) -> bool:
             after[axis] = before[axis] + number(command.name, values, f"{axis}_ADJUST")
     change = {axis: value - before[axis] for axis, value in after.items()}
     if _flag(command, values, "MOVE") and any(change.values()):
-        if job.beside:
+        if job.while_printing:
             _check_reach(job, change)
             for axis, distance in change.items():
                 planner.shift_program(axis, distance)
@@ -81,7 +78,7 @@ def set_gcode_offset(job: Job, command: Command) -> bool:
     return True
 
 
-def _check_reach(job: Job, change: Mapping[str, float]) -> None:
+def _check_reach(job: ProgramContext, change: Mapping[str, float]) -> None:
     """Refuse an offset that would take the very next move out of the machine; the job goes on without it."""
     limits = job.planner.limits
     for axis, at, low, high in zip(
@@ -98,14 +95,14 @@ def _check_reach(job: Job, change: Mapping[str, float]) -> None:
 # ---- States ----------------------------------------------------------------------------------------------
 
 
-def save_gcode_state(job: Job, command: Command) -> bool:
+def save_gcode_state(job: ProgramContext, command: Command) -> bool:
     """NAME: keep modes, speed, factors, origin, offset and position."""
     name = _parameters(command, ("NAME",)).get("NAME", _DEFAULT_STATE)
     save_state(job, name)
     return True
 
 
-def save_state(job: Job, name: str) -> None:
+def save_state(job: ProgramContext, name: str) -> None:
     """Keep what holds for the lines to come under NAME; raises WordError."""
     saved = job.machine.saved
     if name not in saved and len(saved) >= SAVED_MAX:
@@ -129,7 +126,7 @@ def present_state(planner: Planner) -> SavedState:
     )
 
 
-def restore_gcode_state(job: Job, command: Command) -> bool:
+def restore_gcode_state(job: ProgramContext, command: Command) -> bool:
     """NAME: let all that be as it was; MOVE=1: also go back to where X Y Z were."""
     values = _parameters(command, ("NAME", "MOVE", "MOVE_SPEED"))
     name = values.get("NAME", _DEFAULT_STATE)
@@ -141,7 +138,7 @@ def restore_gcode_state(job: Job, command: Command) -> bool:
     return restore_state(job, saved, speed)
 
 
-def restore_state(job: Job, saved: SavedState, move_mm_s: float | None) -> bool:
+def restore_state(job: ProgramContext, saved: SavedState, move_mm_s: float | None) -> bool:
     """Let all be as it was when SAVED was; MOVE_MM_S: also go back at this speed.
 
     E reads as it did, wherever the filament is meanwhile. False: the planner has to be emptied first.
@@ -199,9 +196,9 @@ def come_back(
 # ---- Positions -------------------------------------------------------------------------------------------
 
 
-def get_position(job: Job, _command: Command) -> bool:
+def get_position(job: ProgramContext, _command: Command) -> bool:
     """GET_POSITION where nothing is connected: the frames of the program."""
-    for text in frames(gcode_figures(job)):
+    for text in frames(motion_figures(job.planner, job.machine)):
         job.emit(Reply(job.line, text))
     return True
 

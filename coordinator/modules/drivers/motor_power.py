@@ -9,7 +9,8 @@ from typing import Final
 
 from coordinator.config.options import SectionSpec
 from coordinator.config.pins import PinDescription
-from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.runtime.module_context import ModuleContext
@@ -103,12 +104,12 @@ class MotorPower(Module):
     def _read_off(self, call: Call) -> Reading:
         call.command.words()  # slicers name axes, which means nothing: the motors go off together
         if not self._lines:
-            return AtOnce()
-        return AtRest(lambda: self._all(on=False), Done(unhomed="XYZ"))
+            return Immediate()
+        return AtStandstill(lambda: self._all(on=False), Done(unhomed="XYZ"))
 
     def _read_on(self, call: Call) -> Reading:
         call.command.words()
-        return AtRest(lambda: self._all(on=True))
+        return AtStandstill(lambda: self._all(on=True))
 
     def _read_one(self, call: Call) -> Reading:
         values = call.parameters("STEPPER", "ENABLE")
@@ -122,7 +123,7 @@ class MotorPower(Module):
             raise WordError(f"ENABLE of SET_STEPPER_ENABLE is {quoted(enable)}; it must be 0 or 1")
         lines = [line for line in self._lines if name in line.steppers]
         done = Done(unhomed="" if enable == "1" else self._moved_by(lines))
-        return AtRest(lambda: self._some(lines, enable == "1", done), done)
+        return AtStandstill(lambda: self._some(lines, enable == "1", done), done)
 
     def _moved_by(self, lines: "Iterable[EnableLine]") -> str:
         """Return the letters of the axes whose place is not sure when the motors of LINES are off."""

@@ -5,7 +5,8 @@ from typing import Final
 
 from coordinator.config.model import StepperDescription
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.runtime.module_context import ModuleContext
@@ -49,7 +50,7 @@ class StepperBuzz(Module):
             await self._buzz(stepper)
             return done
 
-        return AtRest(buzz, done)
+        return AtStandstill(buzz, done)
 
     async def _buzz(self, stepper: "StepperDescription") -> None:
         assert self._live is not None

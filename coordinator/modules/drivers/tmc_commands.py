@@ -6,7 +6,8 @@ from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec
 from coordinator.config.pins import PinDescription
 from coordinator.drivers.tmc_chips import Field
-from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import one, parameters, value
@@ -84,7 +85,7 @@ class TmcCommands(Module):
             await driver.set_up()
             return Done()
 
-        return AtRest(perform)
+        return AtStandstill(perform)
 
     def _dump(self, call: Call) -> Reading:
         given = parameters(call.command, ("STEPPER", "REGISTER"))
@@ -94,7 +95,7 @@ class TmcCommands(Module):
         async def perform() -> Done:
             return Done(tuple(await driver.dump(only)))
 
-        return AtRest(perform)
+        return AtStandstill(perform)
 
     def _set_current(self, call: Call) -> Reading:
         given = parameters(call.command, ("STEPPER", "CURRENT", "HOLDCURRENT"))
@@ -113,7 +114,7 @@ class TmcCommands(Module):
             told = f"{driver.stepper.name}: run current {driver.run_a:g} A, hold current {driver.hold_a:g} A"
             return Done((told,))
 
-        return AtRest(perform)
+        return AtStandstill(perform)
 
     def _set_field(self, call: Call) -> Reading:
         given = parameters(call.command, ("STEPPER", "FIELD", "VALUE", "VELOCITY"))
@@ -133,7 +134,7 @@ class TmcCommands(Module):
             await driver.set_fields({name: number})
             return Done()
 
-        return AtRest(perform)
+        return AtStandstill(perform)
 
     @staticmethod
     def _field_value(call: Call, driver: "TmcDriver", given: dict[str, str], field: Field) -> int:

@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import AsyncIterator, Iterator, Mapping
 from typing import ClassVar, Final
 
-from coordinator.config.errors import ConfigError, NotActing
+from coordinator.config.errors import ConfigError, NotSupported
 from coordinator.config.model import StepperDescription
 from coordinator.drivers.tmc_chips import FAULTS, FORGOTTEN, TMC2208, TMC2209, UNDERVOLTAGE, Chip
 from coordinator.drivers.tmc_chips import shown as register_shown
@@ -55,7 +55,7 @@ class TmcDriver(StallEndstop):
         self.stepper = _stepper(build)
         select = build.reader.section.options.get("select_pins")
         if select is not None:
-            raise NotActing(select.place, "drivers that are chosen by select_pins are not built yet")
+            raise NotSupported(select.place, "drivers that are chosen by select_pins are not built yet")
         self.settings = DriverSettings(build, self.CHIP, self.stepper)
         self.address = build.get(UART_ADDRESS if self.CHIP.addresses > 1 else ONLY_UART_ADDRESS)
         if self.CHIP.has_stallguard:

@@ -13,8 +13,8 @@ from coordinator.modules.fans.fan_unit import (
     fan_options,
     shutdown_speed,
 )
-from coordinator.modules.heaters.heater import HeaterUnit
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heater import Heater
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest, shown
 
@@ -64,9 +64,9 @@ class _HeaterNames:
         self._reader, self._option = build.reader, option
         self._names = build.get(option)
         self._given = build.reader.has(option)
-        self._heaters = build.shared(Heaters)
+        self._heaters = build.shared(HeaterRegistry)
 
-    def find(self, modules: Modules) -> list[HeaterUnit]:
+    def find(self, modules: Modules) -> list[Heater]:
         """Return those that act; raises ConfigError. A default that does not exist is nobody's mistake."""
         known = {name: unit for unit in self._heaters.units.values() for name in (unit.key, unit.name)}
         found = []
@@ -100,7 +100,7 @@ class HeaterFan(FanModule):
             build.note(HEATER, "names no heater, so the fan never runs")
         self._hot_c = build.get(HEATER_TEMP)
         self._speed = build.get(FAN_SPEED)
-        self._heaters: list[HeaterUnit] = []
+        self._heaters: list[Heater] = []
 
     def link(self, modules: Modules) -> None:
         """Find its heaters."""
@@ -147,7 +147,7 @@ class ControllerFan(FanModule):
         idle = build.find(IDLE_SPEED)
         self._idle_speed = self._speed if idle is None else idle
         self._idle_s = build.get(IDLE_TIMEOUT)
-        self._heaters: list[HeaterUnit] = []
+        self._heaters: list[Heater] = []
         self._live: ModuleContext | None = None
         self._worked_s: float | None = None
 

@@ -3,7 +3,7 @@
 from typing import ClassVar, Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.fans.fan_unit import (
@@ -30,8 +30,10 @@ class Fan(FanModule):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.unit = FanUnit(build, OFF)
-        build.add_command(GCodeCommand("M106", "Set the part's fan: S, 0 to 255", self._set, beside=True))
-        build.add_command(GCodeCommand("M107", "Stop the part's fan", self._stop, beside=True))
+        build.add_command(
+            GCodeCommand("M106", "Set the part's fan: S, 0 to 255", self._set, while_printing=True)
+        )
+        build.add_command(GCodeCommand("M107", "Stop the part's fan", self._stop, while_printing=True))
 
     def _set(self, call: Call) -> Reading:
         words = numbers(call.command, "SP")
@@ -44,8 +46,8 @@ class Fan(FanModule):
         numbers(call.command, "P")
         return self._at(0.0)
 
-    def _at(self, speed: float) -> InTime:
-        return InTime(lambda print_time_s: self.unit.set_speed(speed, print_time_s))
+    def _at(self, speed: float) -> Synchronized:
+        return Synchronized(lambda print_time_s: self.unit.set_speed(speed, print_time_s))
 
 
 class GenericFans(Module):
@@ -58,7 +60,10 @@ class GenericFans(Module):
         self.units: dict[str, FanUnit] = {}
         build.add_command(
             GCodeCommand(
-                "SET_FAN_SPEED", "Set the speed of a fan_generic: FAN= SPEED=, 0 to 1", self._set, beside=True
+                "SET_FAN_SPEED",
+                "Set the speed of a fan_generic: FAN= SPEED=, 0 to 1",
+                self._set,
+                while_printing=True,
             )
         )
 
@@ -68,7 +73,7 @@ class GenericFans(Module):
         speed = value(call.command, given, "SPEED", 0.0)
         if not 0 <= speed <= 1:
             raise WordError(f"SPEED={speed:g} of SET_FAN_SPEED must be 0 to 1")
-        return InTime(lambda print_time_s: unit.set_speed(speed, print_time_s))
+        return Synchronized(lambda print_time_s: unit.set_speed(speed, print_time_s))
 
 
 class FanGeneric(FanModule):

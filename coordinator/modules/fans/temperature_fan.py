@@ -13,7 +13,7 @@ from coordinator.config.sections.sensor_options import (
     LATER_SENSOR_OPTIONS,
     SENSOR_OPTIONS,
 )
-from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
 from coordinator.gcode.parser import WordError
 from coordinator.heat.controller import Controller
 from coordinator.heat.pid import Pid, PidGains
@@ -27,7 +27,7 @@ from coordinator.modules.fans.fan_unit import (
     shutdown_speed,
 )
 from coordinator.modules.heaters.heater import LOOK_S, SILENT_LOOKS
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.modules.words import one, parameters, value
@@ -70,7 +70,7 @@ class TemperatureFans(Module):
                 "SET_TEMPERATURE_FAN_TARGET",
                 "Set what a temperature_fan holds: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
                 self._set,
-                beside=True,
+                while_printing=True,
             )
         )
 
@@ -92,7 +92,7 @@ class TemperatureFans(Module):
         def act(_: float) -> None:
             fan.target_c, fan.min_speed, fan.max_speed = target, low, high
 
-        return InTime(act)
+        return Synchronized(act)
 
 
 class TemperatureFan(FanModule):
@@ -130,7 +130,7 @@ class TemperatureFan(FanModule):
         if self.min_speed > self.max_speed:
             raise build.reader.bad(MIN_SPEED, f"more than max_speed ({self.max_speed:g})")
         self._controller = _controller(build)
-        build.shared(Heaters).add_sensor(self.input, build.find(GCODE_ID) or "")
+        build.shared(HeaterRegistry).add_sensor(self.input, build.find(GCODE_ID) or "")
         build.shared(TemperatureFans).by_name[build.instance] = self
 
     def link(self, modules: Modules) -> None:

@@ -21,11 +21,10 @@ from coordinator.gcode.parser import WordError
 from coordinator.heat.controller import Controller
 from coordinator.heat.holding import Held, Holding
 from coordinator.heat.mpc import Mpc
-from coordinator.heat.verify import HeaterCheck
+from coordinator.heat.verify import HeaterCheck, VerifyOptions, default_options
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.fans.fan_unit import FanModule
 from coordinator.modules.heaters.control import ControlSettings
-from coordinator.modules.heaters.verify_heater import VerifyHeater, usual
 from coordinator.modules.pinned import AHEAD_S, add_pinned
 from coordinator.modules.sensors.temperature_input import SensorModule, TemperatureInput
 from coordinator.runtime.module_context import ModuleContext
@@ -60,7 +59,7 @@ class Tuning(Protocol):
     def settled(self, measured_c: float, target_c: float, /) -> bool: ...  # noqa: D102
 
 
-class HeaterUnit:
+class Heater:
     """The heater of section BUILD, which programs call KEY."""
 
     def __init__(self, build: Build, key: str) -> None:
@@ -92,7 +91,7 @@ class HeaterUnit:
         self._ambient: SensorModule | None = None
         self.calibrated: dict[str, str] = {}
         """Options of the section and their values, as calibration found them."""
-        self._check = HeaterCheck(usual(key))
+        self._check = HeaterCheck(default_options(key))
         self._holding = Holding()
         self.on_held: Callable[[Held], None] | None = None
         """Called at the end of each steady state."""
@@ -104,7 +103,7 @@ class HeaterUnit:
         """When power was applied last, host's time."""
         self._stale_s = build.get(MAX_DURATION) - AHEAD_S - STALE_SPARE_S
         self._gone: str | None = None
-        """Why the target was forgotten; None: it was not."""
+        """Why the target was cleared; None: it was not."""
         self._bad = 0
         self._told_s = 0.0
 
@@ -113,13 +112,14 @@ class HeaterUnit:
     def link(self, modules: Modules) -> None:
         """Find what belongs to it; raises ConfigError."""
         self.input.link(modules)
-        verify = modules.find(f"verify_heater {self.key}", VerifyHeater)
-        if verify is not None:
-            self._check = HeaterCheck(verify.options)
         if self._find_fan is not None:
             self.fan = self._find_fan(modules)
         if self._find_ambient is not None:
             self._ambient = self._find_ambient(modules)
+
+    def watch(self, options: VerifyOptions) -> None:
+        """Use OPTIONS for the check that the heater heats; before ``connect``."""
+        self._check = HeaterCheck(options)
 
     async def connect(self, live: "ModuleContext") -> None:
         """Begin to act."""
@@ -328,7 +328,7 @@ class HeaterUnit:
             )
 
     def _let_go(self, why: str) -> None:
-        """Forget the target: a node that may be absent is away, its own or that of its sensor."""
+        """Clear the target: a node that may be absent is away, its own or that of its sensor."""
         live, was, on = self._live, self.target_c, self._on
         self.target_c, self.power, self._on = 0.0, 0.0, False
         self._gone = f"heater {self.key} went off: {why}"
@@ -338,7 +338,7 @@ class HeaterUnit:
                 self._output.set(live.node(self.node), clock, 0.0)
         self.input.wake()
         if was > 0 and live is not None:
-            live.say(f"heater {self.key} is off, its target of {was:g} °C is forgotten: {why}")
+            live.say(f"heater {self.key} was turned off; its target ({was:g} °C) was cleared: {why}")
 
 
 def _band(held: Held | None) -> dict[str, Value]:

@@ -4,11 +4,12 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import ClassVar, Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, InTime, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading, Synchronized
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module
-from coordinator.modules.heaters.heater import HeaterUnit
+from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.tuning import calibrate_mpc, calibrate_pid
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.modules.words import numbers, one, parameters, value
@@ -17,24 +18,25 @@ from coordinator.support.values import Value
 FAN_STEPS_MAX: Final = 12
 
 
-class Heaters(Module):
-    """The heaters and sensors of the machine."""
+class HeaterRegistry(Module):
+    """The heaters and temperature sensors of the machine, and the commands for any of them."""
 
     SPEC: ClassVar = SectionSpec(help="What all heaters have in common", options=())
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self.units: dict[str, HeaterUnit] = {}
+        self.name = "heaters"
+        self.units: dict[str, Heater] = {}
         """By what programs call them: extruder, heater_bed, NAME of heater_generic."""
         self.sensors: dict[str, TemperatureSource] = {}
         """By what programs call them: heaters and the sections of sensors."""
-        self._tags: dict[str, HeaterUnit | TemperatureSource] = {}
+        self._tags: dict[str, Heater | TemperatureSource] = {}
         for name, help_, read in (
             ("M105", "Tell all temperatures", self._tell),
             ("TURN_OFF_HEATERS", "Let all heaters cool down", self._turn_off),
             ("SET_HEATER_TEMPERATURE", "Set a heater's target: HEATER= TARGET=", self._set),
         ):
-            build.add_command(GCodeCommand(name, help_, read, beside=True))
+            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
         for name, help_, read in (
             (
                 "TEMPERATURE_WAIT",
@@ -51,7 +53,7 @@ class Heaters(Module):
         ):
             build.add_command(GCodeCommand(name, help_, read))
 
-    def add(self, unit: HeaterUnit, tag: str = "") -> None:
+    def add(self, unit: Heater, tag: str = "") -> None:
         """Take a heater on; TAG is what M105 calls it."""
         self.units[unit.key] = unit
         self.sensors[unit.key] = unit.input
@@ -84,18 +86,18 @@ class Heaters(Module):
         parts = []
         for tag in sorted(self._tags):
             found = self._tags[tag]
-            source = found.input if isinstance(found, HeaterUnit) else found
+            source = found.input if isinstance(found, Heater) else found
             celsius = 0.0 if source.celsius is None else source.celsius
-            target = found.target_c if isinstance(found, HeaterUnit) else 0.0
+            target = found.target_c if isinstance(found, Heater) else 0.0
             parts.append(f"{tag}:{celsius:.1f} /{target:.1f}")
         return " ".join(parts) or "T:0"
 
-    def set_in_time(self, unit: HeaterUnit, celsius: float) -> InTime:
+    def set_in_time(self, unit: Heater, celsius: float) -> Synchronized:
         """Return what sets a target without waiting; WordError for one it cannot have."""
         unit.check_target(celsius)
-        return InTime(lambda _: unit.set_target(celsius))
+        return Synchronized(lambda _: unit.set_target(celsius))
 
-    def set_and_wait(self, unit: HeaterUnit, celsius: float) -> AtRest:
+    def set_and_wait(self, unit: Heater, celsius: float) -> AtStandstill:
         """Return what sets a target and waits for it; WordError for one it cannot have."""
         unit.check_target(celsius)
 
@@ -105,11 +107,11 @@ class Heaters(Module):
                 await unit.reach()
             return Done((self.temperatures(),), kind=ReplyKind.PLAIN)
 
-        return AtRest(perform)
+        return AtStandstill(perform)
 
     def _tell(self, call: Call) -> Reading:
         numbers(call.command, "T")
-        return AtOnce((self.temperatures(),), kind=ReplyKind.PLAIN)
+        return Immediate((self.temperatures(),), kind=ReplyKind.PLAIN)
 
     def _turn_off(self, call: Call) -> Reading:
         parameters(call.command, ())
@@ -118,9 +120,9 @@ class Heaters(Module):
             for unit in self.units.values():
                 unit.set_target(0.0)
 
-        return InTime(act)
+        return Synchronized(act)
 
-    def _unit(self, call: Call, given: Mapping[str, str]) -> HeaterUnit:
+    def _unit(self, call: Call, given: Mapping[str, str]) -> Heater:
         names = {name: unit for unit in self.units.values() for name in (unit.key, unit.name)}
         return names[one(call.command, given, "HEATER", names)]
 
@@ -144,13 +146,15 @@ class Heaters(Module):
             while source.celsius is None or not (source.is_sound and low <= source.celsius <= high):
                 await source.next()
 
-        return AtRest(perform)
+        return AtStandstill(perform)
 
     def _query(self, call: Call) -> Reading:
         given = parameters(call.command, ("NAME", "PULLUP"))
         names = [name for name, source in self.sensors.items() if source.ratio is not None]
         if "NAME" not in given:
-            return AtOnce((f"sensors with a converter: {', '.join(names) or 'none has read anything yet'}",))
+            return Immediate(
+                (f"sensors with a converter: {', '.join(names) or 'none has read anything yet'}",)
+            )
         name = one(call.command, given, "NAME", names)
         ratio = self.sensors[name].ratio or 0.0
         told = f"{name}: {ratio:.6f} of full scale"
@@ -158,7 +162,7 @@ class Heaters(Module):
             ohms = value(call.command, given, "PULLUP")
             below = f"{ohms * ratio / (1 - ratio):.1f} Ω" if ratio < 1 else "no resistor"
             told += f", with {ohms:g} Ω above it {below}"
-        return AtOnce((told,))
+        return Immediate((told,))
 
     def _pid(self, call: Call) -> Reading:
         given = parameters(call.command, ("HEATER", "TARGET", "WRITE_FILE", "TOLERANCE"))
@@ -176,10 +180,10 @@ class Heaters(Module):
         return self._calibration(unit, target, lambda: calibrate_mpc(unit, target, steps))
 
     @staticmethod
-    def _calibration(unit: HeaterUnit, target: float, run: Callable[[], Awaitable[Done]]) -> Reading:
+    def _calibration(unit: Heater, target: float, run: Callable[[], Awaitable[Done]]) -> Reading:
         if not unit.input.min_c < target <= unit.input.max_c:
             raise WordError(
                 f"TARGET={target:g} is outside what [{unit.name}] allows, {unit.input.min_c:g} to"
                 f" {unit.input.max_c:g} °C"
             )
-        return AtRest(run)
+        return AtStandstill(run)

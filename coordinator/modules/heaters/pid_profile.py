@@ -6,12 +6,12 @@ from typing import ClassVar, Final
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.config.sections.heater_options import PID_KD, PID_KI, PID_KP
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading, Synchronized
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.heat.pid import Pid, PidGains
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.heaters.heater import HeaterUnit
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heater import Heater
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.words import one, parameters, value
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest, shown
@@ -40,7 +40,7 @@ class PidProfiles(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "pid_profile"
-        self._heaters = build.shared(Heaters)
+        self._heaters = build.shared(HeaterRegistry)
         self._of: dict[str, dict[str, PidGains]] = {}
         self._loaded: dict[str, str] = {}
         self._live: ModuleContext | None = None
@@ -56,7 +56,7 @@ class PidProfiles(Module):
         """Take a profile on; HEATER is what programs call it."""
         self._of.setdefault(heater, {})[name] = gains
 
-    def heater(self, name: str) -> HeaterUnit | None:
+    def heater(self, name: str) -> Heater | None:
         """Return the heater that programs or sections call NAME."""
         units = self._heaters.units.values()
         return next((unit for unit in units if name in (unit.key, unit.name)), None)
@@ -80,7 +80,7 @@ class PidProfiles(Module):
         (action,) = actions
         name = given[action]
         if action == "GET_VALUES":
-            return AtOnce((self._told(unit),))
+            return Immediate((self._told(unit),))
         if action == "REMOVE":
             raise WordError("a profile is removed by hand: delete its section from the configuration")
         if unit.settings.kind != "pid":
@@ -94,7 +94,7 @@ class PidProfiles(Module):
             return self._use(call, given, unit, name, gains)
         return self._save(unit, name)
 
-    def _load(self, call: Call, given: Mapping[str, str], unit: HeaterUnit, name: str) -> Reading:
+    def _load(self, call: Call, given: Mapping[str, str], unit: Heater, name: str) -> Reading:
         gains = self._find(unit, name)
         if gains is None and "DEFAULT" in given:
             name = given["DEFAULT"]
@@ -105,12 +105,12 @@ class PidProfiles(Module):
             raise WordError(f"PID_PROFILE: {unit.key} has no profile {quoted(name)}{hint}")
         return self._use(call, given, unit, name, gains)
 
-    def _find(self, unit: HeaterUnit, name: str) -> PidGains | None:
+    def _find(self, unit: Heater, name: str) -> PidGains | None:
         return unit.settings.gains if name == DEFAULT else self._of.get(unit.key, {}).get(name)
 
     def _use(
-        self, call: Call, given: Mapping[str, str], unit: HeaterUnit, name: str, gains: PidGains
-    ) -> InTime:
+        self, call: Call, given: Mapping[str, str], unit: Heater, name: str, gains: PidGains
+    ) -> Synchronized:
         keep = value(call.command, given, "KEEP_TARGET", 0.0) > 0
         self._check_room(unit, name)
 
@@ -125,9 +125,9 @@ class PidProfiles(Module):
                 self.add(unit.key, name, gains)
             self._loaded[unit.key] = name
 
-        return InTime(act)
+        return Synchronized(act)
 
-    def _save(self, unit: HeaterUnit, name: str) -> InTime:
+    def _save(self, unit: Heater, name: str) -> Synchronized:
         if name == DEFAULT:
             raise WordError(f"'{DEFAULT}' is the section [{unit.name}] itself; choose another name")
         if " ".join(name.split()) != name or not name:
@@ -144,14 +144,14 @@ class PidProfiles(Module):
                 live.save(f"{KIND} {unit.key} {name}", option, text)
             live.say(f"profile {name} of {unit.key} is there from now on; SAVE_CONFIG writes it")
 
-        return InTime(act)
+        return Synchronized(act)
 
-    def _check_room(self, unit: HeaterUnit, name: str) -> None:
+    def _check_room(self, unit: Heater, name: str) -> None:
         own = self._of.get(unit.key, {})
         if name not in own and len(own) >= PROFILES_MAX:
             raise WordError(f"{unit.key} has {PROFILES_MAX} profiles already; load one of them")
 
-    def _told(self, unit: HeaterUnit) -> str:
+    def _told(self, unit: Heater) -> str:
         if not isinstance(unit.controller, Pid):
             return f"{unit.key} is not controlled by PID"
         values = " ".join(f"{option}: {text}" for option, text in _texts(unit.controller.gains).items())

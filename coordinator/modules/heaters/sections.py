@@ -8,14 +8,14 @@ from coordinator.config.sections.heater_options import (
     EXTRUDER_HEATER_OPTIONS,
     HEATER_OPTIONS,
     HEATER_PIN,
-    LATER_HEATER_OPTIONS,
     MIN_EXTRUDE_TEMP,
+    UNSUPPORTED_HEATER_OPTIONS,
 )
 from coordinator.gcode.commands import Call, GCodeCommand, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module, Modules
-from coordinator.modules.heaters.heater import HeaterUnit
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heater import Heater
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.heaters.pid_profile import PidProfiles
 from coordinator.modules.sensors.temperature_sensor import GCODE_ID
 from coordinator.modules.words import numbers
@@ -23,13 +23,13 @@ from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 
 
-class HeaterModule(Module):
+class HeaterSection(Module):
     """A section with a heater."""
 
     def __init__(self, build: Build, key: str, tag: str = "") -> None:
         super().__init__(build)
-        self.unit = HeaterUnit(build, key)
-        self.heaters = build.shared(Heaters)
+        self.unit = Heater(build, key)
+        self.heaters = build.shared(HeaterRegistry)
         build.shared(PidProfiles)
         self.heaters.add(self.unit, tag)
 
@@ -54,14 +54,16 @@ class HeaterModule(Module):
         return self.unit.status()
 
 
-class HeaterBed(HeaterModule):
+class HeaterBed(HeaterSection):
     """The heater of the bed."""
 
-    SPEC: ClassVar = SectionSpec(help="The heated bed", options=HEATER_OPTIONS, later=LATER_HEATER_OPTIONS)
+    SPEC: ClassVar = SectionSpec(
+        help="The heated bed", options=HEATER_OPTIONS, later=UNSUPPORTED_HEATER_OPTIONS
+    )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build, "heater_bed", "B")
-        build.add_command(GCodeCommand("M140", "Set the bed's target: S", self._set, beside=True))
+        build.add_command(GCodeCommand("M140", "Set the bed's target: S", self._set, while_printing=True))
         build.add_command(GCodeCommand("M190", "Set the bed's target and wait for it: S or R", self._wait))
 
     def _set(self, call: Call) -> Reading:
@@ -71,21 +73,21 @@ class HeaterBed(HeaterModule):
         return self.heaters.set_and_wait(self.unit, _target(call, "SR"))
 
 
-class HeaterGeneric(HeaterModule):
+class HeaterGeneric(HeaterSection):
     """A heater of any kind."""
 
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A heater for anything else; programs call it by NAME",
         options=(*HEATER_OPTIONS, GCODE_ID),
-        later=LATER_HEATER_OPTIONS,
+        later=UNSUPPORTED_HEATER_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build, build.instance, build.find(GCODE_ID) or "")
 
 
-class ExtruderHeaters(Module):
+class ExtruderHeaterCommands(Module):
     """The heaters of all extruders, and the commands for them."""
 
     SPEC: ClassVar = SectionSpec(help="What the heaters of extruders have in common", options=())
@@ -93,10 +95,12 @@ class ExtruderHeaters(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         build.shared(PidProfiles)
-        self.by_extruder: dict[str, ExtruderHeater] = {}
+        self.by_extruder: dict[str, ExtruderHeaterSection] = {}
         self._extruders = [extruder.name for extruder in build.machine.extruders]
-        self.heaters = build.shared(Heaters)
-        build.add_command(GCodeCommand("M104", "Set an extruder's target: S, T", self._set, beside=True))
+        self.heaters = build.shared(HeaterRegistry)
+        build.add_command(
+            GCodeCommand("M104", "Set an extruder's target: S, T", self._set, while_printing=True)
+        )
         build.add_command(
             GCodeCommand("M109", "Set an extruder's target and wait for it: S or R, T", self._wait)
         )
@@ -107,7 +111,7 @@ class ExtruderHeaters(Module):
     def _wait(self, call: Call) -> Reading:
         return self.heaters.set_and_wait(self._unit(call), _target(call, "SRT"))
 
-    def _unit(self, call: Call) -> HeaterUnit:
+    def _unit(self, call: Call) -> Heater:
         words = numbers(call.command, "SRT")
         name = call.extruder or "extruder"
         if "T" in words:
@@ -125,25 +129,25 @@ class ExtruderHeaters(Module):
         return found.unit
 
 
-class ExtruderHeater(Module):
+class ExtruderHeaterSection(Module):
     """The heater of an extruder; an extruder without heater_pin has none."""
 
     TITLE: ClassVar = "[extruder], [extruder1] …"
     SPEC: ClassVar = SectionSpec(
         help="The heater of an extruder",
         options=EXTRUDER_HEATER_OPTIONS,
-        later=LATER_HEATER_OPTIONS,
+        later=UNSUPPORTED_HEATER_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self.unit: HeaterUnit | None = None
+        self.unit: Heater | None = None
         self._connected = False
         self.min_extrude_c = build.get(MIN_EXTRUDE_TEMP)
         if build.find(HEATER_PIN) is None:
             return
-        self.unit = HeaterUnit(build, build.name)
-        shared = build.shared(ExtruderHeaters)
+        self.unit = Heater(build, build.name)
+        shared = build.shared(ExtruderHeaterCommands)
         shared.by_extruder[build.name] = self
         shared.heaters.add(self.unit, f"T{build.name.removeprefix('extruder') or 0}")
 

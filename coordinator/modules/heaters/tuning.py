@@ -1,14 +1,14 @@
 """Calibrates a heater: runs the tuning, uses what was found, and says what to write down."""
 
-from coordinator.gcode.commands import Done
+from coordinator.gcode.events import Done
 from coordinator.heat.mpc_tune import MpcTune
 from coordinator.heat.pid_tune import RelayTune
-from coordinator.modules.heaters.heater import HeaterUnit
+from coordinator.modules.heaters.heater import Heater
 
 REMARK = "in use from now on; SAVE_CONFIG writes them into the configuration"
 
 
-async def calibrate_pid(unit: HeaterUnit, target_c: float) -> Done:
+async def calibrate_pid(unit: Heater, target_c: float) -> Done:
     """Find the PID constants of a heater around TARGET_C; raises CanductorError."""
     tune = RelayTune(target_c, unit.settings.max_power)
     await unit.tune(tune)
@@ -20,7 +20,7 @@ async def calibrate_pid(unit: HeaterUnit, target_c: float) -> Done:
     return _told(unit, found)
 
 
-async def calibrate_mpc(unit: HeaterUnit, target_c: float, fan_steps: int) -> Done:
+async def calibrate_mpc(unit: Heater, target_c: float, fan_steps: int) -> Done:
     """Find the model of a heater by heating it to TARGET_C; raises CanductorError."""
     heater_w, fan = unit.settings.heater_w, unit.fan
     assert heater_w is not None
@@ -53,7 +53,7 @@ async def calibrate_mpc(unit: HeaterUnit, target_c: float, fan_steps: int) -> Do
     return _told(unit, found)
 
 
-def _told(unit: HeaterUnit, found: tuple[tuple[str, str | float], ...]) -> Done:
+def _told(unit: Heater, found: tuple[tuple[str, str | float], ...]) -> Done:
     texts = {name: value if isinstance(value, str) else f"{value:.6g}" for name, value in found}
     unit.keep(texts)
     lines = (f"{name}: {text}" for name, text in texts.items())

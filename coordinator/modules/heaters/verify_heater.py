@@ -2,10 +2,11 @@
 
 from typing import ClassVar, Final
 
-from coordinator.config.errors import ConfigError, NotActing
+from coordinator.config.errors import ConfigError, NotSupported
 from coordinator.config.options import FloatOption, SectionSpec
-from coordinator.heat.verify import VerifyOptions
+from coordinator.heat.verify import VerifyOptions, default_options
 from coordinator.modules.base import Build, Module, Modules
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.support.quoting import nearest
 
 MAX_ERROR: Final = FloatOption(
@@ -40,13 +41,6 @@ HEATING_GAIN: Final = FloatOption(
     above=0,
     maximum=500,
 )
-GAIN_TIME_S: Final = 20.0
-BED_GAIN_TIME_S: Final = 60.0
-
-
-def usual(heater: str) -> VerifyOptions:
-    """Return how a heater is watched that has no section of its own."""
-    return VerifyOptions(check_gain_s=BED_GAIN_TIME_S if heater == "heater_bed" else GAIN_TIME_S)
 
 
 class VerifyHeater(Module):
@@ -65,19 +59,19 @@ class VerifyHeater(Module):
         self.heater = build.instance
         self.options = VerifyOptions(
             max_error_ks=build.get(MAX_ERROR),
-            check_gain_s=build.find(CHECK_GAIN_TIME) or usual(self.heater).check_gain_s,
+            check_gain_s=build.find(CHECK_GAIN_TIME) or default_options(self.heater).check_gain_s,
             hysteresis_k=build.get(HYSTERESIS),
             heating_gain_k=build.get(HEATING_GAIN),
         )
 
     def link(self, modules: Modules) -> None:
-        """Make sure that there is such a heater."""
-        from coordinator.modules.heaters.heaters import Heaters  # noqa: PLC0415 (heaters know this section)
-
-        heaters = modules.find("heaters", Heaters)
+        """Hand the options to the heater; raises ConfigError when there is none of that name."""
+        heaters = modules.find("heaters", HeaterRegistry)
         known = () if heaters is None else tuple(heaters.units)
         if self.heater not in known:
             if modules.is_left_out(self.heater):
-                raise NotActing(self.place, f"the heater {self.heater} does not act yet")
+                raise NotSupported(self.place, f"the heater {self.heater} does not act yet")
             hint = nearest(self.heater, known) or f"; there is {', '.join(known) or 'none'}"
-            raise ConfigError(self.place, f"[{self.name}] is for no heater{hint}")
+            raise ConfigError(self.place, f"[{self.name}] refers to an unknown heater{hint}")
+        assert heaters is not None
+        heaters.units[self.heater].watch(self.options)

@@ -14,7 +14,8 @@ from typing import Final
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import RailDescription
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.events import Done
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.kinematics.base import Point
 from coordinator.modules.base import Build, Module, Modules
@@ -93,7 +94,7 @@ class Homing(Module):
         """Read G28 of AXES (letters)."""
         if self.instead is not None and "G28" not in call.callers:
             return self.instead(call, axes)
-        return AtRest(lambda: self.home(call, axes))
+        return AtStandstill(lambda: self.home(call, axes))
 
     # ---------------------------------------------------------------------------------------------- homing
 
@@ -236,7 +237,7 @@ class Homing(Module):
     # ------------------------------------------------------------------------------------------- endstops
 
     def _read_query(self, _: Call) -> Reading:
-        return AtRest(self._query)
+        return AtStandstill(self._query)
 
     async def _query(self) -> Done:
         rails = self._described.stops

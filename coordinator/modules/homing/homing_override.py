@@ -4,7 +4,8 @@ from dataclasses import replace
 from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec, TextOption
-from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Lines, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Lines, Reading
+from coordinator.gcode.events import Done
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.programs.gcode_macro import GCodeTemplate, parameters
@@ -72,4 +73,4 @@ class HomingOverride(Module):
         async def take() -> Done:
             return done
 
-        return AtRest(take, done)
+        return AtStandstill(take, done)

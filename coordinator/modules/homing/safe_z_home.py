@@ -6,7 +6,8 @@ from typing import Final
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import BadValue, BoolOption, FloatOption, Option, SectionSpec
 from coordinator.config.sections.bounds import MAX_SPEED
-from coordinator.gcode.commands import AtRest, Call, Done, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import Homing
@@ -105,7 +106,7 @@ class SafeZHome(Module):
         missing = "".join(axis for axis in "XY" if axis not in call.homed + axes)
         if "Z" in axes and missing:
             raise WordError(f"G28 of Z comes before {missing[0]} is homed; home with G28 first")
-        return AtRest(lambda: self._home(call, axes))
+        return AtStandstill(lambda: self._home(call, axes))
 
     async def _home(self, call: Call, axes: str) -> Done:
         if "Z" in axes and self._outside:

@@ -11,10 +11,18 @@ from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import FloatOption, SectionSpec
-from coordinator.gcode.builtins.machine import come_to_rest
-from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Position, Reading, ToProgram
-from coordinator.gcode.events import PositionSet, WeightsChange
-from coordinator.gcode.interpreter import Job
+from coordinator.gcode.builtins.machine import come_to_standstill
+from coordinator.gcode.commands import (
+    AtStandstill,
+    Call,
+    GCodeCommand,
+    Immediate,
+    Position,
+    ProgramContext,
+    Reading,
+    ToProgram,
+)
+from coordinator.gcode.events import Done, PositionSet, WeightsChange
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing import Homing
@@ -132,9 +140,9 @@ class Skews(Module):
         factors = {f"{plane.lower()}_skew": getattr(self.now, plane.lower()) for plane in _PLANES}
         return {"current_profile_name": self._profile, **factors}
 
-    def take(self, job: "Job", skew: Skew, profile: str = "") -> bool:
+    def take(self, job: ProgramContext, skew: Skew, profile: str = "") -> bool:
         """Let SKEW hold from here on; the head stays. False: the planner has to be emptied first."""
-        if not come_to_rest(job):
+        if not come_to_standstill(job):
             return False
         planner = job.planner
         believed = self.now.wanted(planner.toolhead_position)
@@ -153,7 +161,9 @@ class Skews(Module):
 
         def homing(call: Call, axes: str) -> Reading:
             reading = read(call, axes)
-            return AtRest(self._corrected(reading.perform, call)) if isinstance(reading, AtRest) else reading
+            if isinstance(reading, AtStandstill):
+                return AtStandstill(self._corrected(reading.perform, call))
+            return reading
 
         return homing
 
@@ -200,19 +210,19 @@ class Skews(Module):
         if not measured:
             raise WordError("SET_SKEW has nothing to set; give XY=AC,BD,AD as measured, or CLEAR=1")
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             return self.take(job, replace(self.now, **{plane.lower(): t for plane, t in measured.items()}))
 
         return ToProgram(act)
 
     def _tell(self, call: Call) -> Reading:
         parameters(call.command, ())
-        return AtOnce(tuple(f"{plane}: {_told(getattr(self.now, plane.lower()))}" for plane in _PLANES))
+        return Immediate(tuple(f"{plane}: {_told(getattr(self.now, plane.lower()))}" for plane in _PLANES))
 
     def _calculate(self, call: Call) -> Reading:
         given = parameters(call.command, ("AC", "BD", "AD"))
         ac, bd, ad = (value(call.command, given, name) for name in ("AC", "BD", "AD"))
-        return AtOnce((f"Calculated skew: {_told(skew_of(call.command, ac, bd, ad))}",))
+        return Immediate((f"Calculated skew: {_told(skew_of(call.command, ac, bd, ad))}",))
 
     def _manage(self, call: Call) -> Reading:
         given = parameters(call.command, ("LOAD", "SAVE"))
@@ -226,7 +236,7 @@ class Skews(Module):
             raise WordError(
                 f"SKEW_PROFILE: {quoted(name)} cannot be a profile's name; take letters, digits and _"
             )
-        return AtOnce((f"skew profile {name} is saved; SAVE_CONFIG writes it",), lambda: self._save(name))
+        return Immediate((f"skew profile {name} is saved; SAVE_CONFIG writes it",), lambda: self._save(name))
 
     def _save(self, name: str) -> None:
         skew = self._profiles[name] = self.now

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Lines, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import bounded, parameters
@@ -70,7 +70,7 @@ class FirmwareRetraction(Module):
             ("GET_RETRACTION", "Tell how G10 and G11 act", self._get),
             ("CLEAR_RETRACTION", "Forget that the filament is drawn back, and all changes", self._clear),
         ):
-            build.add_command(GCodeCommand(name, help_, read, beside=True))
+            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
 
     def status(self) -> Mapping[str, Value]:
         """Tell the settings, and whether the filament is drawn back."""
@@ -79,7 +79,7 @@ class FirmwareRetraction(Module):
     def _retract(self, _call: Call) -> Reading:
         s = self._settings
         if self._retracted is not None or s.retract_length == 0:
-            return AtOnce()
+            return Immediate()
         self._retracted = s
         hop = [f"SET_GCODE_OFFSET Z_ADJUST={s.z_hop_height:g} MOVE=1"] if s.z_hop_height else []
         return self._lines([_extrude(-s.retract_length, s.retract_speed), *hop])
@@ -87,7 +87,7 @@ class FirmwareRetraction(Module):
     def _unretract(self, _call: Call) -> Reading:
         s, self._retracted = self._retracted, None
         if s is None:
-            return AtOnce()
+            return Immediate()
         hop = [f"SET_GCODE_OFFSET Z_ADJUST={-s.z_hop_height:g} MOVE=1"] if s.z_hop_height else []
         now = self._settings
         length = s.retract_length + now.unretract_extra_length
@@ -124,17 +124,17 @@ class FirmwareRetraction(Module):
         def act() -> None:
             self._settings = replace(self._settings, **changes)
 
-        return AtOnce(act=act)
+        return Immediate(act=act)
 
     def _get(self, _call: Call) -> Reading:
         told = [f"{name.upper()}={value:g}" for name, value in vars(self._settings).items()]
-        return AtOnce((" ".join(told),))
+        return Immediate((" ".join(told),))
 
     def _clear(self, _call: Call) -> Reading:
         def act() -> None:
             self._settings, self._retracted = self._configured, None
 
-        return AtOnce(act=act)
+        return Immediate(act=act)
 
 
 def _extrude(length_mm: float, speed_mm_s: float) -> str:

@@ -8,7 +8,8 @@ import math
 from typing import Final
 
 from coordinator.config.options import BoolOption, SectionSpec
-from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.runtime.module_context import ModuleContext
@@ -74,7 +75,7 @@ class ForceMove(Module):
             await self._move(name, distance, speed, accel or min(limits.max_accel, limits.max_z_accel))
             return done
 
-        return AtRest(move, done)
+        return AtStandstill(move, done)
 
     async def _move(self, name: str, distance_mm: float, speed: float, accel: float) -> None:
         assert self._live is not None
@@ -101,7 +102,7 @@ class ForceMove(Module):
         async def take() -> Done:
             return done
 
-        return AtRest(take, done)
+        return AtStandstill(take, done)
 
 
 def _number(call: Call, values: dict[str, str], key: str, low: float, high: float) -> float:

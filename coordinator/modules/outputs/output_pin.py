@@ -5,7 +5,7 @@ from typing import ClassVar, Final
 
 from coordinator.config.options import BoolOption, FloatOption, ListOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
@@ -62,7 +62,7 @@ class OutputPins(Module):
                 "SET_PIN",
                 "Set an output_pin at its place among the moves: PIN= VALUE=",
                 self._set,
-                beside=True,
+                while_printing=True,
             )
         )
 
@@ -72,7 +72,7 @@ class OutputPins(Module):
         wanted = value(call.command, given, "VALUE")
         if not pin.allows(wanted):
             raise WordError(f"VALUE={wanted:g} of SET_PIN must be {pin.rule} for [{pin.name}]")
-        return InTime(lambda print_time_s: pin.set(wanted, print_time_s))
+        return Synchronized(lambda print_time_s: pin.set(wanted, print_time_s))
 
 
 class OutputPin(Module):

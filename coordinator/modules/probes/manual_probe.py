@@ -9,9 +9,8 @@ from typing import Final
 
 from coordinator.config.options import SectionSpec
 from coordinator.gcode.builtins.state import go
-from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading, ToProgram
-from coordinator.gcode.events import Reply
-from coordinator.gcode.interpreter import Job
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, ProgramContext, Reading, ToProgram
+from coordinator.gcode.events import Done, Reply
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.runtime.module_context import ModuleContext
@@ -82,7 +81,7 @@ class ManualProbe(Module):
         async def apply() -> Done:
             return Done(self._keep(endstop - offset) if offset else ("the offset of Z is 0",))
 
-        return AtRest(apply)
+        return AtStandstill(apply)
 
     def _endstop(self, call: Call) -> float:
         """Return position_endstop of stepper_z; raises WordError where there is none."""
@@ -106,7 +105,7 @@ class ManualProbe(Module):
         if self._accepted is not None:
             raise WordError(f"{call.command.name}: a height is looked for already; ACCEPT or ABORT that")
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             self._accepted, self._speed, self._tried = accepted, speed, []
             job.emit(Reply(job.line, _BEGUN))
             self._tell(job)
@@ -122,7 +121,7 @@ class ManualProbe(Module):
         if word is None:
             raise WordError("TESTZ has no Z; add Z=-0.1 or Z=+, -, ++, --")
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             x, y, z, e = job.planner.toolhead_position
             target = self._target(call.command, word, z)
             if not go(job, [x, y, target, e], self._speed):
@@ -154,7 +153,7 @@ class ManualProbe(Module):
         above = [tried for tried in self._tried if tried > z + SAME_MM]
         return (below[-1] if below else None), (above[0] if above else None)
 
-    def _tell(self, job: "Job") -> None:
+    def _tell(self, job: ProgramContext) -> None:
         z = job.planner.toolhead_position[2]
         below, above = ("?" if tried is None else f"{tried:.3f}" for tried in self._beside(z))
         job.emit(Reply(job.line, f"Z position: {below} --> {z:.3f} <-- {above}"))
@@ -169,7 +168,7 @@ class ManualProbe(Module):
             self._accepted = None
             return Done(accepted(call.position[2]))
 
-        return AtRest(accept)
+        return AtStandstill(accept)
 
     def _read_abort(self, call: Call) -> Reading:
         call.parameters()
@@ -179,7 +178,7 @@ class ManualProbe(Module):
             self._accepted = None
             return Done((f"nothing is kept; Z stays at {call.position[2]:.3f}",))
 
-        return AtRest(abort)
+        return AtStandstill(abort)
 
     def _check_active(self, call: Call) -> Callable[[float], tuple[str, ...]]:
         if self._accepted is None:

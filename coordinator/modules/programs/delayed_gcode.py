@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
@@ -99,10 +99,12 @@ class DelayedGCodes(Module):
         build.add_command(
             GCodeCommand(
                 "UPDATE_DELAYED_GCODE", "Have the delayed g-code ID run after DURATION; 0: not at all",
-                self._update, beside=True,
+                self._update, while_printing=True,
             )
         )  # fmt: skip
-        build.add_command(GCodeCommand(_COMMAND, "What a delayed g-code does", self._run, beside=True))
+        build.add_command(
+            GCodeCommand(_COMMAND, "What a delayed g-code does", self._run, while_printing=True)
+        )
 
     def link(self, modules: Modules) -> None:
         """Find them."""
@@ -124,7 +126,7 @@ class DelayedGCodes(Module):
         found = self._named(call.command, values)
         needed(call.command, values, "DURATION")
         duration_s = bounded(call.command, values, "DURATION", 0.0, low=0.0, high=DURATION_MAX_S)
-        return AtOnce(act=lambda: found.wait_from_program(duration_s))
+        return Immediate(act=lambda: found.wait_from_program(duration_s))
 
     def _run(self, call: Call) -> Reading:
         return self._named(call.command, parameters(call.command, ("ID",))).template.lines(call, {})

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, ToProgram
-from coordinator.gcode.interpreter import Job
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, ProgramContext, Reading, ToProgram
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import flag, needed, parameters
@@ -46,13 +45,13 @@ class ExcludeObject(Module):
         """While moves are left out: by how much the filament was drawn back when that began."""
         self.only_looks = False
         """Whether no moves are left out, whatever is excluded: a program is read again up to where it was."""
-        for name, help_, read, beside in (
+        for name, help_, read, while_printing in (
             ("EXCLUDE_OBJECT_DEFINE", "Tell of an object", self._define, False),
             ("EXCLUDE_OBJECT_START", "An object begins", self._start, False),
             ("EXCLUDE_OBJECT_END", "An object ends", self._end, False),
             ("EXCLUDE_OBJECT", "Leave out an object from here on", self._exclude, True),
         ):
-            build.add_command(GCodeCommand(name, help_, read, beside=beside))
+            build.add_command(GCodeCommand(name, help_, read, while_printing=while_printing))
 
     def status(self) -> Mapping[str, Value]:
         """Tell the objects, which of them are left out, and which one is being read."""
@@ -94,20 +93,20 @@ class ExcludeObject(Module):
         if flag(call.command, values, "RESET"):
             return ToProgram(self._reset)
         if "NAME" not in values:
-            return AtOnce((f"Known objects: {' '.join(self._objects) or 'none'}",))
+            return Immediate((f"Known objects: {' '.join(self._objects) or 'none'}",))
         found = _Object(
             values["NAME"].upper(),
             _point(call.command, values["CENTER"].split(",")) if "CENTER" in values else None,
             _polygon(call.command, values.get("POLYGON", "[]")),
         )
-        return AtOnce(act=lambda: self._know(found))
+        return Immediate(act=lambda: self._know(found))
 
     def _know(self, found: _Object) -> None:
         if found.name not in self._objects and len(self._objects) >= OBJECTS_MAX:
             raise WordError(f"the program has more than {OBJECTS_MAX} objects; leave some undefined")
         self._objects[found.name] = found
 
-    def _reset(self, job: "Job") -> bool:
+    def _reset(self, job: ProgramContext) -> bool:
         done = self._make_moves(job)
         if done:
             self.forget()
@@ -116,7 +115,7 @@ class ExcludeObject(Module):
     def _start(self, call: Call) -> Reading:
         name = needed(call.command, parameters(call.command, ("NAME",)), "NAME").upper()
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             if name not in self._objects:
                 self._know(_Object(name))
             if not self._make_moves(job):
@@ -130,7 +129,7 @@ class ExcludeObject(Module):
     def _end(self, call: Call) -> Reading:
         parameters(call.command, ("NAME",))
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             done = self._make_moves(job)
             if done:
                 self._current = None
@@ -151,19 +150,19 @@ class ExcludeObject(Module):
             if not name:
                 raise WordError("EXCLUDE_OBJECT CURRENT=1 comes where no object is; name one by NAME=...")
         if not name:
-            return AtOnce((f"Excluded objects: {' '.join(sorted(self._excluded)) or 'none'}",))
+            return Immediate((f"Excluded objects: {' '.join(sorted(self._excluded)) or 'none'}",))
         if name not in self._objects:
             hint = nearest(name, self._objects) or f"; there is {', '.join(self._objects) or 'none'}"
             raise WordError(f"EXCLUDE_OBJECT names {quoted(name)}, which is no object of this program{hint}")
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             self._excluded.add(name)
             self._look(job)
             return True
 
         return ToProgram(act)
 
-    def _take_back(self, job: "Job", name: str) -> bool:
+    def _take_back(self, job: ProgramContext, name: str) -> bool:
         if (not name or name == self._current) and not self._make_moves(job):
             return False
         if name:
@@ -174,13 +173,13 @@ class ExcludeObject(Module):
 
     # ---- What becomes of the moves ----
 
-    def _look(self, job: "Job") -> None:
+    def _look(self, job: ProgramContext) -> None:
         """Leave out moves from here on, if this is an object to be left out."""
         if self.leaves_out and self._retracted_mm is None and not self.only_looks:
             self._retracted_mm = job.planner.retracted_mm
             job.planner.excluded = True
 
-    def _make_moves(self, job: "Job") -> bool:
+    def _make_moves(self, job: ProgramContext) -> bool:
         """Make moves again; False: the planner has to be emptied first."""
         if self._retracted_mm is None:
             return True

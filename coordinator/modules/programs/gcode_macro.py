@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from coordinator.config.errors import ConfigError, Place
 from coordinator.config.options import GCodeOption, Option, SectionSpec, TextOption
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Lines, Reading
 from coordinator.gcode.parser import Command, WordError, parse, quoted
 from coordinator.gcode.templates.templates import Asked, Template, TemplateError, line_of
 from coordinator.modules.base import Build, Module, Modules
@@ -120,7 +120,7 @@ class GCodeMacro(Module):
         if rename and not _is_command(rename):
             raise build.reader.bad(RENAME, "is no name that a command can have")
         help_ = " ".join(build.get(DESCRIPTION).split()) or "G-Code macro"
-        build.replace_command(GCodeCommand(self.command, help_, self._read, beside=True), rename)
+        build.replace_command(GCodeCommand(self.command, help_, self._read, while_printing=True), rename)
         build.shared(Variables)
 
     def status(self) -> Mapping[str, Value]:
@@ -151,7 +151,7 @@ class Variables(Module):
         self._macros: dict[str, GCodeMacro] = {}
         build.add_command(
             GCodeCommand(
-                "SET_GCODE_VARIABLE", "Give a macro's variable another value", self._set, beside=True
+                "SET_GCODE_VARIABLE", "Give a macro's variable another value", self._set, while_printing=True
             )
         )
 
@@ -187,7 +187,7 @@ class Variables(Module):
         def act() -> None:
             macro.variables[name] = value
 
-        return AtOnce(act=act)
+        return Immediate(act=act)
 
 
 def words_in(text: str) -> set[str]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Lines, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Lines, Reading
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, parameters
@@ -48,7 +48,7 @@ class IdleTimeout(Module):
         self._works = 0
         self._acting = False
         build.add_command(
-            GCodeCommand("SET_IDLE_TIMEOUT", "Let nothing happen for TIMEOUT", self._set, beside=True)
+            GCodeCommand("SET_IDLE_TIMEOUT", "Let nothing happen for TIMEOUT", self._set, while_printing=True)
         )
         build.add_command(GCodeCommand("_IDLE_TIMEOUT", "What is done when nothing happens", self._lines))
 
@@ -125,4 +125,4 @@ class IdleTimeout(Module):
         def act() -> None:
             self._timeout_s = timeout_s
 
-        return AtOnce((f"idle_timeout: Timeout set to {timeout_s:.2f} s",), act)
+        return Immediate((f"idle_timeout: Timeout set to {timeout_s:.2f} s",), act)

@@ -9,9 +9,8 @@ from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.builtins.state import save_state
-from coordinator.gcode.commands import Call, GCodeCommand, Reading, ToProgram
+from coordinator.gcode.commands import Call, GCodeCommand, ProgramContext, Reading, ToProgram
 from coordinator.gcode.events import Reply
-from coordinator.gcode.interpreter import Job
 from coordinator.modules.base import Build, Module
 from coordinator.modules.status.print_stats import PrintStats
 from coordinator.modules.words import bounded, parameters
@@ -46,7 +45,7 @@ class PauseResume(Module):
             ("CANCEL_PRINT", "End the job", self._cancel),
             ("CLEAR_PAUSE", "Forget that there was a pause", self._clear),
         ):
-            build.add_command(GCodeCommand(name, help_, read, beside=True))
+            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
 
     def status(self) -> Mapping[str, Value]:
         """Tell whether there is a pause."""
@@ -63,7 +62,7 @@ class PauseResume(Module):
     def _pause(self, call: Call) -> Reading:
         parameters(call.command, ())
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             if self._paused and (job.prints is None or job.prints.paused):
                 job.emit(Reply(job.line, "the job is paused already"))
                 return True
@@ -81,12 +80,12 @@ class PauseResume(Module):
         values = parameters(call.command, ("VELOCITY",))
         speed = bounded(call.command, values, "VELOCITY", self._velocity_mm_s, low=0.001, high=10_000.0)
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             prints = job.prints
             if not self._paused and (prints is None or not prints.paused):
                 job.emit(Reply(job.line, "nothing is paused: RESUME does nothing"))
                 return True
-            if prints is not None and not job.beside and not prints.come_back(job, speed):
+            if prints is not None and not job.while_printing and not prints.come_back(job, speed):
                 return False
             self._paused = False
             if prints is not None:
@@ -98,7 +97,7 @@ class PauseResume(Module):
     def _cancel(self, call: Call) -> Reading:
         parameters(call.command, ())
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             self._paused = False
             if job.prints is not None:
                 job.prints.cancel_job(job)
@@ -109,7 +108,7 @@ class PauseResume(Module):
     def _clear(self, call: Call) -> Reading:
         parameters(call.command, ())
 
-        def act(_job: "Job") -> bool:
+        def act(_job: ProgramContext) -> bool:
             self._paused = False
             return True
 

@@ -3,7 +3,8 @@
 import asyncio
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.events import Done
 from coordinator.modules.base import Build, Module
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
@@ -52,11 +53,11 @@ class SaveConfig(Module):
 
     def _read_save(self, call: Call) -> Reading:
         call.parameters()
-        return AtRest(self._save)
+        return AtStandstill(self._save)
 
     def _read_restart(self, call: Call, *, firmware: bool) -> Reading:
         call.parameters()
-        return AtRest(lambda: self._restart(firmware=firmware))
+        return AtStandstill(lambda: self._restart(firmware=firmware))
 
     async def _save(self) -> Done | None:
         assert self._live is not None

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec, TextOption
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
@@ -42,7 +42,9 @@ class SaveVariables(Module):
         self._variables: dict[str, Any] = {}
         self._writer: _Writer | None = None
         build.add_command(
-            GCodeCommand("SAVE_VARIABLE", "Keep VALUE as VARIABLE in the file", self._save, beside=True)
+            GCodeCommand(
+                "SAVE_VARIABLE", "Keep VALUE as VARIABLE in the file", self._save, while_printing=True
+            )
         )
 
     def link(self, modules: Modules) -> None:  # noqa: ARG002
@@ -86,7 +88,7 @@ class SaveVariables(Module):
             if self._writer is not None:
                 self._writer.write(_as_text(self._variables))
 
-        return AtOnce(act=act)
+        return Immediate(act=act)
 
 
 def read_variables(path: Path) -> dict[str, Any]:

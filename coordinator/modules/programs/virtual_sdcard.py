@@ -5,10 +5,16 @@ from pathlib import Path
 from typing import Final
 
 from coordinator.config.options import GCodeOption, SectionSpec, TextOption
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, ToProgram
-from coordinator.gcode.interpreter import Job
+from coordinator.gcode.commands import (
+    Call,
+    GCodeCommand,
+    Immediate,
+    ProgramContext,
+    Reading,
+    Recovering,
+    ToProgram,
+)
 from coordinator.gcode.parser import WordError
-from coordinator.gcode.print_control import Recovering
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
@@ -46,7 +52,7 @@ class VirtualSdcard(Module):
         """How far the job is read; by the service."""
         self._stats = build.shared(PrintStats)
         self._selected = ""
-        for name, help_, read, beside in (
+        for name, help_, read, while_printing in (
             ("SDCARD_PRINT_FILE", "Print the file FILENAME", self._print, False),
             ("SDCARD_RESET_FILE", "Forget the file that was printed", self._reset, False),
             ("M20", "List the files", self._list, False),
@@ -59,7 +65,7 @@ class VirtualSdcard(Module):
             ("RESUME_INTERRUPTED", "Go on with a job that a crash has ended", self._recover, False),
             ("_ON_ERROR_GCODE", "What is done when a job failed", self._failed, False),
         ):
-            build.add_command(GCodeCommand(name, help_, read, beside=beside))
+            build.add_command(GCodeCommand(name, help_, read, while_printing=while_printing))
 
     def status(self) -> Mapping[str, Value]:
         """Tell which file is printed, and how far it is read."""
@@ -75,7 +81,7 @@ class VirtualSdcard(Module):
         name = needed(call.command, values, "FILENAME").lstrip("/")
         return ToProgram(lambda job: self._begin(job, name))
 
-    def _begin(self, job: "Job", name: str) -> bool:
+    def _begin(self, job: ProgramContext, name: str) -> bool:
         prints = job.prints
         if prints is None:
             job.notice("printing a file", "only a service (canductor run) prints files: it is skipped")
@@ -95,7 +101,7 @@ class VirtualSdcard(Module):
     def _reset(self, call: Call) -> Reading:
         parameters(call.command, ())
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             if job.prints is not None and job.prints.job_is_active:
                 raise WordError(_BUSY)
             self._selected = ""
@@ -109,10 +115,10 @@ class VirtualSdcard(Module):
             files = [f"{name} {size}" for name, size in self.files()]
         except CanductorError as error:
             raise WordError(str(error)) from None
-        return AtOnce(("Begin file list", *files, "End file list"), kind=ReplyKind.PLAIN)
+        return Immediate(("Begin file list", *files, "End file list"), kind=ReplyKind.PLAIN)
 
     def _init(self, _call: Call) -> Reading:
-        return AtOnce(("SD card ok",), kind=ReplyKind.PLAIN)
+        return Immediate(("SD card ok",), kind=ReplyKind.PLAIN)
 
     def _select(self, call: Call) -> Reading:
         name = call.command.text.strip().lstrip("/")
@@ -123,10 +129,10 @@ class VirtualSdcard(Module):
         def act() -> None:
             self._selected = name
 
-        return AtOnce((f"File selected: {name}",), act, kind=ReplyKind.PLAIN)
+        return Immediate((f"File selected: {name}",), act, kind=ReplyKind.PLAIN)
 
     def _start(self, _call: Call) -> Reading:
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             if job.prints is not None and job.prints.job_is_active:
                 job.prints.resume_job()
                 return True
@@ -137,7 +143,7 @@ class VirtualSdcard(Module):
         return ToProgram(act)
 
     def _pause(self, _call: Call) -> Reading:
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             if job.prints is not None:
                 job.prints.pause_job(job)
             return True
@@ -150,13 +156,13 @@ class VirtualSdcard(Module):
                 "M26 cannot begin in the middle of a file: temperatures, modes and origin would be missing;"
                 " RESUME_INTERRUPTED goes on with one"
             )
-        return AtOnce()
+        return Immediate()
 
     def _tell(self, _call: Call) -> Reading:
         if self._stats.state not in ("printing", "paused"):
-            return AtOnce(("Not SD printing.",), kind=ReplyKind.PLAIN)
+            return Immediate(("Not SD printing.",), kind=ReplyKind.PLAIN)
         place = self.place
-        return AtOnce(
+        return Immediate(
             (f"SD printing byte {place['file_position']}/{place['file_size']}",), kind=ReplyKind.PLAIN
         )
 
@@ -166,7 +172,7 @@ class VirtualSdcard(Module):
         z_mm = bounded(call.command, values, "Z", None, low=-1e6, high=1e6)
         how = Recovering(None if line is None else int(line), flag(call.command, values, "HOME"), z_mm)
 
-        def act(job: "Job") -> bool:
+        def act(job: ProgramContext) -> bool:
             if job.prints is None:
                 job.notice("RESUME_INTERRUPTED", "only a service (canductor run) keeps a journal of jobs")
             elif job.prints.job_is_active:

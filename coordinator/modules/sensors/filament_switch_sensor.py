@@ -5,7 +5,7 @@ from typing import Final
 
 from coordinator.config.options import BoolOption, FloatOption, GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
@@ -126,7 +126,7 @@ class FilamentSensors(Module):
             (_RUNOUT, "What is done when filament runs out", self._runout),
             (_INSERT, "What is done when filament comes", self._insert),
         ):
-            build.add_command(GCodeCommand(name, help_, read, beside=True))
+            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
 
     def link(self, modules: Modules) -> None:
         """Find them."""
@@ -142,7 +142,7 @@ class FilamentSensors(Module):
     def _query(self, call: Call) -> Reading:
         sensor, _ = self._sensor(call)
         found = "detected" if sensor.switch.pressed else "not detected"
-        return AtOnce((f"Filament Sensor {sensor.id}: filament {found}",))
+        return Immediate((f"Filament Sensor {sensor.id}: filament {found}",))
 
     def _set(self, call: Call) -> Reading:
         sensor, given = self._sensor(call, "ENABLE")
@@ -152,7 +152,7 @@ class FilamentSensors(Module):
         def act() -> None:
             sensor.enabled = enabled
 
-        return AtOnce(act=act)
+        return Immediate(act=act)
 
     def _runout(self, call: Call) -> Reading:
         return self._sensor(call)[0].runout.lines(call, {})

@@ -22,7 +22,7 @@ from coordinator.config.sections.sensor_options import (
 )
 from coordinator.heat.chip_sensors import ChipLine, ChipSensor, FactoryPoints, chip_sensor
 from coordinator.modules.base import Build, Modules
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from coordinator.modules.sensors.temperature_source import TemperatureSource
 from coordinator.runtime.module_context import ModuleContext
@@ -177,7 +177,7 @@ class CombinedTemperature(TemperatureSource):
 
     def __init__(self, build: Build, min_c: float, max_c: float) -> None:
         super().__init__(build.name, min_c, max_c)
-        self._heaters = build.shared(Heaters)
+        self._heaters = build.shared(HeaterRegistry)
         self._names = build.get(SENSOR_LIST)
         self._method = build.get(COMBINATION_METHOD)
         self._deviation_k = build.find(MAXIMUM_DEVIATION)

@@ -5,7 +5,7 @@ from typing import Final
 
 from coordinator.config.options import GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
@@ -71,9 +71,9 @@ class GCodeButtons(Module):
         super().__init__(build)
         self._all: dict[str, GCodeButton] = {}
         build.add_command(
-            GCodeCommand("QUERY_BUTTON", "Tell whether BUTTON is pressed", self._query, beside=True)
+            GCodeCommand("QUERY_BUTTON", "Tell whether BUTTON is pressed", self._query, while_printing=True)
         )
-        build.add_command(GCodeCommand(_COMMAND, "What a button does", self._run, beside=True))
+        build.add_command(GCodeCommand(_COMMAND, "What a button does", self._run, while_printing=True))
 
     def link(self, modules: Modules) -> None:
         """Find them."""
@@ -84,7 +84,7 @@ class GCodeButtons(Module):
 
     def _query(self, call: Call) -> Reading:
         name = one(call.command, parameters(call.command, ("BUTTON",)), "BUTTON", self._all)
-        return AtOnce((f"{name}: {self._all[name].status()['state']}",))
+        return Immediate((f"{name}: {self._all[name].status()['state']}",))
 
     def _run(self, call: Call) -> Reading:
         given = parameters(call.command, ("BUTTON", "PRESSED"))

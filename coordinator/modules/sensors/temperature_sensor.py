@@ -10,7 +10,7 @@ from coordinator.config.sections.sensor_options import (
     SENSOR_OPTIONS,
 )
 from coordinator.modules.base import Build, Modules
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.sensors.free_temperatures import find_source
 from coordinator.modules.sensors.temperature_input import SensorModule
 from coordinator.runtime.module_context import ModuleContext
@@ -39,7 +39,7 @@ class TemperatureSensor(SensorModule):
         self.input = find_source(build, limits_needed=False)
         self.input.on_measured = self._measured
         self._extremes: tuple[float, float] | None = None
-        build.shared(Heaters).add_sensor(self.input, build.find(GCODE_ID) or "")
+        build.shared(HeaterRegistry).add_sensor(self.input, build.find(GCODE_ID) or "")
 
     def link(self, modules: Modules) -> None:
         """Find the sensor."""

@@ -4,7 +4,7 @@ from importlib.metadata import version
 from typing import Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.print_stats import PrintStats
@@ -25,7 +25,7 @@ class Console(Module):
             ("STATUS", "Tell how the machine is", self._status),
             ("M115", "Tell what runs the machine", self._identify),
         ):
-            build.add_command(GCodeCommand(name, help_, read, beside=True))
+            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
 
     def link(self, modules: Modules) -> None:
         """Remember who there is."""
@@ -33,15 +33,19 @@ class Console(Module):
 
     def _help(self, call: Call) -> Reading:
         call.parameters()
-        helps = {} if self._modules is None else self._modules.helps
-        return AtOnce(tuple(f"{name}: {helps[name]}" for name in sorted(helps) if not name.startswith("_")))
+        command_help = {} if self._modules is None else self._modules.command_help
+        return Immediate(
+            tuple(
+                f"{name}: {command_help[name]}" for name in sorted(command_help) if not name.startswith("_")
+            )
+        )
 
     def _status(self, call: Call) -> Reading:
         call.parameters()
         stats = None if self._modules is None else self._modules.find("print_stats", PrintStats)
         if stats is None or stats.state not in ("printing", "paused"):
-            return AtOnce(("ready",))
-        return AtOnce((f"{stats.state} {stats.told['filename']}",))
+            return Immediate(("ready",))
+        return Immediate((f"{stats.state} {stats.told['filename']}",))
 
     def _identify(self, _call: Call) -> Reading:
-        return AtOnce((f"FIRMWARE_NAME:{NAME} FIRMWARE_VERSION:{version(NAME)}",), kind=ReplyKind.PLAIN)
+        return Immediate((f"FIRMWARE_NAME:{NAME} FIRMWARE_VERSION:{version(NAME)}",), kind=ReplyKind.PLAIN)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
 from coordinator.gcode.parser import WordError, number
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import parameters
@@ -28,7 +28,7 @@ class DisplayStatus(Module):
             ("SET_DISPLAY_TEXT", "Show MSG; without it, nothing", self._set),
             ("M73", "Tell how many percent of the program are done", self._tell),
         ):
-            build.add_command(GCodeCommand(name, help_, read, beside=True))
+            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
 
     def status(self) -> Mapping[str, Value]:
         """Tell the message, and the progress of 0 to 1; None: not told."""
@@ -48,12 +48,12 @@ class DisplayStatus(Module):
         def act() -> None:
             self._message = text[:TEXT_MAX] or None
 
-        return AtOnce(act=act)
+        return Immediate(act=act)
 
     def _tell(self, call: Call) -> Reading:
         words = call.command.words()
         if "P" not in words:
-            return AtOnce()  # R alone: the minutes that are left
+            return Immediate()  # R alone: the minutes that are left
         percent = number("M73", words, "P")
         if not 0 <= percent <= 100:
             raise WordError(f"P of M73 is {percent:g} %; 0 to 100 % are possible")
@@ -61,4 +61,4 @@ class DisplayStatus(Module):
         def act() -> None:
             self._progress = percent / 100
 
-        return AtOnce(act=act)
+        return Immediate(act=act)

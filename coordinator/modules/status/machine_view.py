@@ -66,7 +66,7 @@ class Commands(Mapping[str, Any]):
     def __getitem__(self, name: str) -> object:
         if name != "commands":
             raise KeyError(name)
-        return {command: {"help": text} for command, text in self._modules.helps.items()}
+        return {command: {"help": text} for command, text in self._modules.command_help.items()}
 
     def __iter__(self) -> Iterator[str]:
         return iter(("commands",))

@@ -1,7 +1,8 @@
 """GET_POSITION: where the machine is in all frames, from what the nodes count to the program's numbers."""
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.events import Done
 from coordinator.gcode.status import frames
 from coordinator.modules.base import Build, Module
 from coordinator.runtime.module_context import ModuleContext
@@ -20,7 +21,7 @@ class Positions(Module):
                 "GET_POSITION",
                 "Tell where the machine is in all frames; beside a job in those of its program",
                 self._read,
-                beside=True,
+                while_printing=True,
             )
         )
 
@@ -30,9 +31,9 @@ class Positions(Module):
 
     def _read(self, call: Call) -> Reading:
         told = frames(call.figures())
-        if call.beside:
-            return AtOnce(told)
-        return AtRest(lambda: self._tell(told), Done(told))
+        if call.while_printing:
+            return Immediate(told)
+        return AtStandstill(lambda: self._tell(told), Done(told))
 
     async def _tell(self, told: tuple[str, ...]) -> Done:
         """Answer with what the nodes count, what follows from that, and what the program was TOLD."""

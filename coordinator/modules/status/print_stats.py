@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import bounded, parameters
 from coordinator.support.values import Value
@@ -40,7 +40,7 @@ class PrintStats(Module):
                 "SET_PRINT_STATS_INFO",
                 "Tell TOTAL_LAYER and CURRENT_LAYER of the job",
                 self._set,
-                beside=True,
+                while_printing=True,
             )
         )
 
@@ -75,4 +75,4 @@ class PrintStats(Module):
             if current is not None:
                 self._current = int(current) if self._total is None else min(int(current), self._total)
 
-        return AtOnce(act=act)
+        return Immediate(act=act)

@@ -1,7 +1,7 @@
 """[respond]: RESPOND shows a line to the user, with a prefix that tells its kind; so does M118."""
 
 from coordinator.config.options import ChoiceOption, SectionSpec, TextOption
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.gcode.reply_kinds import kind_of_line
 from coordinator.modules.base import Build, Module
@@ -23,9 +23,11 @@ class Respond(Module):
         super().__init__(build)
         usual = PREFIXES[build.get(TYPE)]
         self._prefix = build.find(PREFIX) or usual
-        build.add_command(GCodeCommand("M118", "Show a line", self._echo, beside=True))
+        build.add_command(GCodeCommand("M118", "Show a line", self._echo, while_printing=True))
         build.add_command(
-            GCodeCommand("RESPOND", "Show MSG, after PREFIX or that of TYPE", self._respond, beside=True)
+            GCodeCommand(
+                "RESPOND", "Show MSG, after PREFIX or that of TYPE", self._respond, while_printing=True
+            )
         )
 
     def _echo(self, call: Call) -> Reading:
@@ -44,5 +46,5 @@ class Respond(Module):
         return _line(f"{values.get('PREFIX', prefix)} {values.get('MSG', '')}")
 
 
-def _line(line: str) -> AtOnce:
-    return AtOnce((line,), kind=kind_of_line(line))
+def _line(line: str) -> Immediate:
+    return Immediate((line,), kind=kind_of_line(line))

@@ -1,17 +1,25 @@
-"""From G-code text to trapezoids: the Python skin of the look-ahead and the G-code hot path.
+"""From G-code text to trapezoids: the Python side of the look-ahead and the G-code hot path.
 
 Text goes in by ``feed``, trapezoids come out by ``take`` and ``release``; everything between runs in C
 without the interpreter lock. Lengths in mm, times in s, speeds in mm/s, axes in the order X Y Z E.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from typing import Any
+from typing import Any, Final
 
 from coordinator.motion.planner._planner import ffi, lib
-from coordinator.motion.planner.dynamics import Dynamics
-from coordinator.motion.planner.language import Language, Plane, gcode_words
+from coordinator.motion.planner.language import (
+    ARC_DEVIATION_MM,
+    ARC_PIECE_MM,
+    AXES,
+    COMMAND_KINDS,
+    ArcFault,
+    Plane,
+    SuspendedProgram,
+    gcode_words,
+)
 from coordinator.motion.planner.values import (
     SPEED_LIMITS,
     Fault,
@@ -44,13 +52,21 @@ __all__ = [
 AXIS_LETTERS = "XYZE"
 MOVE_LETTERS = "XYZEF"
 _STATUS = tuple(FeedStatus)
+MAX_ADVANCE_S: Final = 10.0
+EXTRUDER_LIMITS: Final = (
+    "max_extrude_only_velocity",
+    "max_extrude_only_accel",
+    "max_extrude_only_distance",
+    "max_extrude_ratio",
+    "instantaneous_corner_velocity",
+)
 DEFAULT_SPEED_MM_S = 25.0
 """Speed of moves before the first F word."""
 RING_TRAPEZOIDS = int(lib.PLANNER_RING)
 """Most trapezoids that can wait for ``take``."""
 
 
-class Planner(Language, Dynamics):
+class Planner:
     """Plans moves with look-ahead; begins at standstill at POSITION, print time 0, nothing homed.
 
     Not thread-safe; ``feed`` releases the interpreter lock while C works. Raises ValueError when a limit is
@@ -79,8 +95,10 @@ class Planner(Language, Dynamics):
         )
         self._offset: Any = ffi.new("size_t *")
         self._count: Any = ffi.new("uint32_t *")
-        Language.__init__(self, self._state, self._core)
-        Dynamics.__init__(self, limits, self._core)
+        self.limits = limits
+        """What was configured; ``accel`` and the like never exceed it."""
+        self._offset_mm = [0.0, 0.0, 0.0, 0.0]
+        self.set_arc_precision()
 
     # ---- Text in ----
 
@@ -324,6 +342,238 @@ class Planner(Language, Dynamics):
         self.max_velocity = self.limits.max_velocity
         self.square_corner_velocity = self.limits.square_corner_velocity
         self.minimum_cruise_ratio = self.limits.minimum_cruise_ratio
+
+    # ---- Speeds, accelerations and ranges; speeds in mm/s ----
+
+    @property
+    def accel(self) -> float:
+        """mm/s² (M204)."""
+        return float(self._core.accel)
+
+    @accel.setter
+    def accel(self, accel: float) -> None:
+        self.set_accel_words({"S": accel})
+
+    def set_accel_words(self, words: Mapping[str, float]) -> None:
+        """M204: S, or the lower of P (print) and T (travel); one of these alone has no effect."""
+        most = self.limits.max_accel
+        capped = {key: min(check_number("the acceleration", a, 1e-3), most) for key, a in words.items()}
+        if lib.gcode_accel(self._core, gcode_words(capped)):
+            raise ValueError("M204 names no acceleration; give S, or P and T (mm/s²)")
+
+    @property
+    def max_velocity(self) -> float:
+        """mm/s along the path."""
+        return float(self._core.limits.max_velocity)
+
+    @max_velocity.setter
+    def max_velocity(self, velocity: float) -> None:
+        velocity = check_number("the velocity", velocity, 1e-3)
+        self._core.limits.max_velocity = min(velocity, self.limits.max_velocity)
+
+    @property
+    def square_corner_velocity(self) -> float:
+        """mm/s."""
+        return float(self._core.limits.square_corner_velocity)
+
+    @square_corner_velocity.setter
+    def square_corner_velocity(self, velocity: float) -> None:
+        velocity = check_number("the square corner velocity", velocity, 0)
+        self._core.limits.square_corner_velocity = min(velocity, self.limits.square_corner_velocity)
+
+    @property
+    def minimum_cruise_ratio(self) -> float:
+        """0 <= ratio < 1."""
+        return float(self._core.limits.minimum_cruise_ratio)
+
+    @minimum_cruise_ratio.setter
+    def minimum_cruise_ratio(self, ratio: float) -> None:
+        self._core.limits.minimum_cruise_ratio = check_number("the minimum cruise ratio", ratio, 0, 0.999)
+
+    @property
+    def pressure_advance(self) -> float:
+        """Seconds, of the printing moves to come."""
+        return float(self._core.pressure_advance)
+
+    @pressure_advance.setter
+    def pressure_advance(self, advance_s: float) -> None:
+        self._core.pressure_advance = check_number("the pressure advance", advance_s, 0, MAX_ADVANCE_S)
+
+    # ---- Where and how the moves to come may go when the machine changes ----
+
+    def set_range(self, axis: int, low: float, high: float) -> None:
+        """AXIS (0 to 2) may go from LOW to HIGH, mm; nowhere when LOW is above HIGH."""
+        self._core.limits.position_min[axis] = check_number("position_min", low, -1e6, 1e9)
+        self._core.limits.position_max[axis] = check_number("position_max", high, -1e6, 1e9)
+
+    def limit_axes(self, what: str, values: Mapping[str, float]) -> None:
+        """Let X, Y, Z and filament alone (E) have at most VALUES of WHAT: ``velocity`` or ``accel``; mm, s.
+
+        Never more than is configured; raises ValueError.
+        """
+        for letter, asked in values.items():
+            name = f"max_extrude_only_{what}" if letter == "E" else f"max_{letter.lower()}_{what}"
+            most = getattr(self.limits, name) or getattr(self.limits, f"max_{what}")
+            setattr(self._core.limits, name, min(check_number(name, asked, 1e-3), most))
+
+    @property
+    def cold(self) -> bool:
+        """Whether moves of filament are refused."""
+        return bool(self._core.cold)
+
+    @cold.setter
+    def cold(self, cold: bool) -> None:
+        self._core.cold = cold
+
+    def set_extruder_limits(self, limits: MotionLimits) -> None:
+        """Take over what LIMITS say of filament: another extruder is active."""
+        check_limits(limits)
+        for name in EXTRUDER_LIMITS:
+            setattr(self._core.limits, name, getattr(limits, name))
+
+    # ---- Offsets ----
+
+    @property
+    def gcode_offset(self) -> Position:
+        """By how much the G-code origin is shifted beside G92 (SET_GCODE_OFFSET), mm; homing keeps it."""
+        x, y, z, e = self._offset_mm
+        return (x, y, z, e)
+
+    def set_gcode_offset(self, words: Mapping[str, float]) -> None:
+        """Shift the G-code origin, so that its offset is WORDS (axis letter to mm)."""
+        for letter, value in words.items():
+            axis = AXES.index(letter)
+            offset_mm = check_number("the offset", value, -1e6, 1e6)
+            self._state.base[axis] += offset_mm - self._offset_mm[axis]
+            self._offset_mm[axis] = offset_mm
+
+    def clear_gcode_base(self, axes: str) -> None:
+        """Put the G-code origin of AXES (letters) back to the machine's, but for the offset."""
+        for letter in axes:
+            axis = AXES.index(letter)
+            self._state.base[axis] = self._offset_mm[axis]
+
+    def restore_origin(self, base: Position, offset: Position) -> None:
+        """Take back an origin (machine's frame, mm) and the offset that is in it."""
+        self._state.base = base
+        self._offset_mm = list(offset)
+
+    def shift_program(self, axis: str, distance_mm: float) -> None:
+        """Let the next move also make up for DISTANCE_MM along AXIS, without a move of its own."""
+        self._state.position[AXES.index(axis)] += distance_mm
+
+    # ---- Arcs ----
+
+    def set_arc_precision(
+        self, piece_mm: float = ARC_PIECE_MM, deviation_mm: float = ARC_DEVIATION_MM
+    ) -> None:
+        """Make arcs of straight pieces, none longer nor further away from its arc than this."""
+        self._state.arc_piece = check_number("the piece of an arc", piece_mm, 1e-3)
+        self._state.arc_deviation = check_number("the deviation of an arc", deviation_mm, 1e-6)
+
+    @property
+    def plane(self) -> Plane:
+        """G17, G18, G19."""
+        return Plane(self._state.plane)
+
+    @plane.setter
+    def plane(self, plane: Plane) -> None:
+        self._state.plane = int(plane)
+
+    @property
+    def arc_open(self) -> bool:
+        """Whether an arc is planned in part only; ``feed`` goes on with it."""
+        return bool(self._state.arc.done < self._state.arc.pieces)
+
+    def begin_arc(self, words: Mapping[str, float], *, clockwise: bool) -> ArcFault | None:
+        """Begin a G2 or G3 with these WORDS (letters of ARC_LETTERS); ``go_on_with_arc`` then."""
+        fault = lib.gcode_arc_begin(self._state, self._core, gcode_words(words), clockwise)
+        return ArcFault(fault) if fault else None
+
+    def go_on_with_arc(self) -> FeedStatus:
+        """Plan what is left of the arc; NEED_DATA says that it was done."""
+        return FeedStatus(lib.gcode_arc_go_on(self._state, self._core))
+
+    def suspend_program(self, *, moving: bool = True) -> SuspendedProgram:
+        """Let other lines come before the one at hand goes on; MOVING: they may move.
+
+        Then moves are made again where they are left out, until it goes on.
+        """
+        state = self._state
+        arc = bytes(ffi.buffer(ffi.addressof(state, "arc")))
+        x, y, z, e = state.position
+        excluded = moving and self.excluded
+        real_e = self._core.position[3]
+        suspended = SuspendedProgram(
+            state.lines, state.left_out, arc, excluded, (x, y, z, e), state.base[3], real_e
+        )
+        self.forget_line()
+        if excluded:
+            self.drop_exclusion()
+        return suspended
+
+    def resume_program(self, suspended: SuspendedProgram) -> None:
+        """Go on with the line that was suspended."""
+        self._state.lines, self._state.left_out = suspended.lines, suspended.left_out
+        if suspended.excluded:
+            self.excluded = True
+            self._state.position, self._state.base[3] = suspended.position, suspended.base_e
+        ffi.buffer(ffi.addressof(self._state, "arc"))[:] = suspended.arc
+        if not suspended.excluded:  # filament that others moved meanwhile is none of the arc's
+            moved_e = self._core.position[3] - suspended.real_e
+            self._state.arc.start[3] += moved_e
+            self._state.arc.target[3] += moved_e
+
+    def forget_line(self) -> None:
+        """Forget what is left of a line: another program begins."""
+        self._state.lines = self._state.arc.pieces = self._state.arc.done = 0
+
+    # ---- What is left out ----
+
+    @property
+    def excluded(self) -> bool:
+        """Whether moves are only followed, and not made."""
+        return bool(self._state.excluded)
+
+    @excluded.setter
+    def excluded(self, excluded: bool) -> None:
+        self._state.excluded = excluded
+
+    @property
+    def retracted_mm(self) -> float:
+        """By how much the filament of the program is drawn back from where it was most forward."""
+        return float(self._state.filament_top - self._state.position[3])
+
+    @property
+    def filament_mm(self) -> float:
+        """How much the program has pushed forward: the furthest that E came."""
+        return float(self._state.filament_top)
+
+    def match_filament(self) -> None:
+        """Let the program go on from where the filament really is, wherever it believes it to be."""
+        state = self._state
+        shift = self._core.position[3] - state.position[3]
+        state.position[3] += shift
+        state.base[3] += shift
+        state.filament_top += shift
+
+    def leave_out_from(self, place: Position) -> None:
+        """Leave out moves from here on; the program believes the head to be at PLACE, wherever it is."""
+        self._state.position = place
+        self.excluded = True
+
+    def drop_exclusion(self) -> None:
+        """Make moves again from where the machine is, and let the program know it."""
+        if self.excluded:
+            self.match_filament()
+            self._state.position = self._core.position
+            self.excluded = False
+
+    def leave_out(self, commands: Iterable[str]) -> None:
+        """Let the lines of COMMANDS, of those that ``feed`` acts on, be the caller's instead."""
+        self._state.left_out = 0
+        for kind in {COMMAND_KINDS[command] for command in commands if command in COMMAND_KINDS}:
+            self._state.left_out |= 1 << kind
 
     # ---- Counters ----
 

@@ -2,11 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from coordinator.motion.specs import NodeStreamSpec, StepperSpec
 from coordinator.motion.steps._steps import ffi, lib
+from nodes.support.c_structs import from_struct
 from nodes.support.errors import CanductorError
 
 MAX_ERROR_S = 12.5e-6
@@ -335,14 +336,12 @@ class StepGenerator:
         self._check_stepper(index)
         s = ffi.new("struct step_stepper_stats *")
         lib.step_stepper_stats(self._gen, index, s)
-        values = (getattr(s, field.name) for field in fields(StepperStats)[1:])
-        return StepperStats(self._steppers[index].name, *values)
+        return from_struct(StepperStats, s, name=self._steppers[index].name)
 
     def _node_stats(self, index: int) -> NodeStats:
         s = ffi.new("struct step_node_stats *")
         lib.step_node_stats(self._gen, index, s)
-        values = (getattr(s, field.name) for field in fields(NodeStats)[1:])
-        return NodeStats(self._nodes[index].name, *values)
+        return from_struct(NodeStats, s, name=self._nodes[index].name)
 
     def _check_node(self, node: int) -> None:
         if not 0 <= node < len(self._nodes):

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Iterator
 from typing import Any, Final
 
-from coordinator.gcode.print_control import Recovering
+from coordinator.gcode.commands import Recovering
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope, shown
 from coordinator.service.core.machine_service import MachineService
 from coordinator.service.core.motion import MotionOver

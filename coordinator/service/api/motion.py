@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from coordinator.gcode.builtins.basic import BESIDE, HANDLERS
+from coordinator.gcode.builtins.basic import HANDLERS, WHILE_PRINTING
 from coordinator.gcode.builtins.machine import is_tool
 from coordinator.gcode.errors import GCodeError
 from coordinator.ipc.protocol.methods import ApiError, Caller, Kind, Method, Param, Scope
@@ -36,7 +36,7 @@ RESTARTS: Final = {"RESTART": False, "FIRMWARE_RESTART": True}
 """Commands that also a machine that stopped takes, and whether the nodes are reset."""
 _DISTANCE_MAX_MM: Final = 1e6
 _STEPS_KEPT_S: Final = 0.2
-"""What nodes told of their steppers is told again for so long: clients cannot load a bus by asking."""
+"""What nodes output of their steppers is output again for so long: clients cannot load a bus by asking."""
 
 _AXES: Final = tuple(
     Param(
@@ -66,15 +66,15 @@ _TOLD: Final = (
 class ScriptOutcome:
     """What lines of a client answered."""
 
-    told: Sequence[ProgramOutput] = ()
+    output: Sequence[ProgramOutput] = ()
     logged: bool = True
-    """Whether the log has it already: not what is answered beside a job."""
+    """Whether the log has it already: not for what a running job lets through."""
 
 
 async def run_script(service: MachineService, script: str, *, wait: bool) -> ScriptOutcome:
     """Have lines of g-code done; WAIT: until their moves are executed, too. Raises CanductorError.
 
-    While a job prints they are done beside it, or between two of its lines.
+    While a job prints they are done while_printing it, or between two of its lines.
     """
     lines = _lines(script)
     names = _commands(lines)
@@ -92,14 +92,14 @@ async def run_script(service: MachineService, script: str, *, wait: bool) -> Scr
     paused = service.programs.interrupted(stay=stay) if interrupting or between else contextlib.nullcontext()
     with paused:
         if job is None or job.gives_way:  # they come between two lines of it, and may move
-            return ScriptOutcome((await _done(service, motion, work)).told)
-        work.beside = True
-        _check_beside(motion, names)
-        return ScriptOutcome((await _done(service, motion, work, aside=True)).told, logged=False)
+            return ScriptOutcome((await _done(service, motion, work)).output)
+        work.while_printing = True
+        _check_while_printing(motion, names)
+        return ScriptOutcome((await _done(service, motion, work, aside=True)).output, logged=False)
 
 
 async def _run(service: MachineService, params: dict[str, Any]) -> Value:
-    return _answer((await run_script(service, params["script"], wait=params["wait"])).told)
+    return _answer((await run_script(service, params["script"], wait=params["wait"])).output)
 
 
 def _restarted(service: MachineService, names: list[str]) -> bool:
@@ -128,22 +128,22 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
         named = params["axes"].upper()
         _idle_motion(service)
         work = LinesWork([f"G28 {' '.join(named)}"], name="move.home")
-        return _answer((await _done(service, service.ready_motion(), work)).told)
+        return _answer((await _done(service, service.ready_motion(), work)).output)
 
     async def position(_caller: Caller, params: dict[str, Any]) -> Value:
         motion = service.ready_motion()
-        told = position_figures(motion)
-        told["offset"] = axes(motion.planned.offset)
-        told["steppers"] = _stepper_figures(service.up_machine(), motion)
+        output = position_figures(motion)
+        output["offset"] = axes(motion.planned.offset)
+        output["steppers"] = _stepper_figures(service.up_machine(), motion)
         if params["ask_nodes"]:
-            told |= _node_figures(service.up_machine(), await steps.ask())
-        return told
+            output |= _node_figures(service.up_machine(), await steps.ask())
+        return output
 
     yield Method(
         "gcode.run",
         Scope.OPERATE,
         "Run lines of g-code. While a job prints, those that neither move nor wait act at once: "
-        + " ".join(sorted(BESIDE))
+        + " ".join(sorted(WHILE_PRINTING))
         + ", and those of modules that say so; for others the job stands still between two of its lines, but"
         " never for " + ", ".join(sorted(NEVER_BETWEEN)) + ". While a job is paused any.",
         run,
@@ -220,8 +220,8 @@ async def _done(service: MachineService, motion: Motion, work: Work, *, aside: b
     return queued
 
 
-def _answer(told: Sequence[ProgramOutput]) -> Value:
-    replies, notices = texts(told)
+def _answer(output: Sequence[ProgramOutput]) -> Value:
+    replies, notices = texts(output)
     return {"replies": list(replies), "notices": list(notices)}
 
 
@@ -261,13 +261,13 @@ def _disturbs(motion: Motion, names: list[str]) -> bool:
     return any(name in disturbing or is_tool(name) for name in names)
 
 
-def _check_beside(motion: Motion, names: list[str]) -> None:
+def _check_while_printing(motion: Motion, names: list[str]) -> None:
     """Refuse commands that would disturb the job."""
     known = motion.feeder.vocabulary.commands
     for name in names:
         if name not in known and name not in HANDLERS and not is_tool(name):
             continue  # nobody knows it: that is said where it stands, not that the machine is busy
-        if not (known[name].beside if name in known else name in BESIDE):
+        if not (known[name].while_printing if name in known else name in WHILE_PRINTING):
             raise ApiError(
                 "busy",
                 f"{name} cannot run while a job prints; pause it with job.pause, or wait for its end",

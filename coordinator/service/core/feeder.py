@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from coordinator.gcode.builtins.state import come_back, present_state
-from coordinator.gcode.commands import NO_WORDS, Vocabulary
+from coordinator.gcode.commands import NO_WORDS, ProgramContext, Recovering, Vocabulary
 from coordinator.gcode.events import (
     AS_SOON_AS_POSSIBLE,
     Emergency,
@@ -26,11 +26,9 @@ from coordinator.gcode.events import (
     StandstillAction,
     Timed,
 )
-from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import MachineState, SavedState
 from coordinator.gcode.parser import WordError
-from coordinator.gcode.print_control import Recovering
-from coordinator.motion.planner.language import Aside
+from coordinator.motion.planner.language import SuspendedProgram
 from coordinator.motion.planner.planner import Planner
 from coordinator.service.core.work import NO_PROGRESS, LinesWork, Rest, Setting, Work
 from nodes.support.errors import CanductorError
@@ -40,7 +38,7 @@ WAITING_MAX: Final = 64
 INTERJECTIONS_MAX: Final = 16
 COME_BACK_MM_S: Final = 50.0
 """At which a job goes back to where it was paused."""
-TOLD_MAX: Final = 1000
+OUTPUT_MAX: Final = 1000
 """Replies and notices that are kept of one work."""
 
 
@@ -54,7 +52,7 @@ class QueuedWork:
 
     work: Work
     is_job: bool = False
-    told: list[Reply | Notice] = field(default_factory=list)
+    output: list[Reply | Notice] = field(default_factory=list)
     progress: Progress = NO_PROGRESS
     """How far it is read."""
     cancelled: bool = False
@@ -95,7 +93,7 @@ class Feeder:
         """That is being done, and has to wait for room."""
         self._interjection_events: deque[Event] = deque()
         self._now: QueuedWork | None = None
-        self._held: tuple[QueuedWork, Aside] | None = None
+        self._held: tuple[QueuedWork, SuspendedProgram] | None = None
         """A paused job that others have come between."""
         self._come_back: SavedState | None = None
         """Where the paused job has to go on, if something may have moved since."""
@@ -212,7 +210,7 @@ class Feeder:
         if queued.read or queued.cancelled:
             return self._finish(queued)
         if self._gives_way(queued):
-            self._held = (queued, self.planner.put_aside())
+            self._held = (queued, self.planner.suspend_program())
             self._now = None
             return queued.progress
         try:
@@ -235,7 +233,7 @@ class Feeder:
             self._now = self._waiting.popleft()
         elif self._held is not None and (not self._paused or self._held[0].cancelled):
             (self._now, aside), self._held = self._held, None
-            self.planner.take_up(aside)
+            self.planner.resume_program(aside)
         elif self._held is None and self._closed:
             return End(0, self.planner.print_time_end_s) if self.planner.flush() else Full()
         else:
@@ -264,12 +262,12 @@ class Feeder:
         """Go where the job was when it was paused; None when that is done."""
         lost = [axis for axis in saved.homed if axis not in self.planner.homed]
         problem, done = "", False
-        aside = self.planner.put_aside()
+        aside = self.planner.suspend_program()
         try:
             done = not lost and come_back(self.planner, saved, COME_BACK_MM_S)
         except WordError as error:
             problem = str(error)
-        self.planner.take_up(aside)
+        self.planner.resume_program(aside)
         if lost:
             problem = f"{' and '.join(lost)} must be homed with G28 before it can go on"
         if problem:
@@ -325,9 +323,9 @@ class Feeder:
         """Act on all lines that neither move nor wait, and tell what comes of it; Full: one needs room."""
         while self._interjection is not None or self._interjections:
             queued = self._interjection = self._interjection or self._interjections.popleft()
-            aside = self.planner.put_aside(moving=False)
+            aside = self.planner.suspend_program(moving=False)
             done = self._do_interjection(queued)
-            self.planner.take_up(aside)
+            self.planner.resume_program(aside)
             if not done:
                 return Full()
             self._interjection = None
@@ -356,7 +354,7 @@ class Feeder:
         self.finished.append(queued)
         return True
 
-    # ------------------------------------------------- for programs (coordinator/gcode/print_control.py)
+    # ------------------------------------------------- for programs (PrintControl)
 
     @property
     def job_is_active(self) -> bool:
@@ -364,7 +362,7 @@ class Feeder:
         found = (self._now, self._held[0] if self._held is not None else None)
         return any(queued is not None and queued.is_job and not queued.cancelled for queued in found)
 
-    def pause_job(self, program: Job) -> None:
+    def pause_job(self, program: ProgramContext) -> None:
         """Let the job read no further, by a line of PROGRAM."""
         if not self.job_is_active:
             return
@@ -376,7 +374,7 @@ class Feeder:
         else:
             self._paused = True
 
-    def come_back(self, program: Job, speed_mm_s: float) -> bool:  # noqa: ARG002 (whose moves it is)
+    def come_back(self, program: ProgramContext, speed_mm_s: float) -> bool:  # noqa: ARG002 (whose moves it is)
         """Go to where the job was paused."""
         return self._come_back is None or come_back(self.planner, self._come_back, speed_mm_s)
 
@@ -384,7 +382,7 @@ class Feeder:
         """Let the job go on when the program at hand has ended."""
         self._paused = self._pause_wanted = False
 
-    def cancel_job(self, program: Job) -> None:
+    def cancel_job(self, program: ProgramContext) -> None:
         """End the job, by a line of PROGRAM."""
         if self._is_job(program):
             self._cancel_wanted = True
@@ -402,11 +400,11 @@ class Feeder:
         """Have the interrupted job go on."""
         self.to_recover.append(how)
 
-    def _is_job(self, program: Job) -> bool:
+    def _is_job(self, program: ProgramContext) -> bool:
         now = self._now
-        return now is not None and now.is_job and not program.beside and self._interjection is None
+        return now is not None and now.is_job and not program.while_printing and self._interjection is None
 
 
 def _keep(queued: QueuedWork, event: Reply | Notice) -> None:
-    if len(queued.told) < TOLD_MAX:
-        queued.told.append(event)
+    if len(queued.output) < OUTPUT_MAX:
+        queued.output.append(event)

@@ -95,7 +95,7 @@ class Motion:
         return await self._wait_for(self.feeder.submit(work))
 
     async def do_interjection(self, lines: LinesWork) -> QueuedWork:
-        """Do the same for lines that may run beside a job."""
+        """Do the same for lines that may run while a job prints."""
         return await self._wait_for(self.feeder.submit_interjection(lines))
 
     async def _wait_for(self, queued: QueuedWork) -> QueuedWork:
@@ -164,7 +164,7 @@ class MotionOver(Exception):  # noqa: N818 (it ended, for whatever reason; its o
     """The machine no longer moves."""
 
 
-def texts(told: Sequence[ProgramOutput]) -> tuple[list[str], list[str]]:
+def texts(output: Sequence[ProgramOutput]) -> tuple[list[str], list[str]]:
     """Return the texts of replies and of notices."""
-    notices = [event.text for event in told if isinstance(event, Notice)]
-    return [event.text for event in told if not isinstance(event, Notice)], notices
+    notices = [event.text for event in output if isinstance(event, Notice)]
+    return [event.text for event in output if not isinstance(event, Notice)], notices

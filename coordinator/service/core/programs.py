@@ -5,7 +5,7 @@ import contextlib
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from typing import Any, Final
 
-from coordinator.gcode.print_control import Recovering
+from coordinator.gcode.commands import Recovering
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.gcode_macro import words_in
@@ -57,7 +57,7 @@ class Programs:
         self._stats = next(machine.modules.of(PrintStats), None)
         self._card = next(machine.modules.of(VirtualSdcard), None)
         self._pauses = next(machine.modules.of(PauseResume), None)
-        # A job of the machine before this one is over: it is told of no more.
+        # A job of an earlier machine is over and no longer reported.
         last = self._service.job
         self._told = None if last is None or last.active else (last, last.phase)
         if self._card is None:
@@ -122,10 +122,10 @@ class Programs:
         log = self._service.log
         try:
             if job is not None and not job.gives_way:
-                work.beside = True
+                work.while_printing = True
                 queued = await motion.do_interjection(work)
-                for told in queued.told:
-                    self._service.report(told)
+                for output in queued.output:
+                    self._service.report(output)
             else:
                 queued = await motion.do(work)
         except FeederFull as error:
@@ -167,9 +167,9 @@ class Programs:
 
     def _state(self, job: JobRun) -> str:
         """Return how JOB is; while it is being cancelled what it was before: it does not go on."""
-        told = "" if self._stats is None else self._stats.state
-        if job.phase is JobPhase.CANCELLING and told in ("printing", "paused"):
-            return told
+        output = "" if self._stats is None else self._stats.state
+        if job.phase is JobPhase.CANCELLING and output in ("printing", "paused"):
+            return output
         return _STATES[job.phase]
 
     def _figures(self, job: JobRun) -> Mapping[str, Value]:

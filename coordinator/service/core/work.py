@@ -9,12 +9,11 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, Protocol
 
-from coordinator.gcode.commands import Vocabulary
+from coordinator.gcode.commands import PrintControl, Vocabulary
 from coordinator.gcode.events import End, Event, Full, Idle, Progress
 from coordinator.gcode.interpreter import Job
 from coordinator.gcode.machine_state import MachineState
 from coordinator.gcode.parser import WordError, parse
-from coordinator.gcode.print_control import PrintControl
 from coordinator.gcode.program import Program
 from coordinator.motion.planner.planner import AXIS_LETTERS, FeedStatus, Planner
 from nodes.support.errors import CanductorError
@@ -40,15 +39,15 @@ class Setting:
     prints: PrintControl | None = None
     """Control of the job for programs; None: the program that is read is all there is."""
 
-    def job(self, program: Program, *, beside: bool = False) -> Job:
-        """Return what reads PROGRAM; BESIDE: between two lines of a job that prints."""
+    def job(self, program: Program, *, while_printing: bool = False) -> Job:
+        """Return what reads PROGRAM; WHILE_PRINTING: between two lines of a job that prints."""
         return Job(
             program,
             self.planner,
             self.homed_position,
             self.machine,
             self.vocabulary,
-            beside=beside,
+            while_printing=while_printing,
             prints=self.prints,
             strict=self.prints is not None,
         )
@@ -129,7 +128,7 @@ class LinesWork:
     lines: Sequence[str]
     name: str = "client"
     rest: Rest = Rest.STANDSTILL
-    beside: bool = False
+    while_printing: bool = False
     """Whether they come between two lines of a job that prints: then none of them may move."""
     _job: Job | None = None
 
@@ -138,7 +137,7 @@ class LinesWork:
         text = "".join(line.rstrip("\r\n") + "\n" for line in self.lines)
         program = Program(_Text(text.encode(errors="replace")), self.name, size_bytes=None)
         setting.planner.lines = 0
-        self._job = setting.job(program, beside=self.beside)
+        self._job = setting.job(program, while_printing=self.while_printing)
 
     def pending(self) -> Event | None:
         """Tell what is left to tell."""

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from coordinator.gcode.builtins.state import come_back
+from coordinator.gcode.commands import Recovering
 from coordinator.gcode.events import Event, Full, Notice
-from coordinator.gcode.print_control import Recovering
 from coordinator.gcode.program import Program
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.exclude_object import ExcludeObject

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from coordinator.config.model import MachineDescription
-from coordinator.gcode.builtins.machine import come_to_rest
-from coordinator.gcode.commands import Done
-from coordinator.gcode.events import Event, Full
+from coordinator.gcode.builtins.machine import come_to_standstill
+from coordinator.gcode.events import Done, Event, Full
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.homing.homing import Homing
 from coordinator.runtime.machine import MachineModules
@@ -110,7 +109,7 @@ class TakeHeight(LinesWork):
         job, setting = self._job, self._setting
         assert job is not None
         if setting is not None:
-            if not come_to_rest(job):
+            if not come_to_standstill(job):
                 return Full()
             x, y, _, e = setting.planner.toolhead_position
             job.take(Done(position=(x, y, self.z_mm, e), homed="Z"))

@@ -5,6 +5,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Final
 
 from nodes.link.types import BusSettings
+from nodes.support.c_structs import field_names
 from nodes.virtual._sim import ffi, lib
 from nodes.virtual.world.settings import WorldError, check_probability, to_ns
 
@@ -28,7 +29,7 @@ def counters(struct: str, read: Callable[[Any], None]) -> dict[str, int]:
     """Return a C struct of counters, which READ fills, by its fields' names."""
     found = ffi.new(f"{struct} *")
     read(found)
-    return {name: int(getattr(found, name)) for name, _ in ffi.typeof(struct).fields or ()}
+    return {name: int(getattr(found, name)) for name in field_names(found)}
 
 
 class CanController:

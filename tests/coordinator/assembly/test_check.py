@@ -267,5 +267,5 @@ def test_the_end_says_what_will_not_act_and_what_that_means(tmp_path: Path) -> N
         f"29: [probe] recognised, not yet acting: {probed}",
         "32: [neopixel a] recognised, not yet acting: no light; a print is as it would be",
     ]
-    means = {entry["section"]: entry["meaning"] for entry in report.to_json()["not_acting"]}
+    means = {entry["section"]: entry["meaning"] for entry in report.to_json()["unsupported"]}
     assert means["neopixel a"] == "no light; a print is as it would be"

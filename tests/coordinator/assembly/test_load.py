@@ -7,7 +7,7 @@ from coordinator.assembly.load import load_machine
 from coordinator.assembly.reference import SECTIONS
 from coordinator.config.model import CanConnection, MachineDescription, UartConnection
 from coordinator.config.options import Option, SectionSpec
-from coordinator.config.unsupported import LATER_SECTIONS
+from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
 from coordinator.support.examples import EXAMPLES
 from tests.stages.printer_text import PRINTER_CFG, changed, write
 
@@ -35,7 +35,7 @@ def test_the_small_machine(tmp_path: Path) -> None:
     ]
     assert [s.step_distance for s in machine.steppers] == [0.0125, 0.0125, 0.0025, 22.5 / 3200]
     assert all(s.step_pulse_s == 2e-6 and s.enable_pin is None for s in machine.steppers)
-    assert machine.not_yet_acting == ()
+    assert machine.unsupported == ()
     assert machine.notes == ()
 
 
@@ -118,7 +118,7 @@ def test_homing_defaults_and_virtual_endstops(tmp_path: Path) -> None:
         12,
         5,
     )
-    assert [(n.section, n.options) for n in machine.not_yet_acting] == [
+    assert [(n.section, n.options) for n in machine.unsupported] == [
         ("stepper_z", ("endstop_pin", "homing_speed")),
     ]
 
@@ -132,7 +132,7 @@ def test_several_steppers_move_one_axis(tmp_path: Path) -> None:
     machine = load(tmp_path, text)
     assert [s.name for s in machine.rails[2].steppers] == ["stepper_z", "stepper_z1", "stepper_z2"]
     assert {s.weights for s in machine.rails[2].steppers} == {(0, 0, 1, 0)}
-    assert [(n.section, n.options) for n in machine.not_yet_acting] == [
+    assert [(n.section, n.options) for n in machine.unsupported] == [
         ("stepper_z1", ("endstop_pin",)),
         ("stepper_z2", ("endstop_pin",)),
     ]
@@ -151,7 +151,7 @@ def test_aliases_and_pins_shared_on_purpose(tmp_path: Path) -> None:
 def test_what_waits_for_its_module_is_listed(tmp_path: Path) -> None:
     text = PRINTER_CFG + "shared_heater: x\n[led a]\nanything: 1\n[tmc5160 stepper_x]\nuart_pin: PA0:x\n"
     machine = load(tmp_path, text)
-    assert [str(entry).replace(f"{tmp_path}/", "") for entry in machine.not_yet_acting] == [
+    assert [str(entry).replace(f"{tmp_path}/", "") for entry in machine.unsupported] == [
         "printer.cfg:33: shared_heater of [extruder] recognised, not yet acting",
         "printer.cfg:41: [led a] recognised, not yet acting",
         "printer.cfg:43: [tmc5160 stepper_x] recognised, not yet acting",
@@ -180,7 +180,7 @@ def test_users_machines_load_unchanged(name: str) -> None:
         pytest.skip("the shared example data is not here")
     machine = load_machine(str(path))
     assert len(machine.steppers) == 4
-    waiting = {entry.section for entry in machine.not_yet_acting}
+    waiting = {entry.section for entry in machine.unsupported}
     assert not waiting & {"input_shaper", "stepper_x", "stepper_z", "heater_bed", "fan"}
     assert [shaper.kind for shaper in machine.shapers] == (
         ["mzv", "mzv"] if name.startswith("corexy") else []
@@ -216,4 +216,4 @@ def test_specifications_are_fit_for_the_reference_page(spec: SectionSpec) -> Non
 
 def test_acting_sections_are_not_in_the_waiting_table() -> None:
     acting = {word.strip("[] ,") for title in SECTIONS for word in title.split() if "[" in word}
-    assert not acting & LATER_SECTIONS
+    assert not acting & UNSUPPORTED_SECTIONS

@@ -133,7 +133,7 @@ def test_nothing_but_that_is_wrong_with_what_they_are_parts_of(tmp_path: Path) -
     path = tmp_path / "corexyuv.cfg"
     path.write_text(f"{whole}{z}[include {real('klipper', 'sample-corexyuv')}]\n")
     machine = load_machine(str(path))
-    waiting = {entry.section for entry in machine.not_yet_acting}
+    waiting = {entry.section for entry in machine.unsupported}
     assert {"dual_carriage carriage_u", "dual_carriage carriage_v"} <= waiting
     refused = {rail.axis for rail in machine.rails if rail.homing.refused}
     assert refused == {"x", "y"}

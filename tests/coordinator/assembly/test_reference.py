@@ -15,7 +15,7 @@ def test_the_page_has_the_table_of(title: str) -> None:
 
 
 def test_the_page_lists_what_does_not_act_yet() -> None:
-    assert PAGE.read_text().endswith(reference.later_sections()), HINT
+    assert PAGE.read_text().endswith(reference.unsupported_sections()), HINT
 
 
 def test_the_page_is_what_would_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,7 +22,7 @@ def load(folder: Path, text: str) -> MachineDescription:
 
 
 def waiting(machine: MachineDescription) -> dict[str, tuple[tuple[str, ...], str]]:
-    return {entry.section: (entry.options, entry.reason) for entry in machine.not_yet_acting}
+    return {entry.section: (entry.options, entry.reason) for entry in machine.unsupported}
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_what_depends_on_something_that_does_not_act_is_listed(
     tmp_path: Path, more: str, section: str, reason: str
 ) -> None:
     machine = load(tmp_path, PRINTER_CFG + more)
-    entries = [entry for entry in machine.not_yet_acting if entry.section == section]
+    entries = [entry for entry in machine.unsupported if entry.section == section]
     assert [(entry.options, entry.reason) for entry in entries] == [((), reason)]
 
 
@@ -250,7 +250,7 @@ def test_an_extra_carriage_of_one_stepper_has_its_own_endstop(tmp_path: Path) ->
     names = (("a", "x"), ("b", "y"), ("c", "y1"), ("d", "z"))
     text = EXTRA + "".join(motor(*pair, number) for number, pair in enumerate(names))
     machine = load(tmp_path, text)
-    assert machine.not_yet_acting == ()
+    assert machine.unsupported == ()
     y = next(rail for rail in machine.rails if rail.axis == "y")
     assert [(name, pin.name) for name, pin, _ in y.second_endstops] == [("c", "PA2")]
 

@@ -5,18 +5,18 @@ from collections.abc import Callable
 import pytest
 
 from coordinator.gcode.commands import (
-    AtOnce,
-    AtRest,
+    AtStandstill,
     Call,
-    Done,
     GCodeCommand,
-    InTime,
+    Immediate,
     Lines,
     Reading,
+    Synchronized,
     Vocabulary,
 )
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import (
+    Done,
     End,
     Event,
     Full,
@@ -71,13 +71,13 @@ def replies(found: list[Event]) -> list[str]:
 
 def test_what_is_done_at_once_is_done_in_order() -> None:
     said: list[int] = []
-    work = job("HELLO", "HELLO", HELLO=AtOnce(("hi", "there"), lambda: said.append(len(said))))
+    work = job("HELLO", "HELLO", HELLO=Immediate(("hi", "there"), lambda: said.append(len(said))))
     assert replies(events(work)) == ["hi", "there", "hi", "there"]
     assert said == [0, 1]
 
 
 def test_what_is_done_in_time_knows_its_place_among_the_moves() -> None:
-    work = job("G28", "BLOW", "G1 X10 F6000", "G1 X20", "BLOW", "G1 X30", BLOW=InTime(lambda _: None))
+    work = job("G28", "BLOW", "G1 X10 F6000", "G1 X20", "BLOW", "G1 X30", BLOW=Synchronized(lambda _: None))
     found = [event for event in events(work) if isinstance(event, Timed)]
     assert [(event.line, event.after_moves) for event in found] == [(2, 0), (5, 2)]
 
@@ -86,7 +86,7 @@ def test_what_is_done_at_rest_comes_to_rest_first_and_hands_back_where_the_machi
     def probed(event: StandstillAction) -> None:
         event.done, event.over = Done(("at 1.5",), position=(10.0, 0.0, 1.5, 0.0), homed="Z"), True
 
-    work = job("G28", "G92 Z7", "G1 X10 F6000", "PROBE", "M114", PROBE=AtRest(nothing))
+    work = job("G28", "G92 Z7", "G1 X10 F6000", "PROBE", "M114", PROBE=AtStandstill(nothing))
     found = events(work, probed)
     assert replies(found) == ["at 1.5", "X:10.000 Y:0.000 Z:1.500 E:0.000"]
     (_, event) = [event for event in found if isinstance(event, PositionSet)]
@@ -96,7 +96,7 @@ def test_what_is_done_at_rest_comes_to_rest_first_and_hands_back_where_the_machi
 
 def test_a_plan_takes_what_the_command_says_for_granted() -> None:
     planned = Done(position=(1.0, 2.0, 3.0, 0.0), homed="XYZ")
-    work = job("FIND", "M114", FIND=AtRest(nothing, planned))
+    work = job("FIND", "M114", FIND=AtStandstill(nothing, planned))
     assert replies(events(work)) == ["X:1.000 Y:2.000 Z:3.000 E:0.000"]
     assert set(work.planner.homed) == set("XYZ")
 
@@ -105,7 +105,7 @@ def test_what_failed_on_its_way_leaves_nothing_homed_and_ends_the_program() -> N
     def lost(event: StandstillAction) -> None:
         event.done, event.over, event.moved, event.failure = None, True, True, "the probe did not switch"
 
-    work = job("G28", "PROBE", "G1 X10 F6000", PROBE=AtRest(nothing))
+    work = job("G28", "PROBE", "G1 X10 F6000", PROBE=AtStandstill(nothing))
     with pytest.raises(GCodeError, match=r"^part\.gcode:2: the probe did not switch$"):
         events(work, lost)
     assert work.planner.homed == ""
@@ -115,14 +115,14 @@ def test_axes_can_be_forgotten() -> None:
     def off(event: StandstillAction) -> None:
         event.done, event.over = Done(unhomed="XY"), True
 
-    work = job("G28", "OFF", OFF=AtRest(nothing))
+    work = job("G28", "OFF", OFF=AtStandstill(nothing))
     events(work, off)
     assert work.planner.homed == "Z"
 
 
 def test_lines_take_a_commands_place() -> None:
     inner = Lines("G1 X10 F6000\nHELLO\n\nG1 X20 ; the last line has no line feed")
-    work = job("G28", "GO", "M114", GO=inner, HELLO=AtOnce(("hi",)))
+    work = job("G28", "GO", "M114", GO=inner, HELLO=Immediate(("hi",)))
     assert replies(events(work)) == ["hi", "X:20.000 Y:0.000 Z:0.000 E:0.000"]
     assert work.planner.moves == 2
     assert work.planner.lines == 3
@@ -159,7 +159,7 @@ def test_callers_are_known() -> None:
 
     def look(call: Call) -> Reading:
         seen.append(call.callers)
-        return AtOnce()
+        return Immediate()
 
     commands = {
         "OUTER": GCodeCommand("OUTER", "", lambda _: Lines("LOOK")),
@@ -175,7 +175,7 @@ def test_homing_is_the_modules_business_and_a_plan_knows_where_it_ends() -> None
 
     def home(_: Call, axes: str) -> Reading:
         asked.append(axes)
-        return AtRest(nothing)
+        return AtStandstill(nothing)
 
     def found(event: StandstillAction) -> None:
         event.done, event.over = Done(position=(0.0, 0.0, 0.25, 0.0), homed="Z"), True
@@ -190,7 +190,7 @@ def test_homing_is_the_modules_business_and_a_plan_knows_where_it_ends() -> None
 
 def test_homing_may_be_replaced_by_lines_that_home() -> None:
     def home(call: Call, _: str) -> Reading:
-        return AtRest(nothing) if "G28" in call.callers else Lines("G28 Z\nG28 X Y")
+        return AtStandstill(nothing) if "G28" in call.callers else Lines("G28 Z\nG28 X Y")
 
     work = job("G28", home=home)
     found = events(work)

@@ -3,7 +3,7 @@
 import pytest
 
 from coordinator.gcode.absent_commands import ABSENT
-from coordinator.gcode.commands import AtOnce, Call, GCodeCommand, Reading, Vocabulary, renamed
+from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading, Vocabulary, renamed
 from coordinator.gcode.errors import GCodeError
 from coordinator.gcode.events import End, Event, Notice, Reply
 from coordinator.gcode.interpreter import Job
@@ -35,7 +35,7 @@ def notices(line: str, vocabulary: Vocabulary | None = None, *, strict: bool = T
 def test_harmless_ones_are_skipped_with_a_notice(name: str) -> None:
     if not name.startswith("M10"):  # those are a machine's own, whatever it has
         assert len(notices(name)) == 1
-    why = Vocabulary({}, not_acting={name: "[it] does not act yet"})
+    why = Vocabulary({}, unsupported={name: "[it] does not act yet"})
     (said,) = notices(name, why)
     assert "[it] does not act yet" in said
 
@@ -46,7 +46,7 @@ OWN = ("M104", "M109", "M140", "M190")
 @pytest.mark.parametrize("name", [name for name, absent in ABSENT.items() if not absent.harmless])
 def test_others_end_a_job_and_are_told_of_in_a_plan(name: str) -> None:
     line = f"{name} S200" if name in OWN else name
-    because = Vocabulary({}, not_acting={name: "[it] does not act yet"})
+    because = Vocabulary({}, unsupported={name: "[it] does not act yet"})
     with pytest.raises(GCodeError) as error:
         run(line, because, strict=True)
     assert "[it] does not act yet; remove the line" in str(error.value)
@@ -61,7 +61,7 @@ def test_heat_for_what_a_machine_does_not_have_is_no_error() -> None:
 
 
 def test_turning_a_heater_off_that_does_not_act_is_no_error() -> None:
-    off = Vocabulary({}, not_acting={"M140": "[heater_bed] does not act yet"})
+    off = Vocabulary({}, unsupported={"M140": "[heater_bed] does not act yet"})
     assert len(notices("M140 S0", off)) == 1
 
 
@@ -75,19 +75,19 @@ def test_what_nobody_knows_is_skipped() -> None:
 def test_a_name_as_it_is_written_comes_before_what_it_usually_means(line: str) -> None:
     def says(text: str) -> GCodeCommand:
         def read(call: Call) -> Reading:
-            return AtOnce((f"{text} {call.command.text}",))
+            return Immediate((f"{text} {call.command.text}",))
 
         return GCodeCommand("M104", text, read)
 
-    base = renamed(says("base"), "M104", "M104.0", beside=False)
+    base = renamed(says("base"), "M104", "M104.0", while_printing=False)
     events = run(line, Vocabulary({"M104": says("macro"), "M104.0": base}), strict=True)
     assert [event.text for event in events if isinstance(event, Reply)] == ["base S3"]
 
 
 def test_a_move_under_another_name_is_a_move() -> None:
     commands = {
-        "G0": GCodeCommand("G0", "a macro", lambda _: AtOnce(("macro",))),
-        "G00": renamed(None, "G0", "G00", beside=False),
+        "G0": GCodeCommand("G0", "a macro", lambda _: Immediate(("macro",))),
+        "G00": renamed(None, "G0", "G00", while_printing=False),
     }
     events = run("G00 F600", Vocabulary(commands), strict=True)
     assert not [event for event in events if isinstance(event, Reply | Notice)]

@@ -42,11 +42,11 @@ class Planned:
 
     def prove(self, windows: list[tuple[float, float]] | None = None) -> list[Verdict]:
         """Compare every stepper's steps with its exact motion, in WINDOWS of print time or everywhere."""
-        stretches, streams = self.record.segments(), self.streams()
+        segments, streams = self.record.segments(), self.streams()
         verdicts = []
         for spec in self.steppers:
             freq = self.nodes[spec.node].clock_freq
-            proof = StepperProof(program_legs(spec, stretches))
+            proof = StepperProof(program_legs(spec, segments))
             verdicts.append(check(proof, streams[spec.name], freq, MAX_ERROR_S, windows))
         return verdicts
 

@@ -144,14 +144,14 @@ def test_an_arc_can_be_put_aside() -> None:
     assert planner.feed(text, 0, len(text), final=True).status is FeedStatus.FULL
     assert planner.arc_open
     stood = planner.toolhead_position
-    aside = planner.put_aside()
+    aside = planner.suspend_program()
     assert not planner.arc_open
     drain(planner)
     other = b"G1 X100\nG1 X110\n"
     assert planner.feed(other, 0, len(other), final=True).status is FeedStatus.NEED_DATA
     flushed(planner)
     planner.set_position(stood)
-    planner.take_up(aside)
+    planner.resume_program(aside)
     while planner.feed(text, 0, len(text), final=True).status is FeedStatus.FULL:
         drain(planner)
     flushed(planner)

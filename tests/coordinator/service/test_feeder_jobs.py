@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.commands import AtRest, Done, GCodeCommand, Vocabulary
-from coordinator.gcode.events import End, Event, Full, Idle, Notice, Reply, StandstillAction
+from coordinator.gcode.commands import AtStandstill, GCodeCommand, Vocabulary
+from coordinator.gcode.events import Done, End, Event, Full, Idle, Notice, Reply, StandstillAction
 from coordinator.gcode.program import Program
 from coordinator.modules.programs.pause_resume import PauseResume
 from coordinator.modules.status.print_stats import PrintStats
@@ -59,22 +59,22 @@ class Fed:
             self.stage.machine,
             self.stage.modules.vocabulary,
         )
-        self.told: list[str] = []
+        self.output: list[str] = []
 
     def job(self, *lines: str) -> QueuedWork:
         work = FileWork(Program.from_lines(["\n".join(lines) + "\n"], "job.gcode"))
         return self.feeder.submit(work, is_job=True)
 
-    def lines(self, *lines: str, beside: bool = False) -> QueuedWork:
-        work = LinesWork(lines, beside=beside)
-        return self.feeder.submit_interjection(work) if beside else self.feeder.submit(work)
+    def lines(self, *lines: str, while_printing: bool = False) -> QueuedWork:
+        work = LinesWork(lines, while_printing=while_printing)
+        return self.feeder.submit_interjection(work) if while_printing else self.feeder.submit(work)
 
     def step(self, *, room: bool = True) -> Event:
         event = self.feeder.step()
         if isinstance(event, Full) and room:
             self.planner.release(self.planner.take().count)
         if isinstance(event, Reply | Notice):
-            self.told.append(event.text)
+            self.output.append(event.text)
         return event
 
     def drive(self) -> None:
@@ -100,7 +100,7 @@ def finding(folder: Path) -> Fed:
     async def perform() -> None:
         return None
 
-    command = GCodeCommand("FIND", "for the test", lambda _: AtRest(perform))
+    command = GCodeCommand("FIND", "for the test", lambda _: AtStandstill(perform))
     vocabulary = Vocabulary({**fed.feeder.vocabulary.commands, "FIND": command})
     fed.feeder = Feeder(fed.planner, fed.stage.description.homed_position, fed.stage.machine, vocabulary)
     return fed
@@ -126,11 +126,11 @@ def test_a_job_pauses_itself_parks_and_goes_on_where_it_was(fed: Fed) -> None:
     assert job.progress.line == 8
     fed.lines("RESUME")
     fed.drive()
-    assert "resuming" in fed.told
+    assert "resuming" in fed.output
     assert not fed.feeder.paused
     assert job.error is None
     assert fed.at == (70, 60, 1, 1.4)
-    assert fed.told[-1] == "X:70.000 Y:60.000 Z:1.000 E:0.400"
+    assert fed.output[-1] == "X:70.000 Y:60.000 Z:1.000 E:0.400"
     assert fed.planner.speed_mm_s == 25.0  # the modes of what comes behind a job
     assert list(fed.feeder.finished)[-1] is job
 
@@ -177,7 +177,7 @@ def test_a_job_is_paused_in_the_middle_of_an_arc(fed: Fed, clockwise: bool) -> N
     fed.drive()
     assert job.error is None
     assert fed.at[:3] == (100, 100, 1)
-    assert fed.told[-1] == "X:100.000 Y:100.000 Z:1.000 E:5.000"
+    assert fed.output[-1] == "X:100.000 Y:100.000 Z:1.000 E:5.000"
 
 
 def test_offsets_and_factors_changed_in_a_pause_stay(fed: Fed) -> None:
@@ -187,7 +187,7 @@ def test_offsets_and_factors_changed_in_a_pause_stay(fed: Fed) -> None:
     fed.lines("RESUME")
     fed.drive()
     assert fed.at == (70, 60, 1.1, 0.4)
-    assert fed.told[-1] == "X:70.000 Y:60.000 Z:1.000 E:0.400"
+    assert fed.output[-1] == "X:70.000 Y:60.000 Z:1.000 E:0.400"
     assert fed.planner.speed_factor == 0.5
     assert fed.planner.gcode_offset[2] == pytest.approx(0.1)
 
@@ -201,7 +201,7 @@ def test_without_its_homing_a_job_stays_paused(fed: Fed) -> None:
     fed.feeder.resume()
     fed.drive()
     assert fed.feeder.paused
-    assert fed.told[-1] == "job.gcode stays paused: X and Y must be homed with G28 before it can go on"
+    assert fed.output[-1] == "job.gcode stays paused: X and Y must be homed with G28 before it can go on"
     failed = fed.lines("RESUME")
     fed.drive()
     assert "home with G28 first" in str(failed.error)
@@ -240,9 +240,9 @@ def test_beside_a_job_macros_may_speak_but_not_move(fed: Fed) -> None:
     fed.planner.plan_until_s = 1.0
     fed.job(*BEGIN, *(f"G1 X{70 + n}" for n in range(40)))
     fed.fill()
-    good = fed.lines("HELLO NAME=you", beside=True)
-    bad = fed.lines("JUMP", beside=True)
-    moved = fed.lines("G1 X5", beside=True)
+    good = fed.lines("HELLO NAME=you", while_printing=True)
+    bad = fed.lines("JUMP", while_printing=True)
+    moved = fed.lines("G1 X5", while_printing=True)
     moves = fed.planner.moves
     fed.step(room=False)
     assert fed.planner.moves == moves
@@ -262,7 +262,7 @@ def test_an_object_is_left_out_from_beside_and_the_pause_within_it_moves(fed: Fe
         "EXCLUDE_OBJECT_END NAME=a", "G1 X20 Y20", "M114",
     )  # fmt: skip
     fed.fill()
-    fed.lines("EXCLUDE_OBJECT CURRENT=1", beside=True)
+    fed.lines("EXCLUDE_OBJECT CURRENT=1", while_printing=True)
     fed.step(room=False)
     assert fed.planner.excluded
     stood = fed.at
@@ -276,7 +276,7 @@ def test_an_object_is_left_out_from_beside_and_the_pause_within_it_moves(fed: Fe
     assert job.error is None
     assert not fed.planner.excluded
     assert fed.at == (20, 20, 1, stood[3])
-    assert fed.told[-1].endswith("E:6.300")
+    assert fed.output[-1].endswith("E:6.300")
 
 
 def test_a_pause_takes_over_what_was_done_at_rest_before_others_move(tmp_path: Path) -> None:
@@ -289,7 +289,7 @@ def test_a_pause_takes_over_what_was_done_at_rest_before_others_move(tmp_path: P
     fed.feeder.submit(MoveWork({"X": 1.0}, 50.0, relative=True))
     fed.drive()
     assert fed.at == (11, 20, 30, 0)
-    assert "found" in fed.told
+    assert "found" in fed.output
     fed.feeder.resume()
     fed.drive()
     assert job.error is None
@@ -301,7 +301,7 @@ def test_programs_have_files_printed_but_not_beside_a_job(fed: Fed) -> None:
     fed.lines("M23 b.gcode", "M24", "M27")
     fed.drive()
     assert list(fed.feeder.to_print) == ["a.gcode", "b.gcode"]
-    assert fed.told == ["File selected: b.gcode", "Not SD printing."]
+    assert fed.output == ["File selected: b.gcode", "Not SD printing."]
     job = fed.job("G28", "SDCARD_PRINT_FILE FILENAME=c.gcode")
     fed.drive()
     assert "a job is on its way" in str(job.error)
@@ -325,11 +325,11 @@ def test_clients_are_answered_while_a_job_waits_at_rest_but_nothing_is_planned(t
         *BEGIN, "EXCLUDE_OBJECT_START NAME=a", "EXCLUDE_OBJECT NAME=a", "G1 E0.1 F600", "FIND", "G1 X70 E0.3"
     )  # fmt: skip
     event = next(event for event in (fed.step() for _ in range(99)) if isinstance(event, StandstillAction))
-    asked = fed.lines("M114", "M220 S50", "HELLO NAME=you", beside=True)
-    back = fed.lines("EXCLUDE_OBJECT RESET=1", beside=True)
+    asked = fed.lines("M114", "M220 S50", "HELLO NAME=you", while_printing=True)
+    back = fed.lines("EXCLUDE_OBJECT RESET=1", while_printing=True)
     moves = fed.planner.moves
     assert fed.feeder.attend_others() is None
-    assert [told.text for told in asked.told if isinstance(told, Reply)] == [
+    assert [output.text for output in asked.output if isinstance(output, Reply)] == [
         "X:60.000 Y:60.000 Z:1.000 E:0.100"
     ]
     assert fed.planner.speed_factor == 0.5
@@ -346,7 +346,7 @@ def test_clients_are_answered_while_a_job_waits_at_rest_but_nothing_is_planned(t
 def test_the_card_and_its_file(fed: Fed) -> None:
     fed.lines("M23 a.gcode", "M26 S0", "M21", "SDCARD_RESET_FILE", "M24")
     fed.drive()
-    assert fed.told == ["File selected: a.gcode", "SD card ok"]
+    assert fed.output == ["File selected: a.gcode", "SD card ok"]
     assert "M24 comes before a file is chosen" in str(fed.feeder.finished[-1].error)
     fed.lines("M26 S100")
     fed.drive()
@@ -379,21 +379,21 @@ def test_a_pause_that_is_cleared_has_nowhere_to_go_back_to(fed: Fed) -> None:
     fed.lines("CLEAR_PAUSE", "G1 X30", "BASE_RESUME")
     fed.drive()
     assert pauses.status() == {"is_paused": False}
-    assert fed.told[-1] == "nothing is paused: RESUME does nothing"
+    assert fed.output[-1] == "nothing is paused: RESUME does nothing"
     assert fed.at[0] == 30
 
 
 def test_what_a_console_asks(fed: Fed) -> None:
     fed.lines("STATUS", "M115", "HELP")
     fed.drive()
-    status, firmware, *helps = fed.told
+    status, firmware, *command_help = fed.output
     assert status == "ready"
     assert firmware.startswith("FIRMWARE_NAME:canductor FIRMWARE_VERSION:")
-    assert "M24: Print the chosen file, or let the paused job go on" in helps
-    assert "G28: Home X, Y, Z, or all axes" in helps
-    assert not [line for line in helps if line.startswith("_")]
+    assert "M24: Print the chosen file, or let the paused job go on" in command_help
+    assert "G28: Home X, Y, Z, or all axes" in command_help
+    assert not [line for line in command_help if line.startswith("_")]
     fed.job("STATUS")
     stats = next(fed.stage.modules.of(PrintStats))
     stats.told = {"state": "printing", "filename": "job.gcode"}
     fed.drive()
-    assert fed.told[-1] == "printing job.gcode"
+    assert fed.output[-1] == "printing job.gcode"

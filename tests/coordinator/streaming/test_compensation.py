@@ -298,13 +298,13 @@ def test_a_table_does_not_change_while_moves_wait() -> None:
 
 
 @pytest.mark.parametrize(
-    ("positions", "take_up"),
+    ("positions", "resume_program"),
     [([1.0], 5.0), ([1.0, 1.0], 5.0), ([0.0, float("nan")], 5.0), ([0.0, 1.0], 0.0), ([*range(2000)], 5.0)],
 )
-def test_bad_tables_are_refused(positions: list[float], take_up: float) -> None:
+def test_bad_tables_are_refused(positions: list[float], resume_program: float) -> None:
     zeros = [0.0] * len(positions)
     with pytest.raises(StepError, match="the table of axis Z is refused"):
-        generator().set_table(2, positions, zeros, zeros, take_up_mm_s=take_up)
+        generator().set_table(2, positions, zeros, zeros, take_up_mm_s=resume_program)
 
 
 def test_a_service_takes_the_kept_tables_that_it_can_use(tmp_path: Path) -> None:

@@ -4,8 +4,7 @@ import asyncio
 
 import pytest
 
-from coordinator.gcode.commands import Done
-from coordinator.gcode.events import StandstillAction
+from coordinator.gcode.events import Done, StandstillAction
 from coordinator.streaming.standstill import StandstillTask
 from nodes.support.errors import CanductorError
 

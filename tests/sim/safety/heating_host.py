@@ -4,7 +4,7 @@ import asyncio
 import sys
 
 from coordinator.assembly.load import load_machine
-from coordinator.gcode.commands import Call, InTime
+from coordinator.gcode.commands import Call, Synchronized
 from coordinator.gcode.parser import parse
 from coordinator.modules.module_set import build_modules
 from coordinator.runtime.host import LinuxHost
@@ -21,7 +21,7 @@ async def main(path: str, celsius: float) -> None:
         assert command is not None
         call = Call(command, 1, (0.0, 0.0, 0.0, 0.0), "")
         reading = machine.modules.vocabulary.commands["M104"].read(call)
-        assert isinstance(reading, InTime)
+        assert isinstance(reading, Synchronized)
         reading.act(0.0)
         sys.stdout.write("heating\n")
         sys.stdout.flush()

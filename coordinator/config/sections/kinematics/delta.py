@@ -16,7 +16,7 @@ from coordinator.config.sections.kinematics.towers import (
 from coordinator.config.sections.rails import read_extra_steppers
 from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.steppers import MOTOR, read_stepper
-from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.delta import MAX_TOWER_SPEED, Delta, Tower
 
 DELTA_RADIUS = FloatOption(
@@ -52,7 +52,7 @@ TOWER = SectionSpec(
     help="A tower of a delta. position_endstop is Z of the head in the middle when the endstop switches; by"
     " default that of stepper_a",
     options=(*MOTOR, ARM_LENGTH, ANGLE, *HOMING),
-    later=LATER_STEPPER_OPTIONS,
+    later=UNSUPPORTED_STEPPER_OPTIONS,
 )
 WHY = "a delta has the towers stepper_a, stepper_b and stepper_c"
 _ANGLES = (210.0, 330.0, 90.0)

@@ -11,7 +11,7 @@ from coordinator.config.sections.kinematics.towers import MINIMUM_Z, check_heigh
 from coordinator.config.sections.rails import read_extra_steppers, read_rail
 from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.steppers import MOTOR, read_stepper
-from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.base import linear
 from coordinator.kinematics.deltesian import Arm, Deltesian
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
@@ -54,7 +54,7 @@ SIDE = SectionSpec(
     help="A tower of a deltesian. position_endstop is Z of the head in the middle when the endstop switches;"
     " by default that of stepper_left",
     options=(*MOTOR, ARM_LENGTH, ARM_X_LENGTH, *HOMING),
-    later=LATER_STEPPER_OPTIONS,
+    later=UNSUPPORTED_STEPPER_OPTIONS,
 )
 WHY = "a deltesian has the towers stepper_left and stepper_right"
 RANGE_OPTIONS = (

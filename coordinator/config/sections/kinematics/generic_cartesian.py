@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from coordinator.config.errors import ConfigError, Place
 from coordinator.config.file import RawSection
-from coordinator.config.model import NotYetActing, RailDescription, StepperDescription
+from coordinator.config.model import RailDescription, StepperDescription, Unsupported
 from coordinator.config.options import BadValue, ChoiceOption, Option, SectionReader, SectionSpec, TextOption
 from coordinator.config.pins import PinDescription
 from coordinator.config.sections.homing import ENDSTOP_PIN, HOMING, WAITING, read_endstop, read_homing
@@ -15,7 +15,7 @@ from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, 
 from coordinator.config.sections.rails import RANGE, read_range
 from coordinator.config.sections.reading import Reading, SecondEndstop
 from coordinator.config.sections.steppers import MOTOR, read_stepper
-from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.base import StepFunction
 from coordinator.kinematics.generic_cartesian import GenericCartesian
 from coordinator.support.quoting import nearest, shown
@@ -26,7 +26,7 @@ AXIS = ChoiceOption(
 CARRIAGE = SectionSpec(
     help="A carriage of a generic_cartesian machine: an axis' range and homing",
     options=(AXIS, *RANGE, *HOMING),
-    later=LATER_STEPPER_OPTIONS,
+    later=UNSUPPORTED_STEPPER_OPTIONS,
 )
 PRIMARY_CARRIAGE = TextOption(
     name="primary_carriage",
@@ -42,7 +42,7 @@ EXTRA_CARRIAGE = SectionSpec(
 DUAL_CARRIAGE = SectionSpec(
     help="The second carriage on the axis of another one (IDEX) of a generic_cartesian machine",
     options=(PRIMARY_CARRIAGE, SAFE_DISTANCE, *RANGE, *HOMING),
-    later=LATER_STEPPER_OPTIONS,
+    later=UNSUPPORTED_STEPPER_OPTIONS,
 )
 
 T = TypeVar("T")
@@ -192,7 +192,7 @@ def _note_second_endstops(reading: Reading, ends: dict[str, _End], motors: list[
         section = f"extra_carriage {name}"
         movers = [motor.stepper.name for motor in motors if name in motor.extra]
         if pin is None or len(movers) != 1:
-            reading.later.append(NotYetActing(section, place, (ENDSTOP_PIN.name,)))
+            reading.later.append(Unsupported(section, place, (ENDSTOP_PIN.name,)))
         else:
             reading.second_endstops[movers[0]] = SecondEndstop(section, place, pin, virtual)
 
@@ -261,7 +261,7 @@ def _without_second(reading: Reading, frame: Frame, carriages: _Carriages) -> Fr
         reader.find(SAFE_DISTANCE)
         reading.finish(reader)
         why = f"second carriages on x and y at once do not act yet, and [{reader.name}] may be in the way"
-        reading.later.append(NotYetActing(reader.name, second.place, (), why))
+        reading.later.append(Unsupported(reader.name, second.place, (), why))
         first = rails[second.axis]
         rails[second.axis] = replace(first, homing=replace(first.homing, refused=f"{why} ({second.place})"))
     return replace(frame, rails=(rails["x"], rails["y"], rails["z"]))

@@ -7,7 +7,7 @@ from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind, 
 from coordinator.config.sections.rails import POSITION_MAX, read_extra_steppers, read_rail
 from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.steppers import TURNING_MOTOR, read_stepper
-from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.polar import Polar
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
@@ -15,7 +15,9 @@ PRINTER = SectionSpec(
     help="What a polar machine may have besides", options=(), later=("max_angular_velocity",)
 )
 BED = SectionSpec(
-    help="The motor that turns the bed of a polar machine", options=TURNING_MOTOR, later=LATER_STEPPER_OPTIONS
+    help="The motor that turns the bed of a polar machine",
+    options=TURNING_MOTOR,
+    later=UNSUPPORTED_STEPPER_OPTIONS,
 )
 ARM_RANGE = "position_min and position_max of [stepper_arm]"
 RANGE_OPTIONS = (ARM_RANGE, ARM_RANGE, AXIS_RANGE_OPTIONS[2])

@@ -16,7 +16,7 @@ from coordinator.config.sections.kinematics.towers import (
 from coordinator.config.sections.rails import read_extra_steppers
 from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.steppers import TURNING_MOTOR, read_stepper
-from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.rotary_delta import Arm, RotaryDelta
 
 SHOULDER_RADIUS = FloatOption(
@@ -69,7 +69,7 @@ ARM = SectionSpec(
     help="An arm of a rotary delta. position_endstop is Z of the head in the middle when the endstop"
     " switches; by default that of stepper_a",
     options=(*TURNING_MOTOR, UPPER_LENGTH, LOWER_LENGTH, ANGLE, *HOMING),
-    later=LATER_STEPPER_OPTIONS,
+    later=UNSUPPORTED_STEPPER_OPTIONS,
 )
 WHY = "a rotary delta has the arms stepper_a, stepper_b and stepper_c"
 _ANGLES = (30.0, 150.0, 270.0)

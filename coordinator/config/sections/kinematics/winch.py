@@ -11,7 +11,7 @@ from coordinator.config.sections.kinematics.frame import Frame, KinematicsKind
 from coordinator.config.sections.rails import read_extra_steppers
 from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.steppers import MOTOR, read_stepper
-from coordinator.config.unsupported import LATER_STEPPER_OPTIONS
+from coordinator.config.unsupported import UNSUPPORTED_STEPPER_OPTIONS
 from coordinator.kinematics.base import Point
 from coordinator.kinematics.geometry import cross, dot, subtract
 from coordinator.kinematics.winch import MIN_WINCHES, Winch
@@ -29,7 +29,7 @@ ANCHORS = tuple(
 SPEC = SectionSpec(
     help="The winch of one cable: stepper_a, stepper_b, stepper_c, up to stepper_z",
     options=(*MOTOR, *ANCHORS),
-    later=LATER_STEPPER_OPTIONS,
+    later=UNSUPPORTED_STEPPER_OPTIONS,
 )
 WHY = "a machine on cables has three winches at least, from stepper_a on"
 _MIN_SINE = 0.01

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Final
 
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import Call, GCodeCommand, InTime, Reading
+from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.support.values import Value
@@ -66,7 +66,7 @@ class Chime(Module):
                     f"LENGTH of CHIME is {quoted(text)}; it must be a number of s from 0.01 to"
                     f" {LENGTH_MAX_S:g}"
                 )
-        return InTime(lambda print_time_s: self._ring(print_time_s, length_s))
+        return Synchronized(lambda print_time_s: self._ring(print_time_s, length_s))
 
     def _ring(self, print_time_s: float, length_s: float) -> None:
         """Ring from PRINT_TIME_S on; both edges are queued on the node, which makes them in time."""

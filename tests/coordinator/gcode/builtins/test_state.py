@@ -43,7 +43,7 @@ def test_homing_keeps_an_offset_and_takes_an_origin_away(machine: ProgramStage) 
 def test_babysteps_beside_a_job_need_no_move_of_their_own(machine: ProgramStage) -> None:
     machine.run("G28", "G1 X10 Y10 Z10 F6000")
     job = machine.job("SET_GCODE_OFFSET Z_ADJUST=0.05 MOVE=1")
-    job.beside = True
+    job.while_printing = True
     moves = machine.planner.moves
     while type(job.step()).__name__ != "End":
         pass
@@ -58,7 +58,7 @@ def test_babysteps_beside_a_job_need_no_move_of_their_own(machine: ProgramStage)
 def test_a_babystep_out_of_the_machine_is_refused_before_it_harms_the_job(machine: ProgramStage) -> None:
     machine.run("G28", "G1 X10 F6000")
     job = machine.job("SET_GCODE_OFFSET Z_ADJUST=-0.05 MOVE=1")
-    job.beside = True
+    job.while_printing = True
     with pytest.raises(GCodeError, match="outside 0 to 220 mm; choose a smaller one"):
         [job.step() for _ in range(9)]
     machine.run("G1 X20")

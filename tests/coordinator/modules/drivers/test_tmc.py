@@ -74,7 +74,7 @@ def test_the_endstop_of_a_driver_is_its_diag_pin(tmp_path: Path) -> None:
     assert y.homing.endstop_pin is not None
     assert (x.homing.endstop_pin.node, x.homing.endstop_pin.name) == ("mcu", "PE0")
     assert (y.homing.endstop_pin.node, y.homing.endstop_pin.pull) == ("toolhead", 1)
-    assert machine.not_yet_acting == ()
+    assert machine.unsupported == ()
     modules = build_modules(machine)
     assert modules.find(section_of(x.homing.virtual_endstop), StallEndstop) is not None
     assert modules.names(TmcDriver) == ["tmc2209 stepper_x", "tmc2209 stepper_y", "tmc2208 stepper_z"]
@@ -145,4 +145,4 @@ def test_a_further_side_of_an_axis_feels_by_its_own_driver(tmp_path: Path) -> No
     assert second.virtual_endstop == "tmc2209_stepper_y1:virtual_endstop"
     assert second.endstop_pin is not None
     assert second.endstop_pin.name == "PE2"
-    assert machine.not_yet_acting == ()
+    assert machine.unsupported == ()

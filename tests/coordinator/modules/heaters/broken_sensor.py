@@ -1,6 +1,6 @@
 """A heater's sensor in a simulated machine: its wire breaks for some measurements, or it falls silent."""
 
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
 from tests.stages.heat_machine import HeatMachine
@@ -10,7 +10,7 @@ class Sensor:
     """The sensor of heater KEY, on a machine that lives."""
 
     def __init__(self, stage: HeatMachine, key: str = "extruder") -> None:
-        heaters = stage.machine.modules.find("heaters", Heaters)
+        heaters = stage.machine.modules.find("heaters", HeaterRegistry)
         assert heaters is not None
         self.unit = heaters.units[key]
         self._stage = stage

@@ -6,10 +6,10 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
-from coordinator.gcode.commands import Call, InTime
+from coordinator.gcode.commands import Call, Synchronized
 from coordinator.gcode.parser import WordError, parse
 from coordinator.heat.known_sensors import PT1000, THERMISTORS
-from coordinator.modules.heaters.sections import ExtruderHeater, HeaterBed
+from coordinator.modules.heaters.sections import ExtruderHeaterSection, HeaterBed
 from coordinator.modules.module_set import build_modules
 from coordinator.modules.sensors.temperature_input import TemperatureInput
 from coordinator.modules.sensors.temperature_sensor import TemperatureSensor
@@ -51,7 +51,7 @@ def test_only_a_sensor_with_limits_stops_its_node(tmp_path: Path) -> None:
 def test_targets_are_for_the_extruder_that_is_meant(tmp_path: Path) -> None:
     second = BASE[BASE.index("[extruder]") :].replace("[extruder]", "[extruder1]").replace("PB", "PD")
     modules = build(tmp_path, HOTEND_PID + second + HOTEND_PID)
-    heaters = {module.name: module for module in modules.of(ExtruderHeater)}
+    heaters = {module.name: module for module in modules.of(ExtruderHeaterSection)}
     for line, active, name in (
         ("M104 S200", "", "extruder"),
         ("M104 S201", "extruder", "extruder"),
@@ -64,7 +64,7 @@ def test_targets_are_for_the_extruder_that_is_meant(tmp_path: Path) -> None:
         reading = modules.vocabulary.commands["M104"].read(
             Call(command, 1, (0, 0, 0, 0), "", extruder=active)
         )
-        assert isinstance(reading, InTime)
+        assert isinstance(reading, Synchronized)
         reading.act(0.0)
         unit = heaters[name].unit
         assert unit is not None
@@ -124,7 +124,7 @@ def test_an_extruder_without_heater_is_never_cold(tmp_path: Path) -> None:
     path.write_text(BASE[: BASE.index("heater_pin")])
     machine = load_machine(str(path))
     modules = build_modules(machine)
-    (heater,) = modules.of(ExtruderHeater)
+    (heater,) = modules.of(ExtruderHeaterSection)
     assert heater.can_extrude
     assert not modules.vocabulary.too_cold("extruder")
     assert "M104" not in modules.vocabulary.commands
@@ -184,7 +184,7 @@ def test_an_extruder_without_heater_is_never_cold(tmp_path: Path) -> None:
         ),
         ("cooling_fan: fan\n", "'cooling_fan' of [extruder] names 'fan', which does not exist"),
         ("\n[verify_heater extruder]\nhysteresis: -1\n", "'hysteresis' of [verify_heater extruder] is '-1'"),
-        ("\n[verify_heater extrudr]\n", "[verify_heater extrudr] is for no heater; did you mean"),
+        ("\n[verify_heater extrudr]\n", "[verify_heater extrudr] refers to an unknown heater; did you mean"),
         (
             BLOWER + "min_speed: 0.9\nmax_speed: 0.5\n",
             "'min_speed' of [temperature_fan x] is '0.9', more than max_speed (0.5)",

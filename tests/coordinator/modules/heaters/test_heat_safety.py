@@ -235,7 +235,9 @@ def test_a_node_that_may_be_away_takes_its_heater_along(tmp_path: Path) -> None:
         await asyncio.sleep(8)
         assert stage.machine.stopped is None
         assert stage.status("heater_generic chamber")["target"] == 0
-        assert any("heater chamber is off, its target of 60 °C is forgotten" in n for n in stage.notices)
+        assert any(
+            "heater chamber was turned off; its target (60 °C) was cleared" in n for n in stage.notices
+        )
         assert 0 < stage.heater_off_after(cut_s, "PA1", "box") <= LIMIT_S
         board.controller.cut(0)
         async with asyncio.timeout(60):

@@ -141,19 +141,19 @@ def test_a_heater_whose_sensors_node_goes_away_forgets_all(tmp_path: Path) -> No
         await asyncio.sleep(AHEAD_S + 0.05)
         off_s = stage.heater_off_after(since_s, "PC3", "mcu")
         assert abs(off_s - AHEAD_S) < 0.05
-        told = "heater chamber is off, its target of 60 °C is forgotten: node box is lost"
-        assert [notice for notice in stage.notices if "forgotten" in notice] == [told]
+        told = "heater chamber was turned off; its target (60 °C) was cleared: node box is lost"
+        assert [notice for notice in stage.notices if "was cleared" in notice] == [told]
         await sensor.good(4)
         assert unit.power == 0
         edges = len(stage.edges("PC3", "mcu"))
         unit._let_go("again")  # no target, no power: there is nothing to say and nothing to switch
         await asyncio.sleep(1.0)
         assert len(stage.edges("PC3", "mcu")) == edges
-        assert [notice for notice in stage.notices if "forgotten" in notice] == [told]
+        assert [notice for notice in stage.notices if "was cleared" in notice] == [told]
         await stage.do("SET_HEATER_TEMPERATURE HEATER=chamber TARGET=0.5")
         assert unit._gone is None
         unit._let_go("a target below one degree is one, too")
-        assert len([notice for notice in stage.notices if "forgotten" in notice]) == 2
+        assert len([notice for notice in stage.notices if "was cleared" in notice]) == 2
         assert stage.machine.stopped is None
 
     stage.connected(main)

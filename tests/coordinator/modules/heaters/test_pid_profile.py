@@ -8,7 +8,7 @@ import pytest
 
 from coordinator.assembly.check import check_config
 from coordinator.gcode.parser import WordError
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from tests.stages.heat_machine import BASE, BED, HOTEND_PID, HeatMachine
 
 FAST = "\n[pid_profile extruder fast]\ncontrol: pid\npid_kp: 30\npid_ki: 2\npid_kd: 120\npid_target: 240\n"
@@ -81,7 +81,7 @@ def test_a_profile_is_saved_and_there_at_the_next_start(tmp_path: Path) -> None:
 
     async def then() -> None:
         await again.do("PID_PROFILE LOAD=mine HEATER=extruder")
-        (heaters,) = again.machine.modules.of(Heaters)
+        (heaters,) = again.machine.modules.of(HeaterRegistry)
         assert heaters.units["extruder"].controller is not None
         assert (await again.do("PID_PROFILE GET_VALUES=1 HEATER=extruder"))[0] == told("mine", "25 1.5 99")
 

@@ -48,10 +48,10 @@ def test_works_are_done_in_order_and_replies_kept_apart(feeder: Feeder) -> None:
     events = drive(feeder)
     assert any(isinstance(event, PositionSet) for event in events)
     assert finished(feeder) == [first, second]
-    assert [told.text for told in first.told if isinstance(told, Reply)] == [
+    assert [output.text for output in first.output if isinstance(output, Reply)] == [
         "X:10.000 Y:0.000 Z:0.000 E:0.000"
     ]
-    assert [told.text for told in second.told] == ["X:15.000 Y:0.000 Z:0.000 E:0.000"]
+    assert [output.text for output in second.output] == ["X:15.000 Y:0.000 Z:0.000 E:0.000"]
     assert first.ends_at_s
     assert second.ends_at_s
     assert second.ends_at_s > first.ends_at_s
@@ -87,7 +87,7 @@ def test_a_bad_line_ends_its_own_work_at_rest(feeder: Feeder) -> None:
     drive(feeder)
     assert "client:3: G5 curves" in str(bad.error)
     assert good.error is None
-    assert [told.text for told in good.told] == ["X:10.000 Y:0.000 Z:0.000 E:0.000"]
+    assert [output.text for output in good.output] == ["X:10.000 Y:0.000 Z:0.000 E:0.000"]
 
 
 def test_pause_reads_no_line_and_resume_the_next_one(feeder: Feeder) -> None:
@@ -104,7 +104,7 @@ def test_pause_reads_no_line_and_resume_the_next_one(feeder: Feeder) -> None:
     lines = feeder.planner.lines
     assert isinstance(feeder.step(), Idle)
     (aside,) = finished(feeder)
-    assert [told.text[:2] for told in aside.told] == ["X:"]
+    assert [output.text[:2] for output in aside.output] == ["X:"]
     assert feeder.planner.speed_factor == 0.5
     assert feeder.planner.lines == lines
     assert feeder.planner.moves == read

@@ -1,0 +1,25 @@
+"""From structs of C to frozen dataclasses: what to copy is what the cffi declaration has."""
+
+from dataclasses import fields
+from typing import Any, TypeVar
+
+from cffi import FFI
+
+T = TypeVar("T")
+_FFI = FFI()
+
+
+def field_names(struct: Any) -> list[str]:
+    """Return the names of the fields of a struct, or of what a pointer points to."""
+    kind = _FFI.typeof(struct)
+    kind = kind.item if kind.kind == "pointer" else kind
+    return [name for name, _ in kind.fields or ()]
+
+
+def from_struct(kind: type[T], struct: Any, **others: Any) -> T:
+    """Return the dataclass KIND with the values of equally named fields of STRUCT; OTHERS has the rest.
+
+    Raises TypeError when a field without a default is in neither.
+    """
+    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]  # any dataclass
+    return kind(**{name: getattr(struct, name) for name in field_names(struct) if name in names} | others)
