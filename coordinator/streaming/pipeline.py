@@ -46,7 +46,7 @@ class MotionSettings:
     shapers: Mapping[str, Shaper]
     """By axis letter."""
     weights: Mapping[str, Position]
-    """By stepper, of those that were output others than their configuration says."""
+    """By stepper, of those that were given others than their configuration says."""
     windows_s: Mapping[str, float]
     """By filament stepper: the window over which pressure advance is spread."""
 

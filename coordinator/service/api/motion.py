@@ -36,7 +36,7 @@ RESTARTS: Final = {"RESTART": False, "FIRMWARE_RESTART": True}
 """Commands that also a machine that stopped takes, and whether the nodes are reset."""
 _DISTANCE_MAX_MM: Final = 1e6
 _STEPS_KEPT_S: Final = 0.2
-"""What nodes output of their steppers is output again for so long: clients cannot load a bus by asking."""
+"""The positions that nodes reported are given again for so long: clients cannot load a bus by asking."""
 
 _AXES: Final = tuple(
     Param(
