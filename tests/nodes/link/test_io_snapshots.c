@@ -181,6 +181,22 @@ static void counters_are_never_anothers(void) {
     io_free(scene.bus);
 }
 
+static void refuse_first_place(const void *at) {
+    const struct io_snapshot *place = &scene.bus->snapshots[0];
+    CHECK(!is_within(at, &place->stats, sizeof place->stats));
+}
+
+static void only_the_links_own_counters_are_copied(void) {
+    begin();
+    struct io_link_stats stats;
+    CHECK_EQUAL(io_open_link(scene.bus, NODE + 1, &usual, &scene.other), IO_OK);
+    before_load = refuse_first_place;
+    CHECK_EQUAL(io_get_link_stats(scene.bus, scene.other, &stats), IO_OK);
+    CHECK_EQUAL(io_get_link_stats(scene.bus, scene.other + 1, &stats), IO_GONE);
+    before_load = NULL;
+    io_free(scene.bus);
+}
+
 // -----------------------------------------------------------------------------------------------------
 // writing
 
@@ -292,6 +308,7 @@ int main(void) {
     what_a_reader_gets_belongs_together();
     a_reader_waits_for_a_writer();
     counters_are_never_anothers();
+    only_the_links_own_counters_are_copied();
     a_writer_says_that_it_is_at_work();
     an_idle_buss_rates_are_zero_after_a_second();
     a_links_figures_are_those_of_its_link();
