@@ -75,8 +75,7 @@ static struct io_stats bus_stats(struct io_bus *bus) {
     return stats;
 }
 
-// -------------------------------------------------------------------------------------------- opening,
-// closing
+// ------------------------------------------------------------------------------------------ opening, closing
 
 struct table {
     struct io_bus *bus;
@@ -167,8 +166,7 @@ static void a_line_may_be_known_from_the_start(void) {
     io_free(bus);
 }
 
-// -------------------------------------------------------------------------------------------------------
-// calls
+// ----------------------------------------------------------------------------------------------------- calls
 
 static size_t make_batch(uint8_t *out, unsigned commands) {
     size_t size = 0;
@@ -285,8 +283,7 @@ static void urgent_commands_empty_the_forecast(void) {
     io_free(bus);
 }
 
-// ------------------------------------------------------------------------------------------------ other
-// frames
+// ---------------------------------------------------------------------------------------------- other frames
 
 // The queue is a ring, which wraps here.
 static void frames_go_in_order_as_they_are(void) {

@@ -79,8 +79,7 @@ static int is_within(const void *at, const void *start, size_t size) {
     return (uintptr_t)at >= (uintptr_t)start && (uintptr_t)at < (uintptr_t)start + size;
 }
 
-// -----------------------------------------------------------------------------------------------------
-// reading
+// --------------------------------------------------------------------------------------------------- reading
 
 // Publishes news once, before the word with number AT is copied.
 static void publish_meanwhile(const void *at) {
@@ -197,8 +196,7 @@ static void only_the_links_own_counters_are_copied(void) {
     io_free(scene.bus);
 }
 
-// -----------------------------------------------------------------------------------------------------
-// writing
+// --------------------------------------------------------------------------------------------------- writing
 
 static struct {
     const void *first, *end; // of what is written
@@ -246,8 +244,7 @@ static void a_writer_says_that_it_is_at_work(void) {
     io_free(scene.bus);
 }
 
-// --------------------------------------------------------------------------------------------------- what is
-// in it
+// --------------------------------------------------------------------------------------------- what is in it
 
 static void an_idle_buss_rates_are_zero_after_a_second(void) {
     struct io_stats stats;
