@@ -42,8 +42,7 @@ static void check_deadline(struct scene *scene, uint64_t from_now_ns) {
     CHECK_EQUAL(io_deadline(scene->bus, scene->now_ns) - scene->now_ns, from_now_ns);
 }
 
-// ------------------------------------------------------------------------------------------------ serial
-// line
+// ----------------------------------------------------------------------------------------------- serial line
 
 static void a_serial_lines_bytes_are_counted_as_they_go(void) {
     struct scene scene;
@@ -100,7 +99,7 @@ static void a_serial_lines_queue_fills_block_by_block(void) {
     }
 }
 
-// --------------------------------------------------------------------------------------------------- budget
+// ---------------------------------------------------------------------------------------------------- budget
 
 // Bulk goes while there is credit, at most a full block's worth (1215 bits); a second block overdraws it, and
 // a third waits until nine tenths of the bit rate have paid for that.

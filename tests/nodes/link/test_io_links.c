@@ -75,8 +75,7 @@ static struct io_stats bus_stats(struct io_bus *bus) {
     return stats;
 }
 
-// -------------------------------------------------------------------------------------------- opening,
-// closing
+// ------------------------------------------------------------------------------------------ opening, closing
 
 struct table {
     struct io_bus *bus;
@@ -167,8 +166,7 @@ static void a_line_may_be_known_from_the_start(void) {
     io_free(bus);
 }
 
-// -------------------------------------------------------------------------------------------------------
-// calls
+// ----------------------------------------------------------------------------------------------------- calls
 
 static size_t make_batch(uint8_t *out, unsigned commands) {
     size_t size = 0;
@@ -285,8 +283,44 @@ static void urgent_commands_empty_the_forecast(void) {
     io_free(bus);
 }
 
-// ------------------------------------------------------------------------------------------------ other
-// frames
+// First contact: the node of NODE takes two empty blocks, the first of which has the sequence 0.
+static void run_up(struct io_bus *bus, unsigned node, uint32_t number) {
+    CHECK_EQUAL(io_send(bus, number, LINK_CONTROL, query, 1, 0, 0), IO_OK);
+    for (unsigned expected = 1; expected <= 3; expected++) {
+        uint8_t out[IO_OUT_FRAMES * FRAME];
+        while (io_next(bus, scene.now_ns, 0, out, sizeof out) > 0)
+            ;
+        struct can_frame frame = {.can_id = 0x101 + 2 * node, .can_dlc = WIRE_BLOCK_MIN};
+        CHECK_EQUAL(wire_block_finish(frame.data, 0, expected), WIRE_BLOCK_MIN);
+        io_received(bus, (const uint8_t *)&frame, FRAME, scene.now_ns);
+    }
+    io_handle_time(bus, scene.now_ns);
+    CHECK_EQUAL(link_stats(bus, number).pending, 0);
+}
+
+// Each has three full blocks, of 8 frames, to send, and all are overdue.
+static void links_that_wait_alike_take_turns(void) {
+    enum { COUNT = 3, BLOCKS = 3, BLOCK = 8 * FRAME };
+    static const uint8_t content[WIRE_CONTENT_MAX] = {5};
+    struct io_bus *bus = begin(IO_CAN_STREAM, &unknown_speed);
+    uint32_t numbers[COUNT];
+    for (unsigned i = 0; i < COUNT; i++) {
+        numbers[i] = open_link(bus, NODE + i);
+        run_up(bus, NODE + i, numbers[i]);
+    }
+    for (unsigned i = 0; i < COUNT * BLOCKS; i++)
+        CHECK_EQUAL(io_send(bus, numbers[i % COUNT], LINK_CONTROL, content, sizeof content, 0, 0), IO_OK);
+    scene.now_ns += 1000 * MS;
+    for (unsigned i = 0; i < COUNT * BLOCKS; i++) {
+        uint8_t out[BLOCK];
+        CHECK_EQUAL(io_next(bus, scene.now_ns, 0, out, BLOCK), BLOCK);
+        for (unsigned at = 0; at < BLOCK; at += FRAME)
+            CHECK_EQUAL(out[at], 2 * (NODE + i % COUNT)); // the ids' last bytes
+    }
+    io_free(bus);
+}
+
+// ---------------------------------------------------------------------------------------------- other frames
 
 // The queue is a ring, which wraps here.
 static void frames_go_in_order_as_they_are(void) {
@@ -324,6 +358,7 @@ int main(void) {
     a_lost_link_takes_no_commands();
     queues_are_as_long_as_they_should_be();
     urgent_commands_empty_the_forecast();
+    links_that_wait_alike_take_turns();
     frames_go_in_order_as_they_are();
     return 0;
 }
