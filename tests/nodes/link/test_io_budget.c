@@ -75,7 +75,8 @@ static void a_serial_lines_blocks_go_as_far_as_there_is_room(void) {
         CHECK_EQUAL(one_round(&scene, cases[i].room, 0), cases[i].first);
         CHECK_EQUAL(one_round(&scene, cases[i].room, 0), cases[i].second);
         CHECK_EQUAL(one_round(&scene, cases[i].room, 0), 0);
-        CHECK_EQUAL(bus_stats(&scene).queued_max, 0); // not bounded
+        CHECK_EQUAL(bus_stats(&scene).queued_max, 0);                // not bounded
+        CHECK_EQUAL(link_stats(&scene).flows[LINK_CONTROL].bits, 0); // the bit rate is unknown
         io_free(scene.bus);
     }
 }
