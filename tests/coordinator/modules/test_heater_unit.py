@@ -11,6 +11,7 @@ from coordinator.heat.mpc import Mpc
 from coordinator.heat.verify import VerifyOptions
 from coordinator.heat.watermark import Watermark
 from nodes.errors import CanductorError
+from nodes.node_states import NodeState
 from tests.coordinator.modules.scripted_live import Driven, heater
 from tests.stages.heat_machine import BED, FAN, HOTEND_PID
 
@@ -23,6 +24,12 @@ MODEL = (
     "sensor_responsiveness: 0.5\n"
 )
 NOT_HELD = {"held_s": None, "held_low": None, "held_high": None}
+
+
+async def turns() -> None:
+    """Let all who can go on do so."""
+    for _ in range(8):
+        await asyncio.sleep(0)
 
 
 @pytest.fixture
@@ -138,10 +145,16 @@ def test_a_target_that_is_reached_already_takes_one_measurement(chamber: Driven)
         chamber.measured(20.0)
         reaching = asyncio.ensure_future(chamber.unit.reach())
         for done in (False, True):
-            for _ in range(5):
-                await asyncio.sleep(0)
+            await turns()
             assert reaching.done() is done
             chamber.measured(20.0)
+        chamber.unit.set_target(60.0)
+        reaching = asyncio.ensure_future(chamber.unit.reach())
+        for celsius, done in ((20.0, False), (57.9, False), (58.0, True)):
+            await turns()
+            chamber.measured(celsius)
+            await turns()
+            assert reaching.done() is done
 
     asyncio.run(main())
 
@@ -171,7 +184,9 @@ def test_the_section_verify_heater_is_what_counts(tmp_path: Path) -> None:
     assert cause.startswith("heater chamber is at 20.0 °C and did not get 1.5 K nearer to 60 °C in 3 s")
 
 
-@pytest.mark.parametrize(("section", "key", "gain_s"), [(CHAMBER, "chamber", 20.0), (BED, "heater_bed", 60.0)])
+@pytest.mark.parametrize(
+    ("section", "key", "gain_s"), [(CHAMBER, "chamber", 20.0), (BED, "heater_bed", 60.0)]
+)
 def test_without_that_section_the_usual_counts(tmp_path: Path, section: str, key: str, gain_s: float) -> None:
     unit = heater(tmp_path, HOTEND_PID + section, key)
     assert unit._check.options == VerifyOptions(check_gain_s=gain_s)
@@ -212,6 +227,40 @@ def test_three_silent_looks_are_allowed_and_the_fourth_stops(chamber: Driven) ->
     assert live.stops == [
         "heater chamber: its sensor has not said anything for some 3 s; check node mcu and its wires"
     ]
+
+
+def test_a_degree_is_a_target_to_look_after(chamber: Driven) -> None:
+    chamber.unit.set_target(1.0)
+    for _ in range(4):
+        chamber.unit._look()
+    assert len(chamber.live.stops) == 1
+
+
+def test_a_look_that_finds_a_node_away_forgets_the_target_and_ends_the_wait(tmp_path: Path) -> None:
+    """That of its sensor is named first; its own is away too here."""
+    text = HOTEND_PID + CHAMBER.replace("PA12", "toolhead:PA12")
+    driven = Driven(heater(tmp_path, text, "chamber"))
+    unit = driven.unit
+
+    async def main() -> None:
+        unit.set_target(60.0)
+        assert driven.measured(20.0) > 0
+        waiting = asyncio.ensure_future(unit.reach())
+        await turns()
+        for board in driven.live.nodes.values():
+            board.state = NodeState.LOST
+        for _ in range(5):
+            unit._look()
+        await turns()
+        assert waiting.done()
+        with pytest.raises(CanductorError, match="heater chamber went off: node toolhead is lost"):
+            await waiting
+        assert (unit.target_c, unit.power, driven.live.stops) == (0.0, 0.0, [])
+        assert len(driven.sent) == 1
+        (told,) = driven.live.said
+        assert told == "heater chamber is off, its target of 60 °C is forgotten: node toolhead is lost"
+
+    asyncio.run(main())
 
 
 def test_an_output_that_takes_nothing_ends_the_target(chamber: Driven) -> None:
@@ -318,12 +367,6 @@ class Relay:
     def power(self, now_s: float, measured_c: float, target_c: float = 0.0) -> float:
         del now_s, measured_c, target_c
         return 0.1
-
-
-async def turns() -> None:
-    """Let all who can go on do so."""
-    for _ in range(8):
-        await asyncio.sleep(0)
 
 
 def test_a_calibration_has_the_heater_until_it_is_done(chamber: Driven) -> None:

@@ -81,9 +81,7 @@ def test_looks_without_a_measurement_are_counted_from_the_last_one() -> None:
     assert [source.missed() for _ in range(2)] == [0, 1]
 
 
-@pytest.mark.parametrize(
-    ("celsius", "sound"), [(4.99, False), (5.0, True), (80.0, True), (80.01, False)]
-)
+@pytest.mark.parametrize(("celsius", "sound"), [(4.99, False), (5.0, True), (80.0, True), (80.01, False)])
 def test_a_measurement_at_the_limits_is_sound_and_one_outside_is_not(celsius: float, sound: bool) -> None:
     source = Source()
     assert not source.is_sound
