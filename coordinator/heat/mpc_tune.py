@@ -77,9 +77,9 @@ class MpcTune:
             return self._heat(now_s, measured_c)
         return self._hold(now_s, measured_c) if self.phase is TunePhase.HOLD else 0.0
 
-    def settled(self, measured_c: float, target_c: float) -> bool:
-        """Tell whether it is done."""
-        del measured_c, target_c
+    @property
+    def is_done(self) -> bool:
+        """Whether it is done."""
         return self.model is not None
 
     def _enter(self, phase: TunePhase, now_s: float) -> None:

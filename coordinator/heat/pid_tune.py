@@ -65,9 +65,9 @@ class RelayTune:
                 self.gains = self._result()
         return self.max_power if self._heating and self.gains is None else 0.0
 
-    def settled(self, measured_c: float, target_c: float) -> bool:
-        """Tell whether it is done."""
-        del measured_c, target_c
+    @property
+    def is_done(self) -> bool:
+        """Whether it is done."""
         return self.gains is not None
 
     def _look_at(self, now_s: float, measured_c: float) -> None:

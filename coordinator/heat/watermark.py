@@ -9,9 +9,8 @@ class Watermark:
         self._max_delta_k = max_delta_k
         self._heating = False
 
-    def power(self, now_s: float, measured_c: float, target_c: float) -> float:
+    def power(self, _now_s: float, measured_c: float, target_c: float) -> float:
         """Return the power from now on."""
-        del now_s
         if target_c <= 0 or measured_c >= target_c + self._max_delta_k:
             self._heating = False
         elif measured_c <= target_c - self._max_delta_k:

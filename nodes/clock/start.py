@@ -81,7 +81,8 @@ class Start:
         return guess
 
     def _solve(self) -> None:
-        self._covariance: Array = np.linalg.inv(self._prior + (self._rows.T * self._precision) @ self._rows)
+        information = self._prior + (self._rows.T * self._precision) @ self._rows
+        self._covariance: Array = np.asarray(np.linalg.inv(information), dtype=np.float64)
         self._mean: Array = self._covariance @ (self._pull + self._shift @ self._rows)
 
     def _sweep(self, guess: float) -> None:

@@ -112,9 +112,9 @@ void io_served(struct io_bus *bus, const struct io_link *node);
 uint32_t io_frame_bits(const struct io_bus *bus, uint32_t can_id, const uint8_t *data, size_t size);
 uint32_t io_serial_bits(const struct io_bus *bus, size_t size);
 
-// io_forecast.c: notes a batch that was put into the motion queue; forgets all that was queued.
+// io_forecast.c: notes a batch that was put into the motion queue. What leaves the queue is forgotten by
+// itself.
 void io_note_batch(struct io_link *node, const uint8_t *batch, size_t size);
-void io_note_motion_dropped(struct io_link *node);
 
 // io_stats.c: makes what changed readable.
 void io_publish(struct io_bus *bus);

@@ -34,10 +34,6 @@ static void drop_sent(struct io_link *node) {
     }
 }
 
-void io_note_motion_dropped(struct io_link *node) {
-    node->segment_count = 0;
-}
-
 static void note_record(struct io_link *node, const struct batch_record *record, uint64_t start,
                         uint64_t end) {
     struct io_segment *last = node->segment_count ? segment_at(node, node->segment_count - 1) : NULL;

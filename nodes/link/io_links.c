@@ -123,8 +123,6 @@ enum io_status io_send_urgent(struct io_bus *bus, uint32_t number, const uint8_t
     struct io_link *node = enter(bus, number, &status);
     if (node)
         status = from_link(link_send_urgent(&node->link, content, size, bus->driver.now(bus->context)));
-    if (status == IO_OK)
-        io_note_motion_dropped(node);
     return leave(bus, status);
 }
 

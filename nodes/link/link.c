@@ -9,7 +9,6 @@
 
 #define RTO_MIN_NS (20 * NS_PER_MS)    // below, a busy host or node would cause needless repeats
 #define RTO_FIRST_NS (100 * NS_PER_MS) // until a round trip was measured
-#define FIRST_SEQUENCE 16              // room below for the adoption of the node's
 
 // -------------------------------------------------------------------------------------------------- set-up
 
@@ -18,8 +17,6 @@ void link_init(struct link *link, const struct link_settings *settings, const st
     link->settings = *settings;
     for (int kind = 0; kind < LINK_CLASSES; kind++)
         link_queue_init(&link->queues[kind], memories[kind].at, memories[kind].size, kind != LINK_MOTION);
-    link->first = link->cursor = link->next = FIRST_SEQUENCE;
-    link->last_ack = LINK_NEVER;
     link->lead_in = LEAD_FLUSH; // an earlier host may have left half a block in the node's buffer
 }
 
@@ -115,8 +112,6 @@ static int may_probe(const struct link *link) {
 static int make_block(struct link *link, uint64_t now, unsigned allowed) {
     struct link_plan plan = {.offer = {.kind = LINK_CONTROL}};
     if (link->state == LINK_RUNNING) {
-        if (link->flying_bytes && !link_fits(link, WIRE_BLOCK_MIN + 1))
-            return 0;
         plan = link_plan_block(link, now, allowed);
         if (!link_may_go(link, &plan, now))
             return 0;
@@ -219,8 +214,7 @@ void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in) {
     link->owed_until_seq = link->next;
     link->cursor = link->first;
     link->flying_bytes = 0;
-    if (link->lead_in < lead_in)
-        link->lead_in = (uint8_t)lead_in;
+    link->lead_in = (uint8_t)lead_in;
 }
 
 uint64_t link_unanswered_since(const struct link *link) {
@@ -247,7 +241,7 @@ static void forgive_sleep(struct link *link, uint64_t now) {
     uint64_t lost_ns = lost_deadline(link), repeat_ns = repeat_deadline(link);
     uint64_t wake_ns = lost_ns < repeat_ns ? lost_ns : repeat_ns;
     uint64_t quarter_ns = link->settings.lost_after_ns / 4;
-    if (now > wake_ns && now - wake_ns > quarter_ns && now - quarter_ns > link->progress_ns)
+    if (now > wake_ns && now - wake_ns > quarter_ns)
         link->progress_ns = now - quarter_ns;
 }
 

@@ -145,7 +145,8 @@ static uint64_t hold_motion(const struct link *link, const struct link_front *fr
     struct link_command head;
     const struct link_queue *motion = &link->queues[LINK_MOTION];
     link_queue_peek(motion, motion->head, &head);
-    uint64_t due_ns = head.req_clock && link->clock_hz > 0 ? link_clock_to_ns(link, head.req_clock) : 0;
+    uint64_t due_ns =
+        head.req_clock ? link_clock_to_ns(link, head.req_clock) : 0; // a gate: the clock is known
     uint64_t pressing_ns = due_ns > PACK_LEAD_NS ? due_ns - PACK_LEAD_NS : 0;
     uint64_t full_ns = filled_at(link, front);
     return full_ns < pressing_ns ? full_ns : pressing_ns;

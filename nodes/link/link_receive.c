@@ -135,8 +135,6 @@ static void handle_block(struct link *link, const uint8_t *bytes, size_t length,
     link->heard_ns = now;
     handle_sequence(link, answer, length == WIRE_BLOCK_MIN, now);
     response->size = (uint8_t)(length - WIRE_BLOCK_MIN);
-    if (!response->size)
-        return;
     memcpy(response->content, bytes + WIRE_HEADER, response->size);
     const struct link_block *asked = const_block_of(link, link->first - 1);
     int known =

@@ -80,7 +80,8 @@ void schedule_advance(struct schedule *schedule, uint64_t now) {
         schedule->held_ns += now - schedule->held_since_ns;
         schedule->held_since_ns = now;
     }
-    static const uint64_t share_ppm[LINK_CLASSES] = {0, CONTROL_SHARE_PPM, BULK_SHARE_PPM};
+    static const uint64_t share_ppm[LINK_CLASSES] = {[LINK_CONTROL] = CONTROL_SHARE_PPM,
+                                                     [LINK_BULK] = BULK_SHARE_PPM};
     int64_t refill_ns = (int64_t)(passed_ns * schedule->ceiling_ppm / PPM);
     schedule->credit_ns = least(schedule->credit_ns + refill_ns, credit_max(schedule));
     for (int kind = LINK_CONTROL; kind < LINK_CLASSES; kind++) {
@@ -163,8 +164,9 @@ static uint64_t unit_ns(const struct schedule *schedule) {
 // estimate counts.
 uint64_t schedule_queued(const struct schedule *schedule, uint64_t queued) {
     int busy = schedule->bitrate && schedule->line_free_ns > schedule->now_ns;
-    uint64_t ahead_ns = busy ? schedule->line_free_ns - schedule->now_ns : 0;
-    uint64_t expected = busy ? (ahead_ns + unit_ns(schedule) - 1) / unit_ns(schedule) : 0;
+    uint64_t expected = 0;
+    if (busy)
+        expected = (schedule->line_free_ns - schedule->now_ns + unit_ns(schedule) - 1) / unit_ns(schedule);
     return queued == UINT64_MAX || queued < expected ? expected : queued;
 }
 

@@ -10,7 +10,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Final
 
 from tests.mutation import c_source, python_source
@@ -68,7 +68,7 @@ class CoverageMap:
             spans = list(enumerate(c_source.statement_spans(source)))
             around = [(end - start, k) for k, (start, end) in spans if start <= mutation.start < end]
             if not around:  # a constant, an initializer
-                return self.by_file[mutation.file]
+                return self.by_file[mutation.file] or self._in_folder(mutation.file)
             return self.by_statement[mutation.file, min(around)[1]]
         statement = python_source.statement_line(source, mutation.start)
         for line in (mutation.line, statement):
@@ -77,6 +77,12 @@ class CoverageMap:
             if found := self.by_line[mutation.file, line]:
                 return found
         return set()
+
+    def _in_folder(self, header: str) -> set[CoveringTest]:
+        """Return the tests that execute anything next to HEADER, which has no statement of its own."""
+        folder = PurePath(header).parent
+        beside = [tests for file, tests in self.by_file.items() if PurePath(file).parent == folder]
+        return set().union(*beside)
 
 
 def collect(*, everything: bool = False) -> CoverageMap:

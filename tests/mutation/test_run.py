@@ -106,3 +106,11 @@ def test_constants_are_covered_by_all_tests_of_their_file() -> None:
     comparison = Mutation("x.py", source.index(b"<"), 0, "", "", 4, "")
     assert covered.tests(constant, source) == {test, other}
     assert covered.tests(comparison, source) == {other}, "by the first line of the statement"
+
+
+def test_a_header_of_constants_is_covered_by_all_tests_of_its_folder() -> None:
+    near, far = CoveringTest("tests/a.py::a", 1.0), CoveringTest("tests/a.py::b", 1.0)
+    covered = CoverageMap()
+    covered.by_file["x/y.c"], covered.by_file["z/y.c"] = {near}, {far}
+    source = b"enum { A = 1 };\n"
+    assert covered.tests(Mutation("x/y.h", source.index(b"1"), 0, "", "", 1, ""), source) == {near}

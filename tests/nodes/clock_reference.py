@@ -17,7 +17,7 @@ LEAD_WITH_SKEW = np.array([1.0, 0, 0, 0, 1])
 
 def direction(sign: int) -> Array:
     """Return what an exchange bounds: the lead of the clock (and skew) in direction SIGN, and the delay."""
-    return sign * LEAD_WITH_SKEW + np.eye(5)[DELAY]
+    return np.asarray(sign * LEAD_WITH_SKEW + np.eye(5)[DELAY])
 
 
 @dataclass

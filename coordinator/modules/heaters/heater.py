@@ -56,7 +56,8 @@ class Tuning(Protocol):
     @property
     def watched_c(self) -> float: ...  # noqa: D102
     def power(self, now_s: float, measured_c: float, target_c: float = ..., /) -> float: ...  # noqa: D102
-    def settled(self, measured_c: float, target_c: float, /) -> bool: ...  # noqa: D102
+    @property
+    def is_done(self) -> bool: ...  # noqa: D102
 
 
 class Heater:
@@ -211,7 +212,7 @@ class Heater:
             raise CanductorError(f"[{self.name}] is being calibrated already; wait for its end")
         self._tuning, self._tuning_failure, self._gone = tuning, None, None
         try:
-            while not tuning.settled(0.0, 0.0):
+            while not tuning.is_done:
                 await self._next()
                 each()
                 if self._tuning_failure is not None:
@@ -244,7 +245,7 @@ class Heater:
         if fault is not None:
             live.stop(f"heater {self.key} {fault}")
             return
-        self._apply(self._wanted(at_s, celsius))
+        self._apply(self._wanted(live, at_s, celsius))
         ended = self._holding.measured(at_s, celsius, self.target_c, self.power, settled=self.settled)
         self._tell_held(ended)
 
@@ -262,7 +263,7 @@ class Heater:
                 f" {self.input.max_c:g} °C; check the sensor and its wires"
             )
 
-    def _wanted(self, at_s: float, celsius: float) -> float:
+    def _wanted(self, live: "Live", at_s: float, celsius: float) -> float:
         if self._gone is not None or self._tuning_failure is not None:
             return 0.0
         if self._tuning is not None:
@@ -274,16 +275,16 @@ class Heater:
         if self.controller is None:
             return 0.0
         if isinstance(self.controller, Mpc):
-            self._tell_model(self.controller, at_s)
+            self._tell_model(live, self.controller, at_s)
         return self.controller.power(at_s, celsius, self.target_c)
 
-    def _tell_model(self, model: Mpc, at_s: float) -> None:
+    def _tell_model(self, live: "Live", model: Mpc, at_s: float) -> None:
         if self.fan is not None:
             model.set_fan(self.fan.unit.speed)
         if self._ambient is not None and self._ambient.input.celsius is not None:
             model.set_ambient(self._ambient.input.celsius)
-        if self._live is not None and model.model.filament_j_per_mm_k > 0:
-            forecast = self._live.machine.filament
+        if model.model.filament_j_per_mm_k > 0:
+            forecast = live.machine.filament
             acts_s = at_s + AHEAD_S
             model.set_filament(
                 forecast.mm_per_s(self.name, self._told_s, at_s),

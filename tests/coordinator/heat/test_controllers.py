@@ -103,6 +103,21 @@ def test_watermark_switches_at_its_marks_only() -> None:
     assert not controller.settled(57.9, 60)
 
 
+def test_watermark_at_its_edges() -> None:
+    controller = Watermark()
+    assert controller.power(0.0, 60.0, 60.0) == 0.0, "off until it is cold"
+    for celsius, target_c, power in (
+        (58.1, 60.0, 0.0),
+        (58.0, 60.0, 1.0),
+        (61.9, 60.0, 1.0),
+        (62.0, 60.0, 0.0),
+        (-50.0, 0.0, 0.0),
+        (-50.0, 1.0, 1.0),
+        (-50.0, 0.0, 0.0),
+    ):
+        assert controller.power(0.0, celsius, target_c) == power
+
+
 # ------------------------------------------------------------------------------------------------------- MPC
 
 

@@ -56,3 +56,10 @@ def test_a_heater_that_was_switched_off_begins_from_where_it_is() -> None:
     for second in range(16, 35):
         assert check.check(second, 100.0, 200.0, 1.0) is None
     assert check.check(37, 100.0, 200.0, 1.0) is not None
+
+
+def test_another_target_below_a_degree_gains_no_time_either() -> None:
+    check = HeaterCheck(OPTIONS)
+    assert check.check(0.0, -20.0, 1.0, 1.0) is None
+    assert check.check(15.0, -20.0, 0.5, 1.0) is None
+    assert check.check(20.0, -20.0, 0.5, 1.0) is not None

@@ -14,6 +14,8 @@ from nodes.node.request_reply import RequestReply
 from tests.nodes import virtual_time
 from tests.nodes.twin_bus import DELAY_S, TwinIO, TwinLink, TwinNode
 
+BITRATE = "CANBUS_FREQUENCY"
+"""Of a node's dictionary."""
 OUT_NS, BACK_NS = 120_000, 150_000
 
 
@@ -29,13 +31,15 @@ class OwingLink(TwinLink):
 class Bench:
     """A keeper over a real conversation with a twin node, and what it reported; it is its connector, too."""
 
-    def __init__(self) -> None:
+    def __init__(self, **constants: int) -> None:
         self.twin = TwinNode()
         self.io = TwinIO([self.twin])
         self.talk = RequestReply("mainboard")
         self.link = OwingLink(self.io, self.twin, self.talk.receive, lambda _: None)
         self.talk.attach(self.link)
+        known = {key: value for key, value in self.twin.dictionary.constants.items() if key != BITRATE}
         self.talk.dictionary = self.twin.dictionary
+        self.talk.dictionary.constants = {**known, **constants}
         self.estimates: list[ClockEstimate] = []
         self.sampled_s: list[float] = []
         self.suspected_s: list[float] = []
@@ -121,8 +125,7 @@ def test_a_clock_is_learned_by_asking_often_and_kept_by_asking_now_and_then() ->
 
 
 def test_the_time_on_the_wire_is_taken_off_the_exchange() -> None:
-    bench = Bench()
-    bench.talk.dictionary.constants["CANBUS_FREQUENCY"] = 250_000
+    bench = Bench(**{BITRATE: 250_000})
     bench.run(sleeping(0.1))
     first = bench.link.sent[0][0]
     assert bench.blocks[0] == (len(first), 250_000, False)
@@ -137,7 +140,6 @@ def test_the_time_on_the_wire_is_taken_off_the_exchange() -> None:
 
 def test_where_the_bit_rate_is_unknown_that_is_what_the_connector_hears() -> None:
     bench = Bench()
-    bench.talk.dictionary.constants.pop("CANBUS_FREQUENCY", None)
     bench.run(sleeping(0.01))
     assert [block[1] for block in bench.blocks] == [0, 0]
 

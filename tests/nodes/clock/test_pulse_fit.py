@@ -78,7 +78,7 @@ class ByLeastSquares:
         t = (pair[0] - last[0]) / REFERENCE_HZ
         a, b, c = self.coefficients
         expected = last[1] + round((t + a + b * t + c * min(t, 6.0) ** 2 / 2) * FREQ_HZ)
-        return abs(pair[1] - expected) / FREQ_HZ
+        return float(abs(pair[1] - expected) / FREQ_HZ)
 
     @staticmethod
     def _seconds(pairs: list[Pair], last: Pair) -> tuple[Array, Array]:

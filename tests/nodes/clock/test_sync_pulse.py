@@ -396,6 +396,22 @@ def test_a_lost_node_gives_up_its_clock_and_a_lonely_one_gets_no_pulses() -> Non
     assert sent[0] == sent[1]
 
 
+def test_a_node_that_comes_back_to_a_lonely_one_is_learned_from_the_beginning() -> None:
+    bus = Bus(1, 0.0)
+    _, second = two_nodes(bus)
+    sent: list[int] = []
+
+    def lose() -> None:
+        second.lost = True
+
+    def come_back() -> None:
+        second.lost = False
+        sent.append(bus.pulses)
+
+    keep(bus, 2.5, lose, come_back, lambda: sent.append(bus.pulses))
+    assert sent[1] - sent[0] >= SETTLE_ROUNDS
+
+
 def test_a_clock_by_pulses_goes_through_the_reference_both_ways() -> None:
     bus = Bus(1, 0.0)
     first, second = two_nodes(bus)

@@ -72,7 +72,7 @@ static inline void kernel_reset(void) {
     CHECK(sem_init(&kernel.to_thread, 0, 0) == 0 && sem_init(&kernel.to_test, 0, 0) == 0);
 }
 
-// -------------------------------------------------------------------------------------- time, mutex, thread
+// --------------------------------------------------------------------------------------- time, mutex, thread
 
 static inline int kernel_clock_gettime(clockid_t clock, struct timespec *out) {
     CHECK_EQUAL(clock, CLOCK_MONOTONIC);

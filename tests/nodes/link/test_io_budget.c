@@ -42,8 +42,7 @@ static void check_deadline(struct scene *scene, uint64_t from_now_ns) {
     CHECK_EQUAL(io_deadline(scene->bus, scene->now_ns) - scene->now_ns, from_now_ns);
 }
 
-// ------------------------------------------------------------------------------------------------ serial
-// line
+// ----------------------------------------------------------------------------------------------- serial line
 
 static void a_serial_lines_bytes_are_counted_as_they_go(void) {
     struct scene scene;
@@ -76,7 +75,8 @@ static void a_serial_lines_blocks_go_as_far_as_there_is_room(void) {
         CHECK_EQUAL(one_round(&scene, cases[i].room, 0), cases[i].first);
         CHECK_EQUAL(one_round(&scene, cases[i].room, 0), cases[i].second);
         CHECK_EQUAL(one_round(&scene, cases[i].room, 0), 0);
-        CHECK_EQUAL(bus_stats(&scene).queued_max, 0); // not bounded
+        CHECK_EQUAL(bus_stats(&scene).queued_max, 0);                // not bounded
+        CHECK_EQUAL(link_stats(&scene).flows[LINK_CONTROL].bits, 0); // the bit rate is unknown
         io_free(scene.bus);
     }
 }
@@ -100,7 +100,7 @@ static void a_serial_lines_queue_fills_block_by_block(void) {
     }
 }
 
-// --------------------------------------------------------------------------------------------------- budget
+// ---------------------------------------------------------------------------------------------------- budget
 
 // Bulk goes while there is credit, at most a full block's worth (1215 bits); a second block overdraws it, and
 // a third waits until nine tenths of the bit rate have paid for that.

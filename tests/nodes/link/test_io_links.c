@@ -75,8 +75,7 @@ static struct io_stats bus_stats(struct io_bus *bus) {
     return stats;
 }
 
-// -------------------------------------------------------------------------------------------- opening,
-// closing
+// ------------------------------------------------------------------------------------------ opening, closing
 
 struct table {
     struct io_bus *bus;
@@ -124,6 +123,10 @@ static void links_come_and_go_in_any_order(void) {
     CHECK_EQUAL(io_open_link(table.bus, 2, &usual, &number), IO_TAKEN);
     CHECK_EQUAL(number, 77);
     check_table(&table);
+    uint8_t out[8 * FRAME]; // the last link may send, too: its first contact takes 8 frames
+    CHECK_EQUAL(io_send(table.bus, table.numbers[1], LINK_CONTROL, query, 1, 0, 0), IO_OK);
+    CHECK_EQUAL(io_next(table.bus, scene.now_ns, 0, out, sizeof out), sizeof out);
+    CHECK_EQUAL(out[0], 2);
     io_close_link(table.bus, 999); // that never was
     CHECK_EQUAL(io_get_link_stats(table.bus, 999, &stats), IO_GONE);
     CHECK_EQUAL(io_get_link_stats(table.bus, 0, &stats), IO_GONE);
@@ -167,8 +170,7 @@ static void a_line_may_be_known_from_the_start(void) {
     io_free(bus);
 }
 
-// -------------------------------------------------------------------------------------------------------
-// calls
+// ----------------------------------------------------------------------------------------------------- calls
 
 static size_t make_batch(uint8_t *out, unsigned commands) {
     size_t size = 0;
@@ -285,8 +287,78 @@ static void urgent_commands_empty_the_forecast(void) {
     io_free(bus);
 }
 
-// ------------------------------------------------------------------------------------------------ other
-// frames
+// First contact: the node of NODE takes two empty blocks, the first of which has the sequence 0.
+static void run_up(struct io_bus *bus, unsigned node, uint32_t number) {
+    CHECK_EQUAL(io_send(bus, number, LINK_CONTROL, query, 1, 0, 0), IO_OK);
+    for (unsigned expected = 1; expected <= 3; expected++) {
+        uint8_t out[IO_OUT_FRAMES * FRAME];
+        while (io_next(bus, scene.now_ns, 0, out, sizeof out) > 0)
+            ;
+        struct can_frame frame = {.can_id = 0x101 + 2 * node, .can_dlc = WIRE_BLOCK_MIN};
+        CHECK_EQUAL(wire_block_finish(frame.data, 0, expected), WIRE_BLOCK_MIN);
+        io_received(bus, (const uint8_t *)&frame, FRAME, scene.now_ns);
+    }
+    io_handle_time(bus, scene.now_ns);
+    CHECK_EQUAL(link_stats(bus, number).pending, 0);
+}
+
+// Each has three full blocks, of 8 frames, to send, and all are overdue.
+static void links_that_wait_alike_take_turns(void) {
+    enum { COUNT = 3, BLOCKS = 3, BLOCK = 8 * FRAME };
+    static const uint8_t content[WIRE_CONTENT_MAX] = {5};
+    struct io_bus *bus = begin(IO_CAN_STREAM, &unknown_speed);
+    uint32_t numbers[COUNT];
+    for (unsigned i = 0; i < COUNT; i++) {
+        numbers[i] = open_link(bus, NODE + i);
+        run_up(bus, NODE + i, numbers[i]);
+    }
+    for (unsigned i = 0; i < COUNT * BLOCKS; i++)
+        CHECK_EQUAL(io_send(bus, numbers[i % COUNT], LINK_CONTROL, content, sizeof content, 0, 0), IO_OK);
+    scene.now_ns += 1000 * MS;
+    for (unsigned i = 0; i < COUNT * BLOCKS; i++) {
+        uint8_t out[BLOCK];
+        CHECK_EQUAL(io_next(bus, scene.now_ns, 0, out, BLOCK), BLOCK);
+        for (unsigned at = 0; at < BLOCK; at += FRAME)
+            CHECK_EQUAL(out[at], 2 * (NODE + i % COUNT)); // the ids' last bytes
+    }
+    bus_stats(bus);
+    struct io_link_stats stats = link_stats(bus, numbers[0]);
+    CHECK(stats.flows[LINK_CONTROL].frames > 0 && stats.received.frames > 0);
+    CHECK(stats.flows[LINK_CONTROL].bits == 0 && stats.received.bits == 0); // the bit rate is unknown
+    io_free(bus);
+}
+
+// What was begun goes on before what is due later, though it would be the other's turn; and what is due
+// earlier goes before the rest of what was begun.
+static void a_block_that_was_begun_is_due_as_before(void) {
+    static const struct {
+        enum link_class begun, other;
+        unsigned next; // whose the frame behind the begun block's first is
+    } cases[] = {{LINK_CONTROL, LINK_BULK, 0}, {LINK_BULK, LINK_CONTROL, 1}};
+    static const uint8_t content[WIRE_CONTENT_MAX] = {5};
+    for (size_t i = 0; i < 2; i++) {
+        struct io_bus *bus = begin(IO_CAN_STREAM, &unknown_speed);
+        uint32_t numbers[2];
+        for (unsigned k = 0; k < 2; k++) {
+            numbers[k] = open_link(bus, NODE + k);
+            run_up(bus, NODE + k, numbers[k]);
+        }
+        uint8_t out[FRAME];
+        CHECK_EQUAL(io_send(bus, numbers[0], cases[i].begun, content, sizeof content, 0, 0), IO_OK);
+        CHECK_EQUAL(io_next(bus, scene.now_ns, 0, out, FRAME), FRAME);
+        CHECK_EQUAL(out[0], 2 * NODE);
+        CHECK_EQUAL(io_send(bus, numbers[1], cases[i].other, content, sizeof content, 0, 0), IO_OK);
+        for (unsigned frame = 0; frame < 15; frame++) {
+            CHECK_EQUAL(io_next(bus, scene.now_ns, 0, out, FRAME), FRAME);
+            unsigned owner = frame < (cases[i].next ? 8 : 7) ? cases[i].next : !cases[i].next;
+            CHECK_EQUAL(out[0], 2 * (NODE + owner));
+        }
+        CHECK_EQUAL(io_next(bus, scene.now_ns, 0, out, FRAME), 0);
+        io_free(bus);
+    }
+}
+
+// ---------------------------------------------------------------------------------------------- other frames
 
 // The queue is a ring, which wraps here.
 static void frames_go_in_order_as_they_are(void) {
@@ -324,6 +396,8 @@ int main(void) {
     a_lost_link_takes_no_commands();
     queues_are_as_long_as_they_should_be();
     urgent_commands_empty_the_forecast();
+    links_that_wait_alike_take_turns();
+    a_block_that_was_begun_is_due_as_before();
     frames_go_in_order_as_they_are();
     return 0;
 }

@@ -79,8 +79,7 @@ static int is_within(const void *at, const void *start, size_t size) {
     return (uintptr_t)at >= (uintptr_t)start && (uintptr_t)at < (uintptr_t)start + size;
 }
 
-// -----------------------------------------------------------------------------------------------------
-// reading
+// --------------------------------------------------------------------------------------------------- reading
 
 // Publishes news once, before the word with number AT is copied.
 static void publish_meanwhile(const void *at) {
@@ -181,8 +180,23 @@ static void counters_are_never_anothers(void) {
     io_free(scene.bus);
 }
 
-// -----------------------------------------------------------------------------------------------------
-// writing
+static void refuse_first_place(const void *at) {
+    const struct io_snapshot *place = &scene.bus->snapshots[0];
+    CHECK(!is_within(at, &place->stats, sizeof place->stats));
+}
+
+static void only_the_links_own_counters_are_copied(void) {
+    begin();
+    struct io_link_stats stats;
+    CHECK_EQUAL(io_open_link(scene.bus, NODE + 1, &usual, &scene.other), IO_OK);
+    before_load = refuse_first_place;
+    CHECK_EQUAL(io_get_link_stats(scene.bus, scene.other, &stats), IO_OK);
+    CHECK_EQUAL(io_get_link_stats(scene.bus, scene.other + 1, &stats), IO_GONE);
+    before_load = NULL;
+    io_free(scene.bus);
+}
+
+// --------------------------------------------------------------------------------------------------- writing
 
 static struct {
     const void *first, *end; // of what is written
@@ -230,8 +244,7 @@ static void a_writer_says_that_it_is_at_work(void) {
     io_free(scene.bus);
 }
 
-// --------------------------------------------------------------------------------------------------- what is
-// in it
+// --------------------------------------------------------------------------------------------- what is in it
 
 static void an_idle_buss_rates_are_zero_after_a_second(void) {
     struct io_stats stats;
@@ -292,6 +305,7 @@ int main(void) {
     what_a_reader_gets_belongs_together();
     a_reader_waits_for_a_writer();
     counters_are_never_anothers();
+    only_the_links_own_counters_are_copied();
     a_writer_says_that_it_is_at_work();
     an_idle_buss_rates_are_zero_after_a_second();
     a_links_figures_are_those_of_its_link();

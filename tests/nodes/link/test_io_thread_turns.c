@@ -80,8 +80,7 @@ static void check_ended(struct io_thread *thread, int cause) {
     CHECK_EQUAL(kernel.write_calls, 0);
 }
 
-// ---------------------------------------------------------------------------------------------- start and
-// end
+// --------------------------------------------------------------------------------------------- start and end
 
 static void a_thread_starts_with_a_look_at_the_line_and_sleeps(enum io_kind kind) {
     struct io_thread *thread = start(kind, &unknown_speed);
@@ -126,8 +125,7 @@ static void a_start_that_fails_leaves_nothing_behind(void) {
     CHECK_EQUAL(kernel.event_calls, 0);
 }
 
-// ----------------------------------------------------------------------------------------------------
-// reading
+// --------------------------------------------------------------------------------------------------- reading
 
 static void check_frames(struct io_thread *thread, size_t wanted) {
     struct io_event events[80];
@@ -224,8 +222,7 @@ static void a_line_may_end_while_it_is_read(void) {
     }
 }
 
-// ----------------------------------------------------------------------------------------------------
-// writing
+// --------------------------------------------------------------------------------------------------- writing
 
 // Who sends does so by itself: the thread sleeps on.
 static void what_is_sent_goes_at_once(enum io_kind kind) {
@@ -328,8 +325,7 @@ static void a_line_may_end_while_it_is_written(void) {
     stop(thread);
 }
 
-// -------------------------------------------------------------------------------------------------------
-// time
+// ------------------------------------------------------------------------------------------------------ time
 
 // The node never answers. Its first block is repeated after 100 ms, then after twice as long each time.
 static void the_thread_sleeps_until_the_next_deadline(void) {
@@ -390,8 +386,7 @@ static void a_thread_that_overslept_reads_first(void) {
     stop(thread);
 }
 
-// --------------------------------------------------------------------------------------------- kernel's
-// queue
+// -------------------------------------------------------------------------------------------- kernel's queue
 
 // How many of 19 frames follow one that was refused, when the kernel has WAITING bytes of memory in use and
 // the line takes frames again. The rest follows, 12 at a time.

@@ -86,6 +86,16 @@ def test_looks_without_a_measurement_are_counted_from_the_last_one() -> None:
     assert [source.missed() for _ in range(2)] == [0, 1]
 
 
+@pytest.mark.parametrize(("celsius", "sound"), [(4.99, False), (5.0, True), (80.0, True), (80.01, False)])
+def test_a_measurement_at_the_limits_is_sound_and_one_outside_is_not(celsius: float, sound: bool) -> None:
+    source = Source()
+    assert not source.is_sound
+    source._take(20.0, lambda _: 1.0)
+    source._take(celsius, lambda _: 1.0)
+    assert source.is_sound is sound
+    assert source.sound_c == (celsius if sound else 20.0)
+
+
 def test_measurements_are_passed_on_from_the_connection_to_the_end() -> None:
     async def main() -> None:
         source = Source()

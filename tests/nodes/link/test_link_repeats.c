@@ -1,0 +1,525 @@
+// SPDX-License-Identifier: Apache-2.0
+// sources: firmware/wire/*.c nodes/link/link*.c nodes/link/queue.c
+// What is not acknowledged: when it goes again and how, what naks say, and when the link is lost.
+#include "tests/nodes/link/link_scene.h"
+
+static void time_passes(struct scene *scene, uint64_t at_ns) {
+    scene->now = at_ns;
+    link_handle_timer(&scene->link, scene->now);
+}
+
+static void nak(struct scene *scene) {
+    answer(scene, scene->link.first, 0);
+}
+
+// SIZE bytes of content in a block of their own.
+static void block_goes(struct scene *scene, char tag, size_t size) {
+    char content[WIRE_BLOCK_MAX] = {0};
+    memset(content, tag, size);
+    control(scene, tag, size);
+    check_goes(scene, content);
+}
+
+// ------------------------------------------------------------------------------------------------ timeouts
+
+static void each_timeout_doubles_the_next_up_to_a_quarter_of_what_loses_the_link(void) {
+    static const uint64_t waits_ms[] = {20, 40, 80, 160, 250, 250};
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    struct link_stats before = stats_of(&scene);
+    block_goes(&scene, 'a', 3);
+    uint64_t sent_ns = scene.now;
+    for (unsigned i = 0; i < 6; i++) {
+        CHECK_EQUAL(link_unanswered_since(&scene.link), scene.now);
+        CHECK_EQUAL(stats_of(&scene).rto_ns, waits_ms[i] * MS);
+        uint64_t due_ns = scene.now + waits_ms[i] * MS;
+        CHECK_EQUAL(deadline_of(&scene), due_ns);
+        time_passes(&scene, due_ns - 1);
+        CHECK_EQUAL(go(&scene), 0);
+        CHECK_EQUAL(offer_of(&scene, LINK_ALL).kind, LINK_CLASSES);
+        time_passes(&scene, due_ns);
+        CHECK_EQUAL(stats_of(&scene).timeouts, i + 1);
+        CHECK_EQUAL(link_unanswered_since(&scene.link), NEVER);
+        CHECK_EQUAL(deadline_of(&scene), sent_ns + SECOND);
+        CHECK_OFFER(&scene, LINK_CONTROL, 0, 0);
+        check_block(&scene, go(&scene), 56, "aaa");
+    }
+    struct link_stats stats = stats_of(&scene);
+    CHECK_EQUAL(stats.blocks_sent - before.blocks_sent, 7);
+    CHECK_EQUAL(stats.bytes_sent - before.bytes_sent, 8 + 6 * 64);
+    CHECK_EQUAL(stats.blocks_repeated, 6);
+    CHECK_EQUAL(stats.bytes_repeated, 6 * 64);
+    CHECK_EQUAL(stats.commands_sent - before.commands_sent, 1);
+    CHECK_EQUAL(scene.link.flying_bytes, 64);
+    CHECK_EQUAL(deadline_of(&scene), sent_ns + SECOND);
+    time_passes(&scene, sent_ns + SECOND - 1);
+    CHECK_EQUAL(scene.link.state, LINK_RUNNING);
+    time_passes(&scene, sent_ns + SECOND);
+    CHECK_EQUAL(scene.link.state, LINK_LOST);
+    CHECK_EQUAL(scene.link.cause, LINK_CAUSE_SILENT);
+}
+
+// An acknowledgement of what was repeated may belong to either: the timeout stays until one is sure.
+static void only_a_sure_round_trip_undoes_the_doublings(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    block_goes(&scene, 'a', 3);
+    time_passes(&scene, scene.now + 20 * MS);
+    CHECK_EQUAL(go(&scene), 64);
+    acknowledge_all(&scene);
+    CHECK_EQUAL(stats_of(&scene).srtt_ns, 1);
+    CHECK_EQUAL(stats_of(&scene).rto_ns, 40 * MS);
+    block_goes(&scene, 'b', 3);
+    scene.now += MS;
+    acknowledge_all(&scene);
+    CHECK_EQUAL(stats_of(&scene).rto_ns, 20 * MS);
+    CHECK_EQUAL(deadline_of(&scene), NEVER);
+    CHECK_EQUAL(scene.link.flying_bytes, 0);
+}
+
+static void round_trips_make_the_timeout(void) {
+    static const struct {
+        uint64_t trip_ns, srtt_ns, rttvar_ns, rto_ns;
+    } steps[] = {
+        {10000000, 10000000, 5000000, 30000000}, // the first: half of it as the deviation
+        {10000000, 10000000, 3750000, 25000000}, {30000000, 12500000, 7812500, 43750000},
+        {2500000, 11250000, 8359375, 44687500},  {11250000, 11250000, 6269531, 36328124},
+        {0, 9843750, 7514648, 39902342},
+    };
+    struct scene scene;
+    open_link(&scene, WINDOW, SECOND);
+    control(&scene, 'a', 1);
+    CHECK_EQUAL(go(&scene), 64);
+    acknowledge_all(&scene);
+    CHECK_EQUAL(go(&scene), 5); // the second question is the first that is measured
+    for (size_t i = 0; i < sizeof steps / sizeof *steps; i++) {
+        scene.now += steps[i].trip_ns;
+        acknowledge_all(&scene);
+        struct link_stats stats = stats_of(&scene);
+        if (steps[i].trip_ns) {
+            CHECK_EQUAL(stats.srtt_ns, steps[i].srtt_ns);
+            CHECK_EQUAL(stats.rttvar_ns, steps[i].rttvar_ns);
+            CHECK_EQUAL(stats.rto_ns, steps[i].rto_ns);
+        } else { // at once is one ns
+            CHECK_EQUAL(stats.srtt_ns, (7 * 11250000ULL + 1) / 8);
+            CHECK_EQUAL(stats.rttvar_ns, (3 * 6269531ULL + 11249999) / 4);
+        }
+        if (i)
+            control(&scene, 'a', 1);
+        CHECK_EQUAL(go(&scene), 6);
+    }
+}
+
+// An acknowledgement of several blocks measures the last of them.
+static void the_last_block_of_several_is_measured(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    block_goes(&scene, 'a', 3);
+    scene.now += 8 * MS;
+    block_goes(&scene, 'b', 3);
+    scene.now += 4 * MS;
+    acknowledge_all(&scene);
+    CHECK_EQUAL(stats_of(&scene).srtt_ns, (7 + 4 * MS) / 8);
+    CHECK_EQUAL(stats_of(&scene).rttvar_ns, (4 * MS - 1) / 4);
+}
+
+// ------------------------------------------------------------------------------------- what a repeat is like
+
+// The first block of a repeat fills a node's buffer up that waits for the rest of a damaged one.
+static void a_timeout_flushes_the_node(void) {
+    static const struct {
+        size_t sizes[3], lead;
+    } cases[] = {
+        {{10}, 49},    {{30, 19}, 5}, {{30, 23}, 1}, {{30, 24}, 1},
+        {{30, 25}, 1}, {{58}, 1},     {{59}, 1},     {{1, 2, 3}, 43},
+    };
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    for (unsigned i = 0; i < 20; i++) { // every slot has held a block of some length
+        block_goes(&scene, 'z', 40);
+        acknowledge_all(&scene);
+    }
+    for (size_t i = 0; i < sizeof cases / sizeof *cases; i++) {
+        for (unsigned k = 0; k < 3 && cases[i].sizes[k]; k++)
+            block_goes(&scene, 'a', cases[i].sizes[k]);
+        time_passes(&scene, deadline_of(&scene));
+        for (unsigned k = 0; k < 3 && cases[i].sizes[k]; k++) {
+            char content[WIRE_BLOCK_MAX] = {0};
+            memset(content, 'a', cases[i].sizes[k]);
+            check_block(&scene, go(&scene), k ? 0 : cases[i].lead, content);
+        }
+        CHECK_EQUAL(go(&scene), 0);
+        acknowledge_all(&scene);
+        CHECK_EQUAL(scene.link.flying_bytes, 0);
+        block_goes(&scene, 'b', 3);
+        acknowledge_all(&scene); // a sure round trip
+    }
+}
+
+// Sync bytes count in the window: what no longer fits waits for its turn, and nothing new goes before it.
+static void repeats_stay_within_the_window(void) {
+    struct scene scene;
+    open_running(&scene, 192);
+    for (unsigned i = 0; i < 3; i++)
+        block_goes(&scene, 'a', 59);
+    control(&scene, 'b', 59);
+    CHECK_EQUAL(go(&scene), 0);
+    CHECK_EQUAL(scene.link.flying_bytes, 192);
+    time_passes(&scene, scene.now + 20 * MS);
+    CHECK_EQUAL(scene.link.flying_bytes, 0);
+    CHECK_EQUAL(go(&scene), 65);
+    CHECK_EQUAL(go(&scene), 64);
+    CHECK_EQUAL(offer_of(&scene, LINK_ALL).kind, LINK_CLASSES);
+    CHECK_EQUAL(go(&scene), 0);
+    CHECK_EQUAL(deadline_of(&scene), scene.now + 40 * MS);
+    answer(&scene, scene.link.first + 1, 0);
+    CHECK_EQUAL(scene.link.flying_bytes, 64);
+    CHECK_OFFER(&scene, LINK_CONTROL, 0, 0);
+    CHECK_EQUAL(go(&scene), 64);
+    CHECK_EQUAL(scene.link.flying_bytes, 128);
+    CHECK_EQUAL(stats_of(&scene).bytes_repeated, 193);
+    CHECK_EQUAL(go(&scene), 64);
+    acknowledge_all(&scene);
+    CHECK_EQUAL(scene.link.flying_bytes, 0);
+}
+
+// A gate that opens does not wake while a repeat waits for room.
+static void what_waits_behind_a_repeat_wakes_nobody(void) {
+    struct scene scene;
+    open_running(&scene, 64);
+    CHECK_EQUAL(link_set_clock(&scene.link, 512, scene.now, 1000), LINK_OK);
+    block_goes(&scene, 'a', 59);
+    motion(&scene, 'm', 1, 1014, 0); // 27 ms, and 2
+    CHECK_EQUAL(deadline_of(&scene), scene.now + 20 * MS);
+    time_passes(&scene, scene.now + 20 * MS);
+    CHECK_EQUAL(deadline_of(&scene), scene.now + 980 * MS);
+    CHECK_EQUAL(go(&scene), 65);
+    CHECK_EQUAL(deadline_of(&scene), scene.now - 20 * MS + 14 * 1953125 + 2 * MS);
+}
+
+// A repeat goes at once, and before everything where motion is in it or waits behind it.
+static void a_repeat_presses_where_motion_or_an_emergency_is_behind_it(void) {
+    enum { CONTROL, BULK, MOTION, MOTION_UNTIMED, BEFORE_MOTION, BEFORE_UNTIMED, BEFORE_URGENT, CASES };
+    static const struct {
+        unsigned kind, pressing;
+    } expected[CASES] = {
+        [CONTROL] = {LINK_CONTROL, 0},       [BULK] = {LINK_BULK, 0},
+        [MOTION] = {LINK_MOTION, 1},         [MOTION_UNTIMED] = {LINK_MOTION, 0},
+        [BEFORE_MOTION] = {LINK_CONTROL, 1}, [BEFORE_UNTIMED] = {LINK_CONTROL, 0},
+        [BEFORE_URGENT] = {LINK_CONTROL, 1},
+    };
+    for (int i = 0; i < CASES; i++) {
+        struct scene scene;
+        open_running(&scene, 64);
+        if (i == MOTION || i == MOTION_UNTIMED)
+            motion(&scene, 'm', 59, 0, i == MOTION ? 1 : 0);
+        else if (i == BULK)
+            bulk(&scene, 'b', 59);
+        else
+            control(&scene, 'c', 59);
+        CHECK_EQUAL(go(&scene), 64);
+        if (i == BEFORE_MOTION || i == BEFORE_UNTIMED)
+            motion(&scene, 'm', 1, 0, i == BEFORE_MOTION ? 1 : 0);
+        if (i == BEFORE_URGENT)
+            CHECK_EQUAL(urgent(&scene, 'u', 1), LINK_OK);
+        CHECK_EQUAL(offer_of(&scene, LINK_ALL).kind, LINK_CLASSES);
+        time_passes(&scene, scene.now + 20 * MS);
+        CHECK_OFFER(&scene, expected[i].kind, 0, expected[i].pressing);
+        struct offered offered = offer_of(&scene, 0); // of a class that may not send, too
+        CHECK_EQUAL(offered.kind, expected[i].kind);
+        CHECK_EQUAL(go_of(&scene, 0), 65);
+    }
+}
+
+// ---------------------------------------------------------------------------------------------------- naks
+
+static void three_blocks_go(struct scene *scene) {
+    block_goes(scene, 'a', 10);
+    block_goes(scene, 'b', 20);
+    block_goes(scene, 'c', 30);
+}
+
+static void three_blocks_go_again(struct scene *scene, size_t lead) {
+    check_block(scene, go(scene), lead, "aaaaaaaaaa");
+    check_block(scene, go(scene), 0, "bbbbbbbbbbbbbbbbbbbb");
+    check_block(scene, go(scene), 0, "cccccccccccccccccccccccccccccc");
+    CHECK_EQUAL(go(scene), 0);
+}
+
+// Each block of a repeat may cause a nak that says nothing: as many are ignored, for the time of a timeout.
+static void naks_that_repeats_may_cause_are_ignored(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    three_blocks_go(&scene);
+    nak(&scene);
+    nak(&scene); // the repeat is on its way already
+    CHECK_EQUAL(scene.link.naks_owed, 3);
+    three_blocks_go_again(&scene, 1);
+    struct link_stats stats = stats_of(&scene);
+    CHECK_EQUAL(stats.naks, 2);
+    CHECK_EQUAL(stats.timeouts, 0);
+    CHECK_EQUAL(stats.rto_ns, 20 * MS);
+    CHECK_EQUAL(stats.blocks_repeated, 3);
+    CHECK_EQUAL(stats.bytes_repeated, 76);
+    scene.now += 20 * MS - 1;
+    for (unsigned i = 0; i < 3; i++) {
+        nak(&scene);
+        CHECK_EQUAL(go(&scene), 0);
+        CHECK_EQUAL(scene.link.naks_owed, 2 - i);
+    }
+    nak(&scene);
+    CHECK_EQUAL(stats_of(&scene).naks, 6);
+    CHECK_EQUAL(scene.link.naks_owed, 3);
+    three_blocks_go_again(&scene, 1);
+    scene.now += 20 * MS - 1;
+    nak(&scene);
+    CHECK_EQUAL(go(&scene), 0);
+    scene.now++;
+    nak(&scene);
+    CHECK_EQUAL(scene.link.naks_owed, 5);
+    three_blocks_go_again(&scene, 1);
+    CHECK_EQUAL(stats_of(&scene).acks_duplicate, 0);
+}
+
+static void an_acknowledgement_behind_the_repeats_ends_their_naks(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    three_blocks_go(&scene);
+    nak(&scene);
+    three_blocks_go_again(&scene, 1);
+    block_goes(&scene, 'd', 1);
+    answer(&scene, scene.link.next - 1, 0); // the repeats, and no more
+    CHECK_EQUAL(scene.link.naks_owed, 3);
+    acknowledge_all(&scene);
+    CHECK_EQUAL(scene.link.naks_owed, 0);
+}
+
+// 30: as many as two times the blocks that can be in flight.
+static void no_more_naks_are_ignored_than_can_come(void) {
+    struct scene scene;
+    open_running(&scene, 4096);
+    for (unsigned i = 0; i < 14; i++)
+        block_goes(&scene, 'a', 1);
+    static const uint64_t owed[] = {14, 28, 30, 30};
+    for (unsigned i = 0; i < 4; i++) {
+        scene.now += 250 * MS - 1; // long enough for every nak to be heard
+        nak(&scene);
+        CHECK_EQUAL(scene.link.naks_owed, owed[i]);
+        for (unsigned k = 0; k < 14; k++)
+            CHECK(go(&scene) > 0);
+    }
+}
+
+// ----------------------------------------------------------------------------------------- acknowledgements
+
+// The acknowledgement may come between the decision to repeat and the repeat.
+static void what_is_acknowledged_is_not_repeated(void) {
+    for (unsigned again = 0; again < 3; again++) {
+        struct scene scene;
+        open_running(&scene, WINDOW);
+        three_blocks_go(&scene);
+        time_passes(&scene, scene.now + 20 * MS);
+        for (unsigned i = 0; i < again; i++)
+            CHECK(go(&scene) > 0);
+        acknowledge_all(&scene);
+        CHECK_EQUAL(scene.link.flying_bytes, 0);
+        CHECK_EQUAL(link_pending(&scene.link), 0);
+        CHECK_EQUAL(go(&scene), 0);
+        CHECK_EQUAL(deadline_of(&scene), NEVER);
+        control(&scene, 'd', 4); // the flush that was meant for the repeat
+        check_block(&scene, go(&scene), again ? 0 : 55, "dddd");
+    }
+}
+
+static void a_part_may_be_acknowledged_while_it_is_repeated(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    three_blocks_go(&scene);
+    time_passes(&scene, scene.now + 20 * MS);
+    CHECK_EQUAL(go(&scene), 15 + 1);
+    CHECK_EQUAL(go(&scene), 25);
+    answer(&scene, scene.link.next - 1, 0);
+    CHECK_EQUAL(scene.link.flying_bytes, 0);
+    CHECK_EQUAL(link_pending(&scene.link), 1);
+    check_block(&scene, go(&scene), 0, "cccccccccccccccccccccccccccccc");
+    CHECK_EQUAL(scene.link.flying_bytes, 35);
+}
+
+static void what_was_never_sent_is_not_acknowledged(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    for (unsigned behind = 1; behind < 15; behind++) {
+        block_goes(&scene, 'a', 1);
+        for (unsigned ahead = 2; ahead < 16; ahead++)
+            answer(&scene, scene.link.first + ahead, ahead % 3);
+        CHECK_EQUAL(stats_of(&scene).acks_never_sent, 14 * behind);
+        CHECK_EQUAL(link_pending(&scene.link), 1);
+        acknowledge_all(&scene);
+        CHECK_EQUAL(link_pending(&scene.link), 0);
+    }
+    CHECK_EQUAL(stats_of(&scene).naks, 0);
+    CHECK_EQUAL(stats_of(&scene).acks_duplicate, 0);
+}
+
+// A response and the acknowledgement behind it name the same sequence: only a second empty block is a nak.
+static void only_a_second_empty_block_is_a_nak(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    three_blocks_go(&scene);
+    nak(&scene);
+    CHECK_EQUAL(stats_of(&scene).naks, 1); // the acknowledgement before named it
+    three_blocks_go_again(&scene, 1);
+    uint64_t second = scene.link.first + 1;
+    answer(&scene, second, 4);
+    CHECK_EQUAL(link_pending(&scene.link), 2);
+    answer(&scene, second, 0);
+    answer(&scene, second, 4);
+    CHECK_EQUAL(stats_of(&scene).naks, 1);
+    answer(&scene, second, 0);
+    CHECK_EQUAL(stats_of(&scene).naks, 2);
+    acknowledge_all(&scene);
+    CHECK_EQUAL(stats_of(&scene).acks_duplicate, 0);
+    answer(&scene, scene.link.first, 4);
+    CHECK_EQUAL(stats_of(&scene).acks_duplicate, 0);
+    acknowledge_all(&scene); // with nothing in flight it refuses nothing
+    CHECK_EQUAL(stats_of(&scene).acks_duplicate, 1);
+    CHECK_EQUAL(stats_of(&scene).naks, 2);
+}
+
+// ---------------------------------------------------------------------------------------------------- loss
+
+static void lose(struct scene *scene) {
+    while (scene->link.state != LINK_LOST) {
+        time_passes(scene, deadline_of(scene));
+        while (go(scene))
+            ;
+    }
+}
+
+static void the_silence_counts_from_the_last_progress(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    scene.now += 7 * SECOND; // an idle link is never lost
+    block_goes(&scene, 'a', 1);
+    scene.now += 2 * MS;
+    block_goes(&scene, 'b', 1);
+    scene.now += 3 * MS;
+    answer(&scene, scene.link.first + 1, 0);
+    uint64_t progress_ns = scene.now;
+    CHECK_EQUAL(link_unanswered_since(&scene.link), progress_ns);
+    scene.now += MS;
+    block_goes(&scene, 'c', 1); // makes no progress
+    CHECK_EQUAL(link_unanswered_since(&scene.link), progress_ns);
+    lose(&scene);
+    CHECK_EQUAL(scene.now, progress_ns + SECOND);
+    CHECK_EQUAL(scene.link.cause, LINK_CAUSE_SILENT); // the last that was heard was the progress
+}
+
+static void a_node_that_accepts_nothing_is_stuck(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    block_goes(&scene, 'a', 1);
+    scene.now++;
+    answer(&scene, scene.link.next + 3, 0);
+    lose(&scene);
+    CHECK_EQUAL(scene.link.cause, LINK_CAUSE_STUCK);
+}
+
+// What is lost stays as it is.
+static void a_lost_link_does_nothing_more(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    block_goes(&scene, 'a', 1);
+    scene.now++;
+    answer(&scene, scene.link.next + 3, 0);
+    control(&scene, 'b', 59);
+    control(&scene, 'c', 59);
+    lose(&scene);
+    struct link_stats before = stats_of(&scene);
+    uint64_t since_ns = link_unanswered_since(&scene.link);
+    CHECK_EQUAL(link_pending(&scene.link), 3);
+    CHECK_EQUAL(try_send(&scene, LINK_CONTROL, 'd', 1, 0, 0), LINK_GONE);
+    CHECK_EQUAL(try_motion(&scene, 'd', 1, 0, 0), LINK_GONE);
+    CHECK_EQUAL(urgent(&scene, 'd', 1), LINK_GONE);
+    CHECK_EQUAL(link_pending(&scene.link), 3);
+    CHECK_EQUAL(deadline_of(&scene), NEVER);
+    time_passes(&scene, scene.now + 9 * SECOND);
+    CHECK_EQUAL(scene.link.cause, LINK_CAUSE_STUCK);
+    CHECK_EQUAL(link_unanswered_since(&scene.link), since_ns);
+    CHECK_EQUAL(answer(&scene, scene.link.first + 2, 3), 1); // a late response is one all the same
+    CHECK_EQUAL(scene.response.sent_ns, 0);
+    acknowledge_all(&scene);
+    CHECK_EQUAL(link_unanswered_since(&scene.link), since_ns);
+    CHECK_EQUAL(link_pending(&scene.link), 3);
+    CHECK_EQUAL(offer_of(&scene, LINK_ALL).kind, LINK_CLASSES);
+    CHECK_EQUAL(go(&scene), 0);
+    struct link_stats after = stats_of(&scene);
+    CHECK_EQUAL(after.timeouts, before.timeouts);
+    CHECK_EQUAL(after.commands_dropped, 0);
+    CHECK_EQUAL(after.blocks_received, before.blocks_received + 2);
+}
+
+// The moment that loses the link repeats nothing more.
+static void the_end_is_no_timeout(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    block_goes(&scene, 'a', 1);
+    uint64_t sent_ns = scene.now;
+    time_passes(&scene, sent_ns + 20 * MS);
+    scene.now = sent_ns + 955 * MS;
+    CHECK(go(&scene) > 0);
+    CHECK_EQUAL(deadline_of(&scene), sent_ns + 995 * MS);
+    time_passes(&scene, sent_ns + SECOND);
+    CHECK_EQUAL(scene.link.state, LINK_LOST);
+    CHECK_EQUAL(stats_of(&scene).timeouts, 1);
+}
+
+// ------------------------------------------------------------------------------------------ a host that
+// slept
+
+// Whoever wakes a quarter of the time late and more has not asked meanwhile: three quarters begin then.
+static void a_sleep_counts_as_a_quarter_at_most(void) {
+    for (uint64_t late_ns = 250 * MS; late_ns <= 250 * MS + 1; late_ns++) {
+        struct scene scene;
+        open_running(&scene, WINDOW);
+        block_goes(&scene, 'a', 1);
+        uint64_t sent_ns = scene.now;
+        time_passes(&scene, sent_ns + 20 * MS + late_ns);
+        CHECK_EQUAL(stats_of(&scene).timeouts, 1);
+        CHECK_EQUAL(deadline_of(&scene), late_ns > 250 * MS ? scene.now + 750 * MS : sent_ns + SECOND);
+    }
+    for (uint64_t late_ns = 250 * MS; late_ns <= 250 * MS + 1; late_ns++) { // with the repeat still to go
+        struct scene scene;
+        open_running(&scene, WINDOW);
+        block_goes(&scene, 'a', 1);
+        uint64_t sent_ns = scene.now;
+        time_passes(&scene, sent_ns + 20 * MS);
+        time_passes(&scene, sent_ns + SECOND + late_ns);
+        CHECK_EQUAL(scene.link.state, late_ns > 250 * MS ? LINK_RUNNING : LINK_LOST);
+        CHECK_EQUAL(deadline_of(&scene), late_ns > 250 * MS ? scene.now + 750 * MS : NEVER);
+    }
+}
+
+int main(void) {
+    each_timeout_doubles_the_next_up_to_a_quarter_of_what_loses_the_link();
+    only_a_sure_round_trip_undoes_the_doublings();
+    round_trips_make_the_timeout();
+    the_last_block_of_several_is_measured();
+    a_timeout_flushes_the_node();
+    repeats_stay_within_the_window();
+    what_waits_behind_a_repeat_wakes_nobody();
+    a_repeat_presses_where_motion_or_an_emergency_is_behind_it();
+    naks_that_repeats_may_cause_are_ignored();
+    an_acknowledgement_behind_the_repeats_ends_their_naks();
+    no_more_naks_are_ignored_than_can_come();
+    what_is_acknowledged_is_not_repeated();
+    a_part_may_be_acknowledged_while_it_is_repeated();
+    what_was_never_sent_is_not_acknowledged();
+    only_a_second_empty_block_is_a_nak();
+    the_silence_counts_from_the_last_progress();
+    a_node_that_accepts_nothing_is_stuck();
+    a_lost_link_does_nothing_more();
+    the_end_is_no_timeout();
+    a_sleep_counts_as_a_quarter_at_most();
+    return 0;
+}
