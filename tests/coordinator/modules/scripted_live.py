@@ -5,14 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from coordinator.modules.heater import HeaterUnit
-from coordinator.modules.heaters import Heaters
-from nodes.node_errors import NodeError
-from nodes.node_states import NodeState
+from coordinator.modules.heaters.heater import HeaterUnit
+from coordinator.modules.heaters.heaters import Heaters
+from nodes.node.errors import NodeError
+from nodes.node.states import NodeState
 from tests.stages.heat_machine import build, configured
 
 if TYPE_CHECKING:
-    from coordinator.modules.live import Live
+    from coordinator.runtime.module_context import Live
 
 TICKS_PER_S = 1000
 PRINT_OFFSET_S = 100.0

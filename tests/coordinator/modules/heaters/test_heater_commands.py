@@ -5,16 +5,16 @@ from pathlib import Path
 
 import pytest
 
+from coordinator.assembly.load import ConfigError, load_machine
 from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, InTime, Reading
+from coordinator.gcode.parser import WordError, parse
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.gcode.words import WordError, parse
-from coordinator.machine.description import ConfigError, load_machine
-from coordinator.modules import heater_tuning
-from coordinator.modules.heater import HeaterUnit
-from coordinator.modules.heaters import Heaters
+from coordinator.modules.heaters import tuning as heater_tuning
+from coordinator.modules.heaters.heater import HeaterUnit
+from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.verify_heater import VerifyHeater
 from coordinator.modules.module_set import ModuleSet
-from coordinator.modules.temperature_source import TemperatureSource
-from coordinator.modules.verify_heater import VerifyHeater
+from coordinator.modules.sensors.temperature_source import TemperatureSource
 from tests.coordinator.modules.scripted_live import Driven
 from tests.stages.heat_machine import BASE, HOTEND_PID, build, configured
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.gcode.words import WordError
+from coordinator.gcode.parser import WordError
 from coordinator.heat.holding import Held
 from coordinator.heat.mpc import Mpc
 from coordinator.heat.verify import VerifyOptions
 from coordinator.heat.watermark import Watermark
-from nodes.errors import CanductorError
-from nodes.node_states import NodeState
+from nodes.node.states import NodeState
+from nodes.support.errors import CanductorError
 from tests.coordinator.modules.scripted_live import Driven, heater
 from tests.stages.heat_machine import BED, FAN, HOTEND_PID
 
