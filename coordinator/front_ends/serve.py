@@ -1,5 +1,6 @@
 """Serves a machine to front ends until Ctrl-C or SIGTERM: ``canductor run``, ``canductor demo --serve``."""
 
+import contextlib
 import platform
 import sys
 from collections.abc import Callable, Mapping
@@ -161,8 +162,26 @@ class _ServiceProcess:
             on_notice=lambda text: service.log.add("notice", text),
         )
         page = self._page(registry, service)
-        await self._server.start()
-        await self._open_page(page)
+        async with contextlib.AsyncExitStack() as stack:
+            if page is not None:
+                stack.push_async_callback(page.close)
+            stack.push_async_callback(self._server.close)  # before the page, whose browsers get the reason so
+            await self._server.start()
+            if page is not None:
+                await page.start()
+            self._report_addresses(page)
+            await self._open_metrics(tree, stack)
+            await self._open_klippy_api(service, stack)
+            self._announce(service, stack)
+            if sys.stdin is not None and sys.stdin.isatty():
+                stack.callback(Typed(service, _print).close)
+            try:
+                await service.run()
+            finally:
+                self.state = str(service.state)
+                self.cut_off = service.cut_off
+
+    def _report_addresses(self, page: WebServer | None) -> None:
         _print(f"serving at {self.path}")
         if self._options.tcp is not None:
             _print(f"serving at {_address(self._options, self._server.tcp_port)}")
@@ -172,40 +191,17 @@ class _ServiceProcess:
                 f"to get in, open {page.new_link(Scope.OPERATE)} within {LINK_S / 60:.0f} minutes;"
                 " it works once, 'canductor page' prints another"
             )
-        metrics = await self._open_metrics(tree)
-        await self._open_klippy_api(service)
-        self._announcer = self._announce(service)
-        typed = Typed(service, _print) if sys.stdin is not None and sys.stdin.isatty() else None
-        try:
-            await service.run()
-        finally:
-            if typed is not None:
-                typed.close()
-            self.state = str(service.state)
-            self.cut_off = service.cut_off
-            if self._announcer is not None:
-                await self._announcer.close()
-            if metrics is not None:
-                await metrics.close()
-            if self._gateway is not None:
-                await self._gateway.close()
-            await self._server.close()
-            if page is not None:
-                await page.close()
 
-    async def _open_klippy_api(self, service: MachineService) -> None:
-        """Serve Moonraker if asked for; raises CanductorError, the server being closed."""
+    async def _open_klippy_api(self, service: MachineService, stack: contextlib.AsyncExitStack) -> None:
+        """Serve Moonraker if asked for; raises CanductorError."""
         path = self._options.klippy_api
         if path is None:
             return
         self._gateway = Gateway(
             service, self._options.config, on_notice=lambda text: service.log.add("notice", text)
         )
-        try:
-            await self._gateway.start(path)
-        except BaseException:
-            await self._server.close()
-            raise
+        await self._gateway.start(path)
+        stack.push_async_callback(self._gateway.close)
         _print(f"serving Moonraker at {path}")
 
     def _page(self, registry: Registry, service: MachineService) -> WebServer | None:
@@ -222,19 +218,10 @@ class _ServiceProcess:
         add_page_methods(registry, page)
         return page
 
-    async def _open_page(self, page: WebServer | None) -> None:
-        """Open PAGE, if there is one; raises CanductorError with the server closed."""
-        try:
-            if page is not None:
-                await page.start()
-        except BaseException:
-            await self._server.close()
-            raise
-
-    async def _open_metrics(self, tree: StateTree) -> MetricsServer | None:
-        """Open the endpoint for Prometheus if asked for; raises CanductorError with the server closed."""
+    async def _open_metrics(self, tree: StateTree, stack: contextlib.AsyncExitStack) -> None:
+        """Open the endpoint for Prometheus if asked for; raises CanductorError."""
         if self._options.metrics is None:
-            return None
+            return
 
         def fields() -> dict[str, Value]:
             figures = {f"api.{name}": value for name, value in self._server.figures().items()}
@@ -243,22 +230,18 @@ class _ServiceProcess:
         host, port = self._options.metrics
         about = {"name": self._options.name, "version": version(), "api": str(API_VERSION)}
         metrics = MetricsServer(fields, about, MetricsSettings(host, port, open=self._options.metrics_open))
-        try:
-            await metrics.start()
-        except BaseException:
-            await self._server.close()
-            raise
+        await metrics.start()
+        stack.push_async_callback(metrics.close)
         _print(f"metrics are at http://{bracketed(host)}:{metrics.port}/metrics")
-        return metrics
 
-    def _announce(self, service: MachineService) -> AnnouncerProcess | None:
+    def _announce(self, service: MachineService, stack: contextlib.AsyncExitStack) -> None:
         """Announce the machine on the network, if wanted."""
         bound, port = self._server.tcp_addresses, self._server.tcp_port
         wanted = self._options.announce
         if wanted is None:
             wanted = not all(ip_address(address.partition("%")[0]).is_loopback for address in bound)
         if not wanted or port is None:
-            return None
+            return
         machine = Announcement(
             name=service.settings.name,
             host=host_word(platform.node()),
@@ -270,9 +253,11 @@ class _ServiceProcess:
             port=port,
             addresses=(),
         )
-        announcer = AnnouncerProcess(machine, bound, lambda sentence: service.log.add("network", sentence))
-        announcer.start()
-        return announcer
+        self._announcer = AnnouncerProcess(
+            machine, bound, lambda sentence: service.log.add("network", sentence)
+        )
+        self._announcer.start()
+        stack.push_async_callback(self._announcer.close)
 
     def _on_entry(self, service: MachineService, entry: Entry) -> None:
         self._server.notify("log", dict(entry))

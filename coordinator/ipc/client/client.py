@@ -22,8 +22,6 @@ __all__ = ["Client", "ConnectionLost", "Event", "Hello", "Refused", "Update"]
 READ_BYTES: Final = 65_536
 RETRY_S: Final = (0.1, 0.2, 0.5, 1.0, 2.0)
 """Pauses between attempts to reconnect; the last one repeats."""
-FINAL_CODES: Final = ("bad_token", "no_token", "bad_version", "not_allowed")
-"""Codes with which the server ends a connection for good."""
 LIMITS: Final = Limits(message_bytes=LENGTH_MAX, nesting=32, items=2_000_000, message_timeout_s=30.0)
 """Of what a server sends: it is trusted more than a client is."""
 

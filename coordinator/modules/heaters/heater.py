@@ -263,7 +263,7 @@ class Heater:
                 f" {self.input.max_c:g} °C; check the sensor and its wires"
             )
 
-    def _wanted(self, live: "Live", at_s: float, celsius: float) -> float:
+    def _wanted(self, live: "ModuleContext", at_s: float, celsius: float) -> float:
         if self._gone is not None or self._tuning_failure is not None:
             return 0.0
         if self._tuning is not None:
@@ -278,7 +278,7 @@ class Heater:
             self._tell_model(live, self.controller, at_s)
         return self.controller.power(at_s, celsius, self.target_c)
 
-    def _tell_model(self, live: "Live", model: Mpc, at_s: float) -> None:
+    def _tell_model(self, live: "ModuleContext", model: Mpc, at_s: float) -> None:
         if self.fan is not None:
             model.set_fan(self.fan.unit.speed)
         if self._ambient is not None and self._ambient.input.celsius is not None:

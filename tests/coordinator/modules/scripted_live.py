@@ -5,14 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from coordinator.modules.heaters.heater import HeaterUnit
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heater import Heater
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from nodes.node.errors import NodeError
 from nodes.node.states import NodeState
 from tests.stages.heat_machine import build, configured
 
 if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
+    from coordinator.runtime.module_context import ModuleContext
 
 TICKS_PER_S = 1000
 PRINT_OFFSET_S = 100.0
@@ -70,8 +70,8 @@ class ScriptedLive:
         return self
 
     @property
-    def live(self) -> "Live":
-        return cast("Live", self)
+    def live(self) -> "ModuleContext":
+        return cast("ModuleContext", self)
 
     def node(self, name: str) -> Board:
         return self.nodes[name]
@@ -99,12 +99,12 @@ class ScriptedLive:
         self.said.append(sentence)
 
 
-def heater(folder: Path, text: str, key: str = "extruder") -> HeaterUnit:
+def heater(folder: Path, text: str, key: str = "extruder") -> Heater:
     """Return heater KEY of the machine of TEXT, which follows BASE; it is not connected."""
     modules = build(folder, text)
     configured(modules, "toolhead")
     configured(modules, "mcu")
-    heaters = modules.find("heaters", Heaters)
+    heaters = modules.find("heaters", HeaterRegistry)
     assert heaters is not None
     return heaters.units[key]
 
@@ -112,7 +112,7 @@ def heater(folder: Path, text: str, key: str = "extruder") -> HeaterUnit:
 class Driven:
     """UNIT on a live machine, measured and looked after by the test."""
 
-    def __init__(self, unit: HeaterUnit, celsius: float | None = 20.0) -> None:
+    def __init__(self, unit: Heater, celsius: float | None = 20.0) -> None:
         self.unit = unit
         self.live = ScriptedLive()
         self.board = self.live.nodes[unit.node]

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.assembly.load import ConfigError, load_machine
-from coordinator.gcode.commands import AtOnce, AtRest, Call, Done, InTime, Reading
+from coordinator.config.errors import ConfigError, load_machine
+from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading, Synchronized
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, parse
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.heaters import tuning as heater_tuning
-from coordinator.modules.heaters.heater import HeaterUnit
-from coordinator.modules.heaters.heaters import Heaters
+from coordinator.modules.heaters.heater import Heater
+from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.heaters.verify_heater import VerifyHeater
 from coordinator.modules.module_set import ModuleSet
 from coordinator.modules.sensors.temperature_source import TemperatureSource
@@ -35,7 +36,7 @@ class Shop:
         self.modules = modules
         for node in ("mcu", "toolhead"):
             configured(modules, node)
-        heaters = modules.find("heaters", Heaters)
+        heaters = modules.find("heaters", HeaterRegistry)
         assert heaters is not None
         self.heaters = heaters
         self.chamber, self.extruder = heaters.units["chamber"], heaters.units["extruder"]
@@ -50,12 +51,12 @@ class Shop:
 
     def told(self, line: str) -> tuple[str, ...]:
         reading = self.read(line)
-        assert isinstance(reading, AtOnce)
+        assert isinstance(reading, Immediate)
         return reading.replies
 
     def perform(self, line: str) -> "asyncio.Future[Done | None]":
         reading = self.read(line)
-        assert isinstance(reading, AtRest)
+        assert isinstance(reading, AtStandstill)
         return asyncio.ensure_future(reading.perform())
 
     def refused(self, line: str) -> str:
@@ -101,7 +102,7 @@ def test_all_temperatures_are_told_in_the_order_of_their_tags(shop: Shop) -> Non
     shop.chamber.input.celsius = 55.55
     shop.source("temperature_sensor air").celsius = 21.04
     reading = shop.read("M105")
-    assert isinstance(reading, AtOnce)
+    assert isinstance(reading, Immediate)
     assert reading.replies == ("A:21.0 /0.0 T0:0.0 /0.0 chamber:55.5 /61.2",)
     assert reading.kind is ReplyKind.PLAIN
     assert "belong" in shop.refused("M105 =")
@@ -113,7 +114,7 @@ def test_without_heaters_there_is_one_temperature_of_nothing(shop: Shop) -> None
 
 
 def test_which_commands_need_not_wait_for_a_job(shop: Shop) -> None:
-    beside = {name for name, command in shop.modules.vocabulary.commands.items() if command.beside}
+    beside = {name for name, command in shop.modules.vocabulary.commands.items() if command.while_printing}
     assert {"M105", "TURN_OFF_HEATERS", "SET_HEATER_TEMPERATURE"} <= beside
     assert not {"TEMPERATURE_WAIT", "QUERY_ADC", "PID_CALIBRATE", "MPC_CALIBRATE"} & beside
 
@@ -125,7 +126,7 @@ def test_which_commands_need_not_wait_for_a_job(shop: Shop) -> None:
 def test_a_target_is_set_in_time_by_either_name(shop: Shop, name: str) -> None:
     for target, celsius in ((" TARGET=60", 60.0), ("", 0.0)):
         reading = shop.read(f"SET_HEATER_TEMPERATURE HEATER={name}{target}")
-        assert isinstance(reading, InTime)
+        assert isinstance(reading, Synchronized)
         reading.act(0.0)
         assert shop.chamber.target_c == celsius
     assert "outside what" in shop.refused(f"SET_HEATER_TEMPERATURE HEATER={name} TARGET=101")
@@ -134,7 +135,7 @@ def test_a_target_is_set_in_time_by_either_name(shop: Shop, name: str) -> None:
 def test_all_are_switched_off_together(shop: Shop) -> None:
     shop.chamber.target_c, shop.extruder.target_c = 60.0, 200.0
     reading = shop.read("TURN_OFF_HEATERS")
-    assert isinstance(reading, InTime)
+    assert isinstance(reading, Synchronized)
     assert shop.chamber.target_c == 60.0
     reading.act(0.0)
     assert (shop.chamber.target_c, shop.extruder.target_c) == (0.0, 0.0)
@@ -256,7 +257,7 @@ def test_a_calibration_is_for_a_target_that_is_possible(
 ) -> None:
     line = f"{name} HEATER=chamber TARGET={target}"
     if allowed:
-        assert isinstance(shop.read(line), AtRest)
+        assert isinstance(shop.read(line), AtStandstill)
     else:
         assert f"TARGET={target:g} is outside what [heater_generic chamber] allows, 5 to 100 °C" in (
             shop.refused(line)
@@ -269,7 +270,7 @@ def test_a_model_is_found_at_200_degrees_with_a_few_fan_speeds(shop: Shop) -> No
     )
     line = "MPC_CALIBRATE HEATER=chamber TARGET=60 FAN_BREAKPOINTS="
     for steps in (2, 12):
-        assert isinstance(shop.read(f"{line}{steps}"), AtRest)
+        assert isinstance(shop.read(f"{line}{steps}"), AtStandstill)
     for steps in (1, 13):
         assert shop.refused(f"{line}{steps}") == "FAN_BREAKPOINTS of MPC_CALIBRATE must be 2 to 12"
     assert "needs the option heater_power of [extruder], in W" in shop.refused(
@@ -280,7 +281,7 @@ def test_a_model_is_found_at_200_degrees_with_a_few_fan_speeds(shop: Shop) -> No
 def test_three_fan_speeds_unless_others_are_asked_for(shop: Shop, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[str, float, int]] = []
 
-    async def note(unit: HeaterUnit, target_c: float, fan_steps: int) -> Done:
+    async def note(unit: Heater, target_c: float, fan_steps: int) -> Done:
         asked.append((unit.key, target_c, fan_steps))
         return Done()
 
@@ -341,7 +342,7 @@ def test_it_waits_for_a_heater_that_does_not_act_yet(tmp_path: Path) -> None:
     path = tmp_path / "printer.cfg"
     later = CHAMBER.replace("Generic 3950", "MAX31865")
     path.write_text(BASE + HOTEND_PID + later + "\n[verify_heater chamber]\n")
-    reasons = {entry.section: entry.reason for entry in load_machine(str(path)).not_yet_acting}
+    reasons = {entry.section: entry.reason for entry in load_machine(str(path)).unsupported}
     assert reasons["verify_heater chamber"] == "the heater chamber does not act yet"
 
 
