@@ -114,7 +114,7 @@ INVERSE: Mapping[StepKinematics, Inverse] = {
 
 
 class StepperPath:
-    """One stepper's place in steps, over a stretch of print time in which nothing is declared anew."""
+    """One stepper's place in steps, over an interval of print time without a declaration."""
 
     def __init__(
         self, spec: StepperSpec, start: Position, moves: NDArray[np.void], setting: Setting, position: float
