@@ -173,7 +173,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
     yield Method(
         "position.get",
         Scope.WATCH,
-        "Tell where the machine is in all frames, and each stepper: steps since the machine started.",
+        "Return the position in all frames, and of each stepper: steps since the machine started.",
         position,
         params=(
             Param(
