@@ -1,4 +1,4 @@
-"""What the demo found, as figures and as text."""
+"""Results of the demo, as figures and as text."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ class DemoReport:
     """Of every steady state of a heater."""
     clocks: tuple[ClockProof, ...]
     stray_edges: int
-    """Level changes of pins that are nobody's."""
+    """Level changes of pins that the configuration does not use."""
     nodes: tuple[NodeReport, ...]
     frames: int
     frames_lost: int
@@ -96,13 +96,13 @@ class DemoReport:
         """Return the proof for a reader."""
         lines = [*self.notices, ""]
         lines += [
-            f"{s.stepper} on {s.node}: {s.steps_executed:,} of {s.steps_expected:,} steps, stands at "
+            f"{s.stepper} on {s.node}: {s.steps_executed:,} of {s.steps_expected:,} steps, at position "
             f"{s.position_executed:,} (plan {s.position_expected:,}, node's counter {s.position_counted:,}), "
             f"timed within {_us(s.worst_band_error_s)} µs of the plan, {_us(s.worst_error_s)} µs in truth"
             for s in self.steppers
         ]
         lines += [
-            f"{p.axis}: homed, and at the end {abs(p.error_mm) * 1e3:.1f} µm beside where it believes to be "
+            f"{p.axis}: homed, and at the end {abs(p.error_mm) * 1e3:.1f} µm from its believed position "
             f"(a step is {p.step_mm * 1e3:.1f} µm)"
             for p in self.places
         ]
@@ -129,11 +129,11 @@ class DemoReport:
             return f"{', '.join(failed)} did not do what was planned"
         lost = [p.axis for p in self.places if not p.holds]
         if lost:
-            return f"{', '.join(lost)} is not where the machine believes it to be"
+            return f"{', '.join(lost)} is not at the position that the machine believes"
         cold = [heat.heater for heat in self.heat if not heat.holds]
         if cold:
-            return f"{', '.join(dict.fromkeys(cold))} left its target in steady state"
-        return f"{self.stray_edges} changes of pins that are nobody's"
+            return f"{', '.join(dict.fromkeys(cold))} left the target in steady state"
+        return f"{self.stray_edges} level changes of pins that the configuration does not use"
 
 
 def report_of(

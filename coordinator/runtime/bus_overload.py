@@ -1,4 +1,4 @@
-"""Sees coming that a bus cannot carry the motion that is planned on it, and says so before a step is late."""
+"""Detects that a bus cannot carry the motion planned on it, before a step is late."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class BusOverloadDetector:
     def look(self, forecast: Forecast, now: HostTime, repeated: Callable[[], float]) -> None:
         """Take the newest forecast; raises BusOverload when motion would be late for certain.
 
-        REPEATED tells the share of the blocks on this bus that had to be sent again, when that matters.
+        REPEATED returns the share of the blocks on this bus that had to be sent again.
         """
         warning_s = forecast.warning_s
         if warning_s is None:

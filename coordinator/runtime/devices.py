@@ -58,7 +58,7 @@ class MachineDevices:
         numbers: Mapping[str, int] = pins.values if pins is not None else {}
         for stepper in self.description.steppers:
             if stepper.node == node:
-                stepper.step_pin.number(numbers)  # tells file and line when the node has no such pin
+                stepper.step_pin.number(numbers)  # raises with file and line when the node has no such pin
                 stepper.dir_pin.number(numbers)
                 self.steppers[stepper.name].configure(config)
         self._add_homing(config, numbers)

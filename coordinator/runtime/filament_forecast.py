@@ -48,17 +48,17 @@ class FilamentForecast:
         return bool(self._tracks)
 
     def want(self, extruder: str) -> None:
-        """Take note of what EXTRUDER moves from now on."""
+        """Record what EXTRUDER moves from now on."""
         self._tracks.setdefault(extruder, _Track())
 
     def follow(self, weights: Mapping[str, tuple[float, float, float, float]]) -> None:
-        """Take note which steppers the moves to come drive: those that move with filament."""
+        """Record which steppers move filament in the next moves."""
         moved = {name: axes[FILAMENT_AXIS] > 0 for name, axes in weights.items()}
         others = [name for name in self._active if name not in moved]
         self._active = (*others, *(name for name, moves in moved.items() if moves))
 
     def see_moves(self, trapezoids: Any, count: int) -> None:
-        """Take note of planned moves (``struct trapezoid *``)."""
+        """Record planned moves (``struct trapezoid *``)."""
         tracks = [self._tracks[name] for name in self._active if name in self._tracks]
         if not tracks or not count:
             return

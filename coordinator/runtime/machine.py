@@ -44,7 +44,7 @@ M = TypeVar("M")
 
 
 class MachineStopped(CanductorError):  # noqa: N818
-    """The machine was stopped for safety; the sentence tells the cause."""
+    """The machine was stopped for safety; the sentence states the cause."""
 
 
 CONFIRM_STOP_S = 0.5
@@ -201,7 +201,7 @@ class Machine:
         self.modules.stopped(cause)
 
     async def sleep(self, name: str) -> None:
-        """Let go of node NAME, so that its power can be switched off: it is not missed until ``wake``.
+        """Disconnect node NAME, so that its power can be switched off; it is not missed until ``wake``.
 
         Raises CanductorError when it is needed.
         """
@@ -213,11 +213,11 @@ class Machine:
                 )
             if node in self.moving:
                 raise CanductorError(f"node {name} cannot sleep while a job runs: it carries steppers")
-        await self._recovery.dismiss(name)
+        await self._recovery.cancel(name)
         await node.sleep()
 
     async def wake(self, name: str) -> None:
-        """Take a node that sleeps back, with its power on again; raises CanductorError, leaving it asleep."""
+        """Reconnect a sleeping node whose power is on again; raises CanductorError, leaving it asleep."""
         node = self._node(name)
         self._waking.add(node)
         try:
@@ -316,7 +316,7 @@ class Machine:
                 )
 
     def is_busy(self, load: float) -> bool:
-        """Tell whether a bus has carried more than LOAD lately, a share of its time."""
+        """Return whether a bus has carried more than LOAD lately, a share of its time."""
         return any(o.bus.closed_because is None and o.bus.io.load().total > load for o in self._open)
 
     async def query_stepper_counts(self) -> dict[str, int]:
@@ -393,7 +393,7 @@ class Machine:
         if not self._ready or not gone or node in self._waking:
             return
         if self.policies[node.name] is not NodePolicy.FATAL and self.stopped is None:
-            self._recovery.take_on(node)
+            self._recovery.start(node)
             return
         self.stop(f"{node.failure}; all other nodes were stopped")
         if node.state is NodeState.SHUTDOWN:

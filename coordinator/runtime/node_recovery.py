@@ -1,4 +1,4 @@
-"""Nodes that may come and go: what the user hears, how they are brought back, and who waits meanwhile."""
+"""Recovery of nodes that may be absent: notices, reconnection, and the job that waits meanwhile."""
 
 import asyncio
 import contextlib
@@ -26,7 +26,7 @@ class PausableJob(Protocol):
 
 
 class NodeRecovery:
-    """Brings nodes of POLICIES other than fatal back, quietly and for ever.
+    """Reconnects nodes of POLICIES other than fatal, without limit of time.
 
     BRING_BACK restarts a node once (CanductorError: not yet), ON_NOTICE gets a sentence when a node is gone
     and one when it is back, NOW_S is any clock in s.
@@ -63,12 +63,12 @@ class NodeRecovery:
         """Forget the job."""
         self._gate = None
 
-    def take_on(self, node: Node) -> None:
-        """Care for NODE, which is lost or shut down; harmless when that is done already."""
+    def start(self, node: Node) -> None:
+        """Recover NODE, which is lost or shut down; without effect when that is under way."""
         if node.name in self._out or self._halted:
             return
-        task = asyncio.get_running_loop().create_task(self._care(node))
-        task.add_done_callback(_tell_bug)
+        task = asyncio.get_running_loop().create_task(self._recover(node))
+        task.add_done_callback(_report_bug)
         self._out[node.name] = task
         if self._policies[node.name] is NodePolicy.PAUSE and self._gate is not None:
             self._on_notice(f"{node.failure}; the job pauses until the node is back")
@@ -76,8 +76,8 @@ class NodeRecovery:
             self._on_notice(f"{node.failure}; its features are off until it is back")
         self._hold_for(node.name, str(node.failure))
 
-    async def dismiss(self, name: str) -> None:
-        """Stop caring for a node: it is to be away."""
+    async def cancel(self, name: str) -> None:
+        """Recover a node no longer: it is away on purpose."""
         task = self._out.pop(name, None)
         if task is not None:
             await _end(task)
@@ -90,19 +90,19 @@ class NodeRecovery:
             task.cancel()
 
     async def close(self) -> None:
-        """Stop caring for all."""
+        """End all recovery."""
         self.halt()
         tasks, self._out = tuple(self._out.values()), {}
         for task in tasks:
             await _end(task)
 
-    async def _care(self, node: Node) -> None:
+    async def _recover(self, node: Node) -> None:
         began_s = self._now_s()
         wait_s = FIRST_TRY_S
         while node.state is not NodeState.READY:
             await asyncio.sleep(wait_s)
             wait_s = min(2 * wait_s, LAST_TRY_S)
-            with contextlib.suppress(CanductorError):  # told once, when it got lost
+            with contextlib.suppress(CanductorError):  # reported once, when it was lost
                 await self._bring_back(node)
         del self._out[node.name]
         self._on_notice(f"node {node.name} is back after {self._now_s() - began_s:.1f} s")
@@ -118,7 +118,7 @@ class NodeRecovery:
             self._gate.release()
 
 
-def _tell_bug(task: asyncio.Task[None]) -> None:
+def _report_bug(task: asyncio.Task[None]) -> None:
     bug = None if task.cancelled() else task.exception()
     if bug is not None:
         task.get_loop().call_exception_handler({"message": "bringing a node back failed", "exception": bug})

@@ -1,8 +1,8 @@
-"""Where each motor has brought what it moves, by the steps that its node counts.
+"""Positions of the motors, from the steps that their nodes count.
 
-A count alone says nothing. When a position is declared (homing ends, another carriage is the head), the place
-of each rail follows from it, and with the count at that moment the place that a count of 0 stands for. From
-then on counts of the nodes give places, past all that the host has planned.
+A count alone is no position. When a position is declared (homing ends, another carriage is the head), that of
+each rail follows from it, and with the count at that moment the position at a count of 0. From then on the
+counts of the nodes give positions, independent of all that the host has planned.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ _XYZ: Final = 3
 
 
 class StepperPositions:
-    """The places of the machine's motors in mm (rad where they turn something); unknown until declared."""
+    """Positions of the machine's motors in mm (rad where they turn something); unknown until declared."""
 
     def __init__(self, described: MachineDescription) -> None:
         self._described = described
@@ -44,17 +44,17 @@ class StepperPositions:
         """
         self._carriages = carriages
         self._at_zero = {
-            stepper.name: self._place(stepper, position, offsets)
+            stepper.name: self._position(stepper, position, offsets)
             - counts[stepper.name] * stepper.step_distance
             for stepper in self._described.steppers
         }
 
     def use(self, carriages: CarriageState | None) -> None:
-        """Take note of which carriage is the head."""
+        """Record which carriage is the head."""
         self._carriages = carriages
 
-    def places(self, counts: Mapping[str, int]) -> dict[str, float]:
-        """Return the place of every motor; empty: nothing was declared yet."""
+    def positions(self, counts: Mapping[str, int]) -> dict[str, float]:
+        """Return the position of every motor; empty: nothing was declared yet."""
         if not self._at_zero:
             return {}
         return {
@@ -62,23 +62,23 @@ class StepperPositions:
             for stepper in self._described.steppers
         }
 
-    def head(self, places: Mapping[str, float]) -> Point | None:
-        """Return where motors at PLACES have the head; None: unknown."""
-        if not places:
+    def head(self, positions: Mapping[str, float]) -> Point | None:
+        """Return where motors at POSITIONS have the head; None: unknown."""
+        if not positions:
             return None
         motors = self._described.motors
         if all(motor.function.linear for motor in motors):
-            return self._head_of_sums(places)
+            return self._head_of_sums(positions)
         rails = {rail.axis: rail.steppers[0].name for rail in self._described.rails}
         kinematics = self._described.kinematics
         try:
-            return kinematics.forward(tuple(places[rails[name]] for name in kinematics.rails))
+            return kinematics.forward(tuple(positions[rails[name]] for name in kinematics.rails))
         except ValueError:
             return None  # arms that do not meet: one of them was moved alone
 
-    # ---------------------------------------------------------------------------------------------- places
+    # ------------------------------------------------------------------------------------------- positions
 
-    def _place(self, stepper: StepperDescription, position: Position, offsets: Sequence[float]) -> float:
+    def _position(self, stepper: StepperDescription, position: Position, offsets: Sequence[float]) -> float:
         function = stepper.function
         if not function.linear:
             rail = next(rail.axis for rail in self._described.rails if stepper in rail.steppers)
@@ -92,14 +92,14 @@ class StepperPositions:
             axes[axis] = self._carriages.at(position[axis])[number] + offsets[axis]
         return float(np.dot(weights, axes))
 
-    def _head_of_sums(self, places: Mapping[str, float]) -> Point:
-        """Return the place that is nearest to what all motors of the head say."""
+    def _head_of_sums(self, positions: Mapping[str, float]) -> Point:
+        """Return the position that fits all motors of the head best."""
         primary = 0 if self._carriages is None else self._carriages.primary
         rows, sums = [], []
         for motor in self._described.motors:
             number, weights = self._of_carriage.get(motor.name, (primary, motor.weights))
             if number == primary:
                 rows.append(weights[:_XYZ])
-                sums.append(places[motor.name])
+                sums.append(positions[motor.name])
         x, y, z = np.linalg.lstsq(np.array(rows), np.array(sums), rcond=None)[0].tolist()
         return (x, y, z)

@@ -126,7 +126,7 @@ class TimeBase:
         return clock_map.bend(print_time, rate + min(max(slew, -limit), limit))
 
     def _ticks(self, clock: EstimatedClock, print_time: float) -> Ticks:
-        """Return a node's ticks at PRINT_TIME as far as CLOCK tells.
+        """Return a node's ticks at PRINT_TIME as CLOCK estimates them.
 
         A clock that pulses tie to the primary's needs no host time: the primary's estimate, which another
         thread may renew between two looks at it, has no part in it.

@@ -7,7 +7,7 @@ from nodes.link.interfaces import LinkIoInterface, OnFrame, OnLost
 
 
 class Wire:
-    """Opens its port by OPEN_PORT when the bus starts its I/O, and anew every time it starts it again."""
+    """Opens its port by OPEN_PORT each time the bus starts its I/O."""
 
     def __init__(self, open_port: Callable[[], Port]) -> None:
         self._open_port = open_port

@@ -26,7 +26,7 @@ from nodes.support.errors import CanductorError
 LIMIT_S: Final = 90.0
 """Simulated time after which a run hangs."""
 AFTERWARDS_S: Final = 2.0
-"""The boards go on for so long after the end: whoever still steps is found out."""
+"""The boards run for so long after the end, so that a board that still steps is detected."""
 LINK_CONTROL_BYTES: Final = 1 << 15
 LINK_MOTION_BYTES: Final = 1 << 20
 """What may wait in a link's queues."""
@@ -34,7 +34,7 @@ BY_THE_USER: Final = "stopped by the user"
 
 
 def play(scenario: Scenario, seed: int) -> Result:
-    """Run SEED of SCENARIO and return what became of it; what the code under test raises goes through."""
+    """Run SEED of SCENARIO and return the result; exceptions of the code under test pass through."""
     began_s = time.process_time()
     stage = Stage(scenario, seed)
     run = _Run(stage)

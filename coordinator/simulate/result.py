@@ -1,4 +1,4 @@
-"""What became of one seed of a scenario, and of many."""
+"""The result of one seed of a scenario, and of many."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

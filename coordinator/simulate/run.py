@@ -133,7 +133,7 @@ def run_all(tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
 
 
 def _begin_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command itself hears Ctrl-C and ends the pool
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command itself handles Ctrl-C and ends the pool
 
 
 def run_one(scenario: Scenario, seed: int, limit_s: float = SEED_LIMIT_S) -> Result:

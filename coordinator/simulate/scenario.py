@@ -89,7 +89,7 @@ class BusSetting:
 FAULT_KINDS: Final = {
     "cut": "the node's cable is off",
     "reset": "the node restarts",
-    "power": "the node has no power, and starts anew after it",
+    "power": "the node has no power, and starts again after it",
     "stall": "the node, or the host, does nothing",
     "babble": "the node sends frames without end",
     "loss": "a share of the bus's frames vanishes",
@@ -166,12 +166,12 @@ class Program:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bounds:
-    """What is still right; beside what always has to hold."""
+    """Bounds, in addition to what always has to hold."""
 
     clock_error_us: float = option(number(0, 2000, "µs"), 8.0)
     """How far a secondary node's clock may be from print time, in truth, while it steps."""
     late_us: float = option(number(0, 2000, "µs"), 0.0)
-    """What the scenario allows every step beside that."""
+    """Deviation that the scenario allows every step in addition."""
     stop_s: float = option(number(0, 10, "s"), 0.1)
     """How long after a stop the last node that can be reached may still step."""
 
@@ -202,7 +202,7 @@ class Scenario:
     causes: tuple[str, ...]
     """Regular expressions; the sentence of a stop must contain one."""
     weight: float
-    """How large its share of the seeds is, beside others with 1; 0: only when it is named."""
+    """Its share of the seeds, relative to others with 1; 0: only when it is named."""
     plant: bool = False
     """Whether there is something to heat and to measure at the boards' pins."""
     nodes: Mapping[str, NodeSetting] = field(default_factory=dict)
@@ -275,7 +275,7 @@ def _machine(name: str, scenario: Path) -> Path:
             return path
     known = sorted(path.stem for path in MACHINES.glob("*.cfg"))
     raise ScenarioError(
-        f"{scenario.name}: there is no machine {shown(name)}: neither a file beside the scenario "
+        f"{scenario.name}: there is no machine {shown(name)}: neither a file in the scenario's folder "
         f"nor one of {', '.join(known)}"
     )
 

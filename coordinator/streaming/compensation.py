@@ -1,7 +1,7 @@
 """Which axis tables step generation uses: taken up and removed at standstill, on homed axes only.
 
 The control loop says which tables are wanted; the motion worker takes them up when it may. A table that is
-taken up makes no step by itself: docs/tables.md tells how it comes into effect.
+taken up makes no step by itself: see docs/tables.md for how it takes effect.
 """
 
 from collections.abc import Mapping
@@ -59,7 +59,7 @@ class Compensation:
         self.wanted = others if table is None else {**others, axis: table}
 
     def is_due(self, homed: str) -> bool:
-        """Tell whether ``resume_program`` has something to do, with the axes HOMED (capital letters)."""
+        """Return whether ``resume_program`` has something to do, with the axes HOMED (capital letters)."""
         if self._looked_at == (self.wanted, homed):  # most of the time: the same map
             return False
         due = any(self._may_use(axis, homed) is not self._taken.get(axis) for axis in AXES)
@@ -83,7 +83,7 @@ class Compensation:
                 self._taken[axis] = table
                 continue
             del self._taken[axis]
-            if axis.upper() not in homed:  # nobody knows where it stands: nothing is left to be undone
+            if axis.upper() not in homed:  # its position is unknown: nothing is left to be undone
                 kept = list(steps.corrections)
                 kept[number] = NO_CORRECTION
                 steps.set_corrections(kept)
@@ -91,7 +91,7 @@ class Compensation:
         self.note(steps)
 
     def begin_again(self, before: StepGenerator) -> None:
-        """Take note that another generator, without tables, follows on BEFORE; no motor moved."""
+        """Record that another generator, without tables, replaces BEFORE; no motor moved."""
         self._carried = before.corrections
         self._taken = {}
         self._looked_at = ({}, "")
@@ -108,7 +108,7 @@ class Compensation:
             )
 
     def note(self, steps: StepGenerator) -> None:
-        """Have ``states`` tell what STEPS do now."""
+        """Update ``states`` from STEPS."""
         self.states = {
             axis: AxisState(
                 self._taken.get(axis) is self.wanted.get(axis),

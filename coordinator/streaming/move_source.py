@@ -1,4 +1,4 @@
-"""What drives the pipeline: a source of moves, and who looks on while they go by."""
+"""Interfaces of the pipeline: a source of moves, and an observer of moves and commands."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ ProgramOutput = Reply | Notice
 
 
 class MoveSource(Protocol):
-    """Plans moves into ``planner`` and tells what its driver has to act on (gcode/events.py).
+    """Plans moves into ``planner`` and returns the events its driver has to act on (gcode/events.py).
 
     A ``Job`` is one that ends; the service's feeder is one that goes on from job to job.
     """
@@ -38,13 +38,13 @@ class MoveSource(Protocol):
         ...
 
     def step(self) -> Event:
-        """Work until there is something to tell; raises GCodeError."""
+        """Work until there is an event; raises GCodeError."""
         ...
 
     def attend_others(self) -> Event | None:
         """Do what may be done while ``step`` must not be called, as the machine rests; nothing is planned.
 
-        Returns what there is to tell, None when that was all.
+        Returns the next event, None when there are no more.
         """
         ...
 
@@ -53,10 +53,10 @@ class Witness(Protocol):
     """Sees what is planned and what is sent."""
 
     def see_moves(self, trapezoids: Any, count: int) -> None:
-        """Take note of moves (``struct trapezoid *``), in the worker's thread; they are gone afterwards."""
+        """Record moves (``struct trapezoid *``), in the worker's thread; they are gone afterwards."""
 
     def see_batch(self, node: int, batch: bytes) -> None:
-        """Take note of commands for a moving node, on the control loop."""
+        """Record commands for a moving node, on the control loop."""
 
 
 @dataclass(frozen=True, slots=True)

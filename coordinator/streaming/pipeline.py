@@ -41,7 +41,7 @@ BATCH_ROOM = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class MotionSettings:
-    """What acts between trapezoids and steppers."""
+    """Settings of step generation, between trapezoids and steppers."""
 
     shapers: Mapping[str, Shaper]
     """By axis letter."""
@@ -53,7 +53,7 @@ class MotionSettings:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """Trapezoids between which nothing is declared or changed."""
+    """Consecutive trapezoids with one position declaration and one set of settings."""
 
     start: Position
     """Where the axes stand at its begin."""
@@ -65,7 +65,7 @@ class Segment:
 
 @dataclass(slots=True)
 class PlanRecord:
-    """What was planned, for whoever checks it: trapezoids in order, and where positions were declared."""
+    """Record of what was planned, for a proof: trapezoids in order, and where positions were declared."""
 
     start: Position
     pieces: "list[NDArray[np.void]]" = field(default_factory=list)
@@ -73,7 +73,7 @@ class PlanRecord:
     """Before trapezoid number N the machine was declared to stand at a position."""
     count: int = 0
     settings: list[tuple[int, MotionSettings]] = field(default_factory=list)
-    """What acts from trapezoid number N on."""
+    """Settings from trapezoid number N on."""
 
     def restart(self) -> None:
         """Forget all: something else has moved the machine."""
@@ -199,7 +199,7 @@ class Pipeline:
         self.planner.begin_at(self.steps.next_move_s)
 
     def _note_settings(self) -> None:
-        """Record what acts from here on."""
+        """Record the settings from here on."""
         if self._record is None:
             return
         shapers = {axis: shaper for axis, shaper in self._shapers.items() if shaper.frequency_hz}

@@ -17,7 +17,7 @@ class StandstillTask:
         self._task = asyncio.ensure_future(self._perform())
 
     def look(self) -> bool:
-        """End it if nobody wants it any more; return whether it is over, with EVENT telling how.
+        """Cancel it if its event was cancelled; return whether it is over; the event has the result.
 
         Raises what performing it raised, but for a CanductorError, which the program gets. Whoever failed or
         was ended on the way may have moved something.

@@ -136,10 +136,10 @@ class Streamer:
                 event = cycle.event
                 if isinstance(event, Emergency):
                     self._hand_over(cycle)
-                    self._tell(cycle)
+                    self._report_output(cycle)
                     self._machine.stop(f"{self._job.name}:{event.line}: M112 stopped the machine")
                     return
-                await self._tell_on(cycle)
+                await self._report_cycle(cycle)
                 self._hand_over(cycle)  # last: links and buses begin to work then, and the loop rests
                 if isinstance(event, StandstillAction):
                     await self._attend(event)
@@ -176,15 +176,15 @@ class Streamer:
             self._machine.check_load()
         self._look_at_load()
 
-    def _tell(self, cycle: Cycle) -> None:
-        for output in cycle.output:
-            self._on_output(output)
+    def _report_output(self, cycle: Cycle) -> None:
+        for told in cycle.output:
+            self._on_output(told)
         self._act(self._due.take(self.print_time_now(), cycle.due))
 
-    async def _tell_on(self, cycle: Cycle) -> None:
-        """Tell of CYCLE in steps: whoever else uses the loop waits for the one that runs, not for all."""
+    async def _report_cycle(self, cycle: Cycle) -> None:
+        """Report CYCLE in steps, so that other tasks of the loop wait for one of them, not for all."""
         await asyncio.sleep(0)
-        self._tell(cycle)
+        self._report_output(cycle)
         await asyncio.sleep(0)
         self._on_state(cycle.planned)
         await asyncio.sleep(0)
@@ -208,7 +208,7 @@ class Streamer:
         while self.print_time_now() < self.ended_s + self.worker.steps.lag_s + SETTLE_S:
             cycle = await loop.run_in_executor(thread, self.worker.rest)
             self._hand_over(cycle)
-            await self._tell_on(cycle)
+            await self._report_cycle(cycle)
             await asyncio.sleep(CYCLE_S)
         self._act(self._due.rest())
         for node in self._nodes:

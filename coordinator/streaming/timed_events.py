@@ -19,8 +19,8 @@ Due = tuple[float, Timed]
 class DueEvents:
     """Keeps the order in which the program has them.
 
-    What somebody beside the program wants as soon as possible is done at once, and all that was read before
-    it, too: a target that waits for its time must not undo that heaters were turned off.
+    An event from outside the program that is wanted as soon as possible is done at once, with all that was
+    read before it: a target that waits for its time must not undo that heaters were turned off.
     """
 
     def __init__(self) -> None:

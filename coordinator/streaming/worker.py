@@ -88,7 +88,7 @@ class MotionWorker:
         self._set_up()
 
     def _set_up(self) -> None:
-        """Make step generation, which begins anew whenever something else has moved the steppers."""
+        """Create step generation, again whenever something else has moved the steppers."""
         machine, witness = self._machine, self._witness
         self._made: dict[str, int] = {}
         self.steps = StepGenerator(machine.devices.stepper_specs(), machine.stream_specs())
@@ -145,17 +145,17 @@ class MotionWorker:
         held = self.held is not None
         if not held and not self._still_waiting(waiting_for, now):
             self._planner.plan_until_s = now + PLAN_AHEAD_S
-            self._begin_anew(now)
+            self._delay_after_standstill(now)
             event = self._advance(output)
         elif isinstance(waiting_for, StandstillAction) and not waiting_for.over:
-            event = self._beside(waiting_for, output)
+            event = self._attend_others(waiting_for, output)
         if held or self._runs_dry(now):
             self._planner.flush()
         self._generate(now)
         return self._cycle(output, event)
 
-    def _beside(self, resting: StandstillAction, output: list[ProgramOutput]) -> Event:
-        """Let others be answered while the job waits, a heater may take minutes; return what to wait for."""
+    def _attend_others(self, resting: StandstillAction, output: list[ProgramOutput]) -> Event:
+        """Execute lines of clients while the job waits, maybe minutes; return what to wait for."""
         while (event := self._job.attend_others()) is not None:
             if isinstance(event, Reply | Notice):
                 output.append(event)
@@ -214,11 +214,11 @@ class MotionWorker:
         if not self._all_generated():
             return False
         self.pipeline.act(event)
-        self._note_places(event)
+        self._note_positions(event)
         return True
 
-    def _note_places(self, event: PositionSet | MachineChange) -> None:
-        """Let the machine know which counts of its nodes stand for where its rails are now."""
+    def _note_positions(self, event: PositionSet | MachineChange) -> None:
+        """Record at the machine which counts of its nodes correspond to the present positions."""
         carriages = self._job.machine.carriage_state
         if isinstance(event, PositionSet):
             offsets = [correction.offset_mm for correction in self.steps.corrections]
@@ -253,7 +253,7 @@ class MotionWorker:
                 return event
         return None
 
-    def _begin_anew(self, now: float) -> None:
+    def _delay_after_standstill(self, now: float) -> None:
         """After a standstill the next move needs time to reach the nodes, and steps to look ahead to it."""
         begin = max(now + self.start_lead_s, self.steps.next_move_s)
         if self._planner.at_standstill and self._planner.print_time_end_s < begin:

@@ -115,7 +115,7 @@ INVERSE: Mapping[str, Inverse] = {
 
 
 class StepperPath:
-    """One stepper's place in steps, over a stretch of print time in which nothing is declared anew."""
+    """One stepper's place in steps, over an interval of print time without a declaration."""
 
     def __init__(
         self, spec: StepperSpec, start: Position, moves: NDArray[np.void], setting: Setting, position: float

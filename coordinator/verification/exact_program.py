@@ -10,7 +10,7 @@ from coordinator.verification.exact_shapers import impulses
 
 
 def program_legs(spec: StepperSpec, segments: Sequence[Segment]) -> list[Leg]:
-    """Return the legs of the stepper SPEC, whose weights hold as long as STRETCHES tell no others."""
+    """Return the legs of the stepper SPEC, whose weights hold unless SEGMENTS have others."""
     return [
         Leg(
             replace(spec, weights=segment.settings.weights.get(spec.name, spec.weights)),

@@ -34,7 +34,7 @@ BLOCK_S = 0.25
 
 @dataclass(frozen=True)
 class Phases:
-    """Motion of all axes in pieces of constant acceleration; the last piece lasts for ever."""
+    """Motion of all axes in pieces of constant acceleration; the last piece has no end."""
 
     time: Floats
     """s, begin of each; not falling. Pieces may last 0 s."""

@@ -19,7 +19,7 @@ from coordinator.virtual_machine.plant_heat import plant_word
 from nodes.virtual.plant_log import PlantEvent
 
 AROUND_NS: Final = 100_000_000
-"""How far beside its steady state the truth is looked at: the log tells it every 50 ms."""
+"""Extension of a steady state at both ends within which the log, written every 50 ms, is looked at."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +46,7 @@ class HeatProof:
 
     @property
     def is_known(self) -> bool:
-        """Whether the plant's log tells how warm it truly was."""
+        """Whether the plant's log has its true temperature."""
         return self.true_low_c <= self.true_high_c
 
     @property

@@ -22,7 +22,7 @@ Clocks = NDArray[np.uint64]
 
 
 class NodeTruth(Protocol):
-    """What a node's log tells: its clock at any moment, in truth."""
+    """A node's true clock at any moment, from its log."""
 
     def ticks_to_monotonic_ns(self, clock: Clocks, /) -> NDArray[np.int64]:
         """Return the host's CLOCK_MONOTONIC at these node clocks."""

@@ -16,8 +16,8 @@ from nodes.virtual.plant import Axis
 from nodes.virtual.plant_page import Motor
 
 STEPS_OFF: Final = 2.0
-"""A homed axis may be so many steps beside where it believes to be: one for each of two roundings. One whose
-motor felt the end may be so many full steps: a motor follows its field no better."""
+"""Error of a homed axis in steps, at most: one for each of two roundings. After sensorless homing it counts
+full steps: a motor follows its field no better."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +33,12 @@ class PlaceProof:
 
     @property
     def error_mm(self) -> float:
-        """How far it is beside where it believes to be."""
+        """Distance from the believed position."""
         return self.true_mm - self.believed_mm
 
     @property
     def holds(self) -> bool:
-        """Whether that is no more than rounding explains: to steps, of an end that was felt full ones."""
+        """Whether rounding explains it: to steps, after sensorless homing to full steps."""
         return abs(self.error_mm) <= self.steps_off * self.step_mm
 
 

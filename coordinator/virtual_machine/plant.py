@@ -42,9 +42,9 @@ class PlantSettings:
     hysteresis_mm: float = 0.1
     """Travel of an endstop from where it closes to where it opens."""
     skew_mm: Mapping[str, float] = field(default_factory=dict)
-    """How far beside the head a side of an axis begins that has an endstop of its own, by its first motor."""
+    """Initial offset from the head of a side of an axis that has its own endstop, by its first motor."""
     switch_noise_mm: float = 0.0
-    """How far beside its place each approach finds an endstop, at most."""
+    """Largest deviation of an endstop's switching position from one approach to the next."""
     heat: HeatSettings = field(default_factory=HeatSettings)
 
 

@@ -137,7 +137,6 @@ class Proved:
         pins = self.service.machine.modules.pins
         self.claimed |= {name: pins.claimed(name) for name in self.service.machine.nodes}
         self.both_edges |= {name: stepper.steps_on_both_edges for name, stepper in steppers.items()}
-        self.service.motion.streamer.worker.began_at = await self.service.machine.query_stepper_counts()
 
     async def _note_leads(self) -> None:
         """Note the smallest lead of each job when the next one begins."""

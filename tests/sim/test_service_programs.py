@@ -97,7 +97,7 @@ def test_jobs_and_programs(tmp_path: Path) -> None:
 
 MISSING = {
     "none.gcode": "there is no file 'none.gcode' in the job folder",
-    "../../etc/passwd": "'../../etc/passwd' is no name of a job; give a file of the job folder",
+    "../../etc/passwd": "'../../etc/passwd' is not the name of a job; use the name of a file",
     "linked.gcode": "there is no file 'linked.gcode' in the job folder",
 }
 

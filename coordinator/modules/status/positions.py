@@ -40,7 +40,7 @@ class Positions(Module):
         assert self._live is not None
         machine = self._live.machine
         counts = await machine.query_stepper_counts()
-        places = machine.stepper_positions.places(counts)
+        places = machine.stepper_positions.positions(counts)
         head = machine.stepper_positions.head(places)
         mcu = " ".join(f"{name}:{count}" for name, count in counts.items())
         stepper = " ".join(f"{name}:{place:.6f}" for name, place in places.items())

@@ -1,9 +1,9 @@
 """Homing moves: steppers on any nodes stop when an endstop on any node switches, and it is known where.
 
 When all nodes involved are on one CAN bus and know trigger groups, the endstop's node tells the others
-itself, within a frame or two. Otherwise the host relays: it hears the stop group of the endstop's node and
+itself, within a frame or two. Otherwise the host relays: it receives the stop group of the endstop's node and
 triggers those of the others. In both cases every node stops by itself when it has not heard from the host
-for TIMEOUT_S, and the host goes on renewing that only while it hears from all nodes.
+for TIMEOUT_S, and the host goes on renewing that only while all nodes answer.
 
 What a stepper did after the trigger (its overshoot) is known exactly: the node counts its steps, and the
 plan says where it was at the moment at which the endstop was seen to switch.
@@ -29,7 +29,7 @@ from nodes.support.errors import CanductorError
 CYCLE_S: Final = 0.025
 """How often steps are sent, and time-outs renewed."""
 TIMEOUT_S: Final = 0.25
-"""A node that hears nothing from the host for so long while it homes with others stops."""
+"""A node that receives nothing from the host for so long while it homes with others stops."""
 TIMEOUT_ALONE_S: Final = 2.0
 """The same when endstop and steppers are on one node: nothing has to be relayed."""
 REPORTS: Final = 10
@@ -355,7 +355,7 @@ class HomingMove:
     async def _trigger_time(leg: _Leg, move: SingleMove) -> float:
         """Return the print time of the first of the looks that found the endstop pressed.
 
-        Its clock has 32 bits. Now may be too late to tell which: other rails may have moved on for long.
+        Its clock has 32 bits. Now may be too late to know which: other rails may have moved on for long.
         """
         state = await leg.endstop.state(leg.endstop_node)
         name = leg.endstop_node.name
@@ -370,7 +370,7 @@ def _way(leg: _Leg, move: SingleMove, steps: dict[str, int]) -> float:
 
 
 def _switched(leg: _Leg, states: Mapping[str, TrsyncState]) -> bool:
-    """Tell whether the endstop ended the round."""
+    """Return whether the endstop ended the round."""
     state = states.get(leg.endstop_node.name)
     return state is not None and state.reason is TriggerReason.ENDSTOP
 

@@ -195,7 +195,7 @@ def job_methods(service: MachineService) -> Iterator[Method]:
         returns=_JOB,
     )
     yield Method(
-        "job.status", Scope.WATCH, "Tell how far the job is, or what became of it.", jobs.status, returns=_JOB
+        "job.status", Scope.WATCH, "Return the progress of the job, or its result.", jobs.status, returns=_JOB
     )
 
 

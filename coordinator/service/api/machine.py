@@ -64,7 +64,7 @@ def machine_methods(service: MachineService) -> Iterator[Method]:
     yield Method(
         "machine.info",
         Scope.WATCH,
-        "Tell what the machine is and can do.",
+        "Return what the machine is and can do.",
         info,
         returns=(
             Param("name", Kind.STR),
@@ -79,7 +79,7 @@ def machine_methods(service: MachineService) -> Iterator[Method]:
             *_STATES,
         ),
     )
-    yield Method("machine.state", Scope.WATCH, "Tell the machine's state.", state, returns=_STATES)
+    yield Method("machine.state", Scope.WATCH, "Return the machine's state.", state, returns=_STATES)
     yield Method(
         "machine.emergency_stop",
         Scope.OPERATE,

@@ -103,7 +103,7 @@ async def _run(service: MachineService, params: dict[str, Any]) -> Value:
 
 
 def _restarted(service: MachineService, names: list[str]) -> bool:
-    """Begin anew if that is all that a machine which stopped is asked for; return whether it was."""
+    """Restart a stopped machine if NAMES ask for nothing else; return whether they did."""
     over = service.state in (ServiceState.SHUTDOWN, ServiceState.ERROR)
     if not over or len(names) != 1 or names[0] not in RESTARTS:
         return False
@@ -173,7 +173,7 @@ def motion_methods(service: MachineService) -> Iterator[Method]:
     yield Method(
         "position.get",
         Scope.WATCH,
-        "Tell where the machine is in all frames, and each stepper: steps since the machine started.",
+        "Return the position in all frames, and of each stepper: steps since the machine started.",
         position,
         params=(
             Param(
@@ -212,7 +212,7 @@ async def _done(service: MachineService, motion: Motion, work: Work, *, aside: b
     except FeederFull as error:
         raise ApiError("busy", str(error)) from None
     except MotionOver:
-        raise ApiError("stopped", f"the machine stopped: {service.cause or 'it begins anew'}") from None
+        raise ApiError("stopped", f"the machine stopped: {service.cause or 'it restarts'}") from None
     if isinstance(queued.error, GCodeError | WorkError):
         raise ApiError("bad_gcode" if isinstance(queued.error, GCodeError) else "bad_move", str(queued.error))
     if queued.error is not None:
@@ -254,7 +254,7 @@ NEVER_BETWEEN: Final = frozenset(
 
 
 def _disturbs(motion: Motion, names: list[str]) -> bool:
-    """Tell whether a job has to stand still for NAMES, between two of its lines."""
+    """Return whether a job has to stand still for NAMES, between two of its lines."""
     disturbing = motion.feeder.vocabulary.disturbing
     if NEVER_BETWEEN.intersection(names):
         return False
@@ -308,7 +308,7 @@ def _stepper_figures(machine: Machine, motion: Motion) -> Value:
 
 def _node_figures(machine: Machine, steps: dict[str, int]) -> dict[str, Value]:
     """Return what follows from the STEPS that the nodes count."""
-    places = machine.stepper_positions.places(steps)
+    places = machine.stepper_positions.positions(steps)
     head = machine.stepper_positions.head(places)
     return {
         "nodes_steps": dict(steps),

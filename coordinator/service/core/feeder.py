@@ -305,7 +305,7 @@ class Feeder:
         """Let QUEUED go once its moves are planned as far as they have to be."""
         early = queued.cancelled or queued.error is not None
         if queued.standstill is not None and queued.standstill.moved:
-            self.planner.homed = ""  # nobody takes over any more where that left the machine
+            self.planner.homed = ""  # its position is not taken over any more
         if (early or queued.work.rest is Rest.STANDSTILL) and not self.planner.flush():
             return Full()
         queued.read = True
@@ -320,7 +320,7 @@ class Feeder:
         return queued.progress
 
     def _do_interjections(self) -> Event | None:
-        """Act on all lines that neither move nor wait, and tell what comes of it; Full: one needs room."""
+        """Execute lines that neither move nor wait, return their events one by one; Full: one needs room."""
         while self._interjection is not None or self._interjections:
             queued = self._interjection = self._interjection or self._interjections.popleft()
             aside = self.planner.suspend_program(moving=False)

@@ -148,7 +148,7 @@ class Motion:
         self._ending = [queued for queued in self._ending if not self._settle(queued, now_s)]
 
     def _settle(self, queued: QueuedWork, now_s: float) -> bool:
-        """Tell that QUEUED is done once its last move is executed; return whether it is."""
+        """Report QUEUED done once its last move is executed; return whether it is."""
         assert queued.ends_at_s is not None
         if now_s < queued.ends_at_s + self.streamer.worker.steps.lag_s and queued.ends_at_s:
             return False
@@ -161,7 +161,7 @@ class Motion:
 
 
 class MotionOver(Exception):  # noqa: N818 (it ended, for whatever reason; its owner knows which)
-    """The machine no longer moves."""
+    """Motion ended: the machine stopped or restarts."""
 
 
 def texts(output: Sequence[ProgramOutput]) -> tuple[list[str], list[str]]:

@@ -18,7 +18,7 @@ class MotionLead:
         self._made_until_s: float | None = None
 
     def look(self, now_s: float, made_until_s: float, *, comes_to_rest: bool) -> None:
-        """Take note that commands up to MADE_UNTIL_S are handed over by NOW_S."""
+        """Record that commands up to MADE_UNTIL_S are handed over by NOW_S."""
         before_s, self._made_until_s = self._made_until_s, made_until_s
         if comes_to_rest:  # the lead shrinks, as it should
             self.now_s = self._made_until_s = None

@@ -139,7 +139,7 @@ class Programs:
     # ------------------------------------------------------------------------------------ for the job
 
     def look(self) -> None:
-        """Tell modules how the job is, and start what programs want to have printed."""
+        """Report the job to modules, and start the files that programs want printed."""
         motion, job = self._service.motion, self._service.job
         if motion is not None and motion.feeder.to_print:
             self._start(self._print(motion.feeder.to_print.popleft()))

@@ -79,7 +79,7 @@ class TableService:
         self._compensation.want(axis, table)
 
     def show_corrections(self) -> None:
-        """Tell front ends what is corrected now."""
+        """Show in the state tree what is corrected now."""
         if self._compensation is not None:
             for axis in self._compensation.states:
                 if axis in self._tables or self._tree.get(f"tables.{axis}.active") is not None:
@@ -121,7 +121,7 @@ class TableService:
         """Forget the table of AXIS, here and on its nodes; returns what that cost. Raises TableError."""
         self._of(machine, axis)
         if axis not in self._tables:
-            raise TableError(f"axis {axis} has no table; 'canductor table status' tells which have")
+            raise TableError(f"axis {axis} has no table; 'canductor table status' lists those that have")
         if self._store is not None:
             await asyncio.to_thread(self._store.remove, axis)
         del self._tables[axis]
@@ -139,7 +139,7 @@ class TableService:
     # --------------------------------------------------------------------------------------------- the nodes
 
     async def bring(self, machine: Machine, axes: Iterable[str]) -> list[DownloadReport]:
-        """Make sure that the nodes of AXES keep their tables, or none; ``status`` tells what became of it.
+        """Make sure that the nodes of AXES keep their tables, or none; ``status`` has the result.
 
         Equal tables go to all their axles in one transmission. Returns what each cost.
         """
@@ -255,7 +255,7 @@ class TableService:
         return found
 
     def _advice(self, machine: Machine) -> str:
-        """Tell which axes can have tables."""
+        """Return the sentence that names the axes that can have tables."""
         with_places = self._axes(machine)
         if not with_places:
             return "add [axis_tables] to the configuration"
@@ -281,8 +281,8 @@ class TableService:
 
     def _changed(self, axis: str, table: AxisTable | None) -> None:
         self._compensate(axis, table)
-        for tell in self.on_change:
-            tell(axis, table)
+        for changed in self.on_change:
+            changed(axis, table)
 
     def _status(self, axis: str, places: Sequence[StepperTables]) -> dict[str, Any]:
         table = self._tables.get(axis)
@@ -343,19 +343,19 @@ class _Side:
             self.problem = str(error)
 
     def took(self, outcome: DownloadOutcome) -> None:
-        """Take note of a download."""
+        """Record a download."""
         if outcome.state is not None:
             self._state = outcome.state
 
     def has(self, pairs: Sequence[Pair]) -> bool:
-        """Tell whether the node keeps PAIRS, or none where there are none."""
+        """Return whether the node keeps PAIRS, or none where there are none."""
         state = self._state
         if state is None or state.status is not MtStatus.OK:
             return False
         return state.holds(pairs) or (not pairs and state.length == 0)
 
     def waits(self, pairs: Sequence[Pair]) -> bool:
-        """Tell whether PAIRS are kept and not in use yet."""
+        """Return whether PAIRS are kept and not in use yet."""
         return self.has(pairs) and self._active is not None and self._wanted() != self._active.generation
 
     def _wanted(self) -> int:
@@ -363,7 +363,7 @@ class _Side:
         return self._state.generation if self._state.length else 0
 
     def activate(self, place: DownloadTarget, at_ns: HostTime) -> None:
-        """Have it used, or no longer used, from AT_NS on."""
+        """Start or end its use at AT_NS."""
         assert isinstance(place.node, Node), "one of the machine's"
         try:
             clock = int(place.node.best_clock.ticks_at(at_ns))

@@ -1,4 +1,4 @@
-"""G-code typed at the terminal of a service: one line after the other, beside its clients."""
+"""G-code typed at the terminal of a service: one line after the other, while clients are connected."""
 
 import asyncio
 import os
@@ -16,7 +16,7 @@ _READ_BYTES: Final = 4096
 
 
 class Typed:
-    """Runs what is typed on SERVICE and has SAY tell the replies; until ``close`` or the end of the input."""
+    """Runs typed lines on SERVICE and passes replies to SAY, until ``close`` or the end of the input."""
 
     def __init__(self, service: MachineService, say: Callable[[str], None]) -> None:
         registry = Registry()

@@ -1,7 +1,7 @@
 """What clients can have the machine do: g-code lines, single moves, a job's file.
 
 A work is stepped in the motion worker's thread, where the planner may be touched; the control loop only makes
-it and hears of its end.
+it and is notified of its end.
 """
 
 from collections.abc import Mapping, Sequence
@@ -83,12 +83,12 @@ class Work(Protocol):
         ...
 
     def pending(self) -> Event | None:
-        """Tell what is left to tell without going on; raises CanductorError."""
+        """Return the next event of what was done so far; raises CanductorError."""
         ...
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is left to tell or to take over."""
+        """Whether no event and no result is pending."""
         ...
 
     @property
@@ -97,7 +97,7 @@ class Work(Protocol):
         ...
 
     def progress(self) -> Progress:
-        """Tell how far it is read."""
+        """Return how far it is read."""
         ...
 
     def close(self) -> None:
@@ -140,12 +140,12 @@ class LinesWork:
         self._job = setting.job(program, while_printing=self.while_printing)
 
     def pending(self) -> Event | None:
-        """Tell what is left to tell."""
+        """Return the next event of what was done so far."""
         return None if self._job is None else self._job.pending()
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is left to tell or to take over."""
+        """Whether no event and no result is pending."""
         return self._job is None or self._job.settled
 
     @property
@@ -160,7 +160,7 @@ class LinesWork:
         return End(self._job.planner.lines, 0.0) if isinstance(event, Idle) else event
 
     def progress(self) -> Progress:
-        """Tell nothing: it is read at once."""
+        """Return no progress: it is read at once."""
         return NO_PROGRESS
 
     def close(self) -> None:
@@ -187,12 +187,12 @@ class FileWork:
         self._job = setting.job(self.program)
 
     def pending(self) -> Event | None:
-        """Tell what is left to tell."""
+        """Return the next event of what was done so far."""
         return None if self._job is None else self._job.pending()
 
     @property
     def settled(self) -> bool:
-        """Whether nothing is left to tell or to take over."""
+        """Whether no event and no result is pending."""
         return self._job is None or self._job.settled
 
     @property
@@ -206,7 +206,7 @@ class FileWork:
         return self._job.step()
 
     def progress(self) -> Progress:
-        """Tell how far the file is read."""
+        """Return how far the file is read."""
         lines = 0 if self._job is None else self._job.planner.lines
         return Progress(lines, self.program.done_bytes, self.program.size_bytes)
 
@@ -239,17 +239,17 @@ class MoveWork:
             self.target[axis] = value + (self.target[axis] if self.relative else 0.0)
 
     def pending(self) -> Event | None:
-        """Tell nothing: it is one move."""
+        """Return nothing: it is one move."""
         return None
 
     @property
     def settled(self) -> bool:
-        """Tell that nothing is left to tell."""
+        """Return True: it is one move."""
         return True
 
     @property
     def at_line(self) -> bool:
-        """Tell that nothing is left of it: it is one move."""
+        """Return True: it is one move."""
         return True
 
     def step(self) -> Event:
@@ -263,7 +263,7 @@ class MoveWork:
         return End(0, 0.0)
 
     def progress(self) -> Progress:
-        """Tell nothing: it is one move."""
+        """Return nothing: it is one move."""
         return NO_PROGRESS
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """Jobs without a file: their lines come piece by piece from a client, for as long as it likes.
 
 The client opens the job with one request that lasts as long as the job, and feeds it with others: each is
-answered when there is room for the next, so that whoever sends waits for the machine, and memory does not
+answered when there is room for the next, so that the sender waits for the machine, and memory does not
 grow. A client that leaves ends the job, since its open request ends: all lines that came are carried out, to
 a standstill, and the job says why there were no more.
 
@@ -20,7 +20,7 @@ from coordinator.service.jobs.jobs import JobPhase, JobRun
 from nodes.support.errors import CanductorError
 
 LINES_AHEAD_MAX: Final = 256
-"""Lines that wait for the machine, beside those of the piece that comes when there is room."""
+"""Lines that wait for the machine, without those of the piece that arrives when there is room."""
 PIECE_BYTES_MAX: Final = 32_768
 PIECE_LINES_MAX: Final = 1024
 NAME_MAX: Final = 128
@@ -45,7 +45,7 @@ class FedSource:
 
     @property
     def lines_ahead(self) -> int:
-        """Lines that nobody has read."""
+        """Lines that are not read yet."""
         return self.lines_put - self._lines_read
 
     def put(self, lines: list[str]) -> None:
@@ -175,7 +175,7 @@ def _takes_lines(job: JobRun) -> bool:
 
 
 def _why_none(name: str, job: JobRun | None) -> str:
-    """Tell what became of the job NAME that takes no more lines."""
+    """Return why the job NAME takes no more lines."""
     if job is None or job.file != name or _takes_lines(job):
         return f"there is no job {name} that is fed; job.stream begins one"
     told = {

@@ -55,7 +55,7 @@ def read_forward(description: "MachineDescription", program: Program, end_bytes:
             raise CanductorError(f"{program.name}:{event.line}: M112 comes before the line")
         part_mm = max(part_mm, _drain(planner))
     if job.machine.carriages is not None:
-        raise CanductorError("which carriage is where is not known any more: begin the print anew")
+        raise CanductorError("the positions of the carriages are no longer known: start the print again")
     return Reached(
         present_state(planner),
         {name: getattr(planner, name) for name in _DYNAMICS},

@@ -74,7 +74,7 @@ class JobFolder:
                 fd = os.open(parts[-1], _NO_LINK | os.O_NONBLOCK, dir_fd=fd)  # a pipe is not waited for
             except OSError:
                 raise NoSuchJob(
-                    f"there is no file {_shown(name)} in the job folder; job.list tells which there are"
+                    f"there is no file {_shown(name)} in the job folder; job.list returns those that exist"
                 ) from None
         status = os.fstat(fd)
         if not stat.S_ISREG(status.st_mode):
@@ -96,7 +96,7 @@ def _parts(name: str) -> tuple[str, ...]:
     )
     if odd:
         raise NoSuchJob(
-            f"{_shown(name)} is no name of a job; give a file of the job folder as job.list tells it"
+            f"{_shown(name)} is not the name of a job; use the name of a file as job.list returns it"
         )
     return parts
 

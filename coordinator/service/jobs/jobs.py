@@ -1,4 +1,4 @@
-"""The job of a machine: one file at a time, from its start to whatever became of it."""
+"""The job of a machine: one file at a time, from its start to its end."""
 
 from collections import deque
 from enum import StrEnum
@@ -33,7 +33,7 @@ ACTIVE = frozenset((JobPhase.PRINTING, JobPhase.PAUSING, JobPhase.PAUSED, JobPha
 
 
 class JobRun:
-    """One file on its way through MOTION; ``look`` as often as is handy."""
+    """One file that MOTION prints; call ``look`` in every cycle."""
 
     def __init__(self, motion: Motion, work: FileWork, now_s: float) -> None:
         self.file = work.name
@@ -117,12 +117,12 @@ class JobRun:
         self.phase = JobPhase.CANCELLING
 
     def stop(self, message: str, now_s: float) -> None:
-        """Take note that the machine stopped."""
+        """Record that the machine stopped."""
         if self.active:
             self._end(JobPhase.STOPPED, message, now_s)
 
     def look(self, now_s: float) -> None:
-        """Take note of how far it is at NOW_S, any clock in s."""
+        """Record the progress at NOW_S, any clock in s."""
         if not self.active:
             return
         self._follow_programs()
@@ -145,7 +145,7 @@ class JobRun:
             self.phase = JobPhase.PAUSED
 
     def _follow_programs(self) -> None:
-        """Take note of what a program has asked for: to pause, to go on, to cancel."""
+        """Follow what a program requested: pause, resume, cancel."""
         if self._queued.cancelled:
             self.phase = JobPhase.CANCELLING
         elif self._feeder.paused and self.phase is JobPhase.PRINTING:
@@ -181,7 +181,7 @@ class Trail:
         self._places: deque[tuple[int, int]] = deque([(0, 0)])  # lines and bytes read, oldest first
 
     def look(self, lines_read: int, read_bytes: int, line: int) -> None:
-        """Take note that so much is read, while LINE is being carried out."""
+        """Record that so much is read while LINE is executed."""
         places = self._places
         if lines_read > places[-1][0]:
             if len(places) == TRAIL_MAX:

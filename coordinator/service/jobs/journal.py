@@ -2,7 +2,7 @@
 
 One small file in the job folder. Each entry is a line of JSON, appended by a thread of its own and brought to
 the disk every SYNC_S; a power cut costs the last entries and nothing else. A file beyond FILE_BYTES_MAX is
-begun anew with what still counts: its head and its newest entry.
+written again with what still counts: its head and its newest entry.
 """
 
 import json
@@ -101,11 +101,11 @@ class Journal:
         self._put(head | ({"fed": True} if fed else {}))
 
     def note(self, line: int, held: Mapping[str, Any]) -> None:
-        """Take note that LINE is being carried out, and of what holds there."""
+        """Record that LINE is being executed, and the settings that hold there."""
         self._put({**held, "line": line})
 
     def end(self) -> None:
-        """Take note that the job ended, by itself or as somebody wanted."""
+        """Record that the job ended, by itself or on request."""
         self._put({"ended": True})
 
     def close(self) -> None:
@@ -123,7 +123,7 @@ class Journal:
 
     def _run(self) -> None:
         head: dict[str, Any] = {}
-        size = FILE_BYTES_MAX  # whatever there is, it is begun anew
+        size = FILE_BYTES_MAX  # an existing file is replaced
         unsynced = False
         while True:
             try:

@@ -275,7 +275,7 @@ class Recovery:
         with contextlib.ExitStack() as unless_done:
             program = unless_done.enter_context(folder.open(found.file))
             if (program.size_bytes, program.modified_ns) != (found.size_bytes, found.modified_ns):
-                raise CanductorError("the file has changed since; begin the print anew")
+                raise CanductorError("the file has changed since; start the print again")
             if not program.skip_lines(line - 1):
                 raise CanductorError(f"it has no line {line}")
             with folder.open(found.file) as again:
@@ -287,7 +287,7 @@ class Recovery:
 
 
 def _hot(modules: "MachineModules") -> Mapping[str, Any]:
-    """Return what is heated, blown and left out, as its modules tell it."""
+    """Return heater targets, fan speeds and excluded objects, as the modules report them."""
     status = modules.status()
     heaters: dict[str, float] = {}
     fans: dict[str, float] = {}

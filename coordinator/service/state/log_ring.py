@@ -14,7 +14,7 @@ Entry = Mapping[str, str | int]
 
 
 class LogRing:
-    """The last KEEP lines, numbered from 1; ON_LINE hears every new one."""
+    """The last KEEP lines, numbered from 1; ON_LINE gets every new one."""
 
     def __init__(self, on_line: Callable[[Entry], None]) -> None:
         self._lines: deque[Entry] = deque(maxlen=KEEP)

@@ -12,7 +12,7 @@ KEEP_SHARE = 0.75
 """When it is full, the points that matter least go until this share is left."""
 _SAME_MM = 1e-6
 _GENERATIONS = itertools.count(1)
-"""Of all paths of this process: one that begins anew is not taken for the one before."""
+"""Unique in this process: a path that starts again is not taken for the one before."""
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class Toolpath:
         return self._count
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Start an empty path."""
         self._put(np.empty((0, 3)), np.empty(0), np.empty(0, dtype=bool))
 
     def add(self, moves: Moves) -> None:

@@ -32,12 +32,12 @@ def test_counts_tell_where_the_head_is(path: Path) -> None:
     first = (*start_point(machine, 20.0), 1.0)
     later = (*start_point(machine, 43.0), 4.0)
     rails = StepperPositions(machine)
-    assert rails.places({}) == {}
+    assert rails.positions({}) == {}
     assert rails.head({}) is None
     state = None if machine.dual_carriage is None else machine.dual_carriage.carriages.home
     rails.declare(first, counts_at(machine, first, 0.3), state)
     counts = counts_at(machine, later, 0.3)
-    places = rails.places(counts)
+    places = rails.positions(counts)
     assert rails.head(places) == pytest.approx(later[:3], abs=0.2)  # a step of a bed that turns is 0.1 mm
     for extruder in machine.extruders[:1]:
         assert places[extruder.stepper.name] == pytest.approx(4.0, abs=extruder.stepper.step_distance)
@@ -51,7 +51,7 @@ def test_the_head_is_where_the_carriage_is_that_prints() -> None:
     rails.declare((-50.0, 0.0, 0.0, 0.0), zeros, dual.home)
     per_mm = round(1 / next(s for s in machine.steppers if s.name == "stepper_x").step_distance)
     counts = zeros | {"stepper_x": 100 * per_mm, "dual_carriage": -60 * per_mm}
-    places = rails.places(counts)
+    places = rails.positions(counts)
     assert (places["stepper_x"], places["dual_carriage"]) == pytest.approx((50, 290))
     assert rails.head(places) == pytest.approx((50, 0, 0))
     rails.use(dual.set_mode(dual.home, 50.0, 1, CarriageMode.PRIMARY))
