@@ -108,7 +108,7 @@ def test_what_is_raised_is_a_failure_with_its_place(
     def fails(*_: object) -> Result:
         raise ZeroDivisionError("by design")
 
-    monkeypatch.setattr("coordinator.simulate.play.play", fails)
+    monkeypatch.setattr("coordinator.simulate.run.play", fails)
     assert cli.main(["simulate", "clean", "--seed", "4"]) == cli.EXIT_FAILED
     out = capsys.readouterr().out
     assert "FAILED exception: ZeroDivisionError: by design (tests/sim/test_run.py:" in out
