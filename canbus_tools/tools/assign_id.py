@@ -86,7 +86,7 @@ class AssignReport:
         }
 
     def to_text(self) -> str:
-        """Say it in one line."""
+        """Return one line."""
         firmware = self.facts.firmware
         has = "had id {} before" if self.had_it else "has id {} now"
         return f"{self.uuid} {has.format(self.nodeid)}: {firmware.mcu}, {firmware.app} {firmware.version}"
@@ -152,13 +152,13 @@ def _check_id(bus: BusTalk, nodeid: int, found: Inventory) -> None:
 
 
 async def _tell(bus: BusTalk, uuid: Uuid, nodeid: int) -> None:
-    """Tell the node its id until it waits no more."""
+    """Send the node its id until it no longer waits for one."""
     for _ in range(TRIES):
         bus.send_frame(ADMIN_ID, bytes((SET_NODEID, *uuid.raw, nodeid)))
         found = await discover_nodes(bus, rounds=2)
         if all(node.uuid != uuid for node in found.waiting):
             return
     raise AssignError(
-        f"node {uuid} on {bus.name} was told id {nodeid} {TRIES} times and still waits for one; the bus may "
-        f"lose frames ('canductor can doctor {where(bus.options)}'), or two boards have this uuid"
+        f"node {uuid} on {bus.name} was sent the id {nodeid} {TRIES} times and still waits for one; the "
+        f"bus may lose frames ('canductor can doctor {where(bus.options)}'), or two boards have this uuid"
     )

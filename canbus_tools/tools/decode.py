@@ -29,7 +29,7 @@ LINES_HELD: Final = 500
 LOOK_S: Final = 0.1
 """How soon Ctrl-C is noticed while nothing comes in."""
 BUSES_MAX: Final = 64
-"""Names of buses that are told apart; a recording with more is no recording."""
+"""Names of buses that are distinguished; a file with more is no recording."""
 _MOMENT: Final = re.compile(r"(\+?)(\d{1,12}(?:\.\d{1,9})?)\Z")
 
 
@@ -159,7 +159,7 @@ class Decoding:
             raise _StoppedError
 
     def _feed(self, frames: Sequence[Frame]) -> bool:
-        """Decode FRAMES; tells whether the end was reached.
+        """Decode FRAMES; return whether the end was reached.
 
         Step by step for all of them, not frame by frame: so each step stays in the processor's cache, which
         makes it a quarter faster.

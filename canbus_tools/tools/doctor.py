@@ -93,7 +93,7 @@ def examine(
             note(
                 "bitrate-unknown",
                 f"the bit rate of {place.name} is not known here",
-                "how busy the bus is cannot be told",
+                "the load of the bus cannot be computed",
                 "give it, such as --bitrate 1000000",
             )
         )

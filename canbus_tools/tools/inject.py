@@ -222,7 +222,7 @@ class Injection:
             await asyncio.sleep(min(TICK_S, left_s))
 
     def _say_ready(self) -> None:
-        """Tell how to get on the bus: in JSON as a line of its own, for programs that start this one."""
+        """Print how to attach to the bus: in JSON on a line of its own, for programs that start this one."""
         path, server = self._options.path, self._server
         uuids = {name: uuid_of(place) for place, name in enumerate(self._processes)}
         if self._options.json:

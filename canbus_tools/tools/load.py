@@ -97,7 +97,7 @@ def find_bitrate(options: BusOptions) -> int:
             " reckon with, such as --bitrate 1000000"
         )
     raise CanductorError(
-        f"CAN bus {options.name}: python-can does not tell the bit rate; give it, such as --bitrate 1000000"
+        f"CAN bus {options.name}: python-can does not report the bit rate; give it, such as --bitrate 1000000"
     )
 
 

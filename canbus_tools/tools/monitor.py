@@ -170,7 +170,7 @@ class Lines:
         )
 
     def _tell_guesses(self) -> None:
-        """Say it once of each; there are at most 255 nodes, and 64 dictionaries in the cache."""
+        """Report each only once; there are at most 255 nodes, and 64 dictionaries in the cache."""
         guesses = {guess for node in self._watch.decoder.nodes.values() if (guess := node.guess)}
         for guess in sorted(guesses - self._told):
             sys.stderr.write(f"canductor: {guess}\n")

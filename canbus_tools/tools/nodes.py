@@ -197,7 +197,7 @@ def _notes(found: Inventory, bus: BusOptions) -> list[str]:
     if any(entry.state is NodePresence.IN_USE for entry in entries):
         notes.append(
             "Nodes in use were not asked, so as not to disturb their host. The coordinator that drives them "
-            "tells what they are; of nodes of other hosts a uuid is known when their firmware is canductor's."
+            "reports what they are; of nodes of other hosts a uuid is known if their firmware is canductor's."
         )
     if any(entry.passive for entry in entries):
         notes.append(
@@ -206,7 +206,7 @@ def _notes(found: Inventory, bus: BusOptions) -> list[str]:
         )
     elif any(entry.state is NodePresence.IN_USE for entry in entries):
         notes.append(
-            "Their traffic tells what they are when their dictionary is in the cache: run this once while "
+            "Their traffic reveals what they are if their dictionary is in the cache: run this once while "
             "their host is stopped."
         )
     return notes

@@ -93,7 +93,7 @@ class ReleaseReport:
         }
 
     def to_text(self) -> str:
-        """Say it in one line."""
+        """Return one line."""
         return self.text
 
 
@@ -159,7 +159,7 @@ async def _find(bus: BusTalk, uuid: Uuid, discovery: DiscoveredNodes, *, force: 
 
 
 async def _reset(bus: BusTalk, nodeid: int) -> Uuid | None:
-    """Reset the node; return its uuid where its firmware tells."""
+    """Reset the node; return its uuid if its firmware reports one."""
     async with bus.node(nodeid) as talk:
         if RESET not in talk.dictionary.commands or talk.dictionary.commands[RESET].names:
             raise AssignError(
@@ -187,6 +187,6 @@ async def _returned(bus: BusTalk, nodeid: int, uuid: Uuid | None, before: Discov
             if node.uuid == uuid or (uuid is None and node.uuid not in known):
                 return node
     raise AssignError(
-        f"node {uuid or nodeid} on {bus.name} was told to reset and does not wait for an id after "
+        f"node {uuid or nodeid} on {bus.name} was reset and does not wait for an id after "
         f"{RETURN_S:g} s; another host may have given it one again, else switch it off and on"
     )

@@ -59,7 +59,7 @@ class Compensation:
         self.wanted = others if table is None else {**others, axis: table}
 
     def is_due(self, homed: str) -> bool:
-        """Return whether ``resume_program`` has something to do, with the axes HOMED (capital letters)."""
+        """Return whether ``take_up`` has something to do, with the axes HOMED (capital letters)."""
         if self._looked_at == (self.wanted, homed):  # most of the time: the same map
             return False
         due = any(self._may_use(axis, homed) is not self._taken.get(axis) for axis in AXES)

@@ -89,7 +89,7 @@ def _send(given: argparse.Namespace) -> Answer:
 
 def _estop(given: argparse.Namespace) -> Answer:
     result = target_of(given).call("machine.emergency_stop")
-    return Answer(result, "stopped: every node was told to shut down")
+    return Answer(result, "stopped: every node was ordered to shut down")
 
 
 # --------------------------------------------------------------------------------------------------- call

@@ -216,12 +216,12 @@ def _notes(table: AxisTable, config: Path | None) -> list[str]:
     if why := why_not_corrected(description, table):
         raise TableError(why)
     rail = rails[table.axis]
-    told = notes(table, rail.position_min, rail.position_max)
+    lines = notes(table, rail.position_min, rail.position_max)
     if description.axis_tables is None:
-        told.append("the machine takes no tables: add [axis_tables] to its configuration")
+        lines.append("the machine takes no tables: add [axis_tables] to its configuration")
     elif len(table.positions) > description.axis_tables.points:
-        told.append(f"the machine has room for {description.axis_tables.points} points: raise 'points'")
-    return told
+        lines.append(f"the machine has room for {description.axis_tables.points} points: raise 'points'")
+    return lines
 
 
 def _answer(result: Any, lines: list[str], downloads: Sequence[Mapping[str, Any]] = ()) -> Answer:

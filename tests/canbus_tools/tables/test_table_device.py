@@ -231,7 +231,7 @@ def test_a_node_on_a_serial_line_confirms(table: Table, stage: CanStage) -> None
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("send",), "what 'send' is for is missing: --axis of a machine that runs, or --device"),
+        (("send",), "'send' needs --axis of a running machine, or --device"),
         (("send", "--axis", "x", "--stepper", "1"), "--stepper goes with --device"),
         (("send", "--device", "can0"), "give either --axles or --stepper"),
         (("send", "--device", "can0", "--axles", "1", "--stepper", "1"), "give either --axles or --stepper"),

@@ -117,7 +117,7 @@ def test_a_node_that_does_not_take_its_id_is_told_of(stage: CanStage, can_tool: 
     with stage.user(lambda frame: answer if frame == question else None):
         said = can_tool("assign", str(BED), "9")
     assert f"{BED} on " in said.sentence
-    assert "was told id 9 3 times and still waits for one" in said.sentence
+    assert "was sent the id 9 3 times and still waits for one" in said.sentence
 
 
 def test_release_refuses_what_another_host_uses_unless_forced(six: SixNodes, can_tool: Command) -> None:

@@ -1,11 +1,12 @@
 """The command line: words become options, every end is one sentence, with --json one object."""
 
+import argparse
 import json
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 
 from coordinator.cli import main as cli
 from coordinator.cli.commands.run import RunOptions
+from coordinator.cli.parser import build_parser
 from coordinator.demo.run import DemoOptions
 from coordinator.planning.options import PlanOptions
 from coordinator.support.examples import DEMO_MACHINE
@@ -300,3 +302,25 @@ def test_a_mistaken_tool_line_names_the_tools_own_help(
 ) -> None:
     assert cli.main(words.split()) == 2
     assert capsys.readouterr().err.endswith(f" (see '{told}')\n")
+
+
+def test_every_command_has_a_help(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each option is explained, and what argparse puts into the text fits."""
+    monkeypatch.setenv("COLUMNS", "120")
+    commands = list(leaf_commands(build_parser()))
+    assert len(commands) > 30
+    for command in commands:
+        assert cli.main([*command.prog.split()[1:], "--help"]) == 0
+        assert capsys.readouterr().out == command.format_help()
+        assert all(action.help for action in command._actions), command.prog
+
+
+def leaf_commands(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    groups = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    if not groups:
+        yield parser
+    for group in groups:
+        for command in group.choices.values():
+            yield from leaf_commands(command)

@@ -79,7 +79,8 @@ def test_a_path_that_cannot_be_served(tmp_path: Path) -> None:
 
 
 def test_the_word_goes_with_serving(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    words = ["run", str(tmp_path / "printer.cfg"), "--klippy-api", str(tmp_path / "s"), "--gcode", "x"]
+    config = str(tmp_path / "printer.cfg")
+    words = ["run", config, "--klippy-api", str(tmp_path / "s"), "--gcode", config]
     (tmp_path / "printer.cfg").write_text("")
     assert cli.main(words) != 0
-    assert "--gcode prints a file and ends" in capsys.readouterr().err
+    assert "--gcode prints a file and exits" in capsys.readouterr().err

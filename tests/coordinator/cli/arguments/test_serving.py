@@ -1,11 +1,14 @@
-"""The words about serving: the page beyond this computer only with what protects it."""
+"""The options that serve a machine: what is reachable from other computers needs protection."""
 
 from pathlib import Path
 
 import pytest
 
 from coordinator.cli import main as cli
+from coordinator.cli.arguments.serving import declare_serving, serving_options
+from coordinator.front_ends.serve import ServeOptions
 from coordinator.support.examples import DEMO_GCODE, DEMO_MACHINE
+from nodes.support.option_values import Parser, UsageError
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -63,3 +66,96 @@ def test_what_a_machine_cannot_be_run_with(
     err = capsys.readouterr().err
     assert sentence in err
     assert err.count("\n") == 1
+
+
+def test_the_library_is_named_when_it_is_missing(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real: Callable[..., Any] = builtins.__import__
+
+    def without(name: str, *rest: Any, **named: Any) -> Any:
+        if name == "coordinator.web.server":
+            raise ModuleNotFoundError("No module named 'aiohttp'", name="aiohttp")
+        return real(name, *rest, **named)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    path = tmp_path / "x.sock"
+    err = refused(capsys, "--ipc", str(path), "--web", "8080")
+    assert err == (
+        "canductor: the live page needs aiohttp, which is not installed; run: pip install aiohttp\n"
+    )
+    assert not path.exists()
+
+
+# ------------------------------------------------------------------------------------- announcing, metrics
+
+
+def served(*words: str, announce: bool | None = None) -> ServeOptions:
+    parser = Parser()
+    declare_serving(parser)
+    return serving_options(parser.parse_args(words), Path("demo.cfg"), announce)
+
+
+@pytest.mark.parametrize(
+    ("words", "of_run", "of_demo"),
+    [
+        ((), None, False),
+        (("--tcp", "x:1", "--tokens", "t"), None, False),
+        (("--tcp", "x:1", "--tokens", "t", "--announce"), True, True),
+        (("--tcp", "x:1", "--tokens", "t", "--no-announce"), False, False),
+        (("--no-announce",), False, False),
+    ],
+)
+def test_announcing(words: tuple[str, ...], of_run: bool | None, of_demo: bool) -> None:
+    assert served(*words).announce is of_run
+    assert served(*words, announce=False).announce is of_demo
+
+
+def test_a_unix_socket_is_not_announced() -> None:
+    with pytest.raises(UsageError, match="--announce needs --tcp"):
+        served("--announce")
+
+
+@pytest.mark.parametrize(
+    ("words", "address"),
+    [
+        ((), None),
+        (("--metrics", "9177"), ("127.0.0.1", 9177)),
+        (("--metrics", "localhost:9177"), ("127.0.0.1", 9177)),
+        (("--metrics", "127.0.0.2:65535"), ("127.0.0.2", 65535)),
+        (("--metrics", "[::1]:9177"), ("::1", 9177)),
+        (("--metrics", "10.0.0.2:9177", "--metrics-open"), ("10.0.0.2", 9177)),
+        (("--metrics", "[::]:9177", "--metrics-open"), ("::", 9177)),
+    ],
+)
+def test_where_the_metrics_are(words: tuple[str, ...], address: tuple[str, int] | None) -> None:
+    assert served(*words).metrics == address
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "http",
+        "",
+        "0",
+        "65536",
+        "٩",
+        "99999999999",
+        "printer.example:9177",
+        "[::1]",
+        "1.2.3:5",
+        "127.0.0.1:-1",
+        ":",
+    ],
+)
+def test_what_is_no_metrics_address(word: str) -> None:
+    with pytest.raises(UsageError, match="must be a port, or an IP address and a port"):
+        served(f"--metrics={word}", "--metrics-open")
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "10.0.0.2", "[::]", "[fe80::1%eth0]"])  # noqa: S104
+def test_others_read_the_metrics_only_if_they_are_to(host: str) -> None:
+    with pytest.raises(UsageError, match="needs --metrics-open"):
+        served("--metrics", f"{host}:9177")
+    with pytest.raises(UsageError, match="goes with --metrics"):
+        served("--metrics-open")
