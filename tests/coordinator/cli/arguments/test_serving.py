@@ -68,25 +68,6 @@ def test_what_a_machine_cannot_be_run_with(
     assert err.count("\n") == 1
 
 
-def test_the_library_is_named_when_it_is_missing(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real: Callable[..., Any] = builtins.__import__
-
-    def without(name: str, *rest: Any, **named: Any) -> Any:
-        if name == "coordinator.web.server":
-            raise ModuleNotFoundError("No module named 'aiohttp'", name="aiohttp")
-        return real(name, *rest, **named)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    path = tmp_path / "x.sock"
-    err = refused(capsys, "--ipc", str(path), "--web", "8080")
-    assert err == (
-        "canductor: the live page needs aiohttp, which is not installed; run: pip install aiohttp\n"
-    )
-    assert not path.exists()
-
-
 # ------------------------------------------------------------------------------------- announcing, metrics
 
 
