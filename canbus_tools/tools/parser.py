@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Callable, Mapping
 from typing import Any, Final, Protocol
 
-from canbus_tools.bus.computer import Computer
+from canbus_tools.bus.computer import Computer, ThisComputer
 from canbus_tools.dissector import dissector
 from canbus_tools.tools import (
     assign_id,
@@ -54,7 +54,7 @@ TOOLS: Final[Mapping[str, tuple[Tool, str]]] = {
 
 
 def add_to(commands: Any) -> None:
-    """Add ``can`` with all tools, and ``console``; they run on ``given.computer``."""
+    """Add ``can`` with all tools, and ``console``; they run on ``given.computer`` where tests give one."""
     tools = add_group(commands, "can", "find, watch and debug nodes on a CAN bus", "TOOL")
     for name, (module, summary) in TOOLS.items():
         _add(tools, name, module, summary)
@@ -63,6 +63,6 @@ def add_to(commands: Any) -> None:
 
 def _add(commands: Any, name: str, tool: Tool, summary: str) -> None:
     def run(given: argparse.Namespace) -> Any:
-        return tool.make_job(given)(given.computer)
+        return tool.make_job(given)(getattr(given, "computer", None) or ThisComputer())
 
     add_command(commands, name, summary, tool.declare, run)
