@@ -78,7 +78,7 @@ class MpcTune:
         return self._hold(now_s, measured_c) if self.phase is TunePhase.HOLD else 0.0
 
     def settled(self, measured_c: float, target_c: float) -> bool:
-        """Tell whether it is done."""
+        """Return whether it is done."""
         del measured_c, target_c
         return self.model is not None
 

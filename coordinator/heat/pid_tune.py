@@ -66,7 +66,7 @@ class RelayTune:
         return self.max_power if self._heating and self.gains is None else 0.0
 
     def settled(self, measured_c: float, target_c: float) -> bool:
-        """Tell whether it is done."""
+        """Return whether it is done."""
         del measured_c, target_c
         return self.gains is not None
 
