@@ -21,7 +21,7 @@ from coordinator.config.unsupported import UNSUPPORTED_SECTIONS
 from coordinator.modules.registry import own_modules, own_option_readers
 
 _BEGIN: Final = "<!-- The tables below"
-_END: Final = "## Sections that do not act yet\n"
+_END: Final = "## Sections that are not supported yet\n"
 SECTIONS: dict[str, SectionSpec] = {
     "[mcu], [mcu NAME]": read_nodes.MCU,
     "[printer]": read_printer.PRINTER,
@@ -89,12 +89,12 @@ def section_table(title: str) -> str:
         lines.append(_row(replace(spec.family, name=f"{spec.family.name}NAME")))
     if spec.later:
         names = ", ".join(f"`{name}`" for name in spec.later)
-        lines += ["", f"Recognised, not yet acting: {names}."]
+        lines += ["", f"Not supported yet, ignored: {names}."]
     return "\n".join(lines) + "\n"
 
 
 def unsupported_sections() -> str:
-    """Return the first words of all sections that do not act yet."""
+    """Return the first words of all sections that are not supported yet."""
     return ", ".join(f"`{name}`" for name in sorted(UNSUPPORTED_SECTIONS)) + ".\n"
 
 

@@ -41,7 +41,7 @@ class RawOption:
     """Where it is given before, under the same header, without effect."""
 
     def is_at(self, place: Place) -> bool:
-        """Tell whether its name or any line of its value stands at PLACE."""
+        """Return whether its name or any line of its value stands at PLACE."""
         return place.path == self.place.path and place.line in (self.place.line, *self.numbers)
 
 

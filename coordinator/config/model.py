@@ -258,7 +258,7 @@ class ModuleSections:
 
 @dataclass(frozen=True, slots=True)
 class Unsupported:
-    """What was recognised but belongs to a module that is not built yet."""
+    """A known section or options that no module supports yet; they are ignored."""
 
     section: str
     place: Place
@@ -269,7 +269,7 @@ class Unsupported:
 
     def __str__(self) -> str:
         what = f"{', '.join(self.options)} of [{self.section}]" if self.options else f"[{self.section}]"
-        return f"{self.place}: {what} recognised, not yet acting" + (self.reason and f": {self.reason}")
+        return f"{self.place}: {what}: not supported yet, ignored" + (self.reason and f": {self.reason}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -174,7 +174,7 @@ class ChoiceOption(Option[str]):
 
     choices: tuple[str, ...]
     later: tuple[str, ...] = ()
-    """Words known from other hosts that do not act yet."""
+    """Words known from other hosts that are not supported yet."""
 
     def parse(self, text: str) -> str:
         """Return the word."""
@@ -300,7 +300,7 @@ class SectionSpec:
     help: str
     options: tuple[Option[Any], ...]
     later: tuple[str, ...] = ()
-    """Options of modules that are not built yet: recognised, recorded, not acting."""
+    """Options of modules that are not supported yet: recognised, recorded, not acting."""
     elsewhere: tuple[str, ...] = ()
     """Options that another specification of the same section has."""
     family: Option[Any] | None = None
@@ -357,7 +357,7 @@ class SectionReader:
         return {name.removeprefix(family.name): raw for name, raw in found.items()}
 
     def has(self, option: Option[T]) -> bool:
-        """Tell whether the user gave the option; does not count as reading it."""
+        """Return whether the user gave the option; does not count as reading it."""
         return option.name in self.section.options
 
     def place_of(self, option: Option[T]) -> Place:

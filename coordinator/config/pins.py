@@ -182,14 +182,14 @@ class PinRegistry:
                     wanted.place, f"{wanted.purpose}: there is no [{MULTI_PIN} {pin.name}]{hint}"
                 )
             section = f"{MULTI_PIN} {pin.name}"
-        return f"{wanted.purpose} is a pin of [{section}], which does not act yet"
+        return f"{wanted.purpose} is a pin of [{section}], which is not supported yet"
 
     def claimed(self, node: str) -> list[str]:
         """Return the names of NODE's pins that are in use."""
         return [name for other, name in self._users if other == node]
 
     def check_unclaimed(self, options: Iterable[RawOption], section: str) -> None:
-        """Raise ConfigError when a section that does not act yet names a pin that is not to be shared.
+        """Raise ConfigError when a section that is not supported yet names a pin that is not to be shared.
 
         Pins it names wrongly are left to its module.
         """

@@ -1,4 +1,4 @@
-"""Names users bring along: sections and options of modules that are not built yet.
+"""Names users bring along: sections and options of modules that are not supported yet.
 
 Recognising them keeps a printer.cfg usable unchanged, and keeps a typo a typo. When a module is built, its
 names leave this table.
@@ -30,9 +30,9 @@ UNSUPPORTED_SECTIONS = frozenset(
         *_words("heated_fan indx"),
     )
 )
-"""First words of sections that are recognised and reported as not yet acting."""
+"""First words of sections that are recognised and reported as not supported yet."""
 
 LATER_EXTRUDER_OPTIONS = _words("per_move_pressure_advance shared_heater")
-"""Those of its heater and sensor that do not act yet: coordinator/config/sections/heater_options.py."""
+"""Those of its heater and sensor are in coordinator/config/sections/heater_options.py."""
 LATER_MCU_OPTIONS = _words("is_non_critical reconnect_interval max_stepper_error")
 UNSUPPORTED_STEPPER_OPTIONS = _words("homing_current min_home_dist use_sensorless_homing")

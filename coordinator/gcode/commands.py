@@ -43,7 +43,7 @@ class Call:
     extruder: str = ""
     """The active extruder; empty where there is none."""
     figures: Callable[[], Mapping[str, Mapping[str, object]]] = dict
-    """Tells ``toolhead`` and ``gcode_move`` as they are there (gcode/figures.py)."""
+    """Return ``toolhead`` and ``gcode_move`` as they are there (gcode/figures.py)."""
     while_printing: bool = False
     """Whether a client gives it while a job prints, which must not wait for it."""
 
@@ -155,7 +155,7 @@ class Vocabulary:
     """Commands that a job has to stand still for between two of its lines, and macros in which they come."""
     unsupported: Mapping[str, str] = field(default_factory=dict)
     """Why, by the name of a command that a section of the configuration should bring, nothing acts on it:
-    ``[bed_mesh] does not act yet``."""
+    ``[bed_mesh] is not supported yet``."""
     set_ups: "tuple[Callable[[Planner], None], ...]" = ()
     """Called for every program that begins."""
 

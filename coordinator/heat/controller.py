@@ -19,7 +19,7 @@ class Controller(Protocol):
         ...
 
     def settled(self, measured_c: float, target_c: float, /) -> bool:
-        """Tell whether who waits for the target may go on."""
+        """Return whether who waits for the target may go on."""
         ...
 
 

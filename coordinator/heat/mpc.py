@@ -138,7 +138,7 @@ class Mpc:
         return self._power_w / self.model.power_w
 
     def settled(self, measured_c: float, target_c: float) -> bool:
-        """Tell whether the target is reached and held."""
+        """Return whether the target is reached and held."""
         return abs(target_c - measured_c) <= NEAR_K and abs(self._slope.k_per_s) <= SLOW_K_PER_S
 
     def _flow_w(self, estimate: _Estimate, mm_per_s: float) -> float:

@@ -60,5 +60,5 @@ class Pid:
         self._slope, self._integral_power = before.held
 
     def settled(self, measured_c: float, target_c: float) -> bool:
-        """Tell whether the target is reached and held."""
+        """Return whether the target is reached and held."""
         return abs(target_c - measured_c) <= NEAR_K and abs(self._slope.k_per_s) <= SLOW_K_PER_S

@@ -18,5 +18,5 @@ class Watermark:
         return self._max_power if self._heating else 0.0
 
     def settled(self, measured_c: float, target_c: float) -> bool:
-        """Tell whether the target is reached."""
+        """Return whether the target is reached."""
         return measured_c >= target_c - self._max_delta_k

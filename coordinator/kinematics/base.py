@@ -69,7 +69,7 @@ class WorkSpace:
     """Of a delta: length of its shortest rod, which lies flatter the further the head is out. 0: no delta."""
 
     def contains(self, point: Point) -> bool:
-        """Tell whether the head may be at POINT."""
+        """Return whether the head may be at POINT."""
         radius = math.hypot(point[0], point[1])
         x, y, z = point
         inside = all(a <= p <= b for a, p, b in zip(self.low[:2], (x, y), self.high[:2], strict=True))

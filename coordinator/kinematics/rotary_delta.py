@@ -156,7 +156,7 @@ class RotaryDelta(Kinematics):
         return min(tops)
 
     def _reaches(self, radius: float) -> bool:
-        """Tell whether the arms stay away from being stretched on the rims of the cylinder."""
+        """Return whether the arms stay away from being stretched on the rims of the cylinder."""
         top = self._top(radius)
         return top >= self.min_z and all(
             self._leverage(arm, (radius * math.cos(direction), radius * math.sin(direction), z))

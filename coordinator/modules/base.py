@@ -51,17 +51,17 @@ class Modules(Protocol):
         """Return the section names of all modules of KIND, in the order of the file."""
 
     def is_left_out(self, name: str) -> bool:
-        """Tell whether NAME, a section or a heater of that name, is one that does not act yet."""
+        """Return whether NAME, a section or a heater of that name, is one that is not supported yet."""
 
     def knows(self, command: str) -> bool:
-        """Tell whether programs know COMMAND, by a module or anyway."""
+        """Return whether programs know COMMAND, by a module or anyway."""
 
     @property
     def command_help(self) -> "Mapping[str, str]":
         """What each command of programs does, by its name: a sentence without a full stop."""
 
     def status(self) -> "Mapping[str, Mapping[str, Value]]":
-        """Tell how each module is, by its name; on the control loop."""
+        """Report how each module is, by its name; on the control loop."""
 
     @property
     def config(self) -> "Mapping[str, Mapping[str, str]]":
@@ -108,11 +108,11 @@ class Module:
         """Release what it holds."""
 
     def status(self) -> Mapping[str, Value]:
-        """Tell how it is: for macros and front ends; cheap, and not changed afterwards."""
+        """Report how it is: for macros and front ends; cheap, and not changed afterwards."""
         return {}
 
     def stands_for(self) -> Mapping[str, set[str]]:
-        """Tell which of its commands stand for lines of g-code, each with what may be commands in them."""
+        """Report which of its commands stand for lines of g-code, each with what may be commands in them."""
         return {}
 
 
@@ -192,10 +192,10 @@ class Build:
     def needs_acting(self, section: str) -> None:
         """Raise NotSupported if SECTION stands in the configuration and nothing acts on its kind yet."""
         if section in self.later:
-            raise NotSupported(self.place, f"it is for [{section}], which does not act yet")
+            raise NotSupported(self.place, f"it is for [{section}], which is not supported yet")
 
     def note(self, option: Option[Any], sentence: str) -> None:
-        """Tell the user something about an option that is no mistake; SENTENCE goes on after its name."""
+        """Report the user something about an option that is no mistake; SENTENCE goes on after its name."""
         self.notes.append(f"{self.reader.place_of(option)}: '{option.name}' of [{self.name}] {sentence}")
 
     def add_device(self, node: str, device: Device) -> None:
@@ -232,7 +232,7 @@ class Build:
             if found is None:
                 if modules.is_left_out(name):
                     raise NotSupported(
-                        self.reader.place_of(option), f"it needs [{name}], which does not act yet"
+                        self.reader.place_of(option), f"it needs [{name}], which is not supported yet"
                     )
                 others = modules.names(kind)
                 hint = nearest(name, others, pattern="[{}]") or f"; there is {', '.join(others) or 'none'}"

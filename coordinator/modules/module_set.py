@@ -102,7 +102,7 @@ class _LinkNotSupported(Exception):  # noqa: N818 (no mistake)
 
 @contextlib.contextmanager
 def _blamed(kind: type[Module], place: Place) -> Iterator[None]:
-    """Tell the user whose module it was that raised what it must not; a bug of our own stays one."""
+    """Report the user whose module it was that raised what it must not; a bug of our own stays one."""
     try:
         yield
     except CanductorError:
@@ -143,7 +143,7 @@ class ModuleSet:
         self.notes: list[str] = []
         """Sentences about what is no mistake."""
         self.left_out: dict[str, LeftOut] = {}
-        """Sections whose module does not act, as something that it depends on does not act yet."""
+        """Sections whose module does not act, as something that it depends on is not supported yet."""
         self._live: ModuleContext | None = None
         self._homing = self.shared(Homing)
         self._motors = self.shared(MotorPower)
@@ -273,7 +273,7 @@ class ModuleSet:
     # ---------------------------------------------------------------------------------------- looking up
 
     def knows(self, command: str) -> bool:
-        """Tell whether programs know COMMAND, by a module or anyway."""
+        """Return whether programs know COMMAND, by a module or anyway."""
         return command in self._commands or command in HANDLERS
 
     @property
@@ -284,12 +284,12 @@ class ModuleSet:
         for name, absent in ABSENT.items():
             section = next((kinds[kind] for kind in absent.sections if kind in kinds), None)
             if section is not None and name not in self._commands:
-                found[name] = f"[{section}] does not act yet"
+                found[name] = f"[{section}] is not supported yet"
         for left in reversed(self.left_out.values()):
             kind = left.name.partition(" ")[0].rstrip("0123456789")
             for name, absent in ABSENT.items():
                 if kind in absent.sections and name not in self._commands:
-                    found[name] = f"[{left.name}] does not act yet: {left.reason}"
+                    found[name] = f"[{left.name}] is not supported yet: {left.reason}"
         return found
 
     @property
@@ -306,7 +306,7 @@ class ModuleSet:
         return [module.name for module in self._modules if isinstance(module, kind)]
 
     def is_left_out(self, name: str) -> bool:
-        """Tell whether NAME, a section or a heater of that name, is one that does not act yet."""
+        """Return whether NAME, a section or a heater of that name, is one that is not supported yet."""
         return name in self.left_out or f"heater_generic {name}" in self.left_out
 
     def of(self, kind: type[K]) -> Iterator[K]:
@@ -379,7 +379,7 @@ class ModuleSet:
             module.ready()
 
     def job_begins(self) -> None:
-        """Tell all that a file is going to be printed."""
+        """Report all that a file is going to be printed."""
         for module in self._modules:
             module.job_begins()
 
@@ -388,7 +388,7 @@ class ModuleSet:
         self._motors.on(steppers)
 
     def stopped(self, cause: str) -> None:
-        """Tell all that the machine is stopped."""
+        """Report all that the machine is stopped."""
         if self._live is not None:
             for module in self._modules:
                 module.stopped(cause)
@@ -403,5 +403,5 @@ class ModuleSet:
         self._live = None
 
     def status(self) -> Mapping[str, Mapping[str, Value]]:
-        """Tell how each is, by the name of its section."""
+        """Report how each is, by the name of its section."""
         return {module.name: status for module in self._modules if (status := module.status())}

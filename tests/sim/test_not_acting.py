@@ -40,11 +40,11 @@ def test_it_is_refused_or_skipped_with_a_notice(tmp_path: Path) -> None:
         await gcode(stage, "G28 X Y")
         assert "homed" in await refusal(stage, "G1 Z5 F600")
         heats = await refusal(stage, "M109 S200")
-        assert "M109 heats, but [extruder] does not act yet: its sensor is a MAX31865" in heats
+        assert "M109 heats, but [extruder] is not supported yet: its sensor is a MAX31865" in heats
         await gcode(stage, "M104 S0")
         assert "cold" in await refusal(stage, "G1 E5 F300")
-        assert "[bed_mesh] does not act yet" in await refusal(stage, "BED_MESH_CALIBRATE")
-        assert "[bed_mesh] does not act yet" in await refusal(stage, "G29")
+        assert "[bed_mesh] is not supported yet" in await refusal(stage, "BED_MESH_CALIBRATE")
+        assert "[bed_mesh] is not supported yet" in await refusal(stage, "G29")
         await gcode(stage, "QUAD_GANTRY_LEVEL", "SET_LED LED=light RED=1", "BED_MESH_CLEAR", "WHAT_IS_THIS")
         stage.write_job("G28 X Y\nBED_MESH_PROFILE LOAD=default\nG1 X20 F6000\n")
         await stage.call("job.start", file="job.gcode")

@@ -53,7 +53,7 @@ class Reading:
     def finish(self, reader: SectionReader, *, waiting: tuple[str, ...] = ()) -> None:
         """Finish a section and note which options wait for a module; raises ConfigError for useless ones.
 
-        WAITING: names of options that were read and checked but do not act yet.
+        WAITING: names of options that were read and checked but are not supported yet.
         """
         unread = {option.name for option in reader.finish()}
         names = tuple(name for name in reader.section.options if name in unread or name in waiting)

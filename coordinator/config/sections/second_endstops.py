@@ -48,7 +48,7 @@ def _with_own(reading: Reading, frame: Frame, rail: RailDescription) -> RailDesc
 
 
 def _moves_by_itself(frame: Frame, rail: RailDescription) -> bool:
-    """Tell whether RAIL is an axis, its steppers move nothing else, and nothing else moves it."""
+    """Return whether RAIL is an axis, its steppers move nothing else, and nothing else moves it."""
     if rail.axis not in "xyz":
         return False
     axis = "xyz".index(rail.axis)

@@ -150,11 +150,11 @@ LATER_SENSOR_OPTIONS: Final = (
     *_words("aht10_report_time htu21d_hold_master htu21d_resolution htu21d_report_time sht3x_report_time"),
     *_words("lm75_report_time"),
 )
-"""Of sensors on SPI, I2C and a single wire, which are not built yet."""
+"""Of sensors on SPI, I2C and a single wire, which are not supported yet."""
 LATER_SENSORS: Final = frozenset(
     (
         *_words("MAX6675 MAX31855 MAX31856 MAX31865 BME280 BMP280 BMP180 BMP388 BME680 AHT10 AHT20 AHT21"),
         *_words("HTU21D SI7013 SI7020 SI7021 SHT21 SHT3X LM75 DS18B20 SDS011"),
     )
 )
-"""Sensors known from other hosts that do not act yet."""
+"""Sensors known from other hosts that are not supported yet."""

@@ -99,7 +99,7 @@ def claim(reader: SectionReader, option: PinOption, pins: PinRegistry) -> PinDes
 
 
 def is_extra_stepper(name: str) -> bool:
-    """Tell whether a section is a further stepper of a rail, such as stepper_z1."""
+    """Return whether a section is a further stepper of a rail, such as stepper_z1."""
     return _EXTRA_STEPPER.fullmatch(name) is not None
 
 

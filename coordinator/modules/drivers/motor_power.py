@@ -78,11 +78,11 @@ class MotorPower(Module):
             line.on = False
 
     def status(self) -> dict[str, Value]:
-        """Tell which motors are on."""
+        """Report which motors are on."""
         return {"steppers": dict(self.are_on())}
 
     def are_on(self) -> "Mapping[str, bool]":
-        """Tell which motors are on, of those with an enable pin."""
+        """Report which motors are on, of those with an enable pin."""
         return {name: line.on for line in self._lines for name in line.steppers}
 
     def on(self, steppers: "Collection[str]") -> None:

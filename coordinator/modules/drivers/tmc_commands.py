@@ -28,7 +28,7 @@ class TmcCommands(Module):
         self._drivers: dict[str, TmcDriver] = {}
         self._wires: dict[tuple[str, str, str], TmcUart] = {}
         for name, text, read in (
-            ("INIT_TMC", "write all registers of the driver of STEPPER= anew", self._init),
+            ("INIT_TMC", "write all registers of the driver of STEPPER= again", self._init),
             ("DUMP_TMC", "show the registers of the driver of STEPPER=, or only REGISTER=", self._dump),
             (
                 "SET_TMC_CURRENT",

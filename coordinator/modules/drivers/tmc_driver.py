@@ -55,7 +55,7 @@ class TmcDriver(StallEndstop):
         self.stepper = _stepper(build)
         select = build.reader.section.options.get("select_pins")
         if select is not None:
-            raise NotSupported(select.place, "drivers that are chosen by select_pins are not built yet")
+            raise NotSupported(select.place, "drivers that are chosen by select_pins are not supported yet")
         self.settings = DriverSettings(build, self.CHIP, self.stepper)
         self.address = build.get(UART_ADDRESS if self.CHIP.addresses > 1 else ONLY_UART_ADDRESS)
         if self.CHIP.has_stallguard:
@@ -297,6 +297,6 @@ def _stepper(build: Build) -> "StepperDescription":
         hint = nearest(build.instance, steppers) or f"; there is {', '.join(steppers)}"
         raise ConfigError(
             build.place,
-            f"[{build.name}] is for the stepper {shown(build.instance)}, which there is not{hint}",
+            f"[{build.name}] refers to unknown stepper {shown(build.instance)}{hint}",
         )
     return found

@@ -187,7 +187,7 @@ class FanUnit:
         self._output.set(node, live.ticks_at(self.node, at_s), speed * self._max_power)
 
     def status(self) -> Mapping[str, Value]:
-        """Tell how it is."""
+        """Report how it is."""
         return {"speed": round(self.speed, 4), "rpm": None if self.rpm is None else round(self.rpm, 1)}
 
 
@@ -210,5 +210,5 @@ class FanModule(Module):
         self.unit.end()
 
     def status(self) -> Mapping[str, Value]:
-        """Tell how the fan is."""
+        """Report how the fan is."""
         return self.unit.status()

@@ -176,7 +176,7 @@ class TemperatureFan(FanModule):
         live.say(f"[{self.name}] runs at its highest speed: its sensor says nothing any more; {where}")
 
     def status(self) -> Mapping[str, Value]:
-        """Tell the fan and the temperature."""
+        """Report the fan and the temperature."""
         celsius = self.input.celsius
         return {
             **self.unit.status(),

@@ -146,7 +146,7 @@ class Heater:
         self.input.end(cause)
 
     def status(self) -> Mapping[str, Value]:
-        """Tell how it is."""
+        """Report how it is."""
         status: dict[str, Value] = {
             "temperature": _rounded(self.input.celsius),
             "target": self.target_c,

@@ -32,7 +32,7 @@ class HeaterRegistry(Module):
         """By what programs call them: heaters and the sections of sensors."""
         self._tags: dict[str, Heater | TemperatureSource] = {}
         for name, help_, read in (
-            ("M105", "Tell all temperatures", self._tell),
+            ("M105", "Report all temperatures", self._tell),
             ("TURN_OFF_HEATERS", "Let all heaters cool down", self._turn_off),
             ("SET_HEATER_TEMPERATURE", "Set a heater's target: HEATER= TARGET=", self._set),
         ):
@@ -43,7 +43,7 @@ class HeaterRegistry(Module):
                 "Wait until a temperature is in a range: SENSOR= MINIMUM= MAXIMUM=",
                 self._wait,
             ),
-            ("QUERY_ADC", "Tell what a sensor's converter reads: NAME= PULLUP=", self._query),
+            ("QUERY_ADC", "Report what a sensor's converter reads: NAME= PULLUP=", self._query),
             ("PID_CALIBRATE", "Find a heater's PID constants: HEATER= TARGET=", self._pid),
             (
                 "MPC_CALIBRATE",
@@ -68,7 +68,7 @@ class HeaterRegistry(Module):
             self._tags[tag] = source
 
     def status(self) -> Mapping[str, Value]:
-        """Tell what there is."""
+        """Report what there is."""
         calibrated: dict[str, Value] = {
             unit.name: dict(unit.calibrated) for unit in self.units.values() if unit.calibrated
         }

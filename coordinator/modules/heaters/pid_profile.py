@@ -66,7 +66,7 @@ class PidProfiles(Module):
         self._live = live
 
     def status(self) -> Mapping[str, Value]:
-        """Tell which profile each heater has; those that have none are left out."""
+        """Report which profile each heater has; those that have none are left out."""
         return {"loaded": dict(self._loaded)}
 
     def _read(self, call: Call) -> Reading:

@@ -50,7 +50,7 @@ class HeaterSection(Module):
         self.unit.end("the machine was closed")
 
     def status(self) -> Mapping[str, Value]:
-        """Tell how the heater is."""
+        """Report how the heater is."""
         return self.unit.status()
 
 
@@ -120,9 +120,7 @@ class ExtruderHeaterCommands(Module):
             if name not in self._extruders:
                 last = len(self._extruders) - 1
                 has = f"T0 to T{last}" if last else "only T0"
-                raise WordError(
-                    f"{call.command.name} names the extruder T{index}, which there is not; there is {has}"
-                )
+                raise WordError(f"{call.command.name} refers to unknown extruder T{index}; there is {has}")
         found = self.by_extruder.get(name)
         if found is None or found.unit is None:
             raise WordError(f"{call.command.name}: [{name}] has no heater; give it a heater_pin")
@@ -185,7 +183,7 @@ class ExtruderHeaterSection(Module):
         return celsius is not None and celsius >= self.min_extrude_c
 
     def status(self) -> Mapping[str, Value]:
-        """Tell how the heater is."""
+        """Report how the heater is."""
         if self.unit is None:
             return {}
         return {**self.unit.status(), "can_extrude": self.can_extrude}

@@ -70,7 +70,7 @@ class VerifyHeater(Module):
         known = () if heaters is None else tuple(heaters.units)
         if self.heater not in known:
             if modules.is_left_out(self.heater):
-                raise NotSupported(self.place, f"the heater {self.heater} does not act yet")
+                raise NotSupported(self.place, f"the heater {self.heater} is not supported yet")
             hint = nearest(self.heater, known) or f"; there is {', '.join(known) or 'none'}"
             raise ConfigError(self.place, f"[{self.name}] refers to an unknown heater{hint}")
         assert heaters is not None

@@ -54,11 +54,13 @@ class Homing(Module):
         """Reads G28 in its place; a G28 among the lines that it stands for is homing again."""
         self.corrected: Callable[[ReadHome], ReadHome] | None = None
         """What homing finds, for programs whose X Y Z are not those of the axes."""
-        build.add_command(GCodeCommand("M119", "Tell which endstops are pressed", self._read_query))
-        build.add_command(GCodeCommand("QUERY_ENDSTOPS", "Tell which endstops are pressed", self._read_query))
+        build.add_command(GCodeCommand("M119", "Report which endstops are pressed", self._read_query))
+        build.add_command(
+            GCodeCommand("QUERY_ENDSTOPS", "Report which endstops are pressed", self._read_query)
+        )
 
     def status(self) -> Mapping[str, Value]:
-        """Tell which endstops were pressed when somebody asked last."""
+        """Report which endstops were pressed when somebody asked last."""
         return {"last_query": dict(self._last_query)}
 
     @property
@@ -111,7 +113,7 @@ class Homing(Module):
                 return rail.homing.refused
             if rail.homing.waits:
                 return (
-                    f"the endstop {rail.homing.virtual_endstop} ({rail.place}) does not act yet; give the"
+                    f"the endstop {rail.homing.virtual_endstop} ({rail.place}) is not supported yet; give the"
                     " axis a switch as its endstop_pin"
                 )
         for stepper in self._described.motors:

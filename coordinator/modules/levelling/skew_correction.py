@@ -116,8 +116,8 @@ class Skews(Module):
         build.shared(Homing).corrected = self.home
         for name, help_, read in (
             ("SET_SKEW", "Correct what was measured: XY=AC,BD,AD XZ= YZ=, or CLEAR=1", self._set),
-            ("GET_CURRENT_SKEW", "Tell what is corrected", self._tell),
-            ("CALC_MEASURED_SKEW", "Tell what AC BD AD mean", self._calculate),
+            ("GET_CURRENT_SKEW", "Report the skew that is corrected", self._tell),
+            ("CALC_MEASURED_SKEW", "Report the skew that the lengths AC BD AD mean", self._calculate),
             ("SKEW_PROFILE", "LOAD or SAVE a profile by its name", self._manage),
             (RESTORE, "Let hold what held before a crash", self._restore),
         ):
@@ -136,7 +136,7 @@ class Skews(Module):
         self._live = live
 
     def status(self) -> Mapping[str, Value]:
-        """Tell the profile that was loaded last, and what holds."""
+        """Report the profile that was loaded last, and what holds."""
         factors = {f"{plane.lower()}_skew": getattr(self.now, plane.lower()) for plane in _PLANES}
         return {"current_profile_name": self._profile, **factors}
 

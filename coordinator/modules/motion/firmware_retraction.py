@@ -67,13 +67,13 @@ class FirmwareRetraction(Module):
         build.add_command(GCodeCommand("G11", "Push the filament forward again", self._unretract))
         for name, help_, read in (
             ("SET_RETRACTION", "Change how G10 and G11 act", self._set),
-            ("GET_RETRACTION", "Tell how G10 and G11 act", self._get),
+            ("GET_RETRACTION", "Report the settings of G10 and G11", self._get),
             ("CLEAR_RETRACTION", "Forget that the filament is drawn back, and all changes", self._clear),
         ):
             build.add_command(GCodeCommand(name, help_, read, while_printing=True))
 
     def status(self) -> Mapping[str, Value]:
-        """Tell the settings, and whether the filament is drawn back."""
+        """Report the settings, and whether the filament is drawn back."""
         return {**vars(self._settings), "retracted": self._retracted is not None}
 
     def _retract(self, _call: Call) -> Reading:

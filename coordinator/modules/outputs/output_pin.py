@@ -127,7 +127,7 @@ class OutputPin(Module):
         return given / self._scale
 
     def allows(self, wanted: float) -> bool:
-        """Tell whether it may have a value."""
+        """Return whether it may have a value."""
         return 0 <= wanted <= self._scale if self._pwm else wanted in (0.0, self._scale)
 
     @property

@@ -61,7 +61,7 @@ class ManualProbe(Module):
         self._live = live
 
     def status(self) -> dict[str, Value]:
-        """Tell whether a height is looked for."""
+        """Return whether a height is looked for."""
         return {"is_active": self._accepted is not None}
 
     # ----------------------------------------------------------------------------------------------- begin

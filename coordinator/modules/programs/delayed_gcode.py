@@ -61,7 +61,7 @@ class DelayedGCode(Module):
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
-        """Tell whether it is going to run."""
+        """Return whether it is going to run."""
         return {"waits": self._call_off is not None}
 
     def wait(self, duration_s: float) -> None:

@@ -46,7 +46,7 @@ class ExcludeObject(Module):
         self.only_looks = False
         """Whether no moves are left out, whatever is excluded: a program is read again up to where it was."""
         for name, help_, read, while_printing in (
-            ("EXCLUDE_OBJECT_DEFINE", "Tell of an object", self._define, False),
+            ("EXCLUDE_OBJECT_DEFINE", "Define an object: NAME, CENTER, POLYGON", self._define, False),
             ("EXCLUDE_OBJECT_START", "An object begins", self._start, False),
             ("EXCLUDE_OBJECT_END", "An object ends", self._end, False),
             ("EXCLUDE_OBJECT", "Leave out an object from here on", self._exclude, True),
@@ -54,7 +54,7 @@ class ExcludeObject(Module):
             build.add_command(GCodeCommand(name, help_, read, while_printing=while_printing))
 
     def status(self) -> Mapping[str, Value]:
-        """Tell the objects, which of them are left out, and which one is being read."""
+        """Report the objects, which of them are left out, and which one is being read."""
         return {
             "objects": [_told(found) for found in tuple(self._objects.values())],
             "excluded_objects": [*sorted(self._excluded)],

@@ -124,11 +124,11 @@ class GCodeMacro(Module):
         build.shared(Variables)
 
     def status(self) -> Mapping[str, Value]:
-        """Tell the variables."""
+        """Report the variables."""
         return {name: plain(value) for name, value in dict(self.variables).items()}
 
     def stands_for(self) -> Mapping[str, set[str]]:
-        """Tell which words its lines have."""
+        """Report which words its lines have."""
         return {self.command: words_in(self.text)}
 
     @property

@@ -48,7 +48,7 @@ class PauseResume(Module):
             build.add_command(GCodeCommand(name, help_, read, while_printing=True))
 
     def status(self) -> Mapping[str, Value]:
-        """Tell whether there is a pause."""
+        """Return whether there is a pause."""
         return {"is_paused": self._paused}
 
     def job_begins(self) -> None:

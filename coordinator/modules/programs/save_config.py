@@ -44,7 +44,7 @@ class SaveConfig(Module):
         self._live = live
 
     def status(self) -> dict[str, Value]:
-        """Tell what SAVE_CONFIG would write."""
+        """Report what SAVE_CONFIG would write."""
         if self._live is None:
             return {}
         pending = self._live.machine.unsaved.pending

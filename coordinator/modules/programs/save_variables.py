@@ -65,7 +65,7 @@ class SaveVariables(Module):
         self._writer = None
 
     def status(self) -> Mapping[str, Value]:
-        """Tell the values."""
+        """Report the values."""
         return {"variables": {name: plain(value) for name, value in dict(self._variables).items()}}
 
     def _save(self, call: Call) -> Reading:

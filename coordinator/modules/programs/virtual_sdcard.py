@@ -61,14 +61,14 @@ class VirtualSdcard(Module):
             ("M24", "Print the chosen file, or let the paused job go on", self._start, True),
             ("M25", "Pause the job", self._pause, True),
             ("M26", "Choose where to begin in the file: only S0, its begin", self._seek, False),
-            ("M27", "Tell how far the job is read", self._tell, True),
+            ("M27", "Report how much of the job is read", self._tell, True),
             ("RESUME_INTERRUPTED", "Go on with a job that a crash has ended", self._recover, False),
             ("_ON_ERROR_GCODE", "What is done when a job failed", self._failed, False),
         ):
             build.add_command(GCodeCommand(name, help_, read, while_printing=while_printing))
 
     def status(self) -> Mapping[str, Value]:
-        """Tell which file is printed, and how far it is read."""
+        """Report which file is printed, and how far it is read."""
         name = self._stats.told["filename"] or None
         return {
             **self.place,

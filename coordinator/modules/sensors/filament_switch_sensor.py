@@ -93,7 +93,7 @@ class FilamentSwitchSensor(Module):
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
-        """Tell whether there is filament, and whether that counts."""
+        """Return whether there is filament, and whether that counts."""
         return {"filament_detected": self.switch.pressed, "enabled": self.enabled}
 
     def _changed(self, there: bool) -> None:
@@ -121,7 +121,7 @@ class FilamentSensors(Module):
         super().__init__(build)
         self._all: dict[str, FilamentSwitchSensor] = {}
         for name, help_, read in (
-            ("QUERY_FILAMENT_SENSOR", "Tell whether SENSOR has filament", self._query),
+            ("QUERY_FILAMENT_SENSOR", "Report whether SENSOR has filament", self._query),
             ("SET_FILAMENT_SENSOR", "Let SENSOR count (ENABLE=1) or not (0)", self._set),
             (_RUNOUT, "What is done when filament runs out", self._runout),
             (_INSERT, "What is done when filament comes", self._insert),

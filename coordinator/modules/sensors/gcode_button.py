@@ -48,7 +48,7 @@ class GCodeButton(Module):
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
-        """Tell whether it is pressed."""
+        """Return whether it is pressed."""
         return {"state": "PRESSED" if self._button.pressed else "RELEASED"}
 
     def _changed(self, pressed: bool) -> None:
@@ -71,7 +71,7 @@ class GCodeButtons(Module):
         super().__init__(build)
         self._all: dict[str, GCodeButton] = {}
         build.add_command(
-            GCodeCommand("QUERY_BUTTON", "Tell whether BUTTON is pressed", self._query, while_printing=True)
+            GCodeCommand("QUERY_BUTTON", "Report whether BUTTON is pressed", self._query, while_printing=True)
         )
         build.add_command(GCodeCommand(_COMMAND, "What a button does", self._run, while_printing=True))
 

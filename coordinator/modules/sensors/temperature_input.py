@@ -50,7 +50,7 @@ class TemperatureInput(TemperatureSource):
         self._type = build.get(SENSOR_TYPE)
         if self._type in LATER_SENSORS:
             place = build.reader.place_of(SENSOR_TYPE)
-            raise NotSupported(place, f"its sensor is a {self._type}, which is recognised but not built yet")
+            raise NotSupported(place, f"its sensor is a {self._type}, which is not supported yet")
         super().__init__(
             build.name,
             build.get(MIN_TEMP) if min_c is None else _or(build.find(MIN_TEMP), min_c),

@@ -62,7 +62,7 @@ class TemperatureSensor(SensorModule):
         self._extremes = min(low, celsius), max(high, celsius)
 
     def status(self) -> Mapping[str, Value]:
-        """Tell the temperature, and the lowest and highest since the start."""
+        """Report the temperature, and the lowest and highest since the start."""
         celsius = self.input.celsius
         low, high = self._extremes or (None, None)
         return {

@@ -22,8 +22,8 @@ class Console(Module):
         self._modules: Modules | None = None
         for name, help_, read in (
             ("HELP", "List the commands there are", self._help),
-            ("STATUS", "Tell how the machine is", self._status),
-            ("M115", "Tell what runs the machine", self._identify),
+            ("STATUS", "Report the machine's state", self._status),
+            ("M115", "Report the firmware name and version", self._identify),
         ):
             build.add_command(GCodeCommand(name, help_, read, while_printing=True))
 

@@ -26,12 +26,12 @@ class DisplayStatus(Module):
         for name, help_, read in (
             ("M117", "Show a message", self._show),
             ("SET_DISPLAY_TEXT", "Show MSG; without it, nothing", self._set),
-            ("M73", "Tell how many percent of the program are done", self._tell),
+            ("M73", "Set the progress of the program: P, percent", self._tell),
         ):
             build.add_command(GCodeCommand(name, help_, read, while_printing=True))
 
     def status(self) -> Mapping[str, Value]:
-        """Tell the message, and the progress of 0 to 1; None: not told."""
+        """Report the message, and the progress of 0 to 1; None: not told."""
         return {"message": self._message, "progress": self._progress}
 
     def job_begins(self) -> None:

@@ -19,7 +19,7 @@ class Positions(Module):
         build.add_command(
             GCodeCommand(
                 "GET_POSITION",
-                "Tell where the machine is in all frames; beside a job in those of its program",
+                "Report the position in all frames; while a job prints, in those of the job",
                 self._read,
                 while_printing=True,
             )

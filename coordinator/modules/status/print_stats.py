@@ -38,7 +38,7 @@ class PrintStats(Module):
         build.add_command(
             GCodeCommand(
                 "SET_PRINT_STATS_INFO",
-                "Tell TOTAL_LAYER and CURRENT_LAYER of the job",
+                "Set TOTAL_LAYER and CURRENT_LAYER of the job",
                 self._set,
                 while_printing=True,
             )
@@ -59,7 +59,7 @@ class PrintStats(Module):
         self.job_begins()
 
     def status(self) -> Mapping[str, Value]:
-        """Tell all."""
+        """Report all."""
         layers: dict[str, Value] = {"total_layer": self._total, "current_layer": self._current}
         return {**self.told, "info": layers}
 

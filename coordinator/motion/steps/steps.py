@@ -129,6 +129,11 @@ class StepGenerator:
             )
         self._memory = ffi.new("char[]", size)
         self._gen = lib.step_gen_init(self._memory, config.struct)
+        if self._gen == ffi.NULL:
+            raise StepError(
+                f"one of the steppers {[s.name for s in steppers]} has no position with the axes at {start}"
+                " mm; correct the machine's geometry"
+            )
 
     def append(self, trapezoids: Any, count: int) -> int:
         """Take over up to COUNT trapezoids; return how many had room.

@@ -259,13 +259,13 @@ def test_the_end_says_what_will_not_act_and_what_that_means(tmp_path: Path) -> N
     assert head.strip() == f"{path}: no mistakes"
     lines = [line.strip().replace(f"{path}:", "") for line in listed.splitlines()]
     homed = (
-        "endstop_pin of [stepper_z] recognised, not yet acting: an axis that has no other endstop is refused"
+        "endstop_pin of [stepper_z]: not supported yet, ignored: an axis that has no other endstop is refused"
     )
     probed = "nothing is probed; an axis that it homes is refused by G28, lines that probe end a job"
     assert lines == [
         f"21: {homed} by G28",
-        f"29: [probe] recognised, not yet acting: {probed}",
-        "32: [neopixel a] recognised, not yet acting: no light; a print is as it would be",
+        f"29: [probe]: not supported yet, ignored: {probed}",
+        "32: [neopixel a]: not supported yet, ignored: no light; a print is as it would be",
     ]
     means = {entry["section"]: entry["meaning"] for entry in report.to_json()["unsupported"]}
     assert means["neopixel a"] == "no light; a print is as it would be"

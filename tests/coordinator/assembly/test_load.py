@@ -152,9 +152,9 @@ def test_what_waits_for_its_module_is_listed(tmp_path: Path) -> None:
     text = PRINTER_CFG + "shared_heater: x\n[led a]\nanything: 1\n[tmc5160 stepper_x]\nuart_pin: PA0:x\n"
     machine = load(tmp_path, text)
     assert [str(entry).replace(f"{tmp_path}/", "") for entry in machine.unsupported] == [
-        "printer.cfg:33: shared_heater of [extruder] recognised, not yet acting",
-        "printer.cfg:41: [led a] recognised, not yet acting",
-        "printer.cfg:43: [tmc5160 stepper_x] recognised, not yet acting",
+        "printer.cfg:33: shared_heater of [extruder]: not supported yet, ignored",
+        "printer.cfg:41: [led a]: not supported yet, ignored",
+        "printer.cfg:43: [tmc5160 stepper_x]: not supported yet, ignored",
     ]
 
 

@@ -82,40 +82,40 @@ def test_bad_input_still_gets_a_sentence(tmp_path: Path, more: str, sentence: st
         (
             "[sx1509 duex]\ni2c_address: 62\n[output_pin a]\npin: sx1509_duex:PIN_1\n",
             "output_pin a",
-            "'pin' of [output_pin a] is a pin of [sx1509 duex], which does not act yet",
+            "'pin' of [output_pin a] is a pin of [sx1509 duex], which is not supported yet",
         ),
         (
             "[multi_pin two]\npins: PF1, PF2\n[heater_fan a]\npin: multi_pin:two\n",
             "heater_fan a",
-            "'pin' of [heater_fan a] is a pin of [multi_pin two], which does not act yet",
+            "'pin' of [heater_fan a] is a pin of [multi_pin two], which is not supported yet",
         ),
         (
             "[adc_scaled vref]\nvref_pin: PF1\nvssa_pin: PF2\n[heater_bed]\n"
             + HEATER.format(sensor="Generic 3950", pin="vref:PF3"),
             "heater_bed",
-            "'sensor_pin' of [heater_bed] is a pin of [adc_scaled vref], which does not act yet",
+            "'sensor_pin' of [heater_bed] is a pin of [adc_scaled vref], which is not supported yet",
         ),
         (
             "[heater_bed]\n" + HEATER.format(sensor="MAX31865", pin="PF3") + "spi_bus: spi1\n",
             "heater_bed",
-            "its sensor is a MAX31865, which is recognised but not built yet",
+            "its sensor is a MAX31865, which is not supported yet",
         ),
         (
             "[heater_bed]\n"
             + HEATER.format(sensor="MAX31865", pin="PF3")
             + "[verify_heater heater_bed]\nhysteresis: 4\n",
             "verify_heater heater_bed",
-            "the heater heater_bed does not act yet",
+            "the heater heater_bed is not supported yet",
         ),
         (
             DRIVER + "select_pins: PF1\n",
             "tmc2209 stepper_x",
-            "drivers that are chosen by select_pins are not built yet",
+            "drivers that are chosen by select_pins are not supported yet",
         ),
         (
             "[manual_stepper gear]\n" + DRIVER.replace("stepper_x", "manual_stepper gear"),
             "tmc2209 manual_stepper gear",
-            "it is for [manual_stepper gear], which does not act yet",
+            "it is for [manual_stepper gear], which is not supported yet",
         ),
         (
             "[gcode_shell_command a]\ncommand: ls\n[gcode_shell_command b]\ncommand: ls\n",
@@ -156,7 +156,7 @@ def test_a_motor_that_cannot_be_switched_on_is_not_homed(tmp_path: Path) -> None
     machine = load(tmp_path, f"{text}[replicape]\nrevision: B3\nhost_mcu: mcu\n")
     assert waiting(machine)["stepper_x"] == (
         ("enable_pin",),
-        "'enable_pin' of [stepper_x] is a pin of [replicape], which does not act yet",
+        "'enable_pin' of [stepper_x] is a pin of [replicape], which is not supported yet",
     )
 
 

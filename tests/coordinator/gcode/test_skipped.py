@@ -35,9 +35,9 @@ def notices(line: str, vocabulary: Vocabulary | None = None, *, strict: bool = T
 def test_harmless_ones_are_skipped_with_a_notice(name: str) -> None:
     if not name.startswith("M10"):  # those are a machine's own, whatever it has
         assert len(notices(name)) == 1
-    why = Vocabulary({}, unsupported={name: "[it] does not act yet"})
+    why = Vocabulary({}, unsupported={name: "[it] is not supported yet"})
     (said,) = notices(name, why)
-    assert "[it] does not act yet" in said
+    assert "[it] is not supported yet" in said
 
 
 OWN = ("M104", "M109", "M140", "M190")
@@ -46,10 +46,10 @@ OWN = ("M104", "M109", "M140", "M190")
 @pytest.mark.parametrize("name", [name for name, absent in ABSENT.items() if not absent.harmless])
 def test_others_end_a_job_and_are_told_of_in_a_plan(name: str) -> None:
     line = f"{name} S200" if name in OWN else name
-    because = Vocabulary({}, unsupported={name: "[it] does not act yet"})
+    because = Vocabulary({}, unsupported={name: "[it] is not supported yet"})
     with pytest.raises(GCodeError) as error:
         run(line, because, strict=True)
-    assert "[it] does not act yet; remove the line" in str(error.value)
+    assert "[it] is not supported yet; remove the line" in str(error.value)
     (said,) = notices(line, because, strict=False)
     assert "a job would end here" in said
     if name not in ("M104", "M109", "M140", "M190"):
@@ -61,7 +61,7 @@ def test_heat_for_what_a_machine_does_not_have_is_no_error() -> None:
 
 
 def test_turning_a_heater_off_that_does_not_act_is_no_error() -> None:
-    off = Vocabulary({}, unsupported={"M140": "[heater_bed] does not act yet"})
+    off = Vocabulary({}, unsupported={"M140": "[heater_bed] is not supported yet"})
     assert len(notices("M140 S0", off)) == 1
 
 

@@ -255,12 +255,15 @@ def _frame(
 
 
 def _without_second(reading: Reading, frame: Frame, carriages: _Carriages) -> Frame:
-    """Return FRAME without its second carriages, of which two do not act yet: their axes cannot be homed."""
+    """Return FRAME without its second carriages: two are not supported yet. Their axes cannot be homed."""
     rails = {rail.axis: rail for rail in frame.rails}
     for second, reader in carriages.second.values():
         reader.find(SAFE_DISTANCE)
         reading.finish(reader)
-        why = f"second carriages on x and y at once do not act yet, and [{reader.name}] may be in the way"
+        why = (
+            "second carriages on x and y at once are not supported yet, and"
+            f" [{reader.name}] may be in the way"
+        )
         reading.later.append(Unsupported(reader.name, second.place, (), why))
         first = rails[second.axis]
         rails[second.axis] = replace(first, homing=replace(first.homing, refused=f"{why} ({second.place})"))

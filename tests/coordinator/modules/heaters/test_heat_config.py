@@ -76,7 +76,7 @@ def test_extruders_that_there_are_not_and_those_without_heater(tmp_path: Path) -
     cold = cold.replace("[extruder]", "[extruder1]").replace("PB", "PD")
     read = build(tmp_path, HOTEND_PID + cold).vocabulary.commands["M109"].read
     for line, told in (
-        ("M109 S200 T7", "M109 names the extruder T7, which there is not; there is T0 to T1"),
+        ("M109 S200 T7", "M109 refers to unknown extruder T7; there is T0 to T1"),
         ("M109 S200 T1", r"M109: \[extruder1\] has no heater; give it a heater_pin"),
     ):
         command = parse(line.encode())

@@ -174,7 +174,7 @@ def test_temperature_wait_in_both_directions(tmp_path: Path) -> None:
     [
         ("M104 S301", "outside what .extruder. allows, 0 to 300"),
         ("M109 S-5", "outside"),
-        ("M104 S200 T1", "M104 names the extruder T1, which there is not; there is only T0"),
+        ("M104 S200 T1", "M104 refers to unknown extruder T1; there is only T0"),
         ("SET_HEATER_TEMPERATURE HEATER=extrudr TARGET=1", "there is no 'extrudr'.*extruder"),
         ("SET_HEATER_TEMPERATURE TARGET=1", "needs HEATER="),
         ("TEMPERATURE_WAIT SENSOR=extruder", "MINIMUM= or MAXIMUM="),
