@@ -135,8 +135,7 @@ class Link:
     def handle_drained(self) -> None:
         """Wake those who wait in drained()."""
         if self._drained:
-            if not self._drained.done():
-                self._drained.set_result(None)
+            self._drained.set_result(None)  # it is shielded: nobody has cancelled it
             self._drained = None
 
     def handle_lost(self, cause: int) -> None:
@@ -168,9 +167,8 @@ class Link:
     def _fail(self, text: str) -> None:
         self._failed = self._failed or text
         if self._drained:
-            if not self._drained.done():
-                self._drained.set_exception(LinkError(text))
-                self._drained.exception()  # nobody has to be waiting
+            self._drained.set_exception(LinkError(text))
+            self._drained.exception()  # nobody has to be waiting
             self._drained = None
 
     def _check(self, status: int) -> None:

@@ -47,8 +47,7 @@ static inline int link_fits(const struct link *link, size_t bytes) {
 
 // The records at the front of a queue that may go now and fit together.
 struct link_front {
-    uint64_t end; // position behind them
-    uint64_t commands;
+    uint64_t end;     // position behind them
     size_t size;      // of their payloads
     uint64_t gate_ns; // when the next one may follow; LINK_NEVER: there is none, or it does not fit
 };

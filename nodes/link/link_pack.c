@@ -49,7 +49,6 @@ static struct link_front ready(const struct link *link, const struct link_queue 
         }
         front.end = behind;
         front.size += command.size;
-        front.commands++;
     }
     return front;
 }
@@ -57,7 +56,7 @@ static struct link_front ready(const struct link *link, const struct link_queue 
 // When the last of the motion commands that fit into the block may go.
 static uint64_t filled_at(const struct link *link, const struct link_front *front) {
     const struct link_queue *motion = &link->queues[LINK_MOTION];
-    uint64_t latest = 0;
+    uint64_t latest = front->gate_ns;
     size_t size = front->size;
     for (uint64_t at = front->end; at < motion->tail;) {
         struct link_command command;
@@ -111,7 +110,6 @@ static void order_classes(const struct link *link, uint64_t now, unsigned allowe
     for (size_t rank = 0; rank < LINK_CLASSES; rank++) {
         enum link_class kind = ranks[rank];
         const struct link_queue *queue = &link->queues[kind];
-        plan->fronts[kind].end = queue->head;
         if (queue->head == queue->tail || (kind != LINK_MOTION && !(allowed & 1u << kind)))
             continue;
         struct link_command head;
@@ -145,8 +143,8 @@ static uint64_t hold_motion(const struct link *link, const struct link_front *fr
     struct link_command head;
     const struct link_queue *motion = &link->queues[LINK_MOTION];
     link_queue_peek(motion, motion->head, &head);
-    uint64_t due_ns =
-        head.req_clock ? link_clock_to_ns(link, head.req_clock) : 0; // a gate: the clock is known
+    // Where there is a gate the clock is known.
+    uint64_t due_ns = head.req_clock ? link_clock_to_ns(link, head.req_clock) : 0;
     uint64_t pressing_ns = due_ns > PACK_LEAD_NS ? due_ns - PACK_LEAD_NS : 0;
     uint64_t full_ns = filled_at(link, front);
     return full_ns < pressing_ns ? full_ns : pressing_ns;
@@ -160,9 +158,9 @@ static struct link_plan plan_allowed(const struct link *link, uint64_t now, unsi
         enum link_class kind = plan.order[i];
         plan.fronts[kind] = ready(link, &link->queues[kind], now, WIRE_CONTENT_MAX - plan.size);
         plan.size += plan.fronts[kind].size;
-        filled += plan.fronts[kind].commands > 0;
+        filled += plan.fronts[kind].size > 0;
     }
-    if (filled == 1 && plan.fronts[LINK_MOTION].commands) {
+    if (filled == 1 && plan.fronts[LINK_MOTION].size) {
         uint64_t hold_ns = hold_motion(link, &plan.fronts[LINK_MOTION]);
         plan.at_ns = hold_ns < plan.at_ns ? hold_ns : plan.at_ns;
     } else if (filled) {
@@ -198,7 +196,7 @@ static int room_for(const struct link *link, const struct link_plan *plan) {
 
 struct link_plan link_plan_block(const struct link *link, uint64_t now, unsigned allowed) {
     struct link_plan plan = plan_allowed(link, now, allowed);
-    if (plan.classes && plan.offer.kind == LINK_BULK && !room_for(link, &plan))
+    if (plan.offer.kind == LINK_BULK && !room_for(link, &plan))
         plan = plan_allowed(link, now, allowed & ~(1u << LINK_BULK));
     return plan;
 }

@@ -328,7 +328,7 @@ class FakeNode:
         return HostTime(round(((ticks - self._start) / self._rate - 100e-6) * 1e9))
 
     async def query(self, name: str, response: str, /, *, timeout_s: float = 1.0, tries: int = 1) -> Message:
-        assert (name, response) == ("get_sync_pulse", "sync_pulse")
+        assert (name, response, timeout_s, tries) == ("get_sync_pulse", "sync_pulse", 0.2, 1)
         if self.lost or self._bus.random.random() < self._bus.loss:
             await asyncio.sleep(timeout_s)
             raise NodeLost(f"{self.name} does not answer")

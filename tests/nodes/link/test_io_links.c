@@ -287,6 +287,26 @@ static void urgent_commands_empty_the_forecast(void) {
     io_free(bus);
 }
 
+// A plan of commands 10 ms apart: the forecast looks at 512 stretches of it, the last of which holds the
+// rest.
+static void a_long_plan_is_forecast_in_512_stretches(void) {
+    enum { COMMANDS = 900, STRETCHES = 512 };
+    static const struct io_settings full_speed = {.bitrate = 1000000};
+    struct io_bus *bus = begin(IO_CAN_STREAM, &full_speed);
+    uint32_t number = open_link(bus, NODE);
+    struct io_forecast forecast;
+    CHECK_EQUAL(io_set_clock(bus, number, 1e9, scene.now_ns, scene.now_ns), IO_OK);
+    const uint64_t start_ns = scene.now_ns + 1000 * MS;
+    for (unsigned i = 0; i < COMMANDS; i++) {
+        uint8_t record[BATCH_HEADER + 1];
+        size_t size = batch_write(record, 0, start_ns + (10 * i + 5) * MS, query, 1);
+        CHECK_EQUAL(io_send_batch(bus, number, record, size), IO_OK);
+    }
+    io_forecast(bus, &forecast);
+    CHECK_EQUAL(forecast.at_ns, start_ns + STRETCHES * 10 * MS);
+    io_free(bus);
+}
+
 // First contact: the node of NODE takes two empty blocks, the first of which has the sequence 0.
 static void run_up(struct io_bus *bus, unsigned node, uint32_t number) {
     CHECK_EQUAL(io_send(bus, number, LINK_CONTROL, query, 1, 0, 0), IO_OK);
@@ -396,6 +416,7 @@ int main(void) {
     a_lost_link_takes_no_commands();
     queues_are_as_long_as_they_should_be();
     urgent_commands_empty_the_forecast();
+    a_long_plan_is_forecast_in_512_stretches();
     links_that_wait_alike_take_turns();
     a_block_that_was_begun_is_due_as_before();
     frames_go_in_order_as_they_are();

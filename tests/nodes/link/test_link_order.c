@@ -131,6 +131,18 @@ static void urgent_goes_first_and_once(void) {
     }
 }
 
+// What a clock holds back is no offer, however long it has waited.
+static void only_what_may_go_is_offered(void) {
+    struct scene scene;
+    open_clocked(&scene, WINDOW);
+    CHECK_EQUAL(try_send(&scene, LINK_CONTROL, 'c', 1, START + 10, 0), LINK_OK);
+    CHECK_EQUAL(try_send(&scene, LINK_BULK, 'b', 1, START + 10, 0), LINK_OK);
+    motion(&scene, 'm', 1, 0, START + 512);
+    CHECK_OFFER(&scene, LINK_MOTION, scene.now + SECOND - margin_ns, 0);
+    check_goes(&scene, "m");
+    CHECK_EQUAL(offer_of(&scene, LINK_ALL).kind, LINK_CLASSES);
+}
+
 // ------------------------------------------------------------------------------------------------- budgets
 
 static void only_allowed_classes_go(void) {
@@ -234,6 +246,22 @@ static void motion_waits_for_the_latest_of_its_fill(void) {
     motion(&scene, 'b', 1, START + 20, START + 1024);
     motion(&scene, 'c', 1, START + 10, START + 1024);
     check_waits_until(&scene, scene.now + 20 * TICK + 2 * MS, "abc");
+}
+
+// Behind the last record the ring may hold one of an earlier turn.
+static void what_is_behind_the_last_record_is_not_looked_at(void) {
+    struct scene scene;
+    open_clocked(&scene, WINDOW);
+    motion(&scene, 'a', 1, 0, START + 1024);
+    uint8_t *behind = scene_memories[LINK_MOTION] + scene.link.queues[LINK_MOTION].tail;
+    batch_write(behind, START + 10, START + 1024, (const uint8_t *)"z", 1);
+    check_goes(&scene, "a");
+    acknowledge_all(&scene);
+    motion(&scene, 'b', 1, 0, START + 1024);
+    motion(&scene, 'c', 1, START + 10, START + 1024);
+    behind = scene_memories[LINK_MOTION] + scene.link.queues[LINK_MOTION].tail;
+    batch_write(behind, START + 20, START + 1024, (const uint8_t *)"z", 1);
+    check_waits_until(&scene, scene.now + 10 * TICK + 2 * MS, "bc");
 }
 
 // It waits no longer than until 100 ms before its first command is due.
@@ -400,12 +428,14 @@ int main(void) {
     equal_times_go_control_motion_bulk();
     the_first_of_three_classes_goes_first();
     urgent_goes_first_and_once();
+    only_what_may_go_is_offered();
     only_allowed_classes_go();
     pressing_motion_needs_no_budget();
     a_gate_and_motion_without_budget_both_wake();
     blocks_are_filled_to_the_last_byte();
     motion_waits_for_its_fill();
     motion_waits_for_the_latest_of_its_fill();
+    what_is_behind_the_last_record_is_not_looked_at();
     motion_that_presses_does_not_wait_for_its_fill();
     motion_without_a_time_does_not_wait_for_its_fill();
     motion_does_not_wait_for_what_never_goes();
