@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from coordinator.assembly.load import load_machine
 from coordinator.gcode.commands import Call
-from coordinator.gcode.words import parse
-from coordinator.machine.description import load_machine
-from coordinator.modules.homing import Homing
-from coordinator.modules.virtual_endstop import StallEndstop
+from coordinator.gcode.parser import parse
+from coordinator.modules.homing.homing import Homing
+from coordinator.modules.homing.virtual_endstop import StallEndstop
 
 if TYPE_CHECKING:
-    from coordinator.modules.live import Live
-    from coordinator.single_move import Ramp
+    from coordinator.runtime.module_context import Live
+    from coordinator.runtime.moves.single import Ramp
 
 Way = tuple[float, float, float]
 
@@ -107,9 +107,9 @@ class HomingStage:
             x, y, z = (asked + more for asked, more in zip(way, stage.made, strict=True))
             return x, y, z
 
-        monkeypatch.setattr("coordinator.homing.HomingMove", Homes)
-        monkeypatch.setattr("coordinator.single_move.SingleMove", Goes)
-        monkeypatch.setattr("coordinator.straight_move.move_by", move_by)
+        monkeypatch.setattr("coordinator.runtime.moves.homing.HomingMove", Homes)
+        monkeypatch.setattr("coordinator.runtime.moves.single.SingleMove", Goes)
+        monkeypatch.setattr("coordinator.runtime.moves.straight.move_by", move_by)
         self.machine = SimpleNamespace(
             devices=SimpleNamespace(
                 endstops={rail.axis: _Endstop(self, rail.axis) for rail in self.described.stops},
@@ -130,7 +130,9 @@ class HomingStage:
         self.moves.append(Feels(section, speed, on=False))
 
     @staticmethod
-    def call(line: str, place: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0), homed: str = "") -> Call:
+    def call(
+        line: str, place: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0), homed: str = ""
+    ) -> Call:
         command = parse(line.encode())
         assert command is not None
         return Call(command, 1, place, homed)

@@ -4,12 +4,12 @@ import asyncio
 from pathlib import Path
 
 import pytest
+from coordinator.support.command_options import EXAMPLES
 
-from coordinator.commands import EXAMPLES
 from coordinator.gcode.commands import AtRest, Done
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.modules.homing import Homing
-from nodes.errors import CanductorError
+from coordinator.modules.homing.homing import Homing
+from nodes.support.errors import CanductorError
 from tests.coordinator.modules.scripted_homing import Feels, Head, HomingStage, Motors, To
 from tests.stages.printer_text import (
     MCU,

@@ -4,10 +4,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from coordinator.support.command_options import EXAMPLES
 
-from coordinator.commands import EXAMPLES
-from coordinator.machine.description import MachineDescription, load_machine
-from coordinator.modules.homing_plan import approaches, landed, second_landed
+from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.modules.homing.homing_plan import approaches, landed, second_landed
 from tests.stages.printer_text import changed, example_text, write
 
 PLACE = (1.0, 2.0, 3.0)
