@@ -13,9 +13,10 @@ from coordinator.gcode.commands import Call
 from coordinator.gcode.parser import parse
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.homing.virtual_endstop import StallEndstop
+from coordinator.modules.module_set import build_modules
 
 if TYPE_CHECKING:
-    from coordinator.runtime.module_context import Live
+    from coordinator.runtime.module_context import ModuleContext
     from coordinator.runtime.moves.single import Ramp
 
 Way = tuple[float, float, float]
@@ -69,7 +70,7 @@ class HomingStage:
 
     def __init__(self, path: str, monkeypatch: pytest.MonkeyPatch, *, live: bool = True) -> None:
         self.described = load_machine(path)
-        self.modules = self.described.modules.build(self.described)
+        self.modules = build_modules(self.described)
         homing = self.modules.find("query_endstops", Homing)
         assert homing is not None
         self.homing = homing
@@ -119,7 +120,7 @@ class HomingStage:
         )
         for feeler in self.modules.of(StallEndstop):
             monkeypatch.setattr(feeler, "feeling", lambda speed, f=feeler: self._feeling(f.name, speed))
-        self.live = cast("Live", SimpleNamespace(machine=self.machine))
+        self.live = cast("ModuleContext", SimpleNamespace(machine=self.machine))
         if live:
             homing._live = self.live
 

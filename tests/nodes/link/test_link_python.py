@@ -4,6 +4,7 @@ import asyncio
 import errno
 import gc
 import struct
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -245,13 +246,14 @@ def test_an_ended_transport_ends_its_links() -> None:
         await asyncio.sleep(0)
         lib.io_end(line.driver.bus, errno.ENODEV)
         words = r"by hand: the connection ended .*; the interface is gone: plug the adapter in, then start"
-        for refused in (
+        calls: tuple[Callable[[], object], ...] = (
             lambda: line.link.send(ask(2)),
             lambda: line.link.send_batch(record(ask(2))),
             lambda: line.link.send_urgent(STOP),
             lambda: line.link.set_receive_window(64),
             lambda: line.link.set_clock(HZ, 1, 1),
-        ):
+        )
+        for refused in calls:
             with pytest.raises(LinkError, match=words):
                 refused()
         line.driver.hand_over()
@@ -319,6 +321,7 @@ def test_counters_are_those_of_the_c_core() -> None:
     assert stats.control_bytes_max == 25 + max(len(ask(1)), len(store(0)))
     assert stats.lead_count == sum(stats.lead_histogram) == 30
     assert stats.min_lead_s == link.lead_min_ns * 1e-9
+    assert stats.min_lead_s is not None
     assert 0.5 < stats.min_lead_s < 0.9
     assert (stats.srtt_s, stats.rttvar_s, stats.rto_s) == (
         link.srtt_ns * 1e-9,

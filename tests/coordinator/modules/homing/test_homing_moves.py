@@ -4,11 +4,12 @@ import asyncio
 from pathlib import Path
 
 import pytest
-from coordinator.support.command_options import EXAMPLES
 
-from coordinator.gcode.commands import AtRest, Done
+from coordinator.gcode.commands import AtStandstill
+from coordinator.gcode.events import Done
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.homing.homing import Homing
+from coordinator.support.examples import EXAMPLES
 from nodes.support.errors import CanductorError
 from tests.coordinator.modules.scripted_homing import Feels, Head, HomingStage, Motors, To
 from tests.stages.printer_text import (
@@ -49,8 +50,8 @@ def home(
     stage: HomingStage, axes: str, place: Position = (100.0, 110.0, 120.0, 5.0), homed: str = ""
 ) -> Done:
     reading = stage.homing.read(stage.call("G28", place, homed), axes)
-    assert isinstance(reading, AtRest)
-    done = asyncio.run(reading.perform())  # type: ignore[arg-type]
+    assert isinstance(reading, AtStandstill)
+    done: Done | None = asyncio.run(reading.perform())  # type: ignore[arg-type]
     assert isinstance(done, Done)
     return done
 
@@ -316,13 +317,13 @@ def test_a_rail_that_is_refused_says_why(stager: Stager) -> None:
     stage = stager()
     rail = stage.homing._approaches[0].rails[0]
     object.__setattr__(rail.homing, "refused", "the second carriage is in its way")
-    with pytest.raises(CanductorError, match="^G28 of X is refused: the second carriage is in its way$"):
+    with pytest.raises(CanductorError, match=r"^G28 of X is refused: the second carriage is in its way$"):
         stage.homing.check("X")
 
 
 def test_what_stands_in_for_g28_is_asked_but_for_g28_among_its_own_lines(stager: Stager) -> None:
     stage = stager(PRINTER_CFG)
-    instead = AtRest(lambda: asyncio.sleep(0))
+    instead = AtStandstill(lambda: asyncio.sleep(0))
     stage.homing.instead = lambda _call, _axes: instead
     assert stage.homing.acts
     call = stage.call("G28")
@@ -340,8 +341,8 @@ def test_endstops_are_told_and_remembered(stager: Stager, name: str) -> None:
     assert stage.homing.status() == {"last_query": {}}
     stage.pressed = {"y"}
     reading = stage.modules.vocabulary.commands[name].read(stage.call(name))
-    assert isinstance(reading, AtRest)
-    done = asyncio.run(reading.perform())  # type: ignore[arg-type]
+    assert isinstance(reading, AtStandstill)
+    done: Done | None = asyncio.run(reading.perform())  # type: ignore[arg-type]
     assert done == Done(("x:open y:pressed z:open",), kind=ReplyKind.PLAIN)
     assert stage.homing.status() == {"last_query": {"x": False, "y": True, "z": False}}
 

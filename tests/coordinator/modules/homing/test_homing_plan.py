@@ -4,10 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from coordinator.support.command_options import EXAMPLES
 
-from coordinator.assembly.load import MachineDescription, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.model import MachineDescription
 from coordinator.modules.homing.homing_plan import approaches, landed, second_landed
+from coordinator.support.examples import EXAMPLES
 from tests.stages.printer_text import changed, example_text, write
 
 PLACE = (1.0, 2.0, 3.0)
