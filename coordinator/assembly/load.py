@@ -62,10 +62,10 @@ def describe(config: ConfigFile) -> MachineDescription:
 
     Where the file collects mistakes it is raised only for those that leave nothing to go on with.
     """
-    later: list[Unsupported] = []
+    unsupported: list[Unsupported] = []
     _check_section_names(config)
-    nodes = read_nodes(config, later)
-    reading = Reading(config, make_pin_registry(config, nodes), later)
+    nodes = read_nodes(config, unsupported)
+    reading = Reading(config, make_pin_registry(config, nodes), unsupported)
     kinematics, reader = open_printer(_required(config, "printer"))
     printer = read_printer(reader)
     frame = with_second_endstops(reading, read_frame(reading, kinematics, reader))
@@ -96,7 +96,7 @@ def describe(config: ConfigFile) -> MachineDescription:
         axis_tables=axis_tables,
         source=ConfigSource(config.path, config.data, saved_values(config)),
     )
-    later += [
+    unsupported += [
         Unsupported(_section_of(stepper), stepper.place, ("enable_pin",), stepper.unpowered)
         for stepper in description.steppers
         if stepper.unpowered
@@ -108,7 +108,7 @@ def describe(config: ConfigFile) -> MachineDescription:
     return replace(
         description,
         unsupported=(
-            *later,
+            *unsupported,
             *(Unsupported(one.name, one.place, (), one.reason) for one in built.left_out.values()),
             *_unsupported_sections(reading, kinematics),
         ),
@@ -193,7 +193,7 @@ def _unsupported_sections(reading: Reading, kinematics: str) -> list[Unsupported
 
     So it does for a motion section that has no place in this machine.
     """
-    waiting = {(entry.section, name) for entry in reading.later for name in entry.options}
+    waiting = {(entry.section, name) for entry in reading.unsupported for name in entry.options}
     result = []
     for section in reading.config.sections.values():
         if section.name in reading.used and not _is_acting(section):

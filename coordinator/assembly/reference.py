@@ -87,8 +87,8 @@ def section_table(title: str) -> str:
     lines += [_row(option) for option in spec.options if not _is_one_of_many(option)]
     if spec.family is not None:
         lines.append(_row(replace(spec.family, name=f"{spec.family.name}NAME")))
-    if spec.later:
-        names = ", ".join(f"`{name}`" for name in spec.later)
+    if spec.unsupported:
+        names = ", ".join(f"`{name}`" for name in spec.unsupported)
         lines += ["", f"Not supported yet, ignored: {names}."]
     return "\n".join(lines) + "\n"
 

@@ -173,12 +173,12 @@ class ChoiceOption(Option[str]):
     """One word of several."""
 
     choices: tuple[str, ...]
-    later: tuple[str, ...] = ()
+    unsupported: tuple[str, ...] = ()
     """Words known from other hosts that are not supported yet."""
 
     def parse(self, text: str) -> str:
         """Return the word."""
-        if text in self.later:
+        if text in self.unsupported:
             raise NotBuilt
         if text not in self.choices:
             raise BadValue
@@ -299,7 +299,7 @@ class SectionSpec:
 
     help: str
     options: tuple[Option[Any], ...]
-    later: tuple[str, ...] = ()
+    unsupported: tuple[str, ...] = ()
     """Options of modules that are not supported yet: recognised, recorded, not acting."""
     elsewhere: tuple[str, ...] = ()
     """Options that another specification of the same section has."""
@@ -324,7 +324,7 @@ class SectionReader:
         if not self.whole:
             return
         spec = self.spec
-        valid = (*(option.name for option in spec.options), *spec.later, *spec.elsewhere)
+        valid = (*(option.name for option in spec.options), *spec.unsupported, *spec.elsewhere)
         for raw in self.section.options.values():
             if raw.name not in valid and not self._of_family(raw.name):
                 hint = nearest(raw.name, valid, pattern="'{}'")
@@ -420,7 +420,7 @@ class SectionReader:
             if name not in self._read and name not in self.spec.elsewhere and (self.whole or name in own)
         ]
         for option in unread:
-            if option.name not in self.spec.later and not self.section.misspelt:
+            if option.name not in self.spec.unsupported and not self.section.misspelt:
                 self.section.report(
                     ConfigError(
                         option.place,

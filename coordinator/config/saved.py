@@ -181,7 +181,7 @@ def replace_file(path: str, before: bytes, after: bytes) -> None:
         if not stat.S_ISREG(status.st_mode) or real.read_bytes() != before:
             raise SaveError(
                 f"{shown_path(path)} has changed since it was read, so nothing was saved; RESTART reads it"
-                " anew, then calibrate again"
+                " again, then calibrate again"
             )
         if not os.access(real, os.W_OK):
             raise PermissionError(13, "it is write-protected")

@@ -32,7 +32,7 @@ UNSUPPORTED_SECTIONS = frozenset(
 )
 """First words of sections that are recognised and reported as not supported yet."""
 
-LATER_EXTRUDER_OPTIONS = _words("per_move_pressure_advance shared_heater")
+UNSUPPORTED_EXTRUDER_OPTIONS = _words("per_move_pressure_advance shared_heater")
 """Those of its heater and sensor are in coordinator/config/sections/heater_options.py."""
-LATER_MCU_OPTIONS = _words("is_non_critical reconnect_interval max_stepper_error")
+UNSUPPORTED_MCU_OPTIONS = _words("is_non_critical reconnect_interval max_stepper_error")
 UNSUPPORTED_STEPPER_OPTIONS = _words("homing_current min_home_dist use_sensorless_homing")

@@ -132,7 +132,7 @@ class Build:
         *,
         whole: bool = True,
         share: "Callable[[type[Module]], Module]",
-        later: Collection[str] = (),
+        unsupported: Collection[str] = (),
     ) -> None:
         self.name = section.name
         self.machine = machine
@@ -145,7 +145,7 @@ class Build:
         """Commands that may take another's name, and the name that one has then; empty: there is no other."""
         self.set_ups: list[Callable[[Planner], None]] = []
         self.notes: list[str] = []
-        self.later = later
+        self.unsupported = unsupported
         """Sections that nothing acts on yet."""
         self._pins = pins
         self._share = share
@@ -191,7 +191,7 @@ class Build:
 
     def needs_acting(self, section: str) -> None:
         """Raise NotSupported if SECTION stands in the configuration and nothing acts on its kind yet."""
-        if section in self.later:
+        if section in self.unsupported:
             raise NotSupported(self.place, f"it is for [{section}], which is not supported yet")
 
     def note(self, option: Option[Any], sentence: str) -> None:

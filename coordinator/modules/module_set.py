@@ -162,7 +162,7 @@ class ModuleSet:
             self._machine,
             whole=source.whole,
             share=self._share,
-            later=[name for name in self.config if name.partition(" ")[0] in UNSUPPORTED_SECTIONS],
+            unsupported=[name for name in self.config if name.partition(" ")[0] in UNSUPPORTED_SECTIONS],
         )
         with _blamed(source.kind, source.section.place):
             module = source.kind(build)

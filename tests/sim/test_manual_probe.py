@@ -36,7 +36,7 @@ def test_a_height_is_found_and_the_endstop_corrected(tmp_path: Path) -> None:
             unsaved = stage.served.service.machine.unsaved
             assert not unsaved.pending
             (told,) = await run("ACCEPT")
-            assert told == "stepper_z: position_endstop: 0.350; SAVE_CONFIG writes it and begins anew"
+            assert told == "stepper_z: position_endstop: 0.350; SAVE_CONFIG writes it and restarts"
             assert unsaved.pending == {"stepper_z": {"position_endstop": "0.350"}}
             await run("SET_GCODE_OFFSET Z=-0.1")
             (told,) = await run("Z_OFFSET_APPLY_ENDSTOP")

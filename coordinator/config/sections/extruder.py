@@ -11,7 +11,7 @@ from coordinator.config.sections.heater_options import EXTRUDER_HEATER_OPTIONS, 
 from coordinator.config.sections.printer import PrinterSection
 from coordinator.config.sections.reading import Reading
 from coordinator.config.sections.steppers import MOTOR, read_stepper
-from coordinator.config.unsupported import LATER_EXTRUDER_OPTIONS
+from coordinator.config.unsupported import UNSUPPORTED_EXTRUDER_OPTIONS
 from coordinator.kinematics.base import FILAMENT, StepFunction, WorkSpace
 from coordinator.motion.specs import MotionLimits
 from coordinator.support.quoting import nearest
@@ -89,7 +89,7 @@ EXTRUDER = SectionSpec(
         PRESSURE_ADVANCE,
         SMOOTH_TIME,
     ),
-    later=LATER_EXTRUDER_OPTIONS + UNSUPPORTED_HEATER_OPTIONS,
+    unsupported=UNSUPPORTED_EXTRUDER_OPTIONS + UNSUPPORTED_HEATER_OPTIONS,
     elsewhere=tuple(option.name for option in EXTRUDER_HEATER_OPTIONS),
 )
 FOLLOWED = TextOption(

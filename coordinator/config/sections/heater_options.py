@@ -4,7 +4,7 @@ from typing import Any, Final
 
 from coordinator.config.options import ChoiceOption, FloatOption, Option, TextOption
 from coordinator.config.pins import PinOption
-from coordinator.config.sections.sensor_options import LATER_SENSOR_OPTIONS, SENSOR_OPTIONS
+from coordinator.config.sections.sensor_options import SENSOR_OPTIONS, UNSUPPORTED_SENSOR_OPTIONS
 
 HEATER_PIN: Final = PinOption(name="heater_pin", help="output that switches the heater")
 MAX_POWER: Final = FloatOption(
@@ -35,7 +35,7 @@ CONTROL: Final = ChoiceOption(
     help="how the temperature is held: by PID, by switching on and off, or by a model of the heater",
     default="watermark",
     choices=("pid", "watermark", "mpc"),
-    later=("pid_v", "pi", "dual_loop_pid", "curve"),
+    unsupported=("pid_v", "pi", "dual_loop_pid", "curve"),
 )
 MAX_DELTA: Final = FloatOption(
     name="max_delta",
@@ -149,7 +149,7 @@ HEATER_OPTIONS: Final[tuple[Option[Any], ...]] = (
     MAX_DURATION,
 )
 UNSUPPORTED_HEATER_OPTIONS: Final = (
-    *LATER_SENSOR_OPTIONS,
+    *UNSUPPORTED_SENSOR_OPTIONS,
     "pid_version",
     "pid_tolerance",
     "min_ambient_change",

@@ -24,7 +24,7 @@ from coordinator.config.options import (
 )
 from coordinator.config.pins import MULTI_PIN, PRIMARY_NODE, PinOption, PinRegistry
 from coordinator.config.sections.virtual_endstops import note_diag_pins
-from coordinator.config.unsupported import LATER_MCU_OPTIONS
+from coordinator.config.unsupported import UNSUPPORTED_MCU_OPTIONS
 from coordinator.support.quoting import nearest, shown
 
 SERIAL = TextOption(
@@ -68,7 +68,7 @@ POLICY = ChoiceOption(
 MCU = SectionSpec(
     help="One micro-controller. [mcu] is the primary, [mcu NAME] another; each has 'serial' or 'canbus_uuid'",
     options=(SERIAL, BAUD, CANBUS_UUID, CANBUS_INTERFACE, RESTART_METHOD, POLICY),
-    later=LATER_MCU_OPTIONS,
+    unsupported=UNSUPPORTED_MCU_OPTIONS,
 )
 BOARD_MCU = ListOption(name="mcu", help="the nodes that have these pins", default=(PRIMARY_NODE,))
 ALIASES = ListOption(name="aliases", help="NAME=PIN pairs; NAME=<WORD> reserves a pin")
@@ -81,7 +81,7 @@ _CHIP_PINS = {"adc_scaled": "", "ads1x1x": "", "ads1118": "", "sx1509": "sx1509_
 _NODE_NAME = re.compile(r"[A-Za-z0-9_.-]+", re.ASCII)
 
 
-def read_nodes(config: ConfigFile, later: list[Unsupported]) -> tuple[NodeDescription, ...]:
+def read_nodes(config: ConfigFile, unsupported: list[Unsupported]) -> tuple[NodeDescription, ...]:
     """Return all nodes, the primary first; raises ConfigError."""
     if PRIMARY_NODE not in config.sections:
         raise ConfigError(
@@ -90,12 +90,12 @@ def read_nodes(config: ConfigFile, later: list[Unsupported]) -> tuple[NodeDescri
         )
     sections = [section for section in config.sections.values() if section.kind == PRIMARY_NODE]
     sections.sort(key=lambda section: section.instance != "")
-    nodes = tuple(_read_node(section, later) for section in sections)
+    nodes = tuple(_read_node(section, unsupported) for section in sections)
     _check_distinct(nodes)
     return nodes
 
 
-def _read_node(section: RawSection, later: list[Unsupported]) -> NodeDescription:
+def _read_node(section: RawSection, unsupported: list[Unsupported]) -> NodeDescription:
     name = section.instance or PRIMARY_NODE
     if section.instance == PRIMARY_NODE or not _NODE_NAME.fullmatch(name):
         raise ConfigError(section.place, f"{shown(name)} is not a name for a node; use letters, digits and _")
@@ -119,7 +119,7 @@ def _read_node(section: RawSection, later: list[Unsupported]) -> NodeDescription
     if isinstance(connection, UartConnection) and reader.find(RESTART_METHOD) not in (None, "command"):
         waiting.append(RESTART_METHOD.name)  # so far a node is only reset by its own commands
     if waiting:
-        later.append(Unsupported(section.name, section.place, tuple(waiting)))
+        unsupported.append(Unsupported(section.name, section.place, tuple(waiting)))
     return NodeDescription(name, connection, section.place, policy, reader.place_of(POLICY))
 
 

@@ -95,7 +95,9 @@ class PrinterSection:
 
 def open_printer(section: RawSection) -> tuple[str, SectionReader]:
     """Return the kinematics, and a reader of [printer] with its options; raises ConfigError."""
-    names = {k: (*spec.later, *(option.name for option in spec.options)) for k, spec in PRINTER_SPECS.items()}
+    names = {
+        k: (*spec.unsupported, *(option.name for option in spec.options)) for k, spec in PRINTER_SPECS.items()
+    }
     every = tuple({name: None for owned in names.values() for name in owned})
     kinematics = SectionReader(section, SectionSpec(PRINTER.help, PRINTER.options, every)).get(KINEMATICS)
     for name, option in section.options.items():
@@ -107,7 +109,7 @@ def open_printer(section: RawSection) -> tuple[str, SectionReader]:
                 f" machine is {kinematics}; remove it",
             )
     own = PRINTER_SPECS.get(kinematics, SectionSpec("", ()))
-    spec = SectionSpec(PRINTER.help, (*PRINTER.options, *own.options), own.later)
+    spec = SectionSpec(PRINTER.help, (*PRINTER.options, *own.options), own.unsupported)
     reader = SectionReader(section, spec)
     reader.get(KINEMATICS)
     return kinematics, reader

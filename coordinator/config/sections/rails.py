@@ -40,7 +40,7 @@ RANGE = (POSITION_MIN, POSITION_MAX)
 RAIL = SectionSpec(
     help="The first stepper of an axis, with the axis' range and its homing",
     options=(*MOTOR, *RANGE, *HOMING),
-    later=UNSUPPORTED_STEPPER_OPTIONS,
+    unsupported=UNSUPPORTED_STEPPER_OPTIONS,
 )
 EXTRA_STEPPER = SectionSpec(
     help="A further stepper of an axis, tower or arm: stepper_z1, …; one of an axis that no other rail moves"

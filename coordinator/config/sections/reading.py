@@ -26,7 +26,7 @@ class Reading:
 
     config: ConfigFile
     pins: PinRegistry
-    later: list[Unsupported] = field(default_factory=list)
+    unsupported: list[Unsupported] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
     """Names of sections that have a place in this machine."""
     second_endstops: dict[str, SecondEndstop] = field(default_factory=dict)
@@ -58,4 +58,4 @@ class Reading:
         unread = {option.name for option in reader.finish()}
         names = tuple(name for name in reader.section.options if name in unread or name in waiting)
         if names:
-            self.later.append(Unsupported(reader.name, reader.place, names))
+            self.unsupported.append(Unsupported(reader.name, reader.place, names))

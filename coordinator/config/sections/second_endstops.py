@@ -22,7 +22,7 @@ def with_second_endstops(reading: Reading, frame: Frame) -> Frame:
             for rail in frame.rails
         )
         if name not in acting and not shared:
-            reading.later.append(Unsupported(second.section, second.place, ("endstop_pin",)))
+            reading.unsupported.append(Unsupported(second.section, second.place, ("endstop_pin",)))
     dual = frame.dual_carriage
     if dual is not None:
         same = dict(zip((rail.axis for rail in frame.rails), rails, strict=True))

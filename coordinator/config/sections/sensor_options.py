@@ -140,7 +140,7 @@ def _words(text: str) -> tuple[str, ...]:
     return tuple(text.split())
 
 
-LATER_SENSOR_OPTIONS: Final = (
+UNSUPPORTED_SENSOR_OPTIONS: Final = (
     *_words("tc_type tc_use_50hz_filter tc_averaging_count rtd_nominal_r"),
     *_words("rtd_reference_r rtd_num_of_wires rtd_use_50hz_filter spi_speed spi_bus"),
     *_words("spi_software_sclk_pin spi_software_mosi_pin spi_software_miso_pin"),
@@ -151,7 +151,7 @@ LATER_SENSOR_OPTIONS: Final = (
     *_words("lm75_report_time"),
 )
 """Of sensors on SPI, I2C and a single wire, which are not supported yet."""
-LATER_SENSORS: Final = frozenset(
+UNSUPPORTED_SENSORS: Final = frozenset(
     (
         *_words("MAX6675 MAX31855 MAX31856 MAX31865 BME280 BMP280 BMP180 BMP388 BME680 AHT10 AHT20 AHT21"),
         *_words("HTU21D SI7013 SI7020 SI7021 SHT21 SHT3X LM75 DS18B20 SDS011"),

@@ -145,7 +145,7 @@ def driver_spec(chip: Chip) -> SectionSpec:
             *more,
             *field_options(chip).values(),
         ),
-        later=(
+        unsupported=(
             *("select_pins", "current_change_dwell_time"),
             *(() if chip.has_stallguard else ("home_current",)),
         ),

@@ -7,7 +7,7 @@ from coordinator.config.options import FloatOption, IntOption, ListOption, Secti
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.drivers.motor_power import MotorPower
 from coordinator.modules.fans.fan_unit import (
-    LATER_FAN_OPTIONS,
+    UNSUPPORTED_FAN_OPTIONS,
     FanModule,
     FanUnit,
     fan_options,
@@ -89,7 +89,7 @@ class HeaterFan(FanModule):
     SPEC: ClassVar = SectionSpec(
         help="A fan that runs while a heater is hot or is to be, as that of a hot end",
         options=(*fan_options(FULL), HEATER, HEATER_TEMP, FAN_SPEED),
-        later=LATER_FAN_OPTIONS,
+        unsupported=UNSUPPORTED_FAN_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:
@@ -134,7 +134,7 @@ class ControllerFan(FanModule):
             IDLE_TIMEOUT,
             IDLE_SPEED,
         ),
-        later=LATER_FAN_OPTIONS,
+        unsupported=UNSUPPORTED_FAN_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:

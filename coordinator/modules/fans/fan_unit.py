@@ -87,7 +87,7 @@ def fan_options(shutdown: FloatOption) -> tuple[Option[Any], ...]:
     )
 
 
-LATER_FAN_OPTIONS: Final = ("min_power", "initial_speed")
+UNSUPPORTED_FAN_OPTIONS: Final = ("min_power", "initial_speed")
 TACHOMETER_S: Final = 1.0
 """How often the tachometer's count is reported."""
 MUCH_FASTER: Final = 0.5

@@ -7,7 +7,7 @@ from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.fans.fan_unit import (
-    LATER_FAN_OPTIONS,
+    UNSUPPORTED_FAN_OPTIONS,
     FanModule,
     FanUnit,
     fan_options,
@@ -24,7 +24,9 @@ class Fan(FanModule):
     """The fan that cools the part."""
 
     SPEC: ClassVar = SectionSpec(
-        help="The fan that cools the part: M106, M107", options=fan_options(OFF), later=LATER_FAN_OPTIONS
+        help="The fan that cools the part: M106, M107",
+        options=fan_options(OFF),
+        unsupported=UNSUPPORTED_FAN_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:
@@ -83,7 +85,7 @@ class FanGeneric(FanModule):
     SPEC: ClassVar = SectionSpec(
         help="A fan that programs set: SET_FAN_SPEED FAN=NAME SPEED=",
         options=fan_options(OFF),
-        later=LATER_FAN_OPTIONS,
+        unsupported=UNSUPPORTED_FAN_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:

@@ -10,8 +10,8 @@ from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.config.sections.heater_options import MAX_DELTA, PID_KD, PID_KI, PID_KP, SMOOTH_TIME
 from coordinator.config.sections.sensor_options import (
     FREE_SENSOR_OPTIONS,
-    LATER_SENSOR_OPTIONS,
     SENSOR_OPTIONS,
+    UNSUPPORTED_SENSOR_OPTIONS,
 )
 from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
 from coordinator.gcode.parser import WordError
@@ -20,7 +20,7 @@ from coordinator.heat.pid import Pid, PidGains
 from coordinator.heat.watermark import Watermark
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.fans.fan_unit import (
-    LATER_FAN_OPTIONS,
+    UNSUPPORTED_FAN_OPTIONS,
     FanModule,
     FanUnit,
     fan_options,
@@ -51,7 +51,7 @@ CONTROL: Final = ChoiceOption(
     name="control",
     help="how its speed follows the temperature",
     choices=("pid", "watermark"),
-    later=("curve",),
+    unsupported=("curve",),
 )
 MIRROR_C: Final = 5000.0
 """Controllers heat: mirrored here, too hot becomes too cold."""
@@ -116,7 +116,7 @@ class TemperatureFan(FanModule):
             MAX_DELTA,
             GCODE_ID,
         ),
-        later=(*LATER_SENSOR_OPTIONS, *LATER_FAN_OPTIONS, "pid_deriv_time", "reverse"),
+        unsupported=(*UNSUPPORTED_SENSOR_OPTIONS, *UNSUPPORTED_FAN_OPTIONS, "pid_deriv_time", "reverse"),
     )
 
     def __init__(self, build: Build) -> None:

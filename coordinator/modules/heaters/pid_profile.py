@@ -23,10 +23,14 @@ DEFAULT: Final = "default"
 PROFILES_MAX: Final = 100
 """For one heater."""
 CONTROL: Final = ChoiceOption(
-    name="control", help="what it is for", default="pid", choices=("pid",), later=("pid_v", "mpc")
+    name="control", help="what it is for", default="pid", choices=("pid",), unsupported=("pid_v", "mpc")
 )
 PID_TARGET: Final = FloatOption(
-    name="pid_target", help="the temperature it was found at; told only", unit="°C", minimum=0, maximum=1500
+    name="pid_target",
+    help="the temperature it was found at; only reported",
+    unit="°C",
+    minimum=0,
+    maximum=1500,
 )
 ACTIONS: Final = ("LOAD", "SAVE", "SET_VALUES", "GET_VALUES", "REMOVE")
 GAINS: Final = ("KP", "KI", "KD")
@@ -171,7 +175,7 @@ class PidProfile(Module):
         help="PID constants of a heater for other circumstances: [pid_profile HEATER NAME], and PID_PROFILE"
         " LOAD=NAME HEATER=HEATER",
         options=(CONTROL, PID_KP, PID_KI, PID_KD, PID_TARGET),
-        later=("pid_version", "pid_tolerance", "smooth_time"),
+        unsupported=("pid_version", "pid_tolerance", "smooth_time"),
     )
 
     def __init__(self, build: Build) -> None:

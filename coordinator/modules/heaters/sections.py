@@ -58,7 +58,7 @@ class HeaterBed(HeaterSection):
     """The heater of the bed."""
 
     SPEC: ClassVar = SectionSpec(
-        help="The heated bed", options=HEATER_OPTIONS, later=UNSUPPORTED_HEATER_OPTIONS
+        help="The heated bed", options=HEATER_OPTIONS, unsupported=UNSUPPORTED_HEATER_OPTIONS
     )
 
     def __init__(self, build: Build) -> None:
@@ -80,7 +80,7 @@ class HeaterGeneric(HeaterSection):
     SPEC: ClassVar = SectionSpec(
         help="A heater for anything else; programs call it by NAME",
         options=(*HEATER_OPTIONS, GCODE_ID),
-        later=UNSUPPORTED_HEATER_OPTIONS,
+        unsupported=UNSUPPORTED_HEATER_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:
@@ -134,7 +134,7 @@ class ExtruderHeaterSection(Module):
     SPEC: ClassVar = SectionSpec(
         help="The heater of an extruder",
         options=EXTRUDER_HEATER_OPTIONS,
-        later=UNSUPPORTED_HEATER_OPTIONS,
+        unsupported=UNSUPPORTED_HEATER_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:

@@ -67,7 +67,7 @@ class SafeZHome(Module):
     SPEC = SectionSpec(
         "G28 homes Z at one place of the bed, behind X and Y",
         (PLACE, SPEED, Z_HOP, Z_HOP_SPEED, BACK),
-        later=("home_y_before_x",),
+        unsupported=("home_y_before_x",),
     )
 
     def __init__(self, build: Build) -> None:

@@ -52,7 +52,9 @@ class FirmwareRetraction(Module):
     """Its commands; how far the filament is drawn back is what G10 did, also when settings change."""
 
     SPEC = SectionSpec(
-        "Retraction by G10 and G11", (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP), later=("clear_zhop_on_z_moves",)
+        "Retraction by G10 and G11",
+        (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP),
+        unsupported=("clear_zhop_on_z_moves",),
     )
 
     def __init__(self, build: Build) -> None:

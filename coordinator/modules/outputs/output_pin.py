@@ -82,7 +82,7 @@ class OutputPin(Module):
     SPEC: ClassVar = SectionSpec(
         help="An output that programs set: SET_PIN PIN=NAME VALUE=",
         options=(PIN, PWM, VALUE, SHUTDOWN_VALUE, SCALE, CYCLE_TIME, HARDWARE_PWM),
-        later=("maximum_mcu_duration", "static_value"),
+        unsupported=("maximum_mcu_duration", "static_value"),
     )
 
     def __init__(self, build: Build) -> None:

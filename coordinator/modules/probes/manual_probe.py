@@ -191,4 +191,4 @@ class ManualProbe(Module):
     def _keep(self, endstop: float) -> tuple[str, ...]:
         assert self._live is not None
         self._live.save("stepper_z", "position_endstop", f"{endstop:.3f}")
-        return (f"stepper_z: position_endstop: {endstop:.3f}; SAVE_CONFIG writes it and begins anew",)
+        return (f"stepper_z: position_endstop: {endstop:.3f}; SAVE_CONFIG writes it and restarts",)

@@ -31,7 +31,9 @@ _COMMAND: Final = "_RUN_DELAYED_GCODE"
 class DelayedGCode(Module):
     """One of them; a service runs its lines as those of a client."""
 
-    SPEC = SectionSpec("G-code that runs by itself after a while", (GCODE, INITIAL), later=("description",))
+    SPEC = SectionSpec(
+        "G-code that runs by itself after a while", (GCODE, INITIAL), unsupported=("description",)
+    )
     NAMED = True
 
     def __init__(self, build: Build) -> None:

@@ -34,7 +34,7 @@ class _Object:
 class ExcludeObject(Module):
     """The objects of the program that is being read."""
 
-    SPEC = SectionSpec("Leaving out single objects of a print", (), later=("enable_exclude_object",))
+    SPEC = SectionSpec("Leaving out single objects of a print", (), unsupported=("enable_exclude_object",))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)

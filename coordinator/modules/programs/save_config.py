@@ -1,4 +1,4 @@
-"""SAVE_CONFIG, RESTART and FIRMWARE_RESTART: what was calibrated is kept, and the machine begins anew."""
+"""SAVE_CONFIG, RESTART and FIRMWARE_RESTART: what was calibrated is kept, and the machine restarts."""
 
 import asyncio
 
@@ -14,7 +14,7 @@ from nodes.support.errors import CanductorError
 class SaveConfig(Module):
     """The commands that end one life of the machine."""
 
-    SPEC = SectionSpec(help="Saving and beginning anew", options=())
+    SPEC = SectionSpec(help="Saving and restarting", options=())
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -23,12 +23,12 @@ class SaveConfig(Module):
         for name, text, read in (
             (
                 "SAVE_CONFIG",
-                "Write what was calibrated into the configuration file, then begin anew",
+                "Write what was calibrated into the configuration file, then restart",
                 self._read_save,
             ),
             (
                 "RESTART",
-                "Read the configuration and start the machine anew",
+                "Read the configuration and restart the machine",
                 lambda call: self._read_restart(call, firmware=False),
             ),
             (
@@ -68,7 +68,7 @@ class SaveConfig(Module):
         path = await asyncio.to_thread(machine.unsaved.write)
         if restart is None:
             return Done((f"saved into {path}; it counts from the next start on",))
-        self._live.say(f"saved into {path}; the machine begins anew")
+        self._live.say(f"saved into {path}; the machine restarts")
         restart(False)
         return None
 
@@ -77,7 +77,7 @@ class SaveConfig(Module):
         prepare = self._live.machine.prepare_restart
         if prepare is None:
             raise CanductorError(
-                "a machine that runs a single file cannot begin anew; start the command again, or serve the"
+                "a machine that runs a single file cannot restart; start the command again, or serve the"
                 " machine with --ipc"
             )
         prepare()(firmware)

@@ -37,7 +37,7 @@ _BUSY: Final = "a job is on its way; wait for its end, or cancel it"
 class VirtualSdcard(Module):
     """Its commands; the service has the files."""
 
-    SPEC = SectionSpec("Files that are printed", (PATH, ON_ERROR), later=("with_subdirs",))
+    SPEC = SectionSpec("Files that are printed", (PATH, ON_ERROR), unsupported=("with_subdirs",))
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)

@@ -57,7 +57,7 @@ class FilamentSwitchSensor(Module):
     SPEC = SectionSpec(
         "A switch that tells whether there is filament",
         (PIN, PAUSE, RUNOUT, INSERT, EVENT_DELAY),
-        later=LATER,
+        unsupported=LATER,
     )
     NAMED = True
 

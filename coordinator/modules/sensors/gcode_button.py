@@ -24,7 +24,7 @@ _COMMAND: Final = "_BUTTON"
 class GCodeButton(Module):
     """One button; a service runs its lines as those of a client."""
 
-    SPEC = SectionSpec("A button that runs g-code", (PIN, PRESS, RELEASE), later=LATER)
+    SPEC = SectionSpec("A button that runs g-code", (PIN, PRESS, RELEASE), unsupported=LATER)
     NAMED = True
 
     def __init__(self, build: Build) -> None:

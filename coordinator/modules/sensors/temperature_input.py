@@ -7,12 +7,12 @@ from coordinator.config.sections.sensor_options import (
     ADC_VOLTAGE,
     FREE_SENSORS,
     INLINE,
-    LATER_SENSORS,
     MAX_TEMP,
     MIN_TEMP,
     PULLUP,
     SENSOR_PIN,
     SENSOR_TYPE,
+    UNSUPPORTED_SENSORS,
     VOLTAGE_OFFSET,
 )
 from coordinator.heat.known_sensors import (
@@ -48,7 +48,7 @@ class TemperatureInput(TemperatureSource):
         A sensor that is not limited does not stop its node when its wire breaks.
         """
         self._type = build.get(SENSOR_TYPE)
-        if self._type in LATER_SENSORS:
+        if self._type in UNSUPPORTED_SENSORS:
             place = build.reader.place_of(SENSOR_TYPE)
             raise NotSupported(place, f"its sensor is a {self._type}, which is not supported yet")
         super().__init__(

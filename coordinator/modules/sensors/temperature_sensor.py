@@ -6,8 +6,8 @@ from typing import ClassVar, Final
 from coordinator.config.options import SectionSpec, TextOption
 from coordinator.config.sections.sensor_options import (
     FREE_SENSOR_OPTIONS,
-    LATER_SENSOR_OPTIONS,
     SENSOR_OPTIONS,
+    UNSUPPORTED_SENSOR_OPTIONS,
 )
 from coordinator.modules.base import Build, Modules
 from coordinator.modules.heaters.heaters import HeaterRegistry
@@ -31,7 +31,7 @@ class TemperatureSensor(SensorModule):
     SPEC: ClassVar = SectionSpec(
         help="A temperature that is watched; with min_temp or max_temp its node stops all outside them",
         options=(*SENSOR_OPTIONS, *FREE_SENSOR_OPTIONS, GCODE_ID),
-        later=LATER_SENSOR_OPTIONS,
+        unsupported=UNSUPPORTED_SENSOR_OPTIONS,
     )
 
     def __init__(self, build: Build) -> None:

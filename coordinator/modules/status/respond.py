@@ -17,7 +17,9 @@ PREFIX = TextOption(name="default_prefix", help="Stands before a line, instead o
 class Respond(Module):
     """Its commands."""
 
-    SPEC = SectionSpec("Lines that programs show to the user", (TYPE, PREFIX), later=("enable_respond",))
+    SPEC = SectionSpec(
+        "Lines that programs show to the user", (TYPE, PREFIX), unsupported=("enable_respond",)
+    )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)

@@ -97,7 +97,7 @@ def machine_methods(service: MachineService) -> Iterator[Method]:
     yield Method(
         "machine.restart",
         Scope.OPERATE,
-        "Read the configuration and start the machine anew, after a stop, an error, or when idle.",
+        "Read the configuration and restart the machine, after a stop, an error, or when idle.",
         restart,
         params=(
             Param(

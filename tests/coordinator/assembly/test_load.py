@@ -204,7 +204,7 @@ def test_examples_load(path: Path) -> None:
 
 @pytest.mark.parametrize("spec", SECTIONS.values(), ids=SECTIONS)
 def test_specifications_are_fit_for_the_reference_page(spec: SectionSpec) -> None:
-    names = [option.name for option in spec.options] + list(spec.later)
+    names = [option.name for option in spec.options] + list(spec.unsupported)
     assert len(names) == len(set(names))
     assert all(name == name.lower() for name in names)
     options: tuple[Option[object], ...] = spec.options

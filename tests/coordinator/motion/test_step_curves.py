@@ -251,3 +251,14 @@ def test_a_bad_shaper_is_refused() -> None:
     run = Run([stepper(0, (1.0, 0.0, 0.0, 0.0))], [node_spec()])
     with pytest.raises(StepError, match="out of range"):
         run.gen.set_shaper(0, [(0.5, -0.01), (0.4, 0.01)])
+
+
+def test_a_stepper_without_a_position_at_the_start_is_refused() -> None:
+    spec = replace(stepper(0, (0.0,) * 4), formula="delta", params=(10.0**2, 90.0, -50.0))
+    with pytest.raises(StepError, match="no position with the axes at"):
+        Run([spec], [node_spec()])
+
+
+def test_a_formula_that_was_not_compiled_is_refused() -> None:
+    with pytest.raises(StepError, match="have no formula 'scara'; add it by STEP_FORMULA"):
+        Run([replace(stepper(0, (0.0,) * 4), formula="scara")], [node_spec()])

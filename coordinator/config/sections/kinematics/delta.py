@@ -52,7 +52,7 @@ TOWER = SectionSpec(
     help="A tower of a delta. position_endstop is Z of the head in the middle when the endstop switches; by"
     " default that of stepper_a",
     options=(*MOTOR, ARM_LENGTH, ANGLE, *HOMING),
-    later=UNSUPPORTED_STEPPER_OPTIONS,
+    unsupported=UNSUPPORTED_STEPPER_OPTIONS,
 )
 WHY = "a delta has the towers stepper_a, stepper_b and stepper_c"
 _ANGLES = (210.0, 330.0, 90.0)

@@ -34,7 +34,7 @@ PRINT_WIDTH = FloatOption(
 PRINTER = SectionSpec(
     help="What a deltesian needs besides",
     options=(MINIMUM_Z, MIN_ANGLE, PRINT_WIDTH),
-    later=("slow_ratio",),
+    unsupported=("slow_ratio",),
 )
 ARM_LENGTH = FloatOption(
     name="arm_length",
@@ -54,7 +54,7 @@ SIDE = SectionSpec(
     help="A tower of a deltesian. position_endstop is Z of the head in the middle when the endstop switches;"
     " by default that of stepper_left",
     options=(*MOTOR, ARM_LENGTH, ARM_X_LENGTH, *HOMING),
-    later=UNSUPPORTED_STEPPER_OPTIONS,
+    unsupported=UNSUPPORTED_STEPPER_OPTIONS,
 )
 WHY = "a deltesian has the towers stepper_left and stepper_right"
 RANGE_OPTIONS = (

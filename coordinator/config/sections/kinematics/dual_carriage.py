@@ -26,7 +26,7 @@ SAFE_DISTANCE = FloatOption(
 DUAL_CARRIAGE = SectionSpec(
     help="The second carriage of a machine with two (IDEX), parked at start; as a rail, and",
     options=(AXIS, SAFE_DISTANCE, *RAIL.options),
-    later=RAIL.later,
+    unsupported=RAIL.unsupported,
 )
 
 

@@ -26,7 +26,7 @@ AXIS = ChoiceOption(
 CARRIAGE = SectionSpec(
     help="A carriage of a generic_cartesian machine: an axis' range and homing",
     options=(AXIS, *RANGE, *HOMING),
-    later=UNSUPPORTED_STEPPER_OPTIONS,
+    unsupported=UNSUPPORTED_STEPPER_OPTIONS,
 )
 PRIMARY_CARRIAGE = TextOption(
     name="primary_carriage",
@@ -42,7 +42,7 @@ EXTRA_CARRIAGE = SectionSpec(
 DUAL_CARRIAGE = SectionSpec(
     help="The second carriage on the axis of another one (IDEX) of a generic_cartesian machine",
     options=(PRIMARY_CARRIAGE, SAFE_DISTANCE, *RANGE, *HOMING),
-    later=UNSUPPORTED_STEPPER_OPTIONS,
+    unsupported=UNSUPPORTED_STEPPER_OPTIONS,
 )
 
 T = TypeVar("T")
@@ -192,7 +192,7 @@ def _note_second_endstops(reading: Reading, ends: dict[str, _End], motors: list[
         section = f"extra_carriage {name}"
         movers = [motor.stepper.name for motor in motors if name in motor.extra]
         if pin is None or len(movers) != 1:
-            reading.later.append(Unsupported(section, place, (ENDSTOP_PIN.name,)))
+            reading.unsupported.append(Unsupported(section, place, (ENDSTOP_PIN.name,)))
         else:
             reading.second_endstops[movers[0]] = SecondEndstop(section, place, pin, virtual)
 
@@ -264,7 +264,7 @@ def _without_second(reading: Reading, frame: Frame, carriages: _Carriages) -> Fr
             "second carriages on x and y at once are not supported yet, and"
             f" [{reader.name}] may be in the way"
         )
-        reading.later.append(Unsupported(reader.name, second.place, (), why))
+        reading.unsupported.append(Unsupported(reader.name, second.place, (), why))
         first = rails[second.axis]
         rails[second.axis] = replace(first, homing=replace(first.homing, refused=f"{why} ({second.place})"))
     return replace(frame, rails=(rails["x"], rails["y"], rails["z"]))

@@ -12,12 +12,12 @@ from coordinator.kinematics.polar import Polar
 from coordinator.motion.specs import AXIS_RANGE_OPTIONS
 
 PRINTER = SectionSpec(
-    help="What a polar machine may have besides", options=(), later=("max_angular_velocity",)
+    help="What a polar machine may have besides", options=(), unsupported=("max_angular_velocity",)
 )
 BED = SectionSpec(
     help="The motor that turns the bed of a polar machine",
     options=TURNING_MOTOR,
-    later=UNSUPPORTED_STEPPER_OPTIONS,
+    unsupported=UNSUPPORTED_STEPPER_OPTIONS,
 )
 ARM_RANGE = "position_min and position_max of [stepper_arm]"
 RANGE_OPTIONS = (ARM_RANGE, ARM_RANGE, AXIS_RANGE_OPTIONS[2])

@@ -69,7 +69,7 @@ ARM = SectionSpec(
     help="An arm of a rotary delta. position_endstop is Z of the head in the middle when the endstop"
     " switches; by default that of stepper_a",
     options=(*TURNING_MOTOR, UPPER_LENGTH, LOWER_LENGTH, ANGLE, *HOMING),
-    later=UNSUPPORTED_STEPPER_OPTIONS,
+    unsupported=UNSUPPORTED_STEPPER_OPTIONS,
 )
 WHY = "a rotary delta has the arms stepper_a, stepper_b and stepper_c"
 _ANGLES = (30.0, 150.0, 270.0)

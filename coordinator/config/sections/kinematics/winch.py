@@ -29,7 +29,7 @@ ANCHORS = tuple(
 SPEC = SectionSpec(
     help="The winch of one cable: stepper_a, stepper_b, stepper_c, up to stepper_z",
     options=(*MOTOR, *ANCHORS),
-    later=UNSUPPORTED_STEPPER_OPTIONS,
+    unsupported=UNSUPPORTED_STEPPER_OPTIONS,
 )
 WHY = "a machine on cables has three winches at least, from stepper_a on"
 _MIN_SINE = 0.01

@@ -69,7 +69,7 @@ def test_pid_calibration_gives_constants_that_hold(tmp_path: Path) -> None:
         path, _, rest = told.removeprefix("saved into ").partition("; ")
         assert rest == "it counts from the next start on", "nobody restarts this machine"
         saved.append(path)
-        with pytest.raises(CanductorError, match="cannot begin anew; start the command again"):
+        with pytest.raises(CanductorError, match="cannot restart; start the command again"):
             await stage.do("RESTART")
         await stage.do("M109 S210")
         await asyncio.sleep(15)
