@@ -16,7 +16,7 @@ ROOMS = {
         *("monitor", "doctor", "tables", "tools"),
     ),
     "coordinator": (
-        *("support", "drivers", "motion", "heat", "kinematics", "ipc", "config", "gcode", "metrics", "web"),
+        *("support", "drivers", "motion", "heat", "kinematics", "ipc", "config", "gcode", "web", "metrics"),
         *("tables", "dnc", "runtime", "modules", "assembly", "streaming", "planning", "virtual_machine"),
         *("service", "verification", "klippy_api", "simulate", "front_ends", "demo", "cli"),
     ),

@@ -15,7 +15,7 @@ from typing import Final
 from coordinator.config.errors import ConfigError
 from coordinator.config.file import SAVED_HEADER, SAVED_PREFIX, parse_saved, saved_header
 from coordinator.config.text import split_lines
-from coordinator.support.atomic_file import write_whole
+from coordinator.support.atomic_file import atomic_write
 from coordinator.support.quoting import shown, shown_path
 from nodes.support.errors import CanductorError
 
@@ -185,7 +185,7 @@ def replace_file(path: str, before: bytes, after: bytes) -> None:
             )
         if not os.access(real, os.W_OK):
             raise PermissionError(13, "it is write-protected")
-        write_whole(real, after, like=status)
+        atomic_write(real, after, like=status)
     except OSError as error:
         raise SaveError(
             f"cannot write {shown_path(path)}: {error.strerror or error}; make the file and its folder"

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 
-def write_whole(path: Path, data: bytes, *, like: os.stat_result | None = None) -> None:
+def atomic_write(path: Path, data: bytes, *, like: os.stat_result | None = None) -> None:
     """Let PATH hold DATA, or what it held before, whatever happens meanwhile; raises OSError.
 
     A power cut, too: the new content is on the disk before the name leads to it. Only the user may read a new

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.support.atomic_file import write_whole
+from coordinator.support.atomic_file import atomic_write
 from coordinator.tables.axis_table import AxisTable, TableError, Unit
 from nodes.support.state_folder import state_folder
 
@@ -41,7 +41,7 @@ class TableStore:
         )
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            write_whole(path, content.encode())
+            atomic_write(path, content.encode())
         except OSError as error:
             raise TableError(
                 f"the table cannot be kept in {self.folder}: {error.strerror or error}"

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from coordinator.ipc.protocol.methods import Scope
-from coordinator.support.atomic_file import write_whole
+from coordinator.support.atomic_file import atomic_write
 from coordinator.web.access import SESSIONS_MAX, PageSession
 from nodes.support.errors import CanductorError
 from nodes.support.secret_file import read_secret
@@ -45,7 +45,7 @@ def write_sessions(path: Path, sessions: list[PageSession]) -> None:
     ]
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        write_whole(path, json.dumps({"version": VERSION, "sessions": kept}).encode())
+        atomic_write(path, json.dumps({"version": VERSION, "sessions": kept}).encode())
     except OSError as error:
         raise CanductorError(
             f"the page's sessions cannot be kept in {path}: {error.strerror or error}"

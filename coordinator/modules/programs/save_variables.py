@@ -18,7 +18,7 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
 from coordinator.modules.words import needed, parameters
 from coordinator.runtime.module_context import ModuleContext
-from coordinator.support.atomic_file import write_whole
+from coordinator.support.atomic_file import atomic_write
 from coordinator.support.quoting import shown_path
 from coordinator.support.values import Value
 from nodes.support.errors import CanductorError
@@ -160,7 +160,7 @@ class _Writer:
             if text is None:
                 return
             try:
-                write_whole(self._path, text.encode())
+                atomic_write(self._path, text.encode())
             except OSError as error:
                 reason = (error.strerror or str(error)).lower()
                 self._say(f"the file of variables {shown_path(str(self._path))} cannot be written: {reason}")

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from coordinator.support.atomic_file import write_whole
+from coordinator.support.atomic_file import atomic_write
 
 NAME: Final = ".canductor-journal"
 ENTRY_S: Final = 1.0
@@ -148,7 +148,7 @@ class Journal:
         text = json.dumps(entry, separators=(",", ":")) + "\n"
         if entry is head or size + len(text) > FILE_BYTES_MAX:
             whole = text if entry is head else json.dumps(head) + "\n" + text
-            write_whole(self._path, whole.encode())
+            atomic_write(self._path, whole.encode())
             return len(whole)
         with self._path.open("a", encoding="utf-8") as file:
             file.write(text)

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.support.atomic_file import write_whole
+from coordinator.support.atomic_file import atomic_write
 
 
 def test_a_new_file_is_the_users_alone_and_another_ones_mode_can_be_kept(tmp_path: Path) -> None:
     path, like = tmp_path / "kept", tmp_path / "like"
-    write_whole(path, b"first")
+    atomic_write(path, b"first")
     assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (b"first", 0o600)
     like.touch()
     like.chmod(0o640)
-    write_whole(path, b"second", like=like.stat())
+    atomic_write(path, b"second", like=like.stat())
     assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (b"second", 0o640)
 
 
@@ -24,14 +24,14 @@ def test_what_cannot_be_written_leaves_the_old_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
 ) -> None:
     path = tmp_path / "kept"
-    write_whole(path, b"first")
+    atomic_write(path, b"first")
 
     def fail(*_: int) -> None:
         raise OSError(28, "no space left")
 
     monkeypatch.setattr(os, step, fail)
     with pytest.raises(OSError, match="no space"):
-        write_whole(path, b"second", like=path.stat())
+        atomic_write(path, b"second", like=path.stat())
     assert path.read_bytes() == b"first"
     assert [entry.name for entry in tmp_path.iterdir()] == ["kept"]
 
@@ -45,5 +45,5 @@ def test_the_content_is_on_the_disk_before_its_name_and_the_name_at_last(
         synced.append((stat.S_ISDIR(os.fstat(handle).st_mode), path.exists()))
 
     monkeypatch.setattr(os, "fsync", note)
-    write_whole(path, b"first")
+    atomic_write(path, b"first")
     assert synced == [(False, False), (True, True)]
