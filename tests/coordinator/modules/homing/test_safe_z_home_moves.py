@@ -4,14 +4,14 @@ import asyncio
 from pathlib import Path
 
 import pytest
+from coordinator.support.command_options import EXAMPLES
 
-from coordinator.commands import EXAMPLES
+from coordinator.assembly.load import ConfigError, load_machine
 from coordinator.gcode.commands import AtRest, Done, Lines, Reading
-from coordinator.gcode.words import WordError
-from coordinator.machine.description import ConfigError, load_machine
-from coordinator.modules.homing_override import HomingOverride
-from coordinator.modules.safe_z_home import SafeZHome
-from nodes.errors import CanductorError
+from coordinator.gcode.parser import WordError
+from coordinator.modules.homing.homing_override import HomingOverride
+from coordinator.modules.homing.safe_z_home import SafeZHome
+from nodes.support.errors import CanductorError
 from tests.coordinator.modules.scripted_homing import Head, HomingStage, To
 from tests.stages.printer_text import SWITCHES_CFG, changed, write
 
