@@ -4,13 +4,13 @@ import asyncio
 from pathlib import Path
 
 import pytest
-from coordinator.support.command_options import EXAMPLES
 
 from coordinator.assembly.load import ConfigError, load_machine
-from coordinator.gcode.commands import AtRest, Done, Lines, Reading
+from coordinator.gcode.commands import AtStandstill, Done, Lines, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.modules.homing.homing_override import HomingOverride
 from coordinator.modules.homing.safe_z_home import SafeZHome
+from coordinator.support.examples import EXAMPLES
 from nodes.support.errors import CanductorError
 from tests.coordinator.modules.scripted_homing import Head, HomingStage, To
 from tests.stages.printer_text import SWITCHES_CFG, changed, write
@@ -41,7 +41,7 @@ def stager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stager:
 
 
 def perform(reading: Reading) -> Done:
-    assert isinstance(reading, AtRest)
+    assert isinstance(reading, AtStandstill)
     done = asyncio.run(reading.perform())  # type: ignore[arg-type]
     assert isinstance(done, Done)
     return done
@@ -142,7 +142,7 @@ def test_z_comes_behind_x_and_y(stager: Stager, axes: str, homed: str, missing: 
         with pytest.raises(WordError, match=f"G28 of Z comes before {missing} is homed; home with G28 first"):
             stage.homing.read(call, axes)
     else:
-        assert isinstance(stage.homing.read(call, axes), AtRest)
+        assert isinstance(stage.homing.read(call, axes), AtStandstill)
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_g28_of_axes_that_it_is_not_for_homes(stager: Stager) -> None:
     stage = override(stager, "axes: zY\n")
     for axes, is_own in (("X", False), ("XZ", True), ("Y", True), ("Z", True)):
         reading = stage.homing.read(stage.call(f"G28 {' '.join(axes)}"), axes)
-        assert isinstance(reading, Lines if is_own else AtRest)
+        assert isinstance(reading, Lines if is_own else AtStandstill)
     done = perform(stage.homing.read(stage.call("G28 X"), "X"))
     assert done.homed == "X"
 
@@ -263,7 +263,7 @@ def test_a_position_is_set_before_the_lines_are_read(
     commands = stage.modules.vocabulary.commands
     call = stage.call("_HOMING_OVERRIDE_SET_POSITION", (1.0, 2.0, 3.0, 4.0))
     taken = commands["_HOMING_OVERRIDE_SET_POSITION"].read(call)
-    assert isinstance(taken, AtRest)
+    assert isinstance(taken, AtStandstill)
     assert taken.planned == Done(position=position, homed=known)
     assert perform(taken) == taken.planned
     lines = commands["_HOMING_OVERRIDE_LINES"].read(stage.call("_HOMING_OVERRIDE_LINES Z0"))
