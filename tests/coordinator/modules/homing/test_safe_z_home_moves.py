@@ -1,12 +1,13 @@
-"""[safe_z_home] and [homing_override] as rows of moves and lines: what is done, in what order, with what figures."""
+"""[safe_z_home] and [homing_override] as rows of moves and lines, with their order and figures."""
 
 import asyncio
 from pathlib import Path
 
 import pytest
 
-from coordinator.assembly.load import ConfigError, load_machine
-from coordinator.gcode.commands import AtStandstill, Done, Lines, Reading
+from coordinator.config.errors import ConfigError, load_machine
+from coordinator.gcode.commands import AtStandstill, Lines, Reading
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
 from coordinator.modules.homing.homing_override import HomingOverride
 from coordinator.modules.homing.safe_z_home import SafeZHome
@@ -42,7 +43,7 @@ def stager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stager:
 
 def perform(reading: Reading) -> Done:
     assert isinstance(reading, AtStandstill)
-    done = asyncio.run(reading.perform())  # type: ignore[arg-type]
+    done: Done | None = asyncio.run(reading.perform())  # type: ignore[arg-type]
     assert isinstance(done, Done)
     return done
 
