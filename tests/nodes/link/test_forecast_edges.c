@@ -204,9 +204,9 @@ static void an_urgent_command_drops_the_queued_motion(void) {
     queue(&scene, 10000, 0, 30);
     CHECK(forecast(&scene).worst_ratio > 1);
     CHECK_EQUAL(io_send_urgent(scene.bus, scene.number, (const uint8_t *)"!", 1), IO_OK);
-    CHECK_EQUAL(scene.bus->links[0]->segment_count, 0);
     check_worst(&scene, 0, 0, 0);
     CHECK_EQUAL(forecast(&scene).queued_bits, 0);
+    CHECK_EQUAL(scene.bus->links[0]->segment_count, 0);
     end(&scene);
 }
 
