@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from coordinator.config.errors import ConfigError, load_machine
+from coordinator.assembly.load import load_machine
+from coordinator.config.errors import ConfigError
 from coordinator.gcode.commands import AtStandstill, Lines, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
