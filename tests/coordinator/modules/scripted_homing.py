@@ -108,9 +108,10 @@ class HomingStage:
             x, y, z = (asked + more for asked, more in zip(way, stage.made, strict=True))
             return x, y, z
 
-        monkeypatch.setattr("coordinator.runtime.moves.homing.HomingMove", Homes)
-        monkeypatch.setattr("coordinator.runtime.moves.single.SingleMove", Goes)
-        monkeypatch.setattr("coordinator.runtime.moves.straight.move_by", move_by)
+        monkeypatch.setattr("coordinator.modules.homing.homing.HomingMove", Homes)
+        monkeypatch.setattr("coordinator.modules.homing.homing.SingleMove", Goes)
+        monkeypatch.setattr("coordinator.modules.homing.homing.move_by", move_by)
+        monkeypatch.setattr("coordinator.modules.homing.safe_z_home.move_by", move_by)
         self.machine = SimpleNamespace(
             devices=SimpleNamespace(
                 endstops={rail.axis: _Endstop(self, rail.axis) for rail in self.described.stops},

@@ -36,5 +36,5 @@ def test_a_computer_without_networks_says_so(tmp_path: Path) -> None:
     finally:
         command.terminate()
         command.communicate(timeout=END_S)
-    assert said == "there is no network to announce the machine on; it will be when there is\n"
+    assert said == "there is no network to announce the machine on; it will be announced when there is one\n"
     assert command.returncode == 0

@@ -11,7 +11,6 @@ from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading, S
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, parse
 from coordinator.gcode.reply_kinds import ReplyKind
-from coordinator.modules.heaters import tuning as heater_tuning
 from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.heaters.verify_heater import VerifyHeater
@@ -286,7 +285,7 @@ def test_three_fan_speeds_unless_others_are_asked_for(shop: Shop, monkeypatch: p
         asked.append((unit.key, target_c, fan_steps))
         return Done()
 
-    monkeypatch.setattr(heater_tuning, "calibrate_mpc", note)
+    monkeypatch.setattr("coordinator.modules.heaters.heaters.calibrate_mpc", note)
 
     async def main() -> None:
         for more in ("", " FAN_BREAKPOINTS=5"):
@@ -344,7 +343,7 @@ def test_it_waits_for_a_heater_that_does_not_act_yet(tmp_path: Path) -> None:
     later = CHAMBER.replace("Generic 3950", "MAX31865")
     path.write_text(BASE + HOTEND_PID + later + "\n[verify_heater chamber]\n")
     reasons = {entry.section: entry.reason for entry in load_machine(str(path)).unsupported}
-    assert reasons["verify_heater chamber"] == "the heater chamber does not act yet"
+    assert reasons["verify_heater chamber"] == "the heater chamber is not supported yet"
 
 
 def test_it_is_for_no_heater_where_there_is_none(tmp_path: Path) -> None:
@@ -354,4 +353,7 @@ def test_it_is_for_no_heater_where_there_is_none(tmp_path: Path) -> None:
     line = text.splitlines().index("[verify_heater extruder]") + 1
     with pytest.raises(ConfigError) as error:
         load_machine(str(path))
-    assert str(error.value) == f"{path}:{line}: [verify_heater extruder] is for no heater; there is none"
+    assert (
+        str(error.value)
+        == f"{path}:{line}: [verify_heater extruder] refers to an unknown heater; there is none"
+    )

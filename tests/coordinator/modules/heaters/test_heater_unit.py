@@ -258,7 +258,7 @@ def test_a_look_that_finds_a_node_away_forgets_the_target_and_ends_the_wait(tmp_
         assert (unit.target_c, unit.power, driven.live.stops) == (0.0, 0.0, [])
         assert len(driven.sent) == 1
         (told,) = driven.live.said
-        assert told == "heater chamber is off, its target of 60 °C is forgotten: node toolhead is lost"
+        assert told == "heater chamber was turned off; its target (60 °C) was cleared: node toolhead is lost"
 
     asyncio.run(main())
 
@@ -269,7 +269,9 @@ def test_an_output_that_takes_nothing_ends_the_target(chamber: Driven) -> None:
     chamber.board.broken = "node mcu is away"
     assert chamber.measured(20.0) == 0.0
     assert (unit.target_c, unit._on, chamber.sent) == (0.0, False, [])
-    assert chamber.live.said == ["heater chamber is off, its target of 60 °C is forgotten: node mcu is away"]
+    assert chamber.live.said == [
+        "heater chamber was turned off; its target (60 °C) was cleared: node mcu is away"
+    ]
     chamber.board.broken = None
     chamber.measured(20.0)
     chamber.look()
