@@ -1,5 +1,6 @@
 """A machine whose homing moves are kept instead of made: their order and figures are what is tested."""
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -121,7 +122,7 @@ class HomingStage:
             monkeypatch.setattr(feeler, "feeling", lambda speed, f=feeler: self._feeling(f.name, speed))
         self.live = cast("Live", SimpleNamespace(machine=self.machine))
         if live:
-            homing._live = self.live
+            asyncio.run(homing.connect(self.live))
 
     @contextlib.asynccontextmanager
     async def _feeling(self, section: str, speed: float) -> AsyncIterator[None]:
@@ -130,7 +131,9 @@ class HomingStage:
         self.moves.append(Feels(section, speed, on=False))
 
     @staticmethod
-    def call(line: str, place: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0), homed: str = "") -> Call:
+    def call(
+        line: str, place: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0), homed: str = ""
+    ) -> Call:
         command = parse(line.encode())
         assert command is not None
         return Call(command, 1, place, homed)
