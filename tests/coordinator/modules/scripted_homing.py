@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from coordinator import homing as homing_moves
+from coordinator import single_move, straight_move
 from coordinator.gcode.commands import Call
 from coordinator.gcode.words import parse
 from coordinator.machine.description import load_machine
@@ -108,9 +110,9 @@ class HomingStage:
             x, y, z = (asked + more for asked, more in zip(way, stage.made, strict=True))
             return x, y, z
 
-        monkeypatch.setattr("coordinator.homing.HomingMove", Homes)
-        monkeypatch.setattr("coordinator.single_move.SingleMove", Goes)
-        monkeypatch.setattr("coordinator.straight_move.move_by", move_by)
+        monkeypatch.setattr(homing_moves, "HomingMove", Homes)
+        monkeypatch.setattr(single_move, "SingleMove", Goes)
+        monkeypatch.setattr(straight_move, "move_by", move_by)
         self.machine = SimpleNamespace(
             devices=SimpleNamespace(
                 endstops={rail.axis: _Endstop(self, rail.axis) for rail in self.described.stops},
