@@ -1,5 +1,6 @@
 """A machine whose homing moves are kept instead of made: their order and figures are what is tested."""
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,6 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+from coordinator import homing as homing_moves
+from coordinator import single_move, straight_move
 from coordinator.gcode.commands import Call
 from coordinator.gcode.words import parse
 from coordinator.machine.description import load_machine
@@ -107,9 +110,9 @@ class HomingStage:
             x, y, z = (asked + more for asked, more in zip(way, stage.made, strict=True))
             return x, y, z
 
-        monkeypatch.setattr("coordinator.homing.HomingMove", Homes)
-        monkeypatch.setattr("coordinator.single_move.SingleMove", Goes)
-        monkeypatch.setattr("coordinator.straight_move.move_by", move_by)
+        monkeypatch.setattr(homing_moves, "HomingMove", Homes)
+        monkeypatch.setattr(single_move, "SingleMove", Goes)
+        monkeypatch.setattr(straight_move, "move_by", move_by)
         self.machine = SimpleNamespace(
             devices=SimpleNamespace(
                 endstops={rail.axis: _Endstop(self, rail.axis) for rail in self.described.stops},
@@ -121,7 +124,7 @@ class HomingStage:
             monkeypatch.setattr(feeler, "feeling", lambda speed, f=feeler: self._feeling(f.name, speed))
         self.live = cast("Live", SimpleNamespace(machine=self.machine))
         if live:
-            homing._live = self.live
+            asyncio.run(homing.connect(self.live))
 
     @contextlib.asynccontextmanager
     async def _feeling(self, section: str, speed: float) -> AsyncIterator[None]:
@@ -130,7 +133,9 @@ class HomingStage:
         self.moves.append(Feels(section, speed, on=False))
 
     @staticmethod
-    def call(line: str, place: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0), homed: str = "") -> Call:
+    def call(
+        line: str, place: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0), homed: str = ""
+    ) -> Call:
         command = parse(line.encode())
         assert command is not None
         return Call(command, 1, place, homed)
