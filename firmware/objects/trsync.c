@@ -160,9 +160,7 @@ void command_trsync_trigger(struct node *node, const struct wire_arg *args) {
     if (!trsync)
         return;
     uint32_t irq = board_irq_save(node);
-    trsync_trigger(node, trsync, (uint8_t)args[1].value);
-    sched_delete_timer(node, &trsync->report_timer);
-    sched_delete_timer(node, &trsync->expire_timer);
+    trsync_trigger(node, trsync, (uint8_t)args[1].value); // its timers find that the round is over
     board_irq_restore(node, irq);
     report(node, args[0].value, trsync);
 }

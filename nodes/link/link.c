@@ -172,7 +172,7 @@ size_t link_next_block(struct link *link, uint64_t now, unsigned allowed, uint8_
 static int offer_repeat(const struct link *link, struct link_offer *out) {
     const struct link_block *block = const_block_of(link, link->cursor);
     *out = (struct link_offer){.kind = block->kind};
-    struct link_command head = {0};
+    struct link_command head = {.req_clock = 0};
     const struct link_queue *motion = &link->queues[LINK_MOTION];
     if (motion->commands)
         link_queue_peek(motion, motion->head, &head);

@@ -44,8 +44,8 @@ int link_queue_put(struct link_queue *queue, const uint8_t *batch, size_t size, 
 int link_queue_put_stamped(struct link_queue *queue, const struct link_command *command,
                            const uint8_t *payload) {
     uint8_t record[BATCH_HEADER + STAMP + UINT8_MAX];
-    memcpy(record, &command->min_clock, 8);
-    memcpy(record + 8, &command->req_clock, 8);
+    memcpy(record, &command->min_clock, sizeof command->min_clock);
+    memcpy(record + 8, &command->req_clock, sizeof command->req_clock);
     record[16] = command->size;
     memcpy(record + BATCH_HEADER, &command->queued_ns, STAMP);
     memcpy(record + BATCH_HEADER + STAMP, payload, command->size);
@@ -59,8 +59,8 @@ uint64_t link_queue_peek(const struct link_queue *queue, uint64_t at, struct lin
         memcpy(header, queue->memory + start, sizeof header);
     else
         copy_out(queue, at, header, sizeof header);
-    memcpy(&out->min_clock, header, 8);
-    memcpy(&out->req_clock, header + 8, 8);
+    memcpy(&out->min_clock, header, sizeof out->min_clock);
+    memcpy(&out->req_clock, header + 8, sizeof out->req_clock);
     out->size = header[16];
     out->queued_ns = 0;
     if (queue->stamped)

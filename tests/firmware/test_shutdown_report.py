@@ -55,3 +55,17 @@ def test_the_report_waits_for_room_and_comes_once() -> None:
         assert (report.name, host.text(report)) == ("shutdown", "Missed scheduling of next digital out event")
         assert report["clock"] == host.now % (1 << 32)
         assert host.node.counters()["tx_dropped"] == 0
+
+
+def test_a_report_that_waits_for_room_is_dropped_by_a_shutdown() -> None:
+    """A stop group expires when there is no room for its report; it is over when there is."""
+    host = Host()
+    host.configure(ON, "config_trsync oid=1")
+    begin = host.now
+    host.send(f"queue_digital_out oid=0 clock={begin + 1000} on_ticks=1")
+    host.send("trsync_start oid=1 report_clock=0 report_ticks=0 expire_reason=2")
+    host.send(f"trsync_set_timeout oid=1 clock={begin + 2000}")
+    while host.node.counters()["rx_overflow_bytes"] == 0:
+        host.pour(ASK_MOST, 1)
+    host.node.run_until(begin + 1000 + LIMIT)
+    assert [answer.name for answer in drain(host)] == ["shutdown"]

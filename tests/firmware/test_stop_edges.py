@@ -279,6 +279,19 @@ def test_a_member_that_joins_when_the_round_is_over_stops_at_once() -> None:
     assert len(host.steps(3)) == at + 3
 
 
+def test_who_comes_when_the_round_is_over_is_no_member_of_the_next_one() -> None:
+    host = stepping()
+    host.ask("trsync_trigger oid=0 reason=3")
+    for _ in range(2):
+        assert host.send("stepper_stop_on_trigger oid=1 trsync_oid=0") == []
+    at = len(host.steps(3))
+    host.send(f"reset_step_clock oid=1 clock={host.now}", "queue_step oid=1 interval=1000 count=99 add=0")
+    host.run(1500)
+    start(host)
+    host.run(3000)
+    assert len(host.steps(3)) == at + 4
+
+
 def test_joining_twice_is_a_shutdown_that_stops_the_member() -> None:
     host = stepping()
     host.run(2500)

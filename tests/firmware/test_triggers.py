@@ -124,6 +124,17 @@ def test_two_triggers_that_cross_are_each_told_once_and_the_first_reason_counts(
     assert hosts[1].ask("trsync_trigger oid=8 reason=9")["trigger_reason"] == HOST_REASON
 
 
+def test_a_group_that_there_is_not_leaves_the_one_that_was_joined() -> None:
+    host = member(0)
+    assert host.dies("trsync_set_group oid=8 group=16") == "Not a valid trigger group"
+    host.send("clear_shutdown")
+    move(host)
+    host.run(10_500)
+    host.node.receive_frame(*frame(GROUP, 7, 123))
+    assert [(a["oid"], a["trigger_reason"]) for a in host.run(100)] == [(8, 7)]
+    assert position(host) == 10
+
+
 def test_duplicates_are_harmless_and_the_stepper_moves_again_after_a_new_start() -> None:
     host = member(0)
     move(host)

@@ -51,13 +51,13 @@ def approaches(described: "MachineDescription") -> list[Approach]:
     rails = {rail.axis: rail for rail in described.rails}
     found = []
     for names in described.kinematics.homing_order:
-        group = [rails[name] for name in names if name in rails]
+        group = [rails[name] for name in names]
         letters = described.kinematics.homed_letters(names)
         if len(letters) == len(AXES):
             found.append(_together(described, group))
         elif len(letters) > 1:
             found.append(_alone(group[0], letters, letters[0].lower()))
-        elif group and names[0] in AXES:
+        else:
             found.append(_axis(described, group[0]))
             if (second := _second(described, names[0])) is not None:
                 found.append(second)
@@ -95,7 +95,10 @@ def _alone(rail: "RailDescription", letters: str, axis: str) -> Approach:
 def _second(described: "MachineDescription", axis: str) -> Approach | None:
     """Return how the second carriage is homed, if there is one on AXIS and it has an endstop."""
     rail, dual = described.second_carriage, described.dual_carriage
-    if dual is None or rail is None or AXES[dual.carriages.axis] != axis or rail.homing.endstop_pin is None:
+    if dual is None or AXES[dual.carriages.axis] != axis:
+        return None
+    assert rail is not None
+    if rail.homing.endstop_pin is None:
         return None
     found = _alone(rail, axis.upper(), axis)
     weights = dict(dual.carriages.carriages[1].steppers)

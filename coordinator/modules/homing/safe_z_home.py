@@ -114,14 +114,13 @@ class SafeZHome(Module):
                 f"G28 of Z is refused: home_xy_position of [{self.name}] is {self._outside}; correct it"
             )
         self._homing.check(axes)
-        before = call.position
         call = await self._lift(call)
         done = Done()
         if others := axes.replace("Z", ""):
             done = await self._homing.home(call, others)
             call = _after(call, done)
         if "Z" in axes:
-            known = before if "X" in call.homed and not others else call.position
+            known = call.position
             call = await self._go(call, *self._place)
             call = _after(call, await self._homing.home(call, "Z"))
             call = await self._lift(call)

@@ -1,5 +1,6 @@
 """A machine whose homing moves are kept instead of made: their order and figures are what is tested."""
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -123,7 +124,7 @@ class HomingStage:
             monkeypatch.setattr(feeler, "feeling", lambda speed, f=feeler: self._feeling(f.name, speed))
         self.live = cast("ModuleContext", SimpleNamespace(machine=self.machine))
         if live:
-            homing._live = self.live
+            asyncio.run(homing.connect(self.live))
 
     @contextlib.asynccontextmanager
     async def _feeling(self, section: str, speed: float) -> AsyncIterator[None]:

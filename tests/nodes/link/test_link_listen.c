@@ -65,6 +65,32 @@ static void responses_of_every_size_come_in_one_piece_or_many(void) {
     CHECK_EQUAL(deadline_of(&scene), NEVER);
 }
 
+// Sync bytes in front of a block are legal, and no part of it.
+static void sync_bytes_may_stand_in_front(void) {
+    struct scene scene;
+    open_running(&scene, WINDOW);
+    control(&scene, 'c', 1);
+    check_goes(&scene, "c");
+    uint8_t data[64];
+    memset(data, WIRE_SYNC, sizeof data);
+    size_t size = 3;
+    memset(data + size, 's', 9);
+    size += wire_block_finish(data + size, 4, (unsigned)scene.link.next);
+    size += 2;
+    memset(data + size, 't', 9);
+    size += wire_block_finish(data + size, 2, (unsigned)scene.link.next);
+    const uint8_t *at = data;
+    struct link_response response;
+    CHECK_EQUAL(link_receive(&scene.link, &at, &size, scene.now, &response), 1);
+    CHECK_EQUAL(response.size, 4);
+    CHECK(memcmp(response.content, "ssss", 4) == 0);
+    CHECK_EQUAL(link_pending(&scene.link), 0);
+    CHECK_EQUAL(link_receive(&scene.link, &at, &size, scene.now, &response), 1);
+    CHECK_EQUAL(response.size, 2);
+    CHECK(memcmp(response.content, "tt", 2) == 0);
+    CHECK_EQUAL(stats_of(&scene).bytes_invalid, 0);
+}
+
 // ------------------------------------------------------------------------------------------------- damage
 
 static void damage_is_counted_and_is_no_response(void) {
@@ -265,6 +291,7 @@ static void only_motion_with_a_time_has_a_lead(void) {
 int main(void) {
     a_response_knows_its_question_when_that_is_sure();
     responses_of_every_size_come_in_one_piece_or_many();
+    sync_bytes_may_stand_in_front();
     damage_is_counted_and_is_no_response();
     a_rest_that_does_not_come_is_given_up();
     a_rest_that_comes_is_waited_for();

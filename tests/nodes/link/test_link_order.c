@@ -386,6 +386,22 @@ static void a_full_window_wakes_nobody(void) {
     CHECK_EQUAL(deadline_of(&scene), sent_ns + 250 * MS); // before the gate
 }
 
+// Nor does motion that begins to press just now.
+static void a_full_window_wakes_nobody_for_what_presses(void) {
+    struct scene scene;
+    open_link(&scene, 64, SECOND);
+    run_up(&scene, 100 * MS);
+    clock(&scene, scene.now);
+    control(&scene, 'c', 59);
+    CHECK_EQUAL(go(&scene), 64);
+    uint64_t sent_ns = scene.now;
+    motion(&scene, 'm', 1, 0, START + 128); // 250 ms
+    motion(&scene, 'n', 1, START + 112, START + 512);
+    CHECK_EQUAL(deadline_of(&scene), sent_ns + 150 * MS);
+    scene.now = sent_ns + 150 * MS;
+    CHECK_EQUAL(deadline_of(&scene), sent_ns + 250 * MS);
+}
+
 static void bulk_leaves_a_block_of_the_window(void) {
     for (uint64_t window = 191; window <= 192; window++) {
         struct scene scene;
@@ -444,6 +460,7 @@ int main(void) {
     fifteen_blocks_fly_at_most();
     the_window_is_filled_to_the_last_byte();
     a_full_window_wakes_nobody();
+    a_full_window_wakes_nobody_for_what_presses();
     bulk_leaves_a_block_of_the_window();
     bulk_without_room_is_passed();
     return 0;

@@ -11,14 +11,18 @@
 
 enum { SIZE = 256, STAMP = 8 };
 
-static struct link_queue open(int stamped) {
+static struct link_queue open_with(int stamped, size_t size) {
     struct link_queue queue;
     memset(&queue, 1, sizeof queue);
-    uint8_t *memory = malloc(SIZE); // of its own, so that a byte beside it is noticed
+    uint8_t *memory = malloc(size); // of its own, so that a byte beside it is noticed
     CHECK(memory);
-    memset(memory, 1, SIZE);
-    link_queue_init(&queue, memory, SIZE, stamped);
+    memset(memory, 1, size);
+    link_queue_init(&queue, memory, size, stamped);
     return queue;
+}
+
+static struct link_queue open(int stamped) {
+    return open_with(stamped, SIZE);
 }
 
 static int put(struct link_queue *queue, uint8_t size, uint64_t number) {
@@ -93,7 +97,17 @@ static void it_is_filled_to_the_last_byte(void) {
     }
 }
 
+static void the_longest_record_is_whole(void) {
+    struct link_queue queue = open_with(1, 512);
+    for (uint64_t number = 1; number <= 9; number++) {
+        CHECK(put(&queue, 255, number));
+        check_first(&queue, 255, number);
+    }
+    free(queue.memory);
+}
+
 int main(void) {
+    the_longest_record_is_whole();
     records_survive_every_wrap(0);
     records_survive_every_wrap(1);
     it_is_filled_to_the_last_byte();

@@ -428,7 +428,7 @@ static void a_node_that_accepts_nothing_is_stuck(void) {
 // What is lost stays as it is.
 static void a_lost_link_does_nothing_more(void) {
     struct scene scene;
-    open_running(&scene, WINDOW);
+    open_running(&scene, 64); // what is queued stays there
     block_goes(&scene, 'a', 1);
     scene.now++;
     answer(&scene, scene.link.next + 3, 0);
@@ -497,6 +497,8 @@ static void a_sleep_counts_as_a_quarter_at_most(void) {
         time_passes(&scene, sent_ns + SECOND + late_ns);
         CHECK_EQUAL(scene.link.state, late_ns > 250 * MS ? LINK_RUNNING : LINK_LOST);
         CHECK_EQUAL(deadline_of(&scene), late_ns > 250 * MS ? scene.now + 750 * MS : NEVER);
+        CHECK_EQUAL(offer_of(&scene, LINK_ALL).kind, late_ns > 250 * MS ? LINK_CONTROL : LINK_CLASSES);
+        CHECK_EQUAL(go(&scene), late_ns > 250 * MS ? 64 : 0);
     }
 }
 

@@ -19,6 +19,7 @@ from tests.stages.printer_text import (
     SWITCHES_CFG,
     TOOLHEAD,
     changed,
+    example_text,
     printer_section,
     stepper_section,
     write,
@@ -185,6 +186,15 @@ def test_motors_that_share_an_axis_give_the_length_of_a_step(stager: Stager) -> 
     assert head.way == pytest.approx((0.5 + longest, 0.0, 0.0))
 
 
+def test_a_motor_of_which_an_axis_takes_half_makes_steps_of_twice_the_length(stager: Stager) -> None:
+    stage = stager(changed("carriages: x+y", "carriages: - .5 * y + x", example_text("generic_cartesian")))
+    stage.beyond = {"y": 0.5}
+    home(stage, "Y")
+    (head,) = [move for move in stage.moves if isinstance(move, Head)]
+    step_mm = stage.described.motors[0].step_distance
+    assert head.way == pytest.approx((0.0, 0.5 + 2 * step_mm, 0.0))
+
+
 def test_only_axes_that_were_homed_come_back_into_their_range(stager: Stager) -> None:
     stage = stager()
     done = home(stage, "X", (-3.0, -7.0, 300.0, 0.0), "YZ")
@@ -305,6 +315,7 @@ def test_axes_that_cannot_be_homed_are_refused_before_anything_moves(stager: Sta
 
 def test_a_motor_that_cannot_be_switched_on_moves_no_axis(stager: Stager) -> None:
     stage = stager()
+    assert stage.homing._refusal(stage.homing._approaches[1]) == ""
     (motor,) = [motor for motor in stage.described.motors if motor.name == "stepper_y"]
     object.__setattr__(motor, "unpowered", "its driver does not act")
     stage.homing.check("XZ")
@@ -317,7 +328,7 @@ def test_a_rail_that_is_refused_says_why(stager: Stager) -> None:
     stage = stager()
     rail = stage.homing._approaches[0].rails[0]
     object.__setattr__(rail.homing, "refused", "the second carriage is in its way")
-    with pytest.raises(CanductorError, match=r"^G28 of X is refused: the second carriage is in its way$"):
+    with pytest.raises(CanductorError, match="G28 of X is refused: the second carriage is in its way"):
         stage.homing.check("X")
 
 

@@ -104,6 +104,12 @@ def test_the_head_is_lifted_to_the_hop_but_never_lowered(
     assert done.homed == "X"
 
 
+def test_a_hop_may_be_small(stager: Stager) -> None:
+    stage = stager(SAFE + "z_hop: 0.5\n")
+    home(stage, "X", PLACE, "")
+    assert steps(stage) == [(0, 0, 0.5), "x"]
+
+
 def test_without_a_hop_nothing_is_lifted(stager: Stager) -> None:
     stage = stager(SAFE)
     home(stage, "XYZ")
@@ -217,6 +223,7 @@ def test_a_place_is_explained_and_has_a_stand_in(stager: Stager) -> None:
     assert place.stand_in() == (0.0, 0.0)
     (safe,) = stager(SAFE + "z_hop: 1000\n").modules.of(SafeZHome)
     assert safe.name == "safe_z_home"
+    assert safe._outside == ""
 
 
 # -------------------------------------------------------------------------------------------- homing_override
