@@ -14,7 +14,7 @@ from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).parent
 PACKAGES = ("nodes", "coordinator", "canbus_tools")
-BUILD_MODULES = {("nodes.support", "native_build"), ("nodes.link", "sources")}
+BUILD_MODULES = {("nodes.support", "native_build"), ("nodes.support", "link_sources")}
 """Modules that only the build scripts import."""
 EXAMPLE_MACHINES = ("coordinator", "example_machines")
 """Where an installation has the files of config/."""

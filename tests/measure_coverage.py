@@ -55,7 +55,7 @@ SITE: Final = "import coverage\ncoverage.process_startup()\n"
 SETTINGS: Final = f"""\
 [run]
 source = {", ".join(PACKAGES)}
-omit = */build_*.py, */nodes/support/native_build.py, */nodes/link/sources.py
+omit = */build_*.py, */nodes/support/native_build.py, */nodes/support/link_sources.py
 data_file = {DATA}/python
 parallel = true
 relative_files = true

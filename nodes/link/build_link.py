@@ -5,7 +5,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent.parent))
 
-from nodes.link.sources import CORE_HEADERS, CORE_SOURCES
+from nodes.support.link_sources import CORE_HEADERS, CORE_SOURCES
 from nodes.support.native_build import builder
 
 ffibuilder = builder(

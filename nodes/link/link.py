@@ -3,13 +3,14 @@
 import asyncio
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
-
-from typing_extensions import Buffer
+from typing import TYPE_CHECKING, Any
 
 from nodes.link.handle import BusHandle
 from nodes.link.types import Flow, LinkError, LinkSettings, LinkStats, Response
 from nodes.support.c_structs import from_struct
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer  # comes with mypy
 
 _S_PER_NS = 1e-9
 

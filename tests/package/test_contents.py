@@ -14,7 +14,7 @@ from tests.package.build import ROOT, setup, unpack
 PACKAGES = ("canbus_tools", "coordinator", "nodes")
 BUILT = ("*.so", "*.o", "*.d", "*.py[cod]", "*/build/*", "*/bin/*", "*.egg-info/*", "*/_*.c")
 """What a checkout may have and no source distribution."""
-BUILD_ONLY = ("*.c", "*.h", "*/build_*.py", "nodes/support/native_build.py", "nodes/link/sources.py")
+BUILD_ONLY = ("*.c", "*.h", "*/build_*.py", "nodes/support/native_build.py", "nodes/support/link_sources.py")
 """What a package's folder has for the build alone."""
 INCLUDE = re.compile(r'^#include "([^"]+)"', re.MULTILINE)
 C_PATH = re.compile(r'"((?:firmware|nodes|coordinator)/[\w/]+\.[ch])"')
