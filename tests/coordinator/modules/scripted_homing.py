@@ -24,6 +24,18 @@ if TYPE_CHECKING:
 Way = tuple[float, float, float]
 
 
+def perform(reading: Reading) -> Done:
+    """Carry out what is done at rest; return what came of it."""
+    assert isinstance(reading, AtRest)
+
+    async def main() -> Done | None:
+        return await reading.perform()
+
+    done = asyncio.run(main())
+    assert done is not None
+    return done
+
+
 @dataclass(frozen=True)
 class To:
     """A move towards the endstops of RAILS."""
