@@ -11,7 +11,7 @@ import pytest
 
 from coordinator import homing as homing_moves
 from coordinator import single_move, straight_move
-from coordinator.gcode.commands import Call
+from coordinator.gcode.commands import AtRest, Call, Done, Reading
 from coordinator.gcode.words import parse
 from coordinator.machine.description import load_machine
 from coordinator.modules.homing import Homing
