@@ -11,7 +11,7 @@ import pytest
 
 from coordinator import homing as homing_moves
 from coordinator import single_move, straight_move
-from coordinator.gcode.commands import Call
+from coordinator.gcode.commands import AtRest, Call, Done, Reading
 from coordinator.gcode.words import parse
 from coordinator.machine.description import load_machine
 from coordinator.modules.homing import Homing
@@ -22,6 +22,18 @@ if TYPE_CHECKING:
     from coordinator.single_move import Ramp
 
 Way = tuple[float, float, float]
+
+
+def perform(reading: Reading) -> Done:
+    """Carry out what is done at rest; return what came of it."""
+    assert isinstance(reading, AtRest)
+
+    async def main() -> Done | None:
+        return await reading.perform()
+
+    done = asyncio.run(main())
+    assert done is not None
+    return done
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from coordinator.gcode.commands import AtRest, Done
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.homing import Homing
 from nodes.errors import CanductorError
-from tests.coordinator.modules.scripted_homing import Feels, Head, HomingStage, Motors, To
+from tests.coordinator.modules.scripted_homing import Feels, Head, HomingStage, Motors, To, perform
 from tests.stages.printer_text import (
     MCU,
     PRINTER_CFG,
@@ -50,10 +50,7 @@ def home(
     stage: HomingStage, axes: str, place: Position = (100.0, 110.0, 120.0, 5.0), homed: str = ""
 ) -> Done:
     reading = stage.homing.read(stage.call("G28", place, homed), axes)
-    assert isinstance(reading, AtRest)
-    done = asyncio.run(reading.perform())  # type: ignore[arg-type]
-    assert isinstance(done, Done)
-    return done
+    return perform(reading)
 
 
 def close(position: Position | None, *expected: float) -> bool:
@@ -351,9 +348,7 @@ def test_endstops_are_told_and_remembered(stager: Stager, name: str) -> None:
     assert stage.homing.status() == {"last_query": {}}
     stage.pressed = {"y"}
     reading = stage.modules.vocabulary.commands[name].read(stage.call(name))
-    assert isinstance(reading, AtRest)
-    done = asyncio.run(reading.perform())  # type: ignore[arg-type]
-    assert done == Done(("x:open y:pressed z:open",), kind=ReplyKind.PLAIN)
+    assert perform(reading) == Done(("x:open y:pressed z:open",), kind=ReplyKind.PLAIN)
     assert stage.homing.status() == {"last_query": {"x": False, "y": True, "z": False}}
 
 

@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 
 from coordinator.commands import EXAMPLES
-from coordinator.gcode.commands import AtRest, Done, Lines, Reading
+from coordinator.gcode.commands import AtRest, Done, Lines
 from coordinator.gcode.words import WordError
 from coordinator.machine.description import ConfigError, load_machine
 from coordinator.modules.homing_override import HomingOverride
 from coordinator.modules.safe_z_home import SafeZHome
 from nodes.errors import CanductorError
-from tests.coordinator.modules.scripted_homing import Head, HomingStage, To
+from tests.coordinator.modules.scripted_homing import Head, HomingStage, To, perform
 from tests.stages.printer_text import SWITCHES_CFG, changed, write
 
 SAFE = "\n[safe_z_home]\nhome_xy_position: 30, 200\n"
@@ -38,13 +38,6 @@ class Stager:
 @pytest.fixture
 def stager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stager:
     return Stager(tmp_path, monkeypatch)
-
-
-def perform(reading: Reading) -> Done:
-    assert isinstance(reading, AtRest)
-    done = asyncio.run(reading.perform())  # type: ignore[arg-type]
-    assert isinstance(done, Done)
-    return done
 
 
 def home(stage: HomingStage, axes: str, place: Position = PLACE, homed: str = "") -> Done:
