@@ -32,6 +32,14 @@ def edges(host: Host) -> list[tuple[int, int, int]]:
 # ---------------------------------------------------------------------------------------------------- outputs
 
 
+@pytest.mark.parametrize(("value", "default"), [(0, 1), (1, 0), (1, 1), (0, 0), (2, 0)])
+def test_a_pin_has_its_first_value_from_the_beginning(value: int, default: int) -> None:
+    host = Host()
+    begin = host.now
+    host.configure(f"config_digital_out oid=0 pin={PIN} value={value} default_value={default} max_duration=0")
+    assert edges(host) == ([(begin, PIN, 1)] if value else [])
+
+
 @pytest.mark.parametrize("on_ticks", [1000, 1001, 5000])
 def test_a_whole_cycle_on_is_on_without_a_gap(on_ticks: int) -> None:
     host = digital(cycle=1000)

@@ -56,9 +56,11 @@ step_pin: PB3
 dir_pin: PB4
 microsteps: 16
 rotation_distance: 40
-endstop_pin: ^PC6
+endstop_pin: ^{endstop}
 """
 STEP_PINS = {"stepper_x": "PB0", "stepper_x1": "PB3"}
+RELAY_S = 0.02
+"""The host is told and tells the other node within this."""
 HALF_A_ROLLOVER_S = (1 << 31) / 168e6
 CLOCKS_S = 10e-6
 """What the host may have a secondary node's clock wrong by, on a quiet bus."""
@@ -69,10 +71,18 @@ STEP_S = 2e-6
 class Switches:
     """A homing of X, with a second side where that has a switch; each closes with a step that is known."""
 
-    def __init__(self, folder: Path, endstop: str, at: int, second_at: int | None = None) -> None:
-        second = "" if second_at is None else SECOND_SIDE
+    def __init__(
+        self,
+        folder: Path,
+        endstop: str,
+        at: int,
+        second_at: int | None = None,
+        second_switch: str = "PC6",
+    ) -> None:
+        second = "" if second_at is None else SECOND_SIDE.format(endstop=second_switch)
         (folder / "home.cfg").write_text(MACHINE.format(endstop=endstop) + second)
-        (folder / "home.toml").write_text('about = "Homing."\nmachine = "home.cfg"\n')
+        legacy = "[nodes.toolhead]\nlegacy = true\n" if "toolhead" in second_switch else ""
+        (folder / "home.toml").write_text(f'about = "Homing."\nmachine = "home.cfg"\n{legacy}')
         self.at = {"stepper_x": at} if second_at is None else {"stepper_x": at, "stepper_x1": second_at}
         self.stage = Stage(scenarios.find(str(folder / "home.toml")), 0)
         mcu, toolhead = (self.stage._boards[name].node for name in ("mcu", "toolhead"))
@@ -87,7 +97,8 @@ class Switches:
         )
         if second_at is not None:
             second_pins = (pins["PB3"], pins["PB4"])
-            mcu.add_axis(*second_pins, target=mcu, target_pin=pins["PC6"], at=-second_at, direction=-1)
+            target = toolhead if "toolhead" in second_switch else mcu
+            mcu.add_axis(*second_pins, target=target, target_pin=pins["PC6"], at=-second_at, direction=-1)
 
     def run(self, speed: float) -> tuple[HomingResult, ...]:
         """Home at SPEED, mm/s."""
@@ -138,3 +149,12 @@ def test_a_trigger_long_before_that_of_the_last_rail_is_not_taken_for_one_to_com
     for result, (stepper, at) in zip(found, switches.at.items(), strict=True):
         assert -STEP_S <= result.triggered_at_s - switches.closed_at_s(stepper) <= LOOK_S + STEP_S
         assert result.way_to_trigger_mm == pytest.approx(at / 80, abs=0.02)
+
+
+def test_a_side_whose_switch_is_on_another_node_stops_while_the_other_side_goes_on(tmp_path: Path) -> None:
+    """Its nodes have no trigger groups: the host relays at once, and not at the end of the move."""
+    switches = Switches(tmp_path, "PC5", 3200, second_at=160, second_switch="toolhead:PC6")
+    first, second = switches.run(20.0)
+    assert not second.through_group
+    assert 0 <= second.beyond_trigger_mm < 20.0 * RELAY_S
+    assert first.way_to_trigger_mm == pytest.approx(40.0, abs=0.02)

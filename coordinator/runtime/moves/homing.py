@@ -176,9 +176,7 @@ class HomingMove:
         late: _LateError | None = None
         try:
             ends = [
-                sync.listen(node, self._hear(leg, node, sync, move))
-                for leg in legs
-                for node, sync in leg.syncs
+                sync.listen(node, self._hear(leg, node, move)) for leg in legs for node, sync in leg.syncs
             ]
             await self._arm(move, legs)
             await self._until_triggered(move, legs)
@@ -268,7 +266,7 @@ class HomingMove:
 
     # ------------------------------------------------------------------------------------------ under way
 
-    def _hear(self, leg: _Leg, node: Node, sync: Trsync, move: SingleMove) -> Callable[[TrsyncState], None]:
+    def _hear(self, leg: _Leg, node: Node, move: SingleMove) -> Callable[[TrsyncState], None]:
         """Return what takes the reports of one node's stop group."""
 
         def heard(state: TrsyncState) -> None:
@@ -279,7 +277,7 @@ class HomingMove:
             leg.triggered.set()
             self._changed.set()
             for other, other_sync in leg.syncs:
-                if other_sync is not sync and other.talks:
+                if other.talks:
                     other_sync.trigger_now(other)
 
         return heard
@@ -377,10 +375,10 @@ def _switched(leg: _Leg, states: Mapping[str, TrsyncState]) -> bool:
 
 def _overshoot(move: SingleMove, stepper: StepperDescription, moved: int, to_trigger: float) -> Overshoot:
     planned = move.planned_steps(stepper, to_trigger)
-    forward = 1 if planned >= 0 else -1
-    steps = forward * (moved - int(np.floor(planned + 0.5)))
-    distance = forward * (moved - planned) * stepper.step_distance
-    return Overshoot(stepper.name, stepper.node, steps, distance / abs(move.along(stepper)))
+    along = move.along(stepper)
+    steps = moved - int(np.floor(planned + 0.5))
+    distance = (moved - planned) * stepper.step_distance / along
+    return Overshoot(stepper.name, stepper.node, steps if along > 0 else -steps, distance)
 
 
 def _names(legs: Sequence[_Leg]) -> str:

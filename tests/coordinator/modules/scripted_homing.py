@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import pytest
 
 from coordinator.assembly.load import load_machine
-from coordinator.gcode.commands import Call
+from coordinator.gcode.commands import AtStandstill, Call, Reading
+from coordinator.gcode.events import Done
 from coordinator.gcode.parser import parse
 from coordinator.modules.homing.homing import Homing
 from coordinator.modules.homing.virtual_endstop import StallEndstop
@@ -21,6 +22,18 @@ if TYPE_CHECKING:
     from coordinator.runtime.moves.single import Ramp
 
 Way = tuple[float, float, float]
+
+
+def perform(reading: Reading) -> Done:
+    """Carry out what is done at rest; return what came of it."""
+    assert isinstance(reading, AtStandstill)
+
+    async def main() -> Done | None:
+        return await reading.perform()
+
+    done = asyncio.run(main())
+    assert done is not None
+    return done
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.homing.homing import Homing
 from coordinator.support.examples import EXAMPLES
 from nodes.support.errors import CanductorError
-from tests.coordinator.modules.scripted_homing import Feels, Head, HomingStage, Motors, To
+from tests.coordinator.modules.scripted_homing import Feels, Head, HomingStage, Motors, To, perform
 from tests.stages.printer_text import (
     MCU,
     PRINTER_CFG,
@@ -51,10 +51,7 @@ def home(
     stage: HomingStage, axes: str, place: Position = (100.0, 110.0, 120.0, 5.0), homed: str = ""
 ) -> Done:
     reading = stage.homing.read(stage.call("G28", place, homed), axes)
-    assert isinstance(reading, AtStandstill)
-    done: Done | None = asyncio.run(reading.perform())  # type: ignore[arg-type]
-    assert isinstance(done, Done)
-    return done
+    return perform(reading)
 
 
 def close(position: Position | None, *expected: float) -> bool:
@@ -352,9 +349,7 @@ def test_endstops_are_told_and_remembered(stager: Stager, name: str) -> None:
     assert stage.homing.status() == {"last_query": {}}
     stage.pressed = {"y"}
     reading = stage.modules.vocabulary.commands[name].read(stage.call(name))
-    assert isinstance(reading, AtStandstill)
-    done: Done | None = asyncio.run(reading.perform())  # type: ignore[arg-type]
-    assert done == Done(("x:open y:pressed z:open",), kind=ReplyKind.PLAIN)
+    assert perform(reading) == Done(("x:open y:pressed z:open",), kind=ReplyKind.PLAIN)
     assert stage.homing.status() == {"last_query": {"x": False, "y": True, "z": False}}
 
 

@@ -7,14 +7,14 @@ import pytest
 
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
-from coordinator.gcode.commands import AtStandstill, Lines, Reading
+from coordinator.gcode.commands import AtStandstill, Lines
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
 from coordinator.modules.homing.homing_override import HomingOverride
 from coordinator.modules.homing.safe_z_home import SafeZHome
 from coordinator.support.examples import EXAMPLES
 from nodes.support.errors import CanductorError
-from tests.coordinator.modules.scripted_homing import Head, HomingStage, To
+from tests.coordinator.modules.scripted_homing import Head, HomingStage, To, perform
 from tests.stages.printer_text import SWITCHES_CFG, changed, write
 
 SAFE = "\n[safe_z_home]\nhome_xy_position: 30, 200\n"
@@ -40,13 +40,6 @@ class Stager:
 @pytest.fixture
 def stager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stager:
     return Stager(tmp_path, monkeypatch)
-
-
-def perform(reading: Reading) -> Done:
-    assert isinstance(reading, AtStandstill)
-    done: Done | None = asyncio.run(reading.perform())  # type: ignore[arg-type]
-    assert isinstance(done, Done)
-    return done
 
 
 def home(stage: HomingStage, axes: str, place: Position = PLACE, homed: str = "") -> Done:
