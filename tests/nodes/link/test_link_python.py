@@ -5,9 +5,8 @@ import errno
 import gc
 import struct
 import weakref
-from collections.abc import Callable
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -18,6 +17,9 @@ from tests.nodes.link.by_hand import START_NS, ByHand
 from tests.nodes.link.peers import Inbox
 from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, store
 from tests.wire_twin import block
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 HZ = 1_000_000
 START_TICKS = 5_000_000
