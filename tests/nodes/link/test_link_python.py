@@ -4,8 +4,9 @@ import asyncio
 import errno
 import gc
 import struct
+import weakref
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -16,6 +17,9 @@ from tests.nodes.link.by_hand import START_NS, ByHand
 from tests.nodes.link.peers import Inbox
 from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, store
 from tests.wire_twin import block
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 HZ = 1_000_000
 START_TICKS = 5_000_000
@@ -253,13 +257,14 @@ def test_an_ended_transport_ends_its_links() -> None:
         await asyncio.sleep(0)
         lib.io_end(line.driver.bus, errno.ENODEV)
         words = r"by hand: the connection ended .*; the interface is gone: plug the adapter in, then start"
-        for refused in (
+        calls: tuple[Callable[[], None], ...] = (
             lambda: line.link.send(ask(2)),
             lambda: line.link.send_batch(record(ask(2))),
             lambda: line.link.send_urgent(STOP),
             lambda: line.link.set_receive_window(64),
             lambda: line.link.set_clock(HZ, 1, 1),
-        ):
+        )
+        for refused in calls:
             with pytest.raises(LinkError, match=words):
                 refused()
         line.driver.hand_over()
@@ -290,9 +295,9 @@ def test_a_closed_link_keeps_its_last_counters_and_frees_its_place() -> None:
     last = line.link.stats()
     assert last.commands_sent == 2
     line.link.send(ask(2))
+    assert line.link.name == "by hand"
     line.link.close()
     assert line.link.stats().pending == 1
-    assert line.link.stats() == line.link.stats()
     line.link.close()
     with pytest.raises(LinkError, match="by hand: the link was closed by this program"):
         line.link.send(ask(3))
@@ -302,6 +307,15 @@ def test_a_closed_link_keeps_its_last_counters_and_frees_its_place() -> None:
 
 
 # -------------------------------------------------------------------------------------------------- counters
+
+
+def test_a_closed_link_is_kept_by_nobody() -> None:
+    line = Line()
+    kept = weakref.ref(line.link)
+    line.link.close()
+    del line.link
+    gc.collect()
+    assert kept() is None
 
 
 def test_counters_are_those_of_the_c_core() -> None:
@@ -327,6 +341,7 @@ def test_counters_are_those_of_the_c_core() -> None:
     assert stats.control_bytes_max == 25 + max(len(ask(1)), len(store(0)))
     assert stats.lead_count == sum(stats.lead_histogram) == 30
     assert stats.min_lead_s == link.lead_min_ns * 1e-9
+    assert stats.min_lead_s is not None
     assert 0.5 < stats.min_lead_s < 0.9
     assert (stats.srtt_s, stats.rttvar_s, stats.rto_s) == (
         link.srtt_ns * 1e-9,
