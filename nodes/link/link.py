@@ -41,8 +41,8 @@ class Link:
         self._name = bus.name if settings.nodeid is None else f"{bus.name} node {settings.nodeid}"
         self._failed: str | None = None
         self._drained: asyncio.Future[None] | None = None
-        self._final = LinkStats()
-        self._closed = False
+        self._final: LinkStats | None = None
+        """The last counters, once it is closed."""
 
     @property
     def name(self) -> str:
@@ -111,19 +111,18 @@ class Link:
 
     def stats(self) -> LinkStats:
         """Return the counters so far; after close(), the last ones."""
-        if not self._closed:
-            raw = self._ffi.new("struct io_link_stats *")
-            if self._lib.io_get_link_stats(self._bus.live(), self._number, raw) == self._lib.IO_OK:
-                self._final = _convert(raw, self._lib)
-        return self._final
+        if self._final:
+            return self._final
+        raw = self._ffi.new("struct io_link_stats *")
+        self._check(self._lib.io_get_link_stats(self._bus.live(), self._number, raw))
+        return _convert(raw, self._lib)
 
     def close(self) -> None:
         """Forget the link; what is queued is dropped. Further calls do nothing."""
-        if self._closed:
+        if self._final:
             return
-        self.stats()
+        self._final = self.stats()
         self._fail(f"{self._name}: the link was closed by this program")
-        self._closed = True
         self._lib.io_close_link(self._bus.live(), self._number)
         self._on_close(self._number)
 

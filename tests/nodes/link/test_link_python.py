@@ -4,9 +4,10 @@ import asyncio
 import errno
 import gc
 import struct
+import weakref
 from collections.abc import Callable
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -17,6 +18,9 @@ from tests.nodes.link.by_hand import START_NS, ByHand
 from tests.nodes.link.peers import Inbox
 from tests.nodes.link.twin import STOP, NodeTwin, answer, ask, store
 from tests.wire_twin import block
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 HZ = 1_000_000
 START_TICKS = 5_000_000
@@ -292,9 +296,9 @@ def test_a_closed_link_keeps_its_last_counters_and_frees_its_place() -> None:
     last = line.link.stats()
     assert last.commands_sent == 2
     line.link.send(ask(2))
+    assert line.link.name == "by hand"
     line.link.close()
     assert line.link.stats().pending == 1
-    assert line.link.stats() == line.link.stats()
     line.link.close()
     with pytest.raises(LinkError, match="by hand: the link was closed by this program"):
         line.link.send(ask(3))
@@ -304,6 +308,15 @@ def test_a_closed_link_keeps_its_last_counters_and_frees_its_place() -> None:
 
 
 # -------------------------------------------------------------------------------------------------- counters
+
+
+def test_a_closed_link_is_kept_by_nobody() -> None:
+    line = Line()
+    kept = weakref.ref(line.link)
+    line.link.close()
+    del line.link
+    gc.collect()
+    assert kept() is None
 
 
 def test_counters_are_those_of_the_c_core() -> None:
