@@ -35,11 +35,12 @@ class Collector:
         self._coverage = coverage.Coverage(data_file=None, include=python, config_file=False, messages=False)
         # That tests of C execute none of the Python in question is no reason for a warning.
         self._coverage.set_option("run:disable_warnings", ["no-data-collected", "module-not-measured"])
-        self._hits = [_counters(script) for script in MODULES]
         self._module = ""
         self._tests: dict[str, dict[str, Any]] = {}
         self._shared: set[int] = set()
         self._coverage.start()
+        # After the start: what these imports execute counts as executed by an import.
+        self._hits = [_counters(script) for script in MODULES]
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
