@@ -12,6 +12,8 @@ extern const struct step_formula *const table_end[] __asm__("__stop_step_formula
     __attribute__((visibility("hidden")));
 
 const struct step_formula *step_find_formula(const char *name) {
+    // Both are names of the same section's ends.
+    // cppcheck-suppress comparePointers
     for (const struct step_formula *const *entry = table_begin; entry < table_end; entry++)
         if (!strcmp((*entry)->name, name))
             return *entry;
