@@ -1,1 +1,1 @@
-"""One node as the host sees it: transports, link, dictionary, id assignment, clock; and virtual nodes."""
+"""The host's side of one node: transports, link, dictionary, id assignment, clock; and virtual nodes."""

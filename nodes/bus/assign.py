@@ -1,16 +1,16 @@
 """Node ids on a CAN bus: finding the nodes that wait for one, and giving each its own. Sans-IO.
 
-A round asks who waits (QUERY_UNASSIGNED) and, of firmware that knows the question, who is there already
-(WHO_IS_HERE); the answers of a round are merged with those before, since frames get lost and answers
-collide: older firmware answers at once, all nodes with the same CAN id, and two that begin in the same bit
-destroy each other's frame. A host's own frame right behind the question would make them wait for its end
-and so begin together: nothing follows QUERY_UNASSIGNED, and some rounds ask it alone. Nodes that still
-collide are told their ids unheard, and then collide no more.
+A round queries which nodes wait for an id (QUERY_UNASSIGNED) and, with firmware that supports it, which have
+one already (WHO_IS_HERE). The answers of a round are merged with those before, since frames get lost and
+answers collide: older firmware answers at once, all nodes with the same CAN id, and two that begin in the
+same bit destroy each other's frame. A frame of the host right behind the query would make them wait for its
+end and so begin together: nothing follows QUERY_UNASSIGNED, and some rounds send it alone. Nodes that still
+collide get their ids without having answered, and then collide no more.
 
-Setting an id is not acknowledged. It counts as done when the node says so (WHO_IS_HERE), or when it no
-longer answers SILENT_ROUNDS queries in a row; until then it is told again in every round, as its silence may
-be lost frames. A node that has an id from before answers no query, so one that never answers is told its id
-all the same, and remains *unheard*: only talking to it (identify) shows whether it is there.
+Setting an id is not acknowledged. It counts as done when the node reports it (WHO_IS_HERE), or when it no
+longer answers SILENT_ROUNDS queries in a row; until then it is sent again in every round, as the silence may
+be due to lost frames. A node that has an id from before answers no query, so a node that never answers gets
+its id all the same and remains *unheard*: only identifying it shows whether it is there.
 """
 
 import re
@@ -36,21 +36,21 @@ from nodes.support.errors import CanductorError
 ROUND_NS: Final = 20_000_000
 """Time for the answers of one round; nodes answer within a few milliseconds."""
 ALL_ASKED_ROUNDS: Final = 3
-"""Rounds after which only every other one asks WHO_IS_HERE."""
+"""Number of rounds after which only every other one sends WHO_IS_HERE."""
 SLOW_ROUND_NS: Final = 100_000_000
 QUICK_ROUNDS: Final = 10
 ANSWER_NS: Final = 540_000
-"""One answer on the wire at 250 kbit/s: a round lasts longer, the more nodes may answer."""
+"""Time of one answer on the wire at 250 kbit/s: the more nodes may answer, the longer a round lasts."""
 PATIENCE_NS: Final = 1_200_000_000
-"""How long a node that does not answer is asked, since a new one appeared last: it may still be booting."""
+"""How long a silent node is queried after the last new one appeared: it may still be booting."""
 MAX_NS: Final = 5_000_000_000
-"""After which it ends even if new ones appear for ever."""
+"""Time after which the assignment ends even if new nodes keep appearing."""
 SILENT_ROUNDS: Final = 3
-"""With 1 % of frames lost, an unassigned node stays silent that long once in 10^5 rounds."""
+"""With 1 % of frames lost, an unassigned node stays silent for so many rounds once in 10^5 rounds."""
 UNHEARD_ROUNDS: Final = 4
-"""After which one that never answered is told its id."""
+"""Number of rounds after which a node that never answered is sent its id."""
 MAX_STRANGERS: Final = 512
-"""Uuids remembered that nobody asked for."""
+"""Most uuids remembered that are not wanted."""
 _UUID: Final = re.compile(r"[0-9a-fA-F]{12}\Z")
 
 
@@ -60,7 +60,7 @@ class AssignError(CanductorError):
 
 @dataclass(frozen=True, slots=True)
 class Uuid:
-    """A board's six bytes as they stand on the wire; printed as 12 hex digits."""
+    """Identity of a board: six bytes in the order of the wire; printed as 12 hex digits."""
 
     raw: bytes
 
@@ -73,7 +73,7 @@ class Uuid:
         """Read 12 hex digits; raises AssignError."""
         if _UUID.match(text.strip()):
             return cls(bytes.fromhex(text.strip()))
-        raise AssignError(f"{text!r} is no uuid: give the 12 hex digits that 'canductor can query' prints")
+        raise AssignError(f"{text!r} is not a uuid: give the 12 hex digits that 'canductor can query' prints")
 
     def __str__(self) -> str:
         return self.raw.hex()
@@ -88,14 +88,14 @@ class AdminFrame:
 
 
 def waiting_uuid(data: bytes) -> Uuid | None:
-    """Return who waits for an id, from an admin response; None when it says something else."""
+    """Return the uuid that waits for an id, from an admin response; None for any other response."""
     if len(data) == UUID_SIZE + 2 and data[0] == NEED_NODEID:
         return Uuid(data[1 : 1 + UUID_SIZE])
     return None
 
 
 def number_nodes(uuids: Iterable[Uuid]) -> dict[Uuid, int]:
-    """Give out node ids 4, 5, 6, … in the order of UUIDS; raises AssignError."""
+    """Assign node ids 4, 5, 6, … in the order of UUIDS; raises AssignError."""
     found: dict[Uuid, int] = {}
     for nodeid, uuid in enumerate(uuids, FIRST_NODEID):
         if uuid in found:
@@ -116,7 +116,7 @@ class _Seen:
     """Answers to WHO_IS_HERE."""
     answered_round: bool = False
     needs_id: bool = False
-    """It said in this round that it has none or another, or somebody else said to have the same."""
+    """In this round it reported no id or another one, or another node reported the same id."""
     silent_rounds: int = 0
     bootloader: bool = False
     settled: bool = False
@@ -124,17 +124,17 @@ class _Seen:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """How it ended: ids are set for all wanted uuids; those UNHEARD have yet to prove that they are there."""
+    """Result: ids are set for all wanted uuids; the presence of those UNHEARD is not yet proved."""
 
     nodeids: Mapping[Uuid, int]
     unheard: tuple[Uuid, ...]
     in_bootloader: tuple[Uuid, ...]
     duplicates: tuple[Uuid, ...]
-    """Uuids that more than one board answered with."""
+    """Uuids with which more than one board answered."""
     strangers: Mapping[Uuid, str] = field(default_factory=dict)
-    """Uuids that wait for an id and are not wanted, and what they are."""
+    """Uuids that wait for an id and are not wanted, with their kind."""
     displaced: Mapping[Uuid, int] = field(default_factory=dict)
-    """Uuids that are not wanted and had an id that a wanted one gets."""
+    """Uuids that are not wanted and had an id that was assigned to a wanted one."""
 
     def check(self, bus: str) -> None:
         """Raise AssignError when a wanted node cannot be used for certain."""
@@ -163,11 +163,12 @@ class Assignment:
 
 
 class IdAssignment:
-    """Gives the uuids of WANTED their node ids. Times are nanoseconds of any one clock.
+    """Assigns node ids to the uuids of WANTED. Times are nanoseconds of any one clock.
 
-    Call ``start``, then ``frame`` for what arrives and ``timer`` when ``deadline_ns`` has come; send what
-    ``frames_to_send`` returns after each; it is over when ``result`` is not None. With nothing
-    WANTED it finds out who waits for an id (``strangers``), until SILENT_ROUNDS rounds brought nobody new.
+    Call ``start``, then ``frame`` for each received frame and ``timer`` when ``deadline_ns`` has come; send
+    what ``frames_to_send`` returns after each. The assignment is over when ``result`` is not None. With
+    nothing WANTED it finds the nodes that wait for an id (``strangers``), until SILENT_ROUNDS rounds found
+    no new one.
     """
 
     def __init__(self, wanted: Mapping[Uuid, int]) -> None:
@@ -190,12 +191,12 @@ class IdAssignment:
         self._next_round(now_ns)
 
     def frames_to_send(self) -> list[AdminFrame]:
-        """Return what is to be sent now, once."""
+        """Return the frames to be sent now; each is returned once."""
         frames, self._outbox = self._outbox, []
         return frames
 
     def frame(self, can_id: int, data: bytes, now_ns: int) -> None:
-        """Take a received frame; anything but an answer of a node is ignored."""
+        """Handle a received frame; anything but an answer of a node is ignored."""
         if can_id != ADMIN_RESPONSE_ID or len(data) != UUID_SIZE + 2 or self.result is not None:
             self.ignored_frames += can_id == ADMIN_RESPONSE_ID
             return
@@ -209,7 +210,7 @@ class IdAssignment:
             self._node_is_here(uuid, seen, data[-1])
 
     def timer(self, now_ns: int) -> None:
-        """Take the time; closes a round whose deadline has come."""
+        """Close the round if its deadline has come."""
         if self.deadline_ns is None or now_ns < self.deadline_ns:
             return
         for uuid, seen in self._seen.items():
@@ -254,12 +255,12 @@ class IdAssignment:
             return
         for other in self._seen.values():
             if other.nodeid == nodeid:
-                # Told its id once more, the wanted node keeps it, and this one drops it and shuts down.
+                # The id is sent once more: the wanted node keeps it, this one drops it and shuts down.
                 self._displaced[uuid] = nodeid
                 other.needs_id = True
 
     def _close_round(self, uuid: Uuid, seen: _Seen) -> None:
-        """Judge a wanted node by the round that ends, and tell it its id when it does not seem to know it."""
+        """Evaluate the round for a wanted node, and send its id when it does not seem to have it."""
         if seen.answered_round:
             seen.silent_rounds = 0
         else:
@@ -267,7 +268,7 @@ class IdAssignment:
             if seen.answers and not seen.bootloader and seen.silent_rounds >= SILENT_ROUNDS:
                 seen.settled = True
         unheard = not seen.answers and not seen.settled and seen.silent_rounds >= UNHEARD_ROUNDS
-        silent = seen.answers and not seen.settled  # it knows its id, or the queries got lost
+        silent = seen.answers and not seen.settled  # it has its id, or the queries got lost
         if seen.nodeid is not None and not seen.bootloader and (seen.needs_id or silent or unheard):
             data = bytes((SET_NODEID, *uuid.raw, seen.nodeid))
             self._outbox.append(AdminFrame(ADMIN_ID, data))

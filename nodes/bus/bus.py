@@ -1,4 +1,4 @@
-"""One bus or UART with its nodes: node ids, links, starting and closing, each unwinding cleanly."""
+"""One bus or UART with its nodes: node ids, links, start and close with a clean unwind on failure."""
 
 import asyncio
 from collections.abc import Callable
@@ -16,14 +16,14 @@ LOST_AFTER_S: Final = 1.0
 
 
 def ignore(*_: object) -> None:
-    """Do nothing: what a callback nobody asked for does."""
+    """Do nothing: the default of an optional callback."""
 
 
 class BusBase:
-    """What a CAN bus and a UART have in common: the I/O, and nodes that live and die with it.
+    """Base of a CAN bus and a UART: the I/O, and the nodes that depend on it.
 
-    START_IO opens the transport; it is called again when a bus that closed is to come back. Nodes share
-    CACHE, their dictionaries. ON_NOTICE gets sentences about what the user should put right.
+    START_IO opens the transport; it is called again when a closed bus is reopened. The nodes share CACHE for
+    their dictionaries. ON_NOTICE gets sentences about what the user should fix.
     A node that acknowledges nothing for LOST_AFTER_S is lost.
     """
 
@@ -55,9 +55,10 @@ class BusBase:
         return self._io
 
     async def start(self) -> None:
-        """Open the bus and bring its nodes to READY, together. What fails is raised with all closed.
+        """Open the bus and bring its nodes to READY, concurrently. On a failure, close all and raise it.
 
-        Nodes that may be absent are LOST when they are, and so are all when the bus has only such.
+        Nodes that may be absent become LOST when they are; so do all nodes of a bus that has only such nodes
+        and cannot be opened.
         """
         try:
             await self._start()
@@ -90,7 +91,7 @@ class BusBase:
                 raise
 
     def ensure_open(self) -> None:
-        """Open the bus again when it closed, for its nodes to be restarted; raises CanductorError."""
+        """Reopen the bus if it closed, so that its nodes can be restarted; raises CanductorError."""
         if self.closed_because is not None:
             io, self._io = self._io, None
             if io is not None:
@@ -136,9 +137,9 @@ class BusBase:
 
 
 def _cause(error: BaseException) -> CanductorError | None:
-    """Return the failure that began it, or None when ERROR holds anything else than failures.
+    """Return the first cause among the failures, or None when ERROR holds anything other than failures.
 
-    Nodes that only went down with their bus say less than what took it down.
+    The failure of a node that went down with its bus is less informative than that of the bus.
     """
     if isinstance(error, CanductorError):
         return error
@@ -183,7 +184,7 @@ class _UartConnector:
         )
 
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:  # noqa: ARG002
-        return 0  # a device file does not tell whether a baud rate is real, or a USB or pseudo-terminal's
+        return 0  # a device file does not show whether its baud rate is real (USB, pseudo-terminals)
 
     def forget(self) -> None:
         pass
@@ -195,7 +196,7 @@ class _UartConnector:
         )
 
     def check_identity(self, found: bytes) -> None:
-        pass  # whatever board is at the other end of the cable, it is the node
+        pass  # the board at the other end of the cable is the node, whichever it is
 
     def suspect(self) -> None:
-        pass  # a node that restarts on a UART says so itself
+        pass  # a node that restarts on a UART reports it itself

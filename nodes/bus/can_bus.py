@@ -1,4 +1,4 @@
-"""A CAN bus with its nodes: ids, links, sync pulses, the bus-wide stop, and who else is there."""
+"""A CAN bus with its nodes: ids, links, sync pulses, the bus-wide stop, and boards not configured here."""
 
 import asyncio
 import contextlib
@@ -23,9 +23,9 @@ from nodes.support.errors import CanductorError
 from nodes.transport.frame import BUS_OFF
 
 SUSPECT_INTERVAL_S: Final = 0.1
-"""The bus is asked at most that often who waits for an id."""
+"""Least interval between queries for nodes that wait for an id."""
 BUS_STOP_FRAMES: Final = 3
-"""Nobody acknowledges it, and a bus that has to be stopped may be one that loses frames."""
+"""Repeats of the stop frame: it is not acknowledged, and a bus that must be stopped may lose frames."""
 
 
 class CanBus(BusBase):
@@ -77,7 +77,7 @@ class CanBus(BusBase):
             task.cancel()
         for result in await asyncio.gather(*tasks, return_exceptions=True):
             if isinstance(result, Exception):
-                raise result  # a bug of those tasks, which expect all that may happen
+                raise result  # a bug in those tasks, which handle every expected error
         await super().close()
 
     def emergency_stop(self) -> None:
@@ -89,7 +89,7 @@ class CanBus(BusBase):
         super().emergency_stop()
 
     async def assign(self, uuids: Iterable[Uuid]) -> Assignment:
-        """Give UUIDS their ids; whether one can be had for certain is for ``Assignment.check_node``."""
+        """Assign ids to UUIDS; ``Assignment.check_node`` reports whether a node can be used for certain."""
         async with self._assigning:
             self._assignment = IdAssignment({uuid: self._nodeids[uuid] for uuid in uuids})
             try:
@@ -105,19 +105,19 @@ class CanBus(BusBase):
         return result
 
     def suspect(self) -> None:
-        """Ask who waits for an id: a node that restarted does. The answers come as frames."""
+        """Query the nodes that wait for an id, as a restarted node does. The answers arrive as frames."""
         now_s = asyncio.get_running_loop().time()
         if now_s - self._asked_s >= SUSPECT_INTERVAL_S:
             self._asked_s = now_s
-            with contextlib.suppress(CanductorError):  # the bus may be gone: that is told elsewhere
+            with contextlib.suppress(CanductorError):  # the bus may be gone: that is reported elsewhere
                 self.io.send_frame(ADMIN_ID, bytes((QUERY_UNASSIGNED,)))
 
     def _node_started(self, node: Node) -> None:
-        # Boards are built for one bit rate, and this one has just been heard at it.
+        # Boards are built for one bit rate, and this one has just been received at it.
         self.io.learn_bitrate(node.dictionary.int_constant("CANBUS_FREQUENCY", 0))
 
     def send_frame(self, can_id: int, data: bytes) -> None:
-        """Send a frame that is no node's, before all data; raises CanductorError when it cannot be queued."""
+        """Send a frame of no node ahead of all data; raises CanductorError when it cannot be queued."""
         self.io.send_frame(can_id, data)
 
     @property
@@ -127,11 +127,11 @@ class CanBus(BusBase):
 
     @property
     def load(self) -> float:
-        """Share of the bit rate within the last second, by whomever; 0 while the bit rate is not known."""
+        """Share of the bit rate used in the last second by all senders; 0 while it is unknown."""
         return self.io.stats().load.total
 
     def nodeid(self, uuid: Uuid) -> int:
-        """Return the id UUID has, or gets."""
+        """Return the id that UUID has or will get."""
         return self._nodeids[uuid]
 
     async def _run(self, assignment: IdAssignment) -> Assignment:
@@ -174,22 +174,22 @@ class CanBus(BusBase):
             self._went_bus_off()
 
     def _bus_stopped(self, reason: int, nodeid: int) -> None:
-        """Take note that a node stopped the bus: what the others report from now on follows from that."""
+        """Record that a node stopped the bus: later reports of the other nodes are consequences."""
         for uuid, node in self._by_uuid.items():
             if self._nodeids[uuid] == nodeid:
                 node.shut_down_for(reason)
 
     def _went_bus_off(self) -> None:
         cause = (
-            f"the controller of {self.name} met too many errors and went off the bus (bus-off); check "
-            "cables, termination and bit rates, and have it return by itself: while the interface is down, "
+            f"the controller of {self.name} left the bus after too many errors (bus-off); check "
+            "cables, termination and bit rates, and let it return by itself: while the interface is down, "
             f"'ip link set {self.name} type can restart-ms 100'"
         )
         for node in self.nodes:
             node.lose(cause)
 
     def _doubt(self, uuid: Uuid | None) -> None:
-        """Find out why a board asks for an id whose node has one: it restarted, or there are two."""
+        """Find out why a board whose node has an id requests one: it restarted, or there are two."""
         node = self._by_uuid.get(uuid) if uuid is not None else None
         if uuid is None or node is None or uuid in self._doubts:
             return
@@ -202,17 +202,17 @@ class CanBus(BusBase):
         if await node.lives():
             self._say(uuid, f"{_twins(uuid, self.name)}; the second one waits for an id and is not used")
         else:
-            node.restarted("its uuid asks for an id again")
+            node.restarted("its uuid requests an id again")
 
     def _say(self, uuid: Uuid, sentence: str) -> None:
-        """Tell the user, once for each board."""
+        """Notify the user, once for each board."""
         if uuid not in self._said:
             self._said.add(uuid)
             self._on_notice(sentence)
 
 
 class _CanConnector:
-    """Connects one node of a CAN bus; after a reset it has to get its id again."""
+    """Connects one node of a CAN bus; after a reset its id has to be assigned again."""
 
     def __init__(self, bus: CanBus, uuid: Uuid) -> None:
         self._bus = bus
@@ -246,7 +246,7 @@ class _CanConnector:
         if found != self._uuid.raw:
             raise NodeError(
                 f"two boards answer on node id {self._bus.nodeid(self._uuid)} of bus {self._bus.name}: "
-                f"{self._uuid}, and one that says it is {found.hex()}; switch both off and on again, and let "
+                f"{self._uuid}, and one that reports {found.hex()}; switch both off and on again, and let "
                 "only one host assign ids on this bus"
             )
 

@@ -1,8 +1,8 @@
-"""A clock that is mostly steady and sometimes warms: two filters, each weighed by what it foretells.
+"""A clock that is mostly steady and sometimes warms up: two filters, weighted by their predictions.
 
-The one lets the rate change for long in one direction, so it follows temperature but remembers only some
-minutes. The other believes the rate stays what it is and so remembers much longer; it is wrong as soon as
-the temperature moves, foretells worse, loses its weight, and begins anew from what the first one knows.
+The first lets the rate drift in one direction, so it follows temperature but remembers only some minutes. The
+second assumes a constant rate and so remembers much longer; when the temperature changes, its predictions get
+worse, it loses its weight, and it starts again from the state of the first.
 """
 
 import math
@@ -11,15 +11,15 @@ from typing import Final
 from nodes.clock.fit import Filter
 
 FIRST_ODDS: Final = -2.0
-"""Logarithm of the odds of a steady filter that begins anew."""
+"""Logarithm of the odds of a steady filter that starts again."""
 MOST_ODDS: Final = 1.0
-"""Not believed more than so, so that a change is noticed soon."""
+"""Upper limit of the odds, so that a change is detected soon."""
 LEAST_ODDS: Final = -3.0
-"""Believed less than so, it begins anew."""
+"""Odds below which the steady filter starts again."""
 
 
 class Blend:
-    """Goes on from FIRST, as ``Filter``; state and covariance are lead (s) and rate only."""
+    """Continues from FIRST, like ``Filter``; state and covariance are lead (s) and rate only."""
 
     def __init__(self, first: Filter) -> None:
         self._warming = first
@@ -29,7 +29,7 @@ class Blend:
         self.covariance = [row[:2] for row in first.covariance[:2]]
 
     def add(self, at_s: float, lead_s: float, round_trip_s: float) -> None:
-        """Take an exchange in whose middle, AT_S, the clock would have been ahead by LEAD_S."""
+        """Process an exchange in whose middle, AT_S, the clock would have been ahead by LEAD_S."""
         warming = self._warming.add(at_s, lead_s, round_trip_s)
         steady = self._steady.add(at_s, lead_s, round_trip_s)
         self._odds = min(self._odds + steady - warming, MOST_ODDS)
@@ -39,11 +39,11 @@ class Blend:
 
     @property
     def faded_s(self) -> float:
-        """Most that forgetting a difference of the ways may have moved the lead."""
+        """Largest change of the lead from discarding a difference of the delays."""
         return max(abs(self._warming.faded_s), abs(self._steady.faded_s))
 
     def _mix(self, share: float) -> None:
-        """Set state and covariance to those of both filters together, the steady one having SHARE."""
+        """Set state and covariance to those of the mixture in which the steady filter has weight SHARE."""
         one, two = self._warming, self._steady
         apart = [two.state[i] - one.state[i] for i in (0, 1)]
         for i in (0, 1):

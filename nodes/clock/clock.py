@@ -3,10 +3,10 @@
 Sans-IO: samples come in with their times, an estimate and the time of the next sample go out. Host time
 is CLOCK_MONOTONIC in integer nanoseconds; a node's ticks have 64 bits in the host and 32 on the wire.
 
-How it estimates. An answer sent for at S and received at R was read after S plus the fastest way out and
-before R minus the fastest way back: two bounds on the clock, most of them loose, some tight. The first
-START_SAMPLES are fitted together (clock_start.py), the later ones update a filter that follows temperature
-(clock_fit.py). A slow exchange only makes loose bounds, so no series of them can spoil the estimate.
+Method: the clock in an answer requested at S and received at R was read after S plus the shortest delay out
+and before R minus the shortest delay back: two bounds on the clock, most of them loose, some tight. The first
+START_SAMPLES are fitted together (start.py), the later ones update a filter that follows temperature
+(fit.py). A slow exchange only gives loose bounds, so no series of them can spoil the estimate.
 """
 
 import math
@@ -31,15 +31,15 @@ SETTLE_INTERVAL_NS: Final = 50_000_000
 SAMPLE_INTERVAL_NS: Final = 984_300_000
 """Not a divisor or multiple of a second: periodic work on a node must not meet every sample."""
 START_SAMPLES: Final = 64
-"""So many are fitted together before the filter goes on alone."""
+"""Number of samples fitted together before the filter continues alone."""
 REMEMBERED: Final = 160
-"""Exchanges among which the fastest is looked for."""
+"""Number of exchanges among which the fastest is sought."""
 CONTRADICTIONS: Final = 3
-"""So many answers in a row that the estimate says are impossible begin it anew."""
+"""After so many consecutive answers that contradict the estimate, it starts again."""
 GAP_NS: Final = 600_000_000_000
-"""A silence after which the filter begins anew: temperature may have done anything."""
+"""Silence after which the filter starts again: the temperature may have changed arbitrarily."""
 AHEAD_S: Final = 1.0
-"""The error bound holds for so long after the sample."""
+"""Time after a sample for which the error bound holds."""
 CONFIDENCE: Final = 4.0
 """Standard deviations in the published error bound."""
 _HALF: Final = 1 << 31
@@ -64,13 +64,13 @@ class ClockEstimate:
     at_ns: HostTime
     at_ticks: Ticks
     error_s: float
-    """Bound of the error, from AT_NS to a second later, if the fastest ways out and back take as long."""
+    """Bound of the error, from AT_NS to a second later, if the shortest delays out and back are equal."""
     asymmetry_s: float = 0.0
-    """What they may add when not: half the fastest exchange, were all of it spent in one direction."""
+    """Further error if they differ: half the fastest exchange, if all its delay is in one direction."""
 
     @property
     def bound_s(self) -> float:
-        """What the error may be in all: ``error_s``, and what unequal ways may add unseen."""
+        """Bound of the total error: ``error_s`` plus what unequal delays may add undetected."""
         return self.error_s + self.asymmetry_s
 
     def ticks_at(self, at_ns: HostTime) -> Ticks:
@@ -100,11 +100,11 @@ class ClockEstimator:
         self._contradictions: int
         self.accepted = 0
         self.unusable = 0
-        """Answers whose times are not known (a repeated block) or make no sense."""
+        """Number of answers whose times are unknown (a repeated block) or implausible."""
 
     @property
     def ready(self) -> bool:
-        """Whether there are samples enough to plan with: what is planned looks two seconds ahead."""
+        """Whether there are enough samples for planning, which reaches two seconds ahead."""
         return self.accepted >= SETTLE_SAMPLES
 
     @property
@@ -113,13 +113,13 @@ class ClockEstimator:
         return min(self._round_trips_s, default=0.0)
 
     def begin(self, sent_ns: int, received_ns: int, high: int, clock32: int) -> bool:
-        """Start, or start anew, with an answer to get_uptime. Returns whether it was usable."""
+        """Start, or start again, with an answer to get_uptime. Return whether it was usable."""
         self._estimate = None
         self.accepted = 0
         return self._take(sent_ns, received_ns, Ticks(high * _WHOLE + clock32 % _WHOLE))
 
     def add(self, sent_ns: int, received_ns: int, clock32: int) -> bool:
-        """Take an answer to get_clock: SENT_NS 0 means unknown. Returns whether it was usable."""
+        """Process an answer to get_clock: SENT_NS 0 means unknown. Return whether it was usable."""
         middle_ns = HostTime((sent_ns + received_ns) // 2)
         return self._take(sent_ns, received_ns, extend32(clock32, self.estimate().ticks_at(middle_ns)))
 
@@ -138,7 +138,7 @@ class ClockEstimator:
         return self.estimate().ns_at(ticks)
 
     def next_sample_ns(self, now_ns: int) -> int:
-        """Return when to ask the node again, given that it was asked at NOW_NS."""
+        """Return when to query the node again after a query at NOW_NS."""
         if self.accepted < BURST_SAMPLES:
             return now_ns + BURST_INTERVAL_NS
         return now_ns + (SETTLE_INTERVAL_NS if self.accepted < SETTLE_SAMPLES else SAMPLE_INTERVAL_NS)
@@ -164,7 +164,7 @@ class ClockEstimator:
         return True
 
     def _restart(self, middle_ns: HostTime, ticks: Ticks) -> None:
-        """Measure from here on, as if nothing were known."""
+        """Start again from this sample, without earlier knowledge."""
         self._zero_ns, self._zero_ticks = middle_ns, ticks
         self._start, self._filter = Start(), None
         self._round_trips_s.clear()
@@ -173,7 +173,7 @@ class ClockEstimator:
     def _impossible(
         self, last: ClockEstimate, middle_ns: HostTime, ticks: Ticks, round_trip_s: float
     ) -> bool:
-        """Whether this reading, like the ones before it, was not taken between question and answer."""
+        """Whether this reading, like those before it, cannot lie between query and answer."""
         off_s = abs(ticks - last.ticks_at(middle_ns)) / self._freq_hz
         age_s = (middle_ns - last.at_ns) * 1e-9
         allowed_s = round_trip_s / 2 + last.error_s * (1 + age_s / AHEAD_S)

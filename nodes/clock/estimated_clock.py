@@ -1,4 +1,4 @@
-"""What whoever times something needs of a node's clock, however it is known."""
+"""The interface of an estimate of a node's clock, whatever its source."""
 
 from typing import Protocol
 
@@ -9,7 +9,7 @@ class EstimatedClock(Protocol):
     """A node's clock as far as the host knows it."""
 
     def ticks_at(self, at_ns: HostTime, /) -> Ticks:
-        """Return the node's 64-bit ticks at a moment of host time."""
+        """Return the node's 64-bit ticks at a host time."""
         ...
 
     def ns_at(self, ticks: Ticks, /) -> HostTime:

@@ -1,9 +1,9 @@
-"""The filter behind a settled clock: a node's lead over host time, cut by one-sided bounds.
+"""The filter of a settled clock: a node's lead over host time, truncated by one-sided bounds.
 
-State: lead of the node's clock over host time (s), its rate, the rate's change (1/s), the fastest way one
-way (s) and half the difference of the two ways (s). An exchange bounds lead + way out from above and
-way back - lead likewise; the distance to the bound is exponential. Each bound updates the Gaussian belief
-with the exact mean and variance of the product, so tight bounds cut and loose ones hardly count.
+State: lead of the node's clock over host time (s), its rate, the rate's change (1/s), the shortest one-way
+delay (s) and half the difference of the two delays (s). An exchange bounds lead + delay out from above, and
+delay back - lead likewise; the distance to the bound is exponential. Each bound updates the Gaussian belief
+with the exact mean and variance of the product, so tight bounds truncate it and loose ones hardly count.
 """
 
 import copy
@@ -17,30 +17,28 @@ RATE_SD: Final = 1.5e-4
 CURVATURE_SD: Final = 1e-8
 """Standard deviation of a rate's change per second: a crystal in a warming board."""
 RATE_WALK: Final = 4e-10
-"""How far a steady rate wanders in a second (square root of)."""
+"""Random walk of a steady rate, per square root of a second."""
 CURVATURE_FADE_S: Final = 250.0
 SKEW_FADE_S: Final = 1000.0
 DELAY_WANDER: Final = 0.01
-"""How far the fastest way wanders in a second (square root of), against the mean delay on top of it."""
+"""Random walk of the shortest delay, per square root of a second, relative to the mean excess delay."""
 NOISE: Final = 0.005
-"""Reading noise against the mean delay on top of the fastest way."""
+"""Reading noise relative to the mean excess over the shortest delay."""
 LOOSE: Final = 7.0
-"""Further from its bound than so many mean delays, an exchange says nothing about them."""
+"""An exchange further from its bound than so many mean delays does not count for their mean."""
 MEMORY: Final = 256.0
-"""Delays over which their mean is taken."""
+"""Number of delays over which their mean is taken."""
 LATE: Final = 16
-"""So many exchanges later than believable, in one direction, mean that the way has become slower."""
+"""So many implausibly late exchanges in one direction mean that its delay has grown."""
 LEAST_SPREAD_S: Final = 1e-7
 OUTLIERS: Final = 1e-4
-"""Density of an exchange that no bound explains, against the mean delay: what one may count as evidence."""
+"""Density of an exchange that no bound explains, relative to the mean delay: limits its evidence."""
 
 
 def hazard(k: float) -> float:
     """Return φ(k)/Φ(k) of the normal distribution, for any K without underflow."""
     if k < -25.0:
-        x = (
-            1 / k
-        )  # so many terms that of r * (k + r), which is 1 - x**2 and some more, the difference to 1 is right
+        x = 1 / k  # enough terms for an accurate difference of r * (k + r), about 1 - x**2, to 1
         return -k - x + 2 * x**3 - 10 * x**5
     return math.exp(-k * k / 2) * 0.3989422804014327 / (0.5 * math.erfc(-k * 0.7071067811865476))
 
@@ -53,10 +51,10 @@ def log_share(k: float) -> float:
 
 
 class Filter:
-    """Goes on from STATE and COVARIANCE (lead, rate, curvature, delay) at AT_S."""
+    """Filter that continues from STATE and COVARIANCE (lead, rate, curvature, delay) at AT_S."""
 
     warming = True
-    """Whether the rate may change for long in one direction; else it only wanders a little."""
+    """Whether the rate may drift in one direction for long; else it only wanders slightly."""
 
     def __init__(
         self, state: Sequence[float], covariance: Sequence[Sequence[float]], at_s: float, spread_s: float
@@ -66,11 +64,11 @@ class Filter:
         self._at_s = at_s
         self._spread_s = spread_s
         self.faded_s = 0.0
-        """Skew given up so far for want of evidence: the lead may be wrong by so much."""
+        """Skew discarded so far for lack of evidence: the lead may be wrong by so much."""
         self._nearest: dict[int, tuple[int, float]] = {1: (0, math.inf), -1: (0, math.inf)}
 
     def steady(self) -> "Filter":
-        """Return a filter that knows the same but believes that from now on the rate stays what it is."""
+        """Return a filter with the same state that assumes a constant rate from now on."""
         other = copy.copy(self)
         other.state = [*self.state]
         other.covariance = [[*row] for row in self.covariance]
@@ -82,9 +80,9 @@ class Filter:
         return other
 
     def add(self, at_s: float, lead_s: float, round_trip_s: float) -> float:
-        """Take an exchange in whose middle, AT_S, the clock would have been ahead by LEAD_S.
+        """Process an exchange in whose middle, AT_S, the clock would have been ahead by LEAD_S.
 
-        Return how well it was foretold: the logarithm of its density against the mean delay.
+        Return how well it was predicted: the logarithm of its density relative to the mean delay.
         """
         foretold = 0.0
         self._predict(at_s - self._at_s)
@@ -94,7 +92,7 @@ class Filter:
             self._watch(sign, bound_s)
             foretold += self._bound(sign, bound_s)
             gap_s = min(max(self._gap(sign, bound_s), 0.0), 5 * self._spread_s)
-            # 1.03: what the limit of 5 takes off the mean
+            # 1.03: compensates what the limit of 5 takes off the mean
             self._spread_s += (1.03 * gap_s - self._spread_s) / MEMORY
             self._spread_s = max(self._spread_s, LEAST_SPREAD_S)
         return foretold
@@ -125,7 +123,7 @@ class Filter:
         p[3][3] += (DELAY_WANDER * self._spread_s) ** 2 * dt
 
     def _doubt(self, sign: int, by_s: float) -> None:
-        """Allow the fastest way in one direction to be another by about BY_S."""
+        """Allow the shortest delay in one direction to change by about BY_S."""
         p, variance = self.covariance, by_s * by_s / 4
         p[3][3] += variance
         p[4][4] += variance
@@ -133,7 +131,7 @@ class Filter:
         p[4][3] += sign * variance
 
     def _watch(self, sign: int, bound_s: float) -> None:
-        """Notice when one direction has become slower: none of LATE exchanges comes near its bound."""
+        """Detect that one direction has become slower: none of LATE exchanges comes near its bound."""
         count, nearest_s = self._nearest[sign]
         count, nearest_s = count + 1, min(nearest_s, self._gap(sign, bound_s))
         if nearest_s < self._spread_s:
@@ -146,7 +144,7 @@ class Filter:
         self._nearest[sign] = count, nearest_s
 
     def _bound(self, sign: int, bound_s: float) -> float:
-        """Cut by: sign·(lead + skew) + delay <= BOUND_S, with an exponential distance; return as ``add``."""
+        """Apply sign·(lead + skew) + delay <= BOUND_S, with an exponential distance; return as ``add``."""
         x, p = self.state, self.covariance
         column = [sign * (row[0] + row[4]) + row[3] for row in p]
         variance = sign * (column[0] + column[4]) + column[3]

@@ -1,10 +1,10 @@
-"""One node's clock against another's, from moments at which both were read at the same time. Sans-IO.
+"""One node's clock relative to another's, from pairs of simultaneous readings. Sans-IO.
 
-A sync pulse is one CAN frame: every node latches its clock when the frame has ended, which on a bus happens
-within a bit time everywhere. What differs is how long each takes to its receive interrupt: usually a fraction
-of a microsecond, sometimes much more, on either side. So the difference of the two clocks is fitted by a
-parabola (crystals warm up at different rates) whose readings count the less the further they lie off and the
-older they are.
+A sync pulse is one CAN frame: every node latches its clock when the frame has ended, which happens everywhere
+on a bus within a bit time. The latency of the receive interrupts differs: usually by a fraction of a
+microsecond, sometimes by much more, on either side. So the difference of the two clocks is fitted by a
+parabola (crystals warm up at different rates), and readings are weighted less the further off and the older
+they are.
 """
 
 import math
@@ -19,31 +19,32 @@ from numpy.typing import NDArray
 from nodes.clock.clock import Ticks
 
 FADE_S: Final = 8.0
-"""Chosen over simulated ramps of 20 ppm in 600 s: shorter follows their begin faster, longer is quieter."""
+"""Chosen with simulated ramps of 20 ppm in 600 s: a shorter time follows their start faster, a longer one
+has less noise."""
 PAIRS_MAX: Final = 64
 SETTLE_PAIRS: Final = 24
 SETTLE_S: Final = 1.0
-"""The rate is known to some 0.2 ppm after so many pairs over so long."""
+"""The rate is known to about 0.2 ppm after so many pairs over so long."""
 BEND_S: Final = 6.0
-"""A curvature is good for no more than so many seconds ahead."""
+"""Seconds ahead for which a curvature is extrapolated at most."""
 JITTER_FLOOR_S: Final = 0.3e-6
-"""No reading is trusted better than this: about what receive interrupts differ by on a quiet chip."""
+"""Least standard deviation of a reading: about the jitter of receive interrupts on an idle chip."""
 RATE_PRIOR: Final = 1e-3
 CURVATURE_PRIOR_PER_S: Final = 1e-7
-"""Standard deviations of what is known of two crystals before anything is measured."""
+"""Standard deviations for two crystals before anything is measured."""
 ROBUST: Final = 3.0
 """Readings further off than so many standard deviations lose weight with the square of that."""
 ROUNDS: Final = 4
 JUMP_S: Final = 1e-3
-"""No two crystals part by so much between two pulses: one of the nodes restarted."""
+"""No two crystals diverge by so much between two pulses: one of the nodes restarted."""
 REACH_S: Final = 1.5
-"""How far ahead of the last pair the error bound is meant: as far as steps are made ahead."""
+"""How far beyond the last pair the error bound holds: as far as steps are generated ahead."""
 CONFIDENCE: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class PulseLine:
-    """A node's clock as a function of the reference node's; never changes, so that any thread may use it."""
+    """A node's clock as a function of the reference node's; immutable, so that any thread may use it."""
 
     reference: Ticks
     ticks: Ticks
@@ -51,9 +52,9 @@ class PulseLine:
     reference_hz: int
     freq_hz: int
     offset_s: float
-    """What the latched pair is off by."""
+    """Deviation of the latched pair from the fit."""
     rate: float
-    """By how much the node's clock is faster, against nominal: 1e-6 is 1 ppm."""
+    """By how much the node's clock is faster, relative to nominal: 1e-6 is 1 ppm."""
     curvature_per_s: float
     error_s: float
     """Bound of the error up to REACH_S ahead of the last pulse, interrupt latency included."""
@@ -67,7 +68,7 @@ class PulseLine:
         """Return the reference's clock when the node's shows TICKS."""
         passed = (ticks - self.ticks) / self.freq_hz
         t = passed
-        for _ in range(3):  # each gains three digits and more: rates differ by less than RATE_PRIOR
+        for _ in range(3):  # each iteration gains at least three digits: rates differ by less than RATE_PRIOR
             t = passed - self._parting_s(t)
         return Ticks(self.reference + round(t * self.reference_hz))
 
@@ -78,8 +79,8 @@ class PulseLine:
 
 
 def _noise(off_s: NDArray[np.float64]) -> float:
-    """Return the middle of what readings are off by, as the standard deviation of a normal distribution."""
-    ranked, half = np.sort(off_s), len(off_s) // 2  # np.median takes ten times as long over so few
+    """Return the median deviation of readings, scaled to the standard deviation of a normal distribution."""
+    ranked, half = np.sort(off_s), len(off_s) // 2  # np.median takes ten times as long for so few values
     return max(JITTER_FLOOR_S, 1.4826 * float(ranked[half] + ranked[~half]) / 2)
 
 
@@ -91,21 +92,21 @@ class PulseFit:
         self._freq_hz = freq_hz
         self._pairs: deque[tuple[Ticks, Ticks]] = deque(maxlen=PAIRS_MAX)
         self._off_s: NDArray[np.float64]
-        """How far the pairs lie off the newest fit."""
+        """Deviation of the pairs from the newest fit."""
         self.line: PulseLine | None = None
         """The newest fit; None before the first pair."""
         self.restarts = 0
-        """How often a jump of either clock made it begin anew."""
+        """Number of restarts of the fit after a jump of either clock."""
 
     @property
     def settled(self) -> bool:
-        """Whether there are pairs enough, over a time long enough."""
+        """Whether there are enough pairs, over a sufficient time."""
         if len(self._pairs) < SETTLE_PAIRS:
             return False
         return (self._pairs[-1][0] - self._pairs[0][0]) / self._reference_hz >= SETTLE_S
 
     def add(self, reference: Ticks, ticks: Ticks) -> None:
-        """Take a pair of clocks latched together; pairs come in order."""
+        """Add a pair of clocks latched together; pairs come in order."""
         if self.line is not None and self._jumped(self.line, reference, ticks):
             self._pairs.clear()
             self.restarts += 1
@@ -113,7 +114,7 @@ class PulseFit:
         self.line = self._fit(self._off_the_last_line())
 
     def fill(self, pairs: Iterable[tuple[Ticks, Ticks]]) -> None:
-        """Begin anew with PAIRS, in order; what lies before a jump of either clock does not count."""
+        """Start again with PAIRS, in order; pairs before a jump of either clock do not count."""
         self._pairs.clear()
         for pair in pairs:
             if self._pairs and self._parted(self._pairs[-1], pair):
@@ -132,7 +133,7 @@ class PulseFit:
         return passed_s <= 0 or off_s > JUMP_S + RATE_PRIOR * passed_s
 
     def _fit(self, off_s: NDArray[np.float64]) -> PulseLine:
-        """Fit the pairs, which are known to lie OFF_S off."""
+        """Fit the pairs, whose known deviations are OFF_S."""
         last_reference, last_ticks = self._pairs[-1]
         pairs = np.array(self._pairs, dtype=np.int64)
         t = (pairs[:, 0] - last_reference) / self._reference_hz
@@ -164,7 +165,7 @@ class PulseFit:
         )
 
     def _off_the_last_line(self) -> NDArray[np.float64]:
-        """Return how far pairs lie off the last fit: a late latch is doubted before it bends the new one."""
+        """Return the deviation of pairs from the last fit, so that a late latch cannot bend the new one."""
         line, count = self.line, len(self._pairs)
         if line is None or count < SETTLE_PAIRS:
             return np.zeros(count)

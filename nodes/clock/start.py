@@ -1,8 +1,8 @@
 """The first samples of a clock, fitted together: lead, rate, curvature and fastest delay.
 
-Expectation propagation: every bound (see clock_fit.py) is replaced by the Gaussian factor that leaves the
-belief the same mean and variance as the bound itself would. All are refined with each new sample, so what the
-first ones meant is judged again by what is known now, and a bad beginning does no harm.
+Expectation propagation: every bound (see fit.py) is replaced by the Gaussian factor that gives the belief
+the same mean and variance as the bound itself would. All factors are refined with each new sample, so the
+first samples are evaluated again with what is known now, and a bad start does no harm.
 """
 
 from bisect import insort
@@ -14,33 +14,33 @@ from numpy.typing import NDArray
 from nodes.clock.fit import CURVATURE_SD, LEAST_SPREAD_S, LOOSE, NOISE, RATE_SD, hazard
 
 SWEEPS: Final = 2
-"""With each new sample; with one the error bound is too small twice as often, more change no figure of
-bench/clock.py that could be told from chance."""
+"""Refinements with each new sample. With one, the error bound is too small twice as often; more make no
+significant difference in bench/clock.py."""
 DAMPING: Final = 0.6
 Array = NDArray[np.float64]
 
 
 class Start:
-    """Collects samples and fits all of them."""
+    """Fit of all samples collected so far."""
 
     def __init__(self) -> None:
         self._trips_s: list[float] = []
         """Sorted."""
-        # For every exchange two bounds, and the factors that stand for them:
+        # For every exchange two bounds, and the factors that replace them:
         self._rows: Array = np.zeros((0, 4))
         self._bounds: Array = np.zeros(0)
         self._precision: Array = np.zeros(0)
         self._shift: Array = np.zeros(0)
         self.spread_s = 0.0
-        """Mean delay on top of the fastest, one way."""
+        """Mean excess over the shortest delay, one way."""
 
     @property
     def samples(self) -> int:
-        """How many have been taken."""
+        """Number of samples so far."""
         return len(self._trips_s)
 
     def add(self, at_s: float, lead_s: float, round_trip_s: float) -> tuple[list[float], list[list[float]]]:
-        """Take an exchange; return state and covariance at AT_S, which must not go back."""
+        """Process an exchange; return state and covariance at AT_S, which must not decrease."""
         is_fastest = not self._trips_s or round_trip_s < self._trips_s[0]
         insort(self._trips_s, round_trip_s)
         bend, way_s = at_s * at_s / 2, round_trip_s / 2
@@ -63,14 +63,14 @@ class Start:
         return state, moved
 
     def _expect(self, lead_s: float, fastest_s: float) -> None:
-        """Set what is believed without any bound, given the fastest exchange."""
+        """Set the prior belief, without any bound, given the fastest exchange."""
         prior = np.array((fastest_s, RATE_SD, CURVATURE_SD, fastest_s / 3)) ** -2.0
         self._prior = np.diag(prior)
         self._pull = prior * (lead_s, 0.0, 0.0, fastest_s / 3)
         self._solve()
 
     def _guess(self) -> float:
-        """Return the mean delay on top as the spread of the round trips shows it."""
+        """Return the mean excess delay, estimated from the spread of the round trips."""
         trips_s, count = self._trips_s, len(self._trips_s)
         guess = trips_s[0] / 6
         if count >= 3:
@@ -92,7 +92,7 @@ class Start:
         if len(gap) >= 12:
             near = float(np.minimum(np.maximum(gap, 0.0), 5 * self.spread_s).sum())
             self.spread_s = max((near + 2 * guess) / (len(gap) + 0.5), LEAST_SPREAD_S)
-        # Each bound sees what all the others say.
+        # Each bound is applied to the belief from all the others.
         other = 1 / np.maximum(1 / variance - self._precision, 1e-3 / variance)
         centre = other * (middle / variance - self._shift)
         tilt = (gap < LOOSE * self.spread_s) / self.spread_s

@@ -1,9 +1,9 @@
-"""Sync pulses: the clocks of a bus's nodes tied together by one frame that all hear at once.
+"""Sync pulses: the clocks of a bus's nodes related by one frame that all receive at once.
 
-Firmware of this project latches its clock in the receive interrupt of an admin frame SYNC_PULSE and tells
-the pair when asked (`get_sync_pulse`). The first capable node of a bus is the reference; every other is
-fitted to it (`nodes.clock.pulse_fit`), far better than answers that pass a host could tell. Nodes without the
-extension keep their own estimate. `PulseRounds` is sans-IO; `PulseKeeper` sends and asks.
+Firmware of this project latches its clock in the receive interrupt of an admin frame SYNC_PULSE and reports
+the pair on request (`get_sync_pulse`). The first capable node of a bus is the reference; every other is
+fitted to it (`nodes.clock.pulse_fit`), far more accurately than by exchanges with the host. Nodes without the
+extension keep their own estimate. `PulseRounds` is sans-IO; `PulseKeeper` sends pulses and queries nodes.
 """
 
 import asyncio
@@ -21,13 +21,13 @@ from nodes.support.can_protocol import ADMIN_ID, SYNC_PULSE
 from nodes.support.errors import CanductorError
 
 CONSTANT: Final = "CAN_SYNC_PULSE"
-"""Of the dictionary: the firmware knows sync pulses."""
+"""Constant of the dictionary: the firmware supports sync pulses."""
 SETTLE_ROUNDS: Final = 40
 SETTLE_INTERVAL_S: Final = 0.05
 INTERVAL_S: Final = 0.933
 """Not a divisor of a second: periodic work on a node must not meet every pulse."""
 IDLE_S: Final = 0.25
-"""How often to look whether there are two capable nodes."""
+"""Interval of the checks for two capable nodes."""
 ANSWER_TIMEOUT_S: Final = 0.2
 MISSED_MAX: Final = 5
 """Rounds in a row without a node's answer after which its fit is no longer used."""
@@ -35,7 +35,7 @@ MISSED_MAX: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class PulseClock:
-    """A follower's clock: the host knows the reference's, pulses tell the rest.
+    """A follower's clock: the host's estimate of the reference's clock, combined with the pulses.
 
     When print time is the reference's own clock the host's error cancels: the same estimate turns print time
     into host time and host time into the reference's ticks.
@@ -46,11 +46,11 @@ class PulseClock:
 
     @property
     def error_s(self) -> float:
-        """Bound of the error against the reference node's clock."""
+        """Bound of the error relative to the reference node's clock."""
         return self.line.error_s
 
     def ticks_at(self, at_ns: HostTime, /) -> Ticks:
-        """Return the node's 64-bit ticks at a moment of host time."""
+        """Return the node's 64-bit ticks at a host time."""
         return self.line.ticks_at(self.reference.ticks_at(at_ns))
 
     def ns_at(self, ticks: Ticks, /) -> HostTime:
@@ -64,37 +64,37 @@ class _Follower:
     missed: int
     """Rounds in a row without a pair."""
     settling: int
-    """Rounds for which it may still hasten the pulses."""
+    """Rounds for which it may still request fast pulses."""
 
 
 class PulseRounds:
-    """Pairs what the nodes latched. A round is one pulse; answers of an older one do not count."""
+    """Pairs the clocks that the nodes latched. A round is one pulse; answers to an older one do not count."""
 
     def __init__(self) -> None:
         self.seq = 0
-        """Of the last pulse, 1..255; 0 before the first."""
+        """Sequence number of the last pulse, 1..255; 0 before the first."""
         self.late = 0
-        """Answers that told of another pulse than the last, or of none."""
+        """Number of answers about a pulse other than the last, or about none."""
         self.reference: str | None = None
         self._followers: dict[str, _Follower] = {}
         self._history: deque[dict[str, Ticks]] = deque(maxlen=PAIRS_MAX)
-        """What was latched, by round; the last entry is that of the present one."""
+        """Latched clocks by round; the last entry is that of the current round."""
 
     @property
     def settling(self) -> bool:
-        """Whether a node has come up so recently that pulses should follow each other fast."""
+        """Whether a node started so recently that pulses should follow each other fast."""
         return any(follower.settling > 0 for follower in self._followers.values())
 
     def forget(self) -> None:
-        """Forget all: there will be no pulses for a time of unknown length."""
+        """Discard everything: there will be no pulses for a time of unknown length."""
         self.reference = None
         self._followers.clear()
         self._history.clear()
 
     def next_pulse(self, members: Mapping[str, int]) -> int:
-        """Begin a round with these nodes (nominal Hz by name, not none, the preferred one first): its seq.
+        """Start a round with these nodes (nominal Hz by name, not empty, preferred first); return its seq.
 
-        The preferred node is the reference, once it was seen often enough for all others to follow at once.
+        The preferred node becomes the reference once it has answered often enough for all others to follow.
         """
         self._followers = {name: f for name, f in self._followers.items() if name in members}
         preferred = next(iter(members))
@@ -111,7 +111,7 @@ class PulseRounds:
         return self.seq
 
     def answer(self, name: str, seq: int, clock32: int, near: Ticks) -> None:
-        """Take a node's answer; NEAR is its clock as far as it is known, within 2^31 ticks."""
+        """Process a node's answer; NEAR is an estimate of its clock, within 2^31 ticks."""
         if seq != self.seq or not self._history:
             self.late += 1
             return
@@ -122,14 +122,14 @@ class PulseRounds:
                 self._pair(other)
 
     def line(self, name: str) -> PulseLine | None:
-        """Return the fit of a follower that can be relied on now, else None."""
+        """Return the fit of a follower if it is reliable now, else None."""
         follower = self._followers.get(name)
         if follower is None or follower.missed > MISSED_MAX or not follower.fit.settled:
             return None
         return follower.fit.line
 
     def _refer_to(self, reference: str, members: Mapping[str, int]) -> None:
-        """Let REFERENCE be it; nodes known against another node are known against this one at once."""
+        """Make REFERENCE the reference; fits to another node are converted to it at once."""
         self.reference = reference
         self._followers = {
             name: self._follower(name, freq_hz, members[reference])
@@ -158,7 +158,7 @@ class PulseRounds:
 
 
 class PulseNode(Protocol):
-    """What the keeper needs of a node."""
+    """Interface of a node as the keeper needs it."""
 
     name: str
     pulse_clock: PulseClock | None
@@ -176,14 +176,14 @@ class PulseNode(Protocol):
     async def query(
         self, name: str, response: str, /, *, timeout_s: float = ..., tries: int = ...
     ) -> Message:
-        """Ask the node."""
+        """Query the node."""
         ...
 
 
 class PulseKeeper:
-    """Keeps the clocks of one CAN bus together for as long as `run` runs.
+    """Relates the clocks of one CAN bus for as long as `run` runs.
 
-    CAPABLE returns the nodes that know pulses and can be asked now, in the order of preference as reference.
+    CAPABLE returns the nodes that support pulses and can be queried now, in order of preference as reference.
     SEND_FRAME sends a frame ahead of all data; NOW is host time.
     """
 
@@ -200,7 +200,7 @@ class PulseKeeper:
         self.rounds = PulseRounds()
 
     async def run(self) -> None:
-        """Send pulses and ask for them until cancelled; a bus that fails is others' concern."""
+        """Send pulses and query the nodes until cancelled; a failure of the bus is handled elsewhere."""
         while True:
             nodes = self._capable()
             if len(nodes) < 2:
@@ -208,7 +208,7 @@ class PulseKeeper:
                 self._publish(())
                 await asyncio.sleep(IDLE_S)
                 continue
-            with contextlib.suppress(CanductorError):  # the bus closes: that is told elsewhere
+            with contextlib.suppress(CanductorError):  # the bus closes: that is reported elsewhere
                 await self._round(nodes)
             self._publish(nodes)
             await asyncio.sleep(SETTLE_INTERVAL_S if self.rounds.settling else INTERVAL_S)
@@ -219,13 +219,13 @@ class PulseKeeper:
         await asyncio.gather(*(self._ask(node) for node in nodes))
 
     async def _ask(self, node: PulseNode) -> None:
-        with contextlib.suppress(CanductorError):  # lost on the way, or the node is: it misses this round
+        with contextlib.suppress(CanductorError):  # the answer or the node is lost: it misses this round
             answer = await node.query("get_sync_pulse", "sync_pulse", timeout_s=ANSWER_TIMEOUT_S, tries=1)
             near = node.clock.ticks_at(self._now())
             self.rounds.answer(node.name, answer.integer("seq"), answer.integer("clock"), near)
 
     def _publish(self, nodes: Sequence[PulseNode]) -> None:
-        """Give every node its clock by pulses, or take it away."""
+        """Set or clear the clock by pulses of every node."""
         present = {node.name: node for node in nodes}
         for name, node in self._asked.items():
             if name not in present:

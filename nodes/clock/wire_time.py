@@ -1,21 +1,21 @@
-"""How long messages are on the wire: known time, which need not blur the reading of a clock."""
+"""Time of messages on the wire: a known delay, which need not widen the bounds on a clock."""
 
 from typing import Final
 
 BLOCK_FRAMING: Final = 5
-"""Bytes that a block has beside its content."""
+"""Bytes of a block besides its content."""
 FRAME_BYTES: Final = 8
 OVERHEAD_BITS: Final = 44
-"""Of a frame, up to the end at which it counts as received; stuff bits, of which there may be none, apart."""
+"""Bits of a frame up to the point at which it counts as received; without stuff bits."""
 PAUSE_BITS: Final = 3
-"""Between two frames."""
+"""Bits between two frames."""
 FRAME_BITS: Final = OVERHEAD_BITS + 8 * FRAME_BYTES
 
 
 def can_wire_ns(content_bytes: int, bitrate: int, *, answer: bool) -> int:
-    """Return how long a block with so much content needs on a CAN bus of BITRATE bit/s, for certain.
+    """Return the least time that a block with so much content takes on a CAN bus of BITRATE bit/s.
 
-    The last frame of an ANSWER is full: it shares it with the acknowledgement behind it.
+    The last frame of an ANSWER counts as full: the acknowledgement behind it shares the frame.
     """
     size = content_bytes + BLOCK_FRAMING
     frames = -(-size // FRAME_BYTES)
@@ -25,9 +25,9 @@ def can_wire_ns(content_bytes: int, bitrate: int, *, answer: bool) -> int:
 
 
 def narrow(sent_ns: int, received_ns: int, out_ns: int, back_ns: int) -> tuple[int, int]:
-    """Take the time on the wire off an exchange: what is left bounds when the node read its clock.
+    """Subtract the time on the wire from an exchange: the rest bounds when the node read its clock.
 
-    An exchange that is shorter than that cannot have gone over such a wire: it is left as it is.
+    An exchange that is shorter than that cannot have used such a wire: it is left unchanged.
     """
     if sent_ns <= 0 or received_ns - sent_ns < out_ns + back_ns:
         return sent_ns, received_ns

@@ -1,8 +1,8 @@
-"""Dictionaries that were downloaded before, so that a node's is known without downloading it again.
+"""Cache of downloaded dictionaries, which saves the download at the next start.
 
-In memory for all nodes that share the cache, and on disk for the next start. What lies on disk is as hostile
-as what comes off a wire: a file counts only when its content has the SHA-256 of its name, and is parsed with
-all the bounds of a download. A file that fails is left out and replaced by the next download.
+In memory for all nodes that share the cache, and on disk for the next start. Files are trusted no more than
+bytes off a wire: a file counts only when its content has the SHA-256 of its name, and is parsed with
+all the bounds of a download. An invalid file is ignored and replaced by the next download.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ from nodes.dictionary.dictionary import MAX_COMPRESSED_BYTES, Dictionary
 from nodes.dictionary.parts import DictionaryError
 
 MAX_FILES: Final = 64
-"""On disk; the ones used longest ago are dropped."""
+"""Most files on disk; the least recently used are dropped."""
 MAX_KEPT: Final = 64
 """In memory."""
 _NAME: Final = re.compile(r"[A-Za-z0-9_.+-]{1,40}-([0-9a-f]{64})\.dict\Z")
@@ -30,7 +30,7 @@ _TEMPORARY: Final = ".new-"
 
 @dataclass(frozen=True, slots=True)
 class CachedDictionary:
-    """A dictionary, parsed and as it was downloaded."""
+    """A dictionary, parsed and in its downloaded form."""
 
     compressed: bytes
     dictionary: Dictionary
@@ -39,15 +39,15 @@ class CachedDictionary:
 class DictionaryCache:
     """Dictionaries by their first bytes; kept in FOLDER, or only in memory when there is none.
 
-    For one event loop. The disk never makes anything fail: what cannot be read or written is as if it had
-    not been cached, and ``problem`` says why.
+    For one event loop. A disk error makes nothing fail: what cannot be read or written counts as not cached,
+    and ``problem`` states the reason.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
         self.problem: str | None = None
-        """Why the last reading or writing failed, in a sentence's words."""
+        """Why the last read or write failed, as a phrase for messages."""
         self.ignored_files = 0
-        """Files with the name of a dictionary that are none."""
+        """Number of files with the name of a dictionary that do not hold one."""
         self._folder = folder
         self._kept: dict[str, CachedDictionary] = {}
         """By SHA-256 of the compressed form; the one used last comes last."""
@@ -58,23 +58,23 @@ class DictionaryCache:
     def of_user(cls) -> "DictionaryCache":
         """Return the cache in the user's own cache folder (XDG_CACHE_HOME)."""
         base = os.environ.get("XDG_CACHE_HOME", "")
-        # A relative path there is to be ignored, says the XDG Base Directory Specification.
+        # The XDG Base Directory Specification requires that a relative path is ignored.
         root = Path(base) if os.path.isabs(base) else Path.home() / ".cache"  # noqa: PTH117
         return cls(root / "canductor" / "dictionaries")
 
     def candidates(self, beginning: bytes) -> list[CachedDictionary]:
-        """Return all dictionaries whose compressed form begins like this, the one used last first."""
+        """Return all dictionaries whose compressed form begins like this, most recently used first."""
         assert beginning
         self._read_folder(beginning)
         return [kept for kept in reversed(self._kept.values()) if kept.compressed.startswith(beginning)]
 
     def all(self) -> list[CachedDictionary]:
-        """Return every dictionary there is, the one used last first."""
+        """Return all dictionaries, most recently used first."""
         self._read_folder(b"")
         return list(reversed(self._kept.values()))
 
     def used(self, cached: CachedDictionary) -> None:
-        """Take note that a node has this dictionary: it is the last to be dropped."""
+        """Record that a node has this dictionary: it becomes the last to be dropped."""
         key = _sha256(cached.compressed)
         self._keep(key, cached)
         if self._folder is not None:
@@ -82,7 +82,7 @@ class DictionaryCache:
                 os.utime(self._folder / _file_name(cached, key))
 
     def store(self, compressed: bytes, dictionary: Dictionary) -> None:
-        """Keep a dictionary that was downloaded, and parsed without complaint."""
+        """Store a dictionary that was downloaded and parsed without an error."""
         cached = CachedDictionary(compressed, dictionary)
         key = _sha256(compressed)
         self._keep(key, cached)
@@ -95,9 +95,9 @@ class DictionaryCache:
 
     @contextlib.asynccontextmanager
     async def downloading(self, beginning: bytes) -> AsyncIterator[None]:
-        """Hold off all other downloads that begin alike: look into the cache again inside, it may be there.
+        """Exclude other downloads with the same beginning; look into the cache again inside the context.
 
-        So of thirty equal nodes that start together one downloads, and different ones do not wait.
+        Of thirty equal nodes that start together one downloads, and different ones do not wait.
         """
         download = self._downloads.setdefault(beginning, _Download(asyncio.Lock()))
         download.users += 1
@@ -120,7 +120,7 @@ class DictionaryCache:
     # --------------------------------------------------------------------------------------------- on disk
 
     def _read_folder(self, beginning: bytes) -> None:
-        """Take what the folder has of dictionaries that begin like this; once for each beginning."""
+        """Read the dictionaries of the folder that begin like this; once for each beginning."""
         if beginning in self._looked_for:
             return
         if len(self._looked_for) >= MAX_KEPT:
@@ -154,14 +154,14 @@ class DictionaryCache:
                 if _NAME.match(entry.name)
             )
         except FileNotFoundError:
-            pass  # nothing was ever cached, or another process just dropped a file
+            pass  # nothing was cached yet, or another process just dropped a file
         except OSError as error:
             self.problem = f"cannot read {self._folder}: {error.strerror or error}"
         return [path for _, path in sorted(found)]
 
     def _write(self, folder: Path, name: str, compressed: bytes) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        # Another process may write the same: each has a file of its own until it is whole.
+        # Another process may write the same: each writes a file of its own and renames it when complete.
         temporary = folder / f"{_TEMPORARY}{os.getpid()}"
         try:
             temporary.write_bytes(compressed)
@@ -183,7 +183,7 @@ def _sha256(data: bytes) -> str:
 
 
 def _checked(compressed: bytes, key: str) -> CachedDictionary | None:
-    """Parse what a file holds; None when it is not what its name says, or no dictionary."""
+    """Parse the content of a file; None when it does not match its name or is not a dictionary."""
     if _sha256(compressed) != key:
         return None
     try:
@@ -198,9 +198,9 @@ def _file_name(cached: CachedDictionary, key: str) -> str:
 
 
 def _read(path: Path, beginning: bytes) -> bytes | None:
-    """Return the content of a regular file that begins like this and is not too big, else None."""
+    """Return the content of a regular file that begins like this and is not too large, else None."""
     try:
-        # A link could lead anywhere, and opening a pipe would wait for its other end.
+        # A symbolic link could lead anywhere, and opening a pipe would wait for its other end.
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
         return None

@@ -1,7 +1,7 @@
-"""The data dictionary: what a node says about its own commands, responses, enumerations and constants.
+"""The data dictionary: a node's description of its own commands, responses, enumerations and constants.
 
-A dictionary comes off a wire and is hostile until parsed: every size is bounded, and whatever is wrong ends
-in one DictionaryError sentence. Once parsed it does not change; decoding is total (a message or None).
+A dictionary comes off a wire and is untrusted until parsed: every size is bounded, and every fault raises
+DictionaryError with one sentence. Once parsed it does not change; decoding is total (a message or None).
 """
 
 import json
@@ -20,9 +20,9 @@ from nodes.dictionary.parts import (
 )
 
 MAX_INFLATED_BYTES: Final = 1 << 20
-"""Real ones have 10 to 13 kB."""
+"""Largest compressed size; real dictionaries have 10 to 13 kB."""
 MAX_COMPRESSED_BYTES: Final = 1 << 18
-"""Where a download is given up."""
+"""Size at which a download is given up."""
 IDENTIFY: Final = "identify offset=%u count=%c"
 IDENTIFY_RESPONSE: Final = "identify_response offset=%u data=%.*s"
 _WORD: Final = re.compile(r'\s*([A-Za-z_]\w*)=("(?:[^"\\]|\\.)*"|\S*)')
@@ -31,7 +31,7 @@ _INTEGER: Final = re.compile(r"[+-]?(?:0x[0-9a-fA-F]{1,16}|[0-9]{1,20})\Z")
 
 
 class Dictionary:
-    """What one firmware build understands and says. Make it with ``parse`` or ``from_json``."""
+    """The messages of one firmware build. Create it with ``parse`` or ``from_json``."""
 
     def __init__(self, source: Mapping[str, object]) -> None:
         self.version = _text(source, "version")
@@ -96,7 +96,7 @@ class Dictionary:
         raise MessageError(f"the node's firmware ({self.version}) has no command {name!r}")
 
     def int_constant(self, name: str, default: int | None = None) -> int:
-        """Return a whole-number constant, or DEFAULT; DictionaryError when neither serves."""
+        """Return an integer constant, or DEFAULT; DictionaryError when there is neither."""
         value = self.constants.get(name, default)
         if isinstance(value, int):
             return value
@@ -104,7 +104,7 @@ class Dictionary:
         raise DictionaryError(f"dictionary: constant {name} must be a whole number and is {found}")
 
     def str_constant(self, name: str, default: str | None = None) -> str:
-        """Return a text constant, or DEFAULT; DictionaryError when neither serves."""
+        """Return a text constant, or DEFAULT; DictionaryError when there is neither."""
         value = self.constants.get(name, default)
         if isinstance(value, str):
             return value
@@ -117,7 +117,7 @@ class Dictionary:
         freq_hz = self.int_constant("CLOCK_FREQ")
         if 0 < freq_hz < 1 << 32:
             return freq_hz
-        raise DictionaryError(f"dictionary: CLOCK_FREQ={freq_hz} is no frequency")
+        raise DictionaryError(f"dictionary: CLOCK_FREQ={freq_hz} is not a frequency")
 
     @property
     def receive_window(self) -> int:
@@ -128,7 +128,7 @@ class Dictionary:
         raise DictionaryError(f"dictionary: RECEIVE_WINDOW={window} cannot hold a block of 64 bytes")
 
     def enumeration_for(self, param: str) -> Enumeration | None:
-        """Return the enumeration of parameter PARAM: named like it or like what follows an underscore."""
+        """Return the enumeration of parameter PARAM: named like it or like the part after an underscore."""
         while param:
             if param in self.enumerations:
                 return self.enumerations[param]
@@ -184,17 +184,17 @@ class Dictionary:
         return decoded[0] if decoded and decoded[1] == len(content) else None
 
     def response_at(self, content: bytes) -> "tuple[MessageFormat | OutputFormat, int] | None":
-        """Return the format of the response in CONTENT and where its parameters begin; None: unknown id."""
+        """Return the format of the response in CONTENT and the offset of its parameters; None: unknown id."""
         return _format_at(self._by_prefix, self._responses_by_id, content, 0)
 
     def command_at(self, content: bytes, at: int) -> tuple[MessageFormat, int] | None:
-        """Return the format of the command at AT of CONTENT and where its parameters begin, or None."""
+        """Return the format of the command at AT of CONTENT and the offset of its parameters, or None."""
         return _format_at(self._commands_by_prefix, self._commands_by_id, content, at)
 
     def decode_commands(self, content: bytes, *, as_sent: bool = False) -> list[Message] | None:
         """Decode all commands of a block; None when any of them is unknown or cut short.
 
-        AS_SENT keeps what ``MessageFormat.decode_as_sent`` keeps, so that ``encode_commands`` gives CONTENT.
+        AS_SENT: decode with ``MessageFormat.decode_as_sent``, so that ``encode_commands`` restores CONTENT.
         """
         messages: list[Message] = []
         at = 0
@@ -211,7 +211,7 @@ class Dictionary:
         return messages
 
     def encode_commands(self, messages: list[Message]) -> bytes:
-        """Encode commands as ``decode_commands(…, as_sent=True)`` gave them."""
+        """Encode commands that ``decode_commands(…, as_sent=True)`` returned."""
         return b"".join(self.command(message.name).encode_as_sent(message) for message in messages)
 
 
@@ -233,7 +233,7 @@ def encode_values(dictionary: Dictionary, command: MessageFormat, values: Mappin
 
 
 def _text_value(command: MessageFormat, param: str, text: str) -> Value | str:
-    """Read one value of a command's text: what it can be depends on the parameter."""
+    """Read one value of a command's text; its permitted forms depend on the parameter."""
     codes = dict(zip(command.names, command.code_texts, strict=True))
     if not codes.get(param, "").endswith("s"):
         return int(text, 0 if "x" in text else 10) if _INTEGER.match(text) else text
@@ -251,7 +251,7 @@ F = TypeVar("F")
 def _format_at(
     by_prefix: Mapping[bytes, F], by_id: Mapping[int, F], content: bytes, at: int
 ) -> tuple[F, int] | None:
-    """Look up the id at AT of CONTENT; return what has it and what stands behind it, or None."""
+    """Look up the id at AT of CONTENT; return the format with it and the offset behind it, or None."""
     found = by_prefix.get(content[at : at + 1])
     if found is not None:
         return found, at + 1
@@ -277,7 +277,7 @@ def _unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def _refuse_constant(text: str) -> object:
-    raise ValueError(f"{text} is no number")
+    raise ValueError(f"{text} is not a number")
 
 
 def _text(source: Mapping[str, object], key: str) -> str:

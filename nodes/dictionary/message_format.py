@@ -1,7 +1,7 @@
-"""One message of a node's vocabulary: its format, and its way to and from bytes through the C codec.
+"""One message of a node's vocabulary: its format, and its encoding and decoding by the C codec.
 
-Every encoding and decoding is one call into ``firmware/wire``. The buffers a format hands to C are its own
-and reused, so a format must be used from one thread only (the control loop's).
+Every encoding and decoding is one call into ``firmware/wire``. A format reuses the buffers that it passes to
+C, so it must be used from one thread only (the control loop's).
 """
 
 import re
@@ -39,14 +39,14 @@ class Message:
     params: dict[str, Value]
 
     def integer(self, param: str) -> int:
-        """Return the number PARAM; a buffer or a missing parameter is a caller's error (KeyError)."""
+        """Return the number PARAM; raises KeyError for a buffer or a missing parameter."""
         value = self.params[param]
         if isinstance(value, int):
             return value
         raise KeyError(f"{self.name} {param} is a buffer")
 
     def data(self, param: str) -> bytes:
-        """Return the bytes of buffer PARAM; a number or a missing one is a caller's error (KeyError)."""
+        """Return the bytes of buffer PARAM; raises KeyError for a number or a missing parameter."""
         value = self.params[param]
         if isinstance(value, bytes):
             return value
@@ -59,10 +59,10 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """What a parameter's code says: the C codec's type and the numbers it takes.
+    """Meaning of a parameter's code: the C codec's type and the range of numbers.
 
-    The code documents size, signedness is the reader's: an unsigned one takes negative numbers of its size
-    too (``invert_step=%c`` is -1 for steps on both edges).
+    The code states the size; the reader chooses the signedness: an unsigned parameter also takes negative
+    numbers of its size (``invert_step=%c`` is -1 for steps on both edges).
     """
 
     wire_type: int
@@ -91,7 +91,7 @@ _SKIP_POINTER: Final = f"{_ARG_SIZE - 4}x"
 _POINTER: Final = f"{_DATA_AT - 4}x{'Q' if struct.calcsize('=Q') == _POINTER_SIZE else 'I'}"
 
 
-# Looked up once: these run for every message.
+# Looked up once: used for every message.
 _from_buffer: Final = ffi.from_buffer
 _unpack: Final = lib.wire_unpack
 
@@ -99,7 +99,7 @@ _unpack: Final = lib.wire_unpack
 class MessageFormat:
     """A message's name, id and parameters, able to encode and decode it.
 
-    NAMES and CODES_ are its parameters in order; the caller checked them. MESSAGE_ID -2^31..2^31-1.
+    NAMES and CODES_ are its parameters in order, checked by the caller. MESSAGE_ID: -2^31..2^31-1.
     """
 
     def __init__(self, name: str, message_id: int, names: Sequence[str], codes: Sequence[str]) -> None:
@@ -125,7 +125,7 @@ class MessageFormat:
 
     @property
     def text(self) -> str:
-        """The format as dictionaries write it."""
+        """The format in the notation of dictionaries."""
         pairs = zip(self.names, self.code_texts, strict=True)
         return " ".join((self.name, *(f"{name}={code}" for name, code in pairs)))
 
@@ -187,7 +187,7 @@ class MessageFormat:
     def decode(self, content: bytes, start: int) -> tuple[Message, int] | None:
         """Decode the parameters at START of CONTENT.
 
-        Returns the message and where it ends, or None when it is cut short.
+        Return the message and the offset of its end, or None when it is cut short.
         """
         found = self.read_values(content, start)
         if found is None:
@@ -195,7 +195,7 @@ class MessageFormat:
         return Message(self.name, dict(zip(self.names, found[0], strict=True))), found[1]
 
     def read_values(self, content: bytes, start: int) -> tuple[Sequence[Value], int] | None:
-        """Decode like ``decode``, but give only the parameters' values, in the order of ``names``."""
+        """Decode like ``decode``, but return only the parameters' values, in the order of ``names``."""
         if not self._count:
             return (), start
         held = _from_buffer("uint8_t[]", content)
@@ -214,10 +214,10 @@ class MessageFormat:
     # ------------------------------------------------------------------------------------- numbers as sent
 
     def decode_as_sent(self, data: bytes, start: int) -> tuple[Message, int] | None:
-        """Decode like ``decode``, but tell numbers apart that a node reads as the same 32 bits.
+        """Decode like ``decode``, but distinguish numbers that a node reads as the same 32 bits.
 
         Hosts send a clock in its 64-bit form, of which 35 bits reach the wire, and -1 as ``7f`` or as 2^32-1
-        in five bytes. For comparing recordings: ``encode_as_sent`` makes the same bytes of it.
+        in five bytes. For comparing recordings: ``encode_as_sent`` restores the same bytes.
         """
         values: list[Value] = []
         at = start
@@ -237,7 +237,7 @@ class MessageFormat:
         return Message(self.name, dict(zip(self.names, values, strict=True))), at
 
     def encode_as_sent(self, message: Message) -> bytes:
-        """Encode what ``decode_as_sent`` gave."""
+        """Encode the result of ``decode_as_sent``."""
         out = self.prefix
         for value in message.params.values():
             out += vlq(len(value)) + value if isinstance(value, bytes) else _vlq_as_sent(value)
@@ -269,7 +269,7 @@ def vlq(value: int) -> bytes:
 
 
 def vlq_read(data: bytes, start: int) -> tuple[int, int] | None:
-    """Return the number at START of DATA as unsigned 32 bits and where it ends; None when cut short."""
+    """Return the number at START of DATA as unsigned 32 bits and its end; None when it is cut short."""
     held = ffi.from_buffer("uint8_t[]", data)
     cursor = ffi.new("const uint8_t *[1]", [held + start])
     value = ffi.new("uint32_t *")

@@ -79,7 +79,7 @@ def parse_format(text: str, message_id: int) -> MessageFormat:
     if len(text) > MAX_NAME_LENGTH * 4 or len(words) > MAX_PARAMETERS:
         raise DictionaryError(f"dictionary: the format {_shown(text)} is too long; refused")
     if not NAME.match(name):
-        raise DictionaryError(f"dictionary: {_shown(text)} does not begin with a message name")
+        raise DictionaryError(f"dictionary: {_shown(text)} does not start with a message name")
     names: list[str] = []
     codes: list[str] = []
     for word in words:
@@ -135,7 +135,7 @@ class OutputFormat:
 
 
 class Enumeration:
-    """Names of numbers, ranges spelled out. Several names may mean one number; the first one names it."""
+    """Names of numbers, ranges spelled out. Of several names for one number, decoding gives the first."""
 
     def __init__(self, name: str, values: Mapping[str, int]) -> None:
         self.name = name
@@ -145,7 +145,7 @@ class Enumeration:
             self._names.setdefault(value, text)
 
     def value_of(self, name: str) -> int:
-        """Return the number NAME means; MessageError when there is none."""
+        """Return the number of NAME; MessageError when there is none."""
         if name in self.values:
             return self.values[name]
         few = ", ".join(list(self.values)[:4])

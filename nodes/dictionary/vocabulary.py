@@ -1,6 +1,6 @@
-"""What the coordinator itself needs a firmware to understand, checked once when its dictionary is read.
+"""The messages that the coordinator needs of any firmware, checked once when its dictionary is read.
 
-Afterwards these messages can be used without looking; a strange dictionary ends in one sentence here.
+Afterwards these messages can be used without a check; an unsuitable dictionary raises one sentence here.
 """
 
 from typing import Final
@@ -9,7 +9,7 @@ from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.parts import DictionaryError
 
 KNOWS_BUS_STOP: Final = "CAN_BUS_STOP"
-"""A constant: firmware that has it stops its whole bus when it is told so, or when it shuts down itself."""
+"""A constant: firmware that has it stops its whole bus on request, or when it shuts down itself."""
 REQUIRED_COMMANDS: Final = {
     "get_config": (),
     "allocate_oids": ("count",),
@@ -31,7 +31,7 @@ OPTIONAL_RESPONSES: Final = {
 
 
 def check_vocabulary(dictionary: Dictionary) -> None:
-    """Raise DictionaryError when a firmware cannot be used because of what it does not say or understand."""
+    """Raise DictionaryError when a firmware cannot be used because it lacks messages."""
     for name, params in REQUIRED_COMMANDS.items():
         found = dictionary.commands.get(name)
         if found is None or found.names != params:
@@ -46,7 +46,7 @@ def check_vocabulary(dictionary: Dictionary) -> None:
 
 
 def carries_identity(dictionary: Dictionary) -> bool:
-    """Tell whether the node can be asked which board it is (get_canbus_id), with the answer as bytes."""
+    """Return whether the node answers get_canbus_id with its uuid as bytes."""
     format_ = dictionary.responses.get("canbus_id")
     asked = dictionary.commands.get("get_canbus_id")
     if format_ is None or asked is None or asked.names:

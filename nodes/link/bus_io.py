@@ -1,4 +1,4 @@
-"""The Python skin of a bus's I/O thread (io_thread.h): links, raw frames, events in the asyncio loop."""
+"""Python wrapper of a bus's I/O thread (io_thread.h): links, raw frames, events in the asyncio loop."""
 
 import asyncio
 from typing import Any, Self
@@ -30,10 +30,10 @@ class LinkIO:
     """One bus or serial line: its links, and what arrives on it, handed over in the event loop's thread.
 
     LinkIO(transport, loop) starts an I/O thread for the transport, which stays the caller's: close() here
-    first, then the transport. LinkIO.driven_by() takes a bus that something else drives, for example a
-    simulation. ON_FRAME gets CAN frames that belong to no link, ON_CLOSED one sentence when the transport
-    ends by itself. SETTINGS say what the bus can carry; without them a CAN transport's bit rate counts, where
-    it knows it. Not thread-safe: use from the loop's thread.
+    first, then the transport. LinkIO.driven_by() uses a bus with another driver, for example a simulation.
+    ON_FRAME gets CAN frames that belong to no link, ON_CLOSED one sentence when the transport ends by itself.
+    SETTINGS define what the bus can carry; without them a CAN transport's bit rate counts, if it is known.
+    Not thread-safe: use from the loop's thread.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class LinkIO:
         settings: BusSettings | None = None,
     ) -> None:
         if settings is None:
-            # A serial line's rate may be a mere word, as on USB: nothing is budgeted unless asked for.
+            # A serial line's rate may be nominal only, as on USB: nothing is budgeted unless requested.
             serial = transport.kind == TransportKind.BYTES
             settings = BusSettings(bitrate=0 if serial else getattr(transport, "bitrate", None) or 0)
         self._attach(ThreadDriver(transport, loop, settings), on_frame, on_closed)
@@ -123,12 +123,12 @@ class LinkIO:
         return link
 
     def learn_bitrate(self, bitrate: int) -> None:
-        """Take BITRATE (bit/s, 0: unknown) for what the bus carries, unless that is known already."""
+        """Set BITRATE (bit/s, 0: unknown) as the capacity of the bus, unless that is known already."""
         if self.stats().bitrate == 0:
             self._lib.io_set_bitrate(self._bus.live(), bitrate)
 
     def send_frame(self, can_id: int, data: bytes) -> None:
-        """Send one CAN frame that belongs to no link, before all data. Raises LinkError when it cannot."""
+        """Send one CAN frame that belongs to no link, before all data. Raises LinkError when that fails."""
         status = self._lib.io_send_frame(self._bus.live(), can_id, self._ffi.from_buffer(data), len(data))
         if status == self._lib.IO_INVALID:
             raise LinkError(
@@ -146,7 +146,7 @@ class LinkIO:
         return _convert(self._final, self._lib)
 
     def load(self) -> BusLoad:
-        """Return what ``stats`` says of the bus's load, in a fraction of the time."""
+        """Return the bus's load as in ``stats``, in a fraction of the time."""
         self._look()
         return _load(self._final, self._lib)
 
@@ -177,7 +177,7 @@ class LinkIO:
         self._bus.close()
 
     def _handle_events(self) -> None:
-        # A callback may close this bus or any link: every step looks again.
+        # A callback may close this bus or any link: every step checks again.
         taken = _BATCH
         while taken == _BATCH and self._bus.open:
             taken = self._lib.io_take(self._bus.live(), self._events, _BATCH)
@@ -197,7 +197,7 @@ class LinkIO:
                 frames.append(Frame(event.can_id, content, event.received_ns))
             else:
                 notices.append((event.notice, event.link, event.value))
-        # Frames first: one with which a node stops its bus tells why, what the others then report does not.
+        # Frames first: the frame with which a node stops its bus has the reason, later reports do not.
         for frame in frames:
             if self._bus.open and self._on_frame:
                 self._on_frame(frame)

@@ -1,4 +1,4 @@
-"""What a bus and its links share: the driver's C side, and the words for its refusals."""
+"""What a bus and its links share: the driver's C side, and the messages for its errors."""
 
 import errno
 import os
@@ -7,10 +7,10 @@ from typing import Any
 from nodes.link.types import BusDriver, LinkError
 
 _ENDED_ADVICE = {
-    errno.ENETDOWN: "somebody set the interface down: set it up with 'ip link set {0} up'",
+    errno.ENETDOWN: "the interface was set down: set it up with 'ip link set {0} up'",
     errno.ENODEV: "the interface is gone: plug the adapter in",
 }
-"""What a user can do about an end, by errno; {0} is the transport's name."""
+"""Advice for a transport that ended, by errno; {0} is the transport's name."""
 
 
 class BusHandle:
@@ -26,7 +26,7 @@ class BusHandle:
 
     @property
     def open(self) -> bool:
-        """Whether close() was not called yet."""
+        """Whether the driver is open: close() was not called yet."""
         return self._bus is not None
 
     def live(self) -> Any:
@@ -47,12 +47,12 @@ class BusHandle:
         return f"{self.name}: the connection ended ({reason}); {advice}, then start again"
 
     def check(self, status: int, where: str) -> None:
-        """Raise LinkError for what can happen to any call."""
+        """Raise LinkError for the errors that any call can have."""
         if status == self.lib.IO_OK:
             return
         if status == self.lib.IO_CLOSED:
-            # The driver knows before the notice has come through the loop.
+            # The driver may have ended before the notice has passed through the loop.
             raise LinkError(self.ended_because(self.lib.io_end_cause(self.live())))
         if status == self.lib.IO_NO_MEMORY:
-            raise LinkError(f"{where}: no memory for a further link")
+            raise LinkError(f"{where}: no memory for another link")
         raise LinkError(f"{where}: refused by the bus (status {status}); an argument is out of range")

@@ -1,6 +1,6 @@
-"""What nodes need of the link: the seam at which a simulation or a test takes its place.
+"""Interfaces of the link as nodes need them; a simulation or a test may implement them instead.
 
-``nodes.link`` provides all of it; its classes are documented there.
+``nodes.link`` implements all of them; its classes are documented there.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,7 +10,7 @@ from nodes.link import BusLoad, Forecast, IOStats, LinkSettings
 
 
 class ResponseLike(Protocol):
-    """One message from a node. Times are HostTime; sent_ns 0: which sending it answers is not known."""
+    """One message from a node. Times are HostTime; sent_ns 0: not known which transmission it answers."""
 
     @property
     def content(self) -> bytes: ...  # noqa: D102
@@ -35,7 +35,7 @@ OnFrame = Callable[[FrameLike], None]
 
 
 class LinkInterface(Protocol):
-    """The reliable way to one node. Callbacks run on the control loop."""
+    """The reliable connection to one node. Callbacks run on the control loop."""
 
     def send(  # noqa: D102
         self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False

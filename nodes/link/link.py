@@ -46,13 +46,13 @@ class Link:
 
     @property
     def name(self) -> str:
-        """How messages to the user call it: transport and node id."""
+        """Name in messages to the user: transport and node id."""
         return self._name
 
     def send(self, content: bytes, *, min_clock: int = 0, req_clock: int = 0, bulk: bool = False) -> None:
         """Queue one encoded command: in order within its class, not before MIN_CLOCK (node ticks).
 
-        A control command goes within milliseconds, BULK data with what motion and control leave of the bus.
+        A control command is sent within milliseconds, BULK data when motion and control leave room for it.
         Raises LinkError when the queue is full, the command is too long, or the link is closed or lost.
         """
         data = self._ffi.from_buffer(content)
@@ -78,7 +78,7 @@ class Link:
         self._check(status)
 
     def send_urgent(self, content: bytes) -> None:
-        """Drop everything that is queued and unsent and send CONTENT next; raises LinkError as send()."""
+        """Drop everything that is queued but unsent and send CONTENT next; raises LinkError as send()."""
         status = self._lib.io_send_urgent(
             self._live(), self._number, self._ffi.from_buffer(content), len(content)
         )
@@ -91,7 +91,7 @@ class Link:
         self._check(self._lib.io_set_receive_window(self._live(), self._number, size))
 
     def set_clock(self, freq_hz: float, at_ns: int, at_ticks: int) -> None:
-        """Tell the node's clock: it reads AT_TICKS (64 bits) at host time AT_NS and runs at FREQ_HZ (> 0)."""
+        """Set the node's clock: it reads AT_TICKS (64 bits) at host time AT_NS and runs at FREQ_HZ (> 0)."""
         if not (math.isfinite(freq_hz) and freq_hz > 0 and at_ns >= 0 and at_ticks >= 0):
             raise LinkError(
                 f"{self._name}: not a clock: {freq_hz} Hz at {at_ns} ns, {at_ticks} ticks; estimate it again"
@@ -133,13 +133,13 @@ class Link:
         self._on_responses(responses)
 
     def handle_drained(self) -> None:
-        """Wake those who wait in drained()."""
+        """Wake the tasks that wait in drained()."""
         if self._drained:
-            self._drained.set_result(None)  # it is shielded: nobody has cancelled it
+            self._drained.set_result(None)  # it is shielded, so it was not cancelled
             self._drained = None
 
     def handle_lost(self, cause: int) -> None:
-        """Tell the user, once, that the node does not acknowledge any more."""
+        """Notify the user, once, that the node no longer acknowledges."""
         heard = (
             "answers, but accepts nothing"
             if cause == self._lib.LINK_CAUSE_STUCK
@@ -154,7 +154,7 @@ class Link:
         self._on_lost(text)
 
     def handle_ended(self, text: str) -> None:
-        """Note that the transport is gone; LinkIO's on_closed tells the user."""
+        """Record that the transport is gone; LinkIO's on_closed notifies the user."""
         self._fail(text)
 
     # ----------------------------------------------------------------------------------- inside
@@ -168,7 +168,7 @@ class Link:
         self._failed = self._failed or text
         if self._drained:
             self._drained.set_exception(LinkError(text))
-            self._drained.exception()  # nobody has to be waiting
+            self._drained.exception()  # there may be no waiter
             self._drained = None
 
     def _check(self, status: int) -> None:

@@ -1,4 +1,4 @@
-"""The life of a link in words, from the table in link_states.c.
+"""The life cycle of a link as text and diagram, from the table in link_states.c.
 
 docs/link-states.md is generated from it: ``python -m nodes.link.states > docs/link-states.md``.
 """
@@ -29,13 +29,13 @@ class LinkEvent(IntEnum):
 
 STATE_WORDS: Final = {
     LinkState.PROBING: "the sequence that the node expects is unknown; an empty block asks for it",
-    LinkState.CONFIRMING: "the node has named it; a second empty block makes sure that it is still so",
+    LinkState.CONFIRMING: "the node has reported it; a second empty block checks that it is still valid",
     LinkState.RUNNING: "commands are sent, acknowledged and repeated",
-    LinkState.LOST: "given up, for good: a new link has to be opened",
+    LinkState.LOST: "given up permanently: a new link has to be opened",
 }
 EVENT_WORDS: Final = {
     LinkEvent.TAKEN: "an answer acknowledges the empty block",
-    LinkEvent.REFUSED: "an answer names another sequence",
+    LinkEvent.REFUSED: "an answer reports another sequence",
     LinkEvent.SILENCE: "no acknowledgement for lost_after_s",
 }
 

@@ -11,7 +11,7 @@ from nodes.link.types import BusSettings, LinkError, LinkTransport, TransportKin
 
 
 class ThreadDriver:
-    """Runs TRANSPORT, which stays the caller's, by a thread of its own; tells LOOP what arrives."""
+    """Runs TRANSPORT, which stays the caller's, in a thread of its own; notifies LOOP of what arrives."""
 
     def __init__(
         self, transport: LinkTransport, loop: asyncio.AbstractEventLoop, settings: BusSettings

@@ -1,4 +1,4 @@
-"""The values that pass between a link and its users."""
+"""The data types exchanged between a link and its users."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,11 +24,11 @@ class TransportKind(IntEnum):
 
 
 class LinkTransport(Protocol):
-    """What a link needs of a transport; the transports of ``nodes.transport`` are such."""
+    """Interface of a transport as a link needs it; ``nodes.transport`` implements it."""
 
     @property
     def name(self) -> str:
-        """How messages to the user call it, for example ``can0`` or ``/dev/ttyACM0``."""
+        """Name in messages to the user, for example ``can0`` or ``/dev/ttyACM0``."""
 
     @property
     def kind(self) -> int:
@@ -43,12 +43,12 @@ class LinkTransport(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class BusSettings:
-    """What is known of a bus or serial line (``struct io_settings`` of io_core.h)."""
+    """Properties of a bus or serial line (``struct io_settings`` of io_core.h)."""
 
     bitrate: int = 0
     """Bits per second; 0: unlimited or unknown, nothing is budgeted."""
     ceiling: float = 0.9
-    """Share of the bit rate that is given out, 0.1..1."""
+    """Share of the bit rate that may be used, 0.1..1."""
     queue_frames: int = 0
     """Most frames (a serial line: bytes) that may sit in the kernel or adapter; 0: from the bit rate."""
 
@@ -69,11 +69,11 @@ class BusSettings:
 
 
 class BusDriver(Protocol):
-    """What moves the bytes of a bus: its I/O thread, or a simulation (io_core.h)."""
+    """Driver of a bus, which transfers its bytes: its I/O thread, or a simulation (io_core.h)."""
 
     @property
     def name(self) -> str:
-        """How messages to the user call the bus."""
+        """Name of the bus in messages to the user."""
 
     @property
     def serial(self) -> bool:
@@ -85,7 +85,7 @@ class BusDriver(Protocol):
 
     @property
     def lib(self) -> Any:
-        """With the functions of io_api.h."""
+        """The functions of io_api.h."""
 
     @property
     def bus(self) -> Any:
@@ -104,7 +104,7 @@ class Response:
 
     content: bytes
     sent_ns: int
-    """Host time at which the block it acknowledges was sent; 0 when that was repeated, and so ambiguous."""
+    """Host time at which the acknowledged block was sent; 0 when it was repeated (ambiguous)."""
     received_ns: int
     """Host time at which it was read."""
 
@@ -121,19 +121,19 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class LinkSettings:
-    """What a link has to know of its node."""
+    """Properties of a node that its link needs."""
 
     nodeid: int | None
     """1..255 on CAN, None on a serial line."""
     receive_window: int = 192
     """Bytes the node can buffer, at least 64: RECEIVE_WINDOW of its dictionary."""
     lost_after_s: float = 1.0
-    """Without an acknowledgement for so long, the link is lost."""
+    """Time without an acknowledgement after which the link is lost."""
 
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """What passed on the wire. Bits are the true lengths of frames, 0 while the bit rate is unknown."""
+    """Traffic on the wire. Bits are the true lengths of frames, 0 while the bit rate is unknown."""
 
     frames: int = 0
     bits: int = 0
@@ -145,11 +145,11 @@ class LinkStats:
     """Counters of one link, since it was opened. Times in s; queue depths in commands and bytes."""
 
     blocks_sent: int = 0
-    """Everything put on the wire, repeats included; bytes_sent has the sync bytes too."""
+    """Everything sent, repeats included; bytes_sent also counts the sync bytes."""
     bytes_sent: int = 0
     commands_sent: int = 0
     commands_dropped: int = 0
-    """Queued commands thrown away by send_urgent."""
+    """Queued commands dropped by send_urgent."""
     blocks_repeated: int = 0
     bytes_repeated: int = 0
     naks: int = 0
@@ -157,7 +157,7 @@ class LinkStats:
     blocks_received: int = 0
     bytes_received: int = 0
     bytes_invalid: int = 0
-    """Received bytes that were part of no sound block."""
+    """Received bytes that were part of no valid block."""
     acks_duplicate: int = 0
     acks_never_sent: int = 0
     """Acknowledgements of blocks that were never sent: ignored."""
@@ -207,11 +207,11 @@ class BusLoad:
     data: float = 0.0
     """Received otherwise; a serial line: all that was received."""
     weak: float = 0.0
-    """Received with ids above those of nodes and host: frames that give way to all of these."""
+    """Received with ids above those of nodes and host: frames of lower priority than all of these."""
 
     @property
     def total(self) -> float:
-        """All of it together."""
+        """Sum of all shares."""
         return self.motion + self.control + self.bulk + self.acks + self.data + self.weak
 
 
@@ -224,20 +224,20 @@ class IOStats:
     frames_unclaimed: int
     """Received frames that belong to no link."""
     frames_dropped: int
-    """Of those: the oldest gave way because Python was too slow."""
+    """Of those, frames dropped (the oldest first) because Python was too slow."""
     frames_malformed: int
     responses_dropped: int
-    """Responses that gave way because Python was too slow."""
+    """Responses dropped because Python was too slow."""
     responses_max: int
     unclaimed_max: int
     admin_max: int
     bytes_sent: int
     bytes_received: int
     waits: int
-    """Times the kernel took no more and sending paused."""
+    """Number of pauses in sending because the kernel accepted no more."""
     wakeups: int
     bitrate: int
-    """The line's, 0: unknown; all that follows is 0 then, too."""
+    """Bit rate of the line, 0: unknown; then all fields below are 0 too."""
     motion_bits: int
     """Sent so far, true frame lengths."""
     control_bits: int
@@ -248,10 +248,10 @@ class IOStats:
     queue_frames: int
     """Most frames that may sit in the kernel (a serial line: bytes; 0: not bounded)."""
     queued_max: int
-    """Most that ever did."""
+    """Largest number so far."""
     queue_waits: int
     held_s: float
-    """Time for which the budget held something back."""
+    """Time for which the budget delayed frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,19 +261,19 @@ class Forecast:
     now_ns: int
     """Host time of this forecast."""
     worst_ratio: float
-    """Highest demand of any stretch of time, relative to what the bus can carry in it; above 1: too much."""
+    """Highest demand of any interval, relative to what the bus can carry in it; above 1: too much."""
     at_ns: int
-    """Host time at which that stretch ends; 0 without demand, or while the bit rate is unknown."""
+    """Host time at which that interval ends; 0 without demand, or while the bit rate is unknown."""
     late_ns: int | None
-    """Host time at which the first command is due that would be late; None: none would."""
+    """Host time at which the first command that would be late is due; None: none would be late."""
     motion_bits_per_s: float
-    """What the bus can carry of motion, beside the other traffic and below the ceiling; 0: unknown."""
+    """Capacity of the bus for motion, besides the other traffic and below the ceiling; 0: unknown."""
     queued_bits: int
-    """What the queued motion needs, acknowledgements included."""
+    """Demand of the queued motion, acknowledgements included."""
 
     @property
     def warning_s(self) -> float | None:
-        """How early that is known; None: nothing would be late."""
+        """Time from this forecast to the first late command; None: nothing would be late."""
         return None if self.late_ns is None else (self.late_ns - self.now_ns) * 1e-9
 
 

@@ -1,4 +1,4 @@
-"""What a transmission of MT costs, and how long it takes at least: what measured times are told against."""
+"""Cost and least duration of a transmission of MT, for comparison with measured times."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,26 +9,26 @@ from nodes.support._can_bits import lib
 from nodes.support.can_protocol import MT_CAN_ID
 
 AROUND: Final = 10
-"""Words of a transmission that are neither values nor LIT: what begins and ends it."""
+"""Number of words at the beginning and end of a transmission, which are neither values nor LIT."""
 FRAME_BITS_MAX: Final = 135
-"""Of a frame with two words, stuffing and the pause behind it included, whatever they are."""
+"""Most bits of a frame with two words, stuff bits and interframe space included."""
 LOAD_MAX: Final = 0.999
 
 
 def literals(words: Sequence[int]) -> int:
-    """Return how many LIT a sender put in between the values of a transmission's WORDS."""
+    """Return how many LIT a sender inserted between the values of a transmission's WORDS."""
     values = words[AROUND - len(CLOSING) : -len(CLOSING)]
     return sum(word == LIT for word in values)
 
 
 def frame_bits(frames: Sequence[bytes], can_id: int = MT_CAN_ID) -> list[int]:
-    """Return what each of FRAMES takes of a bus, in bits: true lengths, with the pause behind."""
+    """Return the bits that each of FRAMES takes on a bus: true lengths, interframe space included."""
     return [int(lib.can_frame_bits(can_id, len(frame), frame)) for frame in frames]
 
 
 @dataclass(frozen=True, slots=True)
 class RegisterCost:
-    """By a polled register: one word every DELAY_S, and no faster, since the drive would miss one."""
+    """Through a polled register: one word every DELAY_S and no faster, since the drive would miss words."""
 
     pairs: int
     words: int
@@ -42,7 +42,7 @@ class RegisterCost:
 
     @property
     def bound_s(self) -> float:
-        """Of all words; the last one stands as long as the others."""
+        """Duration of all words; the last one is held as long as the others."""
         return self.words * self.delay_s
 
     def text(self) -> str:
@@ -83,22 +83,22 @@ class CanCost:
 
     @property
     def alone_s(self) -> float:
-        """With the whole bus: no sender is faster."""
+        """With the whole bus: the least possible duration."""
         return self.bits / self.bitrate
 
     @property
     def paced_s(self) -> float:
-        """Within the share."""
+        """Duration within the share."""
         return self.alone_s / self.share
 
     @property
     def free_s(self) -> float:
-        """With all that others leave: tables have the lowest priority."""
+        """Duration with the capacity that others leave: tables have the lowest priority."""
         return self.alone_s / (1 - min(self.load, LOAD_MAX))
 
     @property
     def bound_s(self) -> float:
-        """What one broadcast takes at least. Asking nodes before and after, and repeats, come on top."""
+        """Least duration of one broadcast, without queries before and after, and without repeats."""
         return max(self.paced_s, self.free_s)
 
     def text(self) -> str:

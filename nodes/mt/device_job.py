@@ -1,4 +1,4 @@
-"""What is to be sent to drives without a coordinator, as the command line tells the tool that does it."""
+"""Description of what the command line's tool is to send to drives without a coordinator."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -14,7 +14,7 @@ SHARE: Final = 0.2
 
 
 class DeviceKind(StrEnum):
-    """What a device's name means."""
+    """Kind of a device, derived from its name."""
 
     CAN = "can"
     SERIAL = "serial"
@@ -30,7 +30,7 @@ class Load:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceJob:
-    """LOADS for what is at DEVICE; without any, the nodes are only asked what AXLES keep."""
+    """LOADS for the receivers at DEVICE; without any, the nodes are only queried for the tables of AXLES."""
 
     device: str
     """``can0``, ``virtual:PATH`` or ``INTERFACE:CHANNEL`` of python-can; ``/dev/…`` or a pyserial URL."""
@@ -39,27 +39,27 @@ class DeviceJob:
     delay_s: float | None = None
     """T, for drives that poll a register: one word at a time. None: as fast as the line or share allows."""
     nodes: tuple[int, ...] = ()
-    """Ids on a CAN bus, of nodes that keep tables and can tell."""
+    """Ids, on a CAN bus, of the nodes that keep tables and report them."""
     link: bool = False
     """Whether such a node is at the other end of the serial line."""
     force: bool = False
-    """Talk to nodes to which somebody else seems to talk."""
+    """Whether to use nodes that another host seems to use."""
     baud: int = BAUD
     bitrate: int | None = None
-    """Of the CAN bus; None: as the interface knows."""
+    """Bit rate of the CAN bus; None: that of the interface."""
     share: float = SHARE
     can_id: int = MT_CAN_ID
 
     @property
     def kind(self) -> DeviceKind:
-        """Read from the device's name; raises CanductorError for one that is none."""
+        """The kind, from the device's name; raises CanductorError for an invalid name."""
         name = self.device
         if "://" in name or name.startswith("/"):
             return DeviceKind.SERIAL
         interface, colon, channel = name.partition(":")
         if not interface or (colon and not channel) or any(c.isspace() for c in interface):
             raise CanductorError(
-                f"'{name}' is no device; give a CAN interface (can0), virtual:PATH, INTERFACE:CHANNEL of "
+                f"'{name}' is not a device; give a CAN interface (can0), virtual:PATH, INTERFACE:CHANNEL of "
                 "python-can, a serial device (/dev/ttyUSB0) or a pyserial URL (socket://HOST:PORT)"
             )
         return DeviceKind.CAN

@@ -1,8 +1,8 @@
-"""Brings a table to axles on several nodes, and makes sure of every one.
+"""Download of a table to axles on several nodes, each of them verified.
 
-First by broadcast, which serves all nodes of a bus at once; then, for the nodes that still miss it, through
-their links, which repeat what gets lost. A long table seldom arrives whole by broadcast on a bus that loses
-frames, so how many nodes a broadcast reached decides whether there is another.
+First by broadcast, which serves all nodes of a bus at once; then, for the nodes that still lack it, through
+their links, which repeat lost blocks. A long table rarely arrives complete by broadcast on a bus that loses
+frames, so the number of nodes that a broadcast reached decides whether there is another.
 """
 
 import asyncio
@@ -21,27 +21,27 @@ from nodes.support.errors import CanductorError
 BROADCASTS_MAX: Final = 6
 LINK_TRIES: Final = 2
 BUS_SHARE: Final = 0.2
-"""Of a CAN bus, for broadcasts; nodes on it go on moving meanwhile."""
+"""Share of a CAN bus for broadcasts; nodes on it continue to move meanwhile."""
 BURST_FRAMES: Final = 8
-"""What an interface's queue takes beside motion."""
+"""Room that an interface's queue has besides motion."""
 LINK_BYTES: Final = 48
-"""Of the stream in one command: twelve words."""
+"""Bytes of the stream in one command: twelve words."""
 LINK_WINDOW_WORDS: Final = 2048
-"""Sent and not yet heard: bounds the link's queue."""
+"""Most words sent and not yet confirmed: bounds the link's queue."""
 POLL_S: Final = 0.02
 QUICK_S: Final = 0.08
 QUICK_TRIES: Final = 3
-"""Of many answers on a bus that loses frames one is missing nearly always; slow lines get more time then."""
+"""On a bus that loses frames, one of many answers is nearly always missing; slow lines get more time then."""
 STUCK_S: Final = 5.0
-"""After so long without progress a node is given up."""
+"""Time without progress after which a node is given up."""
 SETTLE_S: Final = 0.01
-"""From the last frame handed to the bus until nodes are asked; frames before a question stay before it."""
+"""Time from the last frame passed to the bus to the queries; frames before a query stay before it."""
 SLOW_BITRATE: Final = 250_000
-"""Taken for a bus whose bit rate nobody told."""
+"""Bit rate assumed for a bus whose bit rate is unknown."""
 
 
 class Bus(Protocol):
-    """A CAN bus, as ``nodes.bus.can_bus.CanBus`` is one."""
+    """Interface of a CAN bus; ``nodes.bus.can_bus.CanBus`` implements it."""
 
     @property
     def name(self) -> str: ...  # noqa: D102
@@ -54,7 +54,7 @@ class Bus(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DownloadTarget:
-    """Where a table goes: TABLE on NODE, which is on BUS; None: on a serial line."""
+    """Destination of a table: TABLE on NODE, which is on BUS; None: on a serial line."""
 
     table: AxleTable
     node: TableNode
@@ -63,22 +63,22 @@ class DownloadTarget:
 
 @dataclass(frozen=True, slots=True)
 class DownloadOutcome:
-    """What became of it at one place."""
+    """Result of a download at one place."""
 
     place: DownloadTarget
     ok: bool
     state: TableState | None
-    """What the node keeps now; None when it does not answer."""
+    """State of the table on the node; None when the node does not answer."""
     broadcasts: int
-    """How many it took part in."""
+    """Number of broadcasts that addressed it."""
     by_link: int
     """How often it was sent through the node's link."""
     problem: str
-    """A sentence; empty when it is ok."""
+    """A sentence about the failure; empty when there is none."""
 
     @property
     def generation(self) -> int:
-        """Of the table that the node keeps; 0 when that is not known."""
+        """Generation of the table that the node keeps; 0 when that is not known."""
         return 0 if self.state is None else self.state.generation
 
 
@@ -88,10 +88,10 @@ class Cast:
 
     bus: str
     cost: CanCost
-    """Of the first; later ones address fewer axles, with as many words."""
+    """Cost of the first; later ones address fewer axles, with as many words."""
     times: int
     elapsed_s: float
-    """Of all, from the first frame handed over until the last one had its share of time."""
+    """Duration of all, from the first frame until the share of time of the last one has passed."""
 
     def text(self) -> str:
         """Return it for a reader."""
@@ -107,17 +107,17 @@ class DownloadReport:
     """What a download did and cost."""
 
     outcomes: tuple[DownloadOutcome, ...]
-    """In the order of the places."""
+    """Results in the order of the places."""
     words: int
-    """Of one transmission."""
+    """Number of words of one transmission."""
     casts: tuple[Cast, ...]
     """By bus; empty when there was none."""
     asking_s: float
-    """Before, between and after broadcasts, until they had settled too."""
+    """Time of queries before, between and after broadcasts, settling times included."""
     links_s: float
-    """For those that broadcasts did not reach."""
+    """Time of transfers over links, to the nodes that broadcasts did not reach."""
     elapsed_s: float
-    """All of it."""
+    """Total time."""
 
     @property
     def ok(self) -> bool:
@@ -126,11 +126,11 @@ class DownloadReport:
 
     @property
     def bound_s(self) -> float:
-        """One broadcast on each bus, nothing lost and nobody asked; 0 without one."""
+        """Least time: one broadcast on each bus without losses or queries; 0 without a broadcast."""
         return sum(cast.cost.bound_s for cast in self.casts)
 
     def text(self) -> str:
-        """Return what it cost, for a reader."""
+        """Return the cost as text for a user."""
         told = [f"{self.words} words in {self.elapsed_s:.3f} s", *(cast.text() for cast in self.casts)]
         if self.casts:
             told.append(f"asking the nodes took {self.asking_s:.3f} s, links {self.links_s:.3f} s")
@@ -138,18 +138,18 @@ class DownloadReport:
 
 
 class _Aim:
-    """One place, while the table is brought to it."""
+    """One place during the download."""
 
     def __init__(self, place: DownloadTarget) -> None:
         self.place = place
         self.state: TableState | None = None
-        """What the node said last."""
+        """The node's last report."""
         self.done = False
         self.broadcasts = self.by_link = 0
         self.problem = ""
 
     async def look(self) -> TableState | None:
-        """Ask the node; None (and a problem) when it does not answer."""
+        """Query the node; return None (and set a problem) when it does not answer."""
         table, node = self.place.table, self.place.node
         try:
             try:
@@ -161,7 +161,7 @@ class _Aim:
         return self.state
 
     async def judge(self, pairs: Sequence[Pair], before: TableState | None) -> None:
-        """Find out whether the table is there, of a later generation than BEFORE."""
+        """Check whether the node has the table, with a later generation than BEFORE."""
         state = await self.look()
         if state is None:
             return
@@ -182,7 +182,7 @@ def _why(place: DownloadTarget, state: TableState, *, fresh: bool) -> str:
     elif state.status is MtStatus.TRANSMITTING:
         told = "the end did not arrive"
     else:
-        told = "another table is there" if fresh else "the transmission did not reach it"
+        told = "it has another table" if fresh else "the transmission did not reach it"
     return f"{table.name} on node {node.name}: {told} ({state.status.name.lower()}); send it again"
 
 
@@ -194,9 +194,9 @@ async def download(
     share: float = BUS_SHARE,
     broadcasts_max: int = BROADCASTS_MAX,
 ) -> DownloadReport:
-    """Bring PAIRS (none: remove the table) to PLACES; returns what became of it, without raising for a node.
+    """Transfer PAIRS (none: remove the table) to PLACES; return the result, which includes failures of nodes.
 
-    Two downloads at one time on one bus spoil each other. Raises MtError for what MT cannot carry.
+    Concurrent downloads on one bus corrupt each other. Raises MtError for values that MT cannot carry.
     """
     aims = [_Aim(place) for place in places]
     words = transmission(pairs, {aim.place.table.axle for aim in aims})
@@ -225,7 +225,7 @@ async def download(
 
 
 def _by_node(aims: Iterable[_Aim]) -> dict[TableNode, list[_Aim]]:
-    """Return those that are not served yet, by node."""
+    """Return the places without the table, by node."""
     groups: dict[TableNode, list[_Aim]] = {}
     for aim in aims:
         if not aim.done:
@@ -241,7 +241,7 @@ async def _look_all(aims: Iterable[_Aim]) -> None:
 
 
 class _Caster:
-    """Broadcasts PAIRS on one bus after another, and counts."""
+    """Broadcasts PAIRS on one bus after another and records the cost."""
 
     def __init__(self, pairs: Sequence[Pair], now_ns: Callable[[], int], share: float) -> None:
         self.casts: dict[int, Cast] = {}
@@ -251,7 +251,7 @@ class _Caster:
         self._share = share
 
     async def reach(self, aims: Sequence[_Aim], bus: Bus, tries: int) -> None:
-        """Broadcast on BUS to AIMS; again for those that missed it, while that serves a node each time."""
+        """Broadcast on BUS to AIMS; repeat for those that missed it, as long as each repeat serves a node."""
         for _ in range(tries):
             groups = _by_node(aims)
             if not groups:
@@ -263,7 +263,7 @@ class _Caster:
             before = {aim: aim.state for aim in heard}
             try:
                 await self._cast(bus, {aim.place.table.axle for aim in heard})
-            except CanductorError as error:  # the bus ended; what its nodes say is judged below
+            except CanductorError as error:  # the bus ended; the reports of its nodes are evaluated below
                 for aim in heard:
                     aim.problem = str(error)
                 return
@@ -271,7 +271,7 @@ class _Caster:
                 aim.broadcasts += 1
             await asyncio.gather(*(aim.judge(self._pairs, before[aim]) for aim in heard))
             missed = len(_by_node(aims))
-            # As many of those that missed it will hear the next one, with luck a little more.
+            # The next broadcast is expected to reach the same share of the remaining nodes.
             reached = len(groups) - missed
             if missed * (reached + 0.5) < len(groups) + 1:
                 return
@@ -291,7 +291,7 @@ class _Caster:
             at += count
             if paced.deadline_ns is not None:
                 await asyncio.sleep(max(0, paced.deadline_ns - self._now_ns()) / NS_PER_S)
-        await asyncio.sleep(max(0, paced.paid_ns - self._now_ns()) / NS_PER_S)  # the last one's own time
+        await asyncio.sleep(max(0, paced.paid_ns - self._now_ns()) / NS_PER_S)  # the last one's duration
         past = self.casts.get(id(bus), Cast(bus.name, cost, 0, 0.0))
         elapsed_s = past.elapsed_s + (self._now_ns() - began_ns) / NS_PER_S
         self.casts[id(bus)] = Cast(bus.name, past.cost, past.times + 1, elapsed_s)
@@ -322,7 +322,7 @@ async def _by_link(pairs: Sequence[Pair], aims: Sequence[_Aim]) -> None:
 
 
 async def _stream(pairs: Sequence[Pair], aims: Sequence[_Aim]) -> None:
-    """Send the words to the node of AIMS in commands, never far ahead of what it has heard."""
+    """Send the words to the node of AIMS in commands, never far ahead of what it has received."""
     node, first = aims[0].place.node, aims[0]
     words = transmission(pairs, {aim.place.table.axle for aim in aims})
     assert first.state is not None

@@ -1,4 +1,4 @@
-"""MT on the wire: the words of a transmission, and how transports carry them. See firmware/objects/mt.h.
+"""MT on the wire: the words of a transmission, and their transports. See firmware/objects/mt.h.
 
 A word is an integer of 32 bits, here 0..2^32-1; the values of a table are signed.
 """
@@ -19,10 +19,10 @@ DATA_MASK: Final = 0x0FFFFFFF
 COMMAND_MASK: Final = 0xF0000000
 
 AXLES: Final = range(1, 29)
-"""The bits of a mask; the command's own begin above them."""
+"""The bits of a mask; those of the command begin above them."""
 VALUES: Final = range(-(1 << 28), 1 << 28)
-"""What a sender sends. None of it looks like a command, ESC or LIT to a receiver that lost its place, and
-none gets lost in a register that shows changes only."""
+"""Range of values. None looks like a command, ESC or LIT to a receiver that lost synchronization, and none
+gets lost in a register that shows changes only."""
 PAIRS_MAX: Final = DATA_MASK
 WORD_BYTES: Final = 4
 DIGEST_FACTOR: Final = 0x01000193
@@ -35,7 +35,7 @@ Pair = tuple[int, int]
 
 
 class MtStatus(IntEnum):
-    """What a receiver says of the last transmission to it."""
+    """Status that a receiver reports of the last transmission to it."""
 
     OK = 0
     TRANSMITTING = 1
@@ -44,7 +44,7 @@ class MtStatus(IntEnum):
 
 
 class MtError(CanductorError):
-    """A table or a mask that MT cannot carry."""
+    """MT cannot carry a table or a mask."""
 
 
 def mask_of(axles: Iterable[int]) -> int:
@@ -65,7 +65,7 @@ def checksum(pairs: Iterable[Pair]) -> int:
 
 
 def digest(pairs: Iterable[Pair]) -> int:
-    """Return what receivers of ours say besides: another order of the same values is another digest."""
+    """Return the digest that this project's receivers also report; it depends on the order of the values."""
     total = 0
     for value in _flat(pairs):
         total = (total * DIGEST_FACTOR + value) & _WORD
@@ -73,9 +73,9 @@ def digest(pairs: Iterable[Pair]) -> int:
 
 
 def transmission(pairs: Sequence[Pair], axles: Iterable[int]) -> list[int]:
-    """Return the words that bring PAIRS to AXLES; raises MtError for what MT cannot carry.
+    """Return the words that transfer PAIRS to AXLES; raises MtError for values that MT cannot carry.
 
-    An empty table removes the one a receiver has.
+    An empty table removes the table of a receiver.
     """
     mask = mask_of(axles)
     for number, pair in enumerate(pairs):
@@ -93,7 +93,7 @@ def transmission(pairs: Sequence[Pair], axles: Iterable[int]) -> list[int]:
     last = words[-1]
     for value in _flat(pairs):
         word = value & _WORD
-        if word == last:  # who polls a register would not see it
+        if word == last:  # a receiver that polls a register would not see it
             words.append(LIT)
         words.append(word)
         last = word
@@ -117,11 +117,11 @@ def to_bytes(words: Iterable[int]) -> bytes:
 
 
 def to_frames(words: Sequence[int]) -> list[bytes]:
-    """Return the contents of the CAN frames of WORDS: two words each, in the last one perhaps one."""
+    """Return the contents of the CAN frames of WORDS: two words each, one or two in the last."""
     return [to_bytes(words[at : at + 2]) for at in range(0, len(words), 2)]
 
 
 def from_bytes(data: bytes) -> list[int]:
-    """Return the words of DATA, whole words only (what is over is left out)."""
+    """Return the complete words of DATA; remaining bytes are ignored."""
     whole = len(data) - len(data) % WORD_BYTES
     return [int.from_bytes(data[at : at + WORD_BYTES], "little") for at in range(0, whole, WORD_BYTES)]

@@ -1,4 +1,4 @@
-"""When the words of a transmission go out: sans-IO, in host time."""
+"""Pacing of the words and frames of a transmission: sans-IO, in host time."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -26,7 +26,7 @@ class PacedWords:
     def take(self, now_ns: int) -> int | None:
         """Return the word to be sent at NOW_NS, None while none is due.
 
-        A sender that comes late sends the next word a whole delay later: the drive needs it.
+        After a late word the next one still waits a whole delay: the drive needs it.
         """
         if self.deadline_ns is None or now_ns < self.deadline_ns:
             return None
@@ -35,15 +35,15 @@ class PacedWords:
         return word
 
     def delay(self, by_ns: int) -> None:
-        """Have the next word wait BY_NS longer: so long the last one was under way."""
+        """Delay the next word by BY_NS, the time that the last one was in transit."""
         if self.deadline_ns is not None:
             self.deadline_ns += by_ns
 
 
 class PacedFrames:
-    """CAN frames within a budget of bits: those behind have to wait, so that motion does not.
+    """CAN frames within a budget of bits, so that they do not delay motion.
 
-    COSTS[i] is what frame i costs in bits; BITS_PER_S what the frames may have of the bus. Up to BURST_BITS
+    COSTS[i] is the length of frame i in bits; BITS_PER_S is the frames' share of the bus. Up to BURST_BITS
     are sent at once after a pause.
     """
 
@@ -54,7 +54,7 @@ class PacedFrames:
         self._ns_per_bit = NS_PER_S / bits_per_s
         self._burst_ns = round(burst_bits * self._ns_per_bit)
         self.paid_ns = now_ns
-        """Until when what was sent uses the budget up."""
+        """Time until which the frames sent so far use up the budget."""
 
     @property
     def left(self) -> int:

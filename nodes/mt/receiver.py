@@ -1,6 +1,6 @@
-"""MT, receiving side in Python: what the firmware's receiver (firmware/objects/mt.h) is, for hosts and tools.
+"""MT, receiving side in Python: the counterpart of firmware/objects/mt.h for hosts and tools.
 
-Total: any word in any order is taken; nothing raises, and memory is bounded by the capacity.
+Total: any word in any order is accepted; nothing raises, and memory is bounded by the capacity.
 """
 
 from typing import Final
@@ -31,8 +31,8 @@ _SIGN: Final = 1 << 31
 class MtReceiver:
     """The receiver of AXLE (1..28), with room for CAPACITY pairs; raises MtError for another axle.
 
-    ``pairs``, ``checksum``, ``digest`` and ``generation`` are those of the table it keeps; ``status`` is
-    about the last transmission to it.
+    ``pairs``, ``checksum``, ``digest`` and ``generation`` are those of the table it keeps; ``status`` is that
+    of the last transmission to it.
     """
 
     def __init__(self, axle: int, capacity: int) -> None:
@@ -52,7 +52,7 @@ class MtReceiver:
         self._shadow: list[int] = []
 
     def word(self, word: int) -> bool:
-        """Take a word (0..2^32-1); True when it ended a transmission whose table is kept."""
+        """Process a word (0..2^32-1); return True when it completed a transmission whose table is kept."""
         if not self._in_values:
             self._command(word & COMMAND_MASK, word & DATA_MASK)
             return False
@@ -111,17 +111,17 @@ class MtReceiver:
 
 
 class ByteWords:
-    """Words from a serial line, which loses bytes: after GAP_NS of silence the next byte begins a word."""
+    """Words from a serial line, which may lose bytes: after GAP_NS of silence the next byte starts a word."""
 
     def __init__(self, gap_ns: int) -> None:
         self.dropped = 0
-        """Bytes of words that never became whole."""
+        """Number of bytes of incomplete words."""
         self._gap_ns = gap_ns
         self._last_ns = 0
         self._partial = b""
 
     def receive(self, data: bytes, now_ns: int) -> list[int]:
-        """Take DATA, come at NOW_NS; returns the words that are whole by now."""
+        """Process DATA, received at NOW_NS; return the words that are now complete."""
         if self._partial and now_ns - self._last_ns > self._gap_ns:
             self.dropped += len(self._partial)
             self._partial = b""
@@ -134,12 +134,12 @@ class ByteWords:
 
 
 class PolledRegister:
-    """Words from a register that is polled: only a change is seen, and the first poll sees none."""
+    """Words from a polled register: only a change counts as a word, and the first poll gives none."""
 
     def __init__(self) -> None:
         self._last: int | None = None
 
     def poll(self, value: int) -> int | None:
-        """Take what the register holds now; returns it when it is another word than at the last poll."""
+        """Process the register's present value; return it when it differs from that at the last poll."""
         before, self._last = self._last, value
         return value if before is not None and before != value else None

@@ -1,4 +1,4 @@
-"""A table on a node that MT brings (firmware/objects/table.h): its configuration, and what the node has."""
+"""A table on a node, transferred by MT (firmware/objects/table.h): its configuration and its state."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from nodes.node.errors import NodeError
 
 COMMANDS: Final = ("config_table", "table_query", "table_bytes", "table_activate", "table_query_active")
 CONSTANT: Final = "MT_AXLES"
-"""Of the dictionary: the firmware keeps tables; its value is how many axles a mask can select."""
+"""Constant of the dictionary: the firmware keeps tables; its value is how many axles a mask can select."""
 CAPACITY_MAX: Final = 0xFFFF
 ANSWER_S: Final = 0.25
 ANSWER_TRIES: Final = 6
@@ -23,7 +23,7 @@ _NO_STEPPER: Final = 255
 
 
 class TableNode(Protocol):
-    """What a table needs of its node: one of the coordinator's, or one that a tool talks to."""
+    """Interface of a table's node: one of the coordinator's, or one that a tool uses."""
 
     @property
     def name(self) -> str: ...  # noqa: D102
@@ -45,36 +45,36 @@ class TableNode(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class TableState:
-    """What a node says of the table it keeps."""
+    """State of the table that a node keeps, as the node reports it."""
 
     status: MtStatus
     """Of the last transmission to it."""
     generation: int
-    """How many tables it has kept since it was configured; 0: none, whatever the status."""
+    """Number of tables accepted since it was configured; 0: it has none, whatever the status."""
     length: int
     checksum: int
     digest: int
     words: int
-    """How many words of MT it has heard, modulo 2^32."""
+    """Number of MT words it has received, modulo 2^32."""
 
     def holds(self, pairs: "Sequence[Pair]") -> bool:
-        """Tell whether the table kept can only be PAIRS."""
+        """Return whether the kept table is PAIRS for certain."""
         found = (self.length, self.checksum, self.digest)
         return self.generation > 0 and found == (len(pairs), checksum(pairs), digest(pairs))
 
 
 class Activation(IntEnum):
-    """What became of the last ``activate``."""
+    """Result of the last ``activate``."""
 
     NEVER = 0
     WAITING = 1
     DONE = 2
     LATE = 3
-    """The clock was in the past when the command came, or the node shut down before."""
+    """The clock was in the past when the command arrived, or the node shut down before."""
     MOVING = 4
     """The table's stepper moved at that clock."""
     REPLACED = 5
-    """Another table had been kept by then."""
+    """Another table was kept by then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,10 +90,10 @@ class ActiveTable:
 
 
 class AxleTable:
-    """The table for AXLE (1..28) with room for CAPACITY pairs; in use or not, while STEPPER stands.
+    """The table for AXLE (1..28) with room for CAPACITY pairs; activated only while STEPPER stands still.
 
-    NAME is what messages call it, such as "axis x forward". NodeConfigError for an axle or capacity that
-    cannot be.
+    NAME is for messages, such as "axis x forward". Raises NodeConfigError for an axle or capacity out of
+    range.
     """
 
     def __init__(self, name: str, axle: int, capacity: int, stepper: "Stepper | None" = None) -> None:
@@ -124,7 +124,7 @@ class AxleTable:
     async def state(
         self, node: TableNode, *, timeout_s: float = ANSWER_S, tries: int = ANSWER_TRIES
     ) -> TableState:
-        """Ask NODE for what it keeps, TRIES times; raises QueryTimeout, NodeError."""
+        """Query NODE for the table that it keeps, TRIES times; raises QueryTimeout, NodeError."""
         oid = self._oid()
         answer = await node.query("table_query", "table_state", timeout_s=timeout_s, tries=tries, oid=oid)
         status = answer.integer("table_status")
@@ -140,7 +140,7 @@ class AxleTable:
         )
 
     async def active(self, node: TableNode) -> ActiveTable:
-        """Ask NODE which table is in use; raises NodeError."""
+        """Query NODE for the table in use; raises NodeError."""
         answer = await node.query("table_query_active", "table_active", oid=self._oid())
         activation = answer.integer("table_activation")
         if activation not in tuple(Activation):
@@ -153,9 +153,9 @@ class AxleTable:
         )
 
     def activate(self, node: TableNode, *, clock: int, generation: int) -> None:
-        """Have NODE use the table of GENERATION (0: none) from CLOCK (ticks) on; ``active`` tells whether.
+        """Make NODE use the table of GENERATION (0: none) from CLOCK (ticks); ``active`` returns the result.
 
-        Tables of several nodes come into use together when each gets its own clock of one moment.
+        Tables of several nodes come into use together when each gets its own clock for the same time.
         """
         node.link.send(
             node.dictionary.encode(

@@ -1,1 +1,1 @@
-"""One node through its life: configuration, states, requests and replies, watchdog."""
+"""One node over its life cycle: configuration, states, requests and replies, watchdog."""

@@ -1,4 +1,4 @@
-"""Asks one node for its clock, for as long as it can be talked to, and suspects it when it goes silent."""
+"""Regular queries of one node's clock, and a check for a restart when the node goes silent."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
@@ -11,14 +11,14 @@ from nodes.node.request_reply import Answer, QueryTimeout, RequestReply
 from nodes.support.errors import CanductorError
 
 SILENCE_S: Final = 0.25
-"""A node that owes an acknowledgement and says nothing for so long may have restarted: the bus is asked."""
+"""A node that owes an acknowledgement and is silent for so long may have restarted: the bus is queried."""
 
 
 class ClockKeeper:
     """Keeps the clock of the node that TALK talks with, reached through CONNECTOR, until ``close``.
 
-    ON_ESTIMATE gets every new estimate; ON_SAMPLE is awaited after every sample and may raise as the
-    conversation does; ON_LOST gets a sentence when the clock is no longer kept.
+    ON_ESTIMATE gets every new estimate; ON_SAMPLE is awaited after every sample and may raise whatever
+    RequestReply.ask raises; ON_LOST gets a sentence when the clock is no longer kept.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class ClockKeeper:
     ) -> None:
         self.estimator = ClockEstimator(talk.dictionary.clock_freq_hz)
         self.ready = asyncio.Event()
-        """Set when the clock is learnt, or nobody needs to wait for it any more."""
+        """Set when the clock is known, or when waiting for it has become pointless."""
         self._talk = talk
         self._connector = connector
         self._on_estimate = on_estimate
@@ -42,13 +42,13 @@ class ClockKeeper:
         self._task.add_done_callback(self._ended)
 
     async def close(self) -> None:
-        """Stop asking; what was learnt remains. Doing it again is harmless."""
+        """Stop the queries; the estimate remains. Calling it again has no effect."""
         if not self._task.done():
             self._task.cancel()
             await asyncio.wait([self._task])
 
     def _ended(self, task: asyncio.Task[None]) -> None:
-        """Bring a bug in keeping the clock to light, and stop using the node: its time is not known."""
+        """Log a bug in keeping the clock and stop using the node, since its time is not known."""
         bug = None if task.cancelled() else task.exception()
         if bug is not None:
             self._on_lost("its clock is no longer kept; this is a bug, please report it")
@@ -67,7 +67,7 @@ class ClockKeeper:
             await self._wait_watching(self.estimator.next_sample_ns(0) * 1e-9)
 
     async def _wait_watching(self, wait_s: float) -> None:
-        """Wait, and suspect the node when it owes answers and gives none."""
+        """Wait, and have the bus check the node when it owes an acknowledgement and is silent."""
         while wait_s > 0:
             heard = self._talk.heard
             await asyncio.sleep(min(wait_s, SILENCE_S))

@@ -1,4 +1,4 @@
-"""What a node is to be configured as: object ids, configuration and init commands, checked as added."""
+"""The configuration of a node: object ids, configuration and init commands, checked when added."""
 
 import zlib
 from collections.abc import Iterable
@@ -13,30 +13,30 @@ MAX_OIDS: Final = 255
 
 
 class NodeConfigError(CanductorError):
-    """A node cannot be what the machine wants it to be."""
+    """A node cannot be configured as the machine needs it."""
 
 
 class NodeConfig:
-    """Collects the commands that make node NAME what it is. Every command is checked against DICTIONARY."""
+    """Collects the commands that configure node NAME. Every command is checked against DICTIONARY."""
 
     def __init__(self, name: str, dictionary: Dictionary) -> None:
         self.name = name
         self.dictionary = dictionary
         self.oid_count = 0
         self.timed_outputs = 0
-        """Outputs whose values wait in the node's move queue; who adds one counts it."""
+        """Number of outputs whose values wait in the node's move queue; increment it when adding one."""
         self._config: list[str] = []
         self._init: list[str] = []
 
     def create_oid(self) -> int:
         """Return a new object id, 0..254; raises NodeConfigError when there is none left."""
         if self.oid_count >= MAX_OIDS:
-            raise NodeConfigError(f"node {self.name} would carry more than {MAX_OIDS} objects; move some")
+            raise NodeConfigError(f"node {self.name} would have more than {MAX_OIDS} objects; move some")
         self.oid_count += 1
         return self.oid_count - 1
 
     def require(self, feature: str, commands: Iterable[str]) -> None:
-        """Raise NodeConfigError naming the commands that FEATURE needs and the firmware has not."""
+        """Raise NodeConfigError naming the commands that FEATURE needs and the firmware lacks."""
         missing = [name for name in commands if name not in self.dictionary.commands]
         if missing:
             raise NodeConfigError(
@@ -72,5 +72,5 @@ class NodeConfig:
 
     @property
     def crc(self) -> int:
-        """CRC-32 of the text of the configuration commands: tells a node's configuration from another."""
+        """CRC-32 of the text of the configuration commands: identifies the configuration."""
         return zlib.crc32("\n".join(self.config_commands).encode())

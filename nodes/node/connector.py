@@ -1,4 +1,4 @@
-"""What a node needs of its bus: a link, and answers that only the bus has."""
+"""What a node needs of its bus: a link, and information that only the bus has."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -9,16 +9,16 @@ from nodes.node.config import NodeConfig
 
 
 class Connector(Protocol):
-    """How a node gets its link; the bus provides it."""
+    """Interface through which a node gets its link; the bus provides it."""
 
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
-        """Open a link, giving the node its id first where it needs one."""
+        """Open a link; assign the node's id first where it needs one."""
 
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:
-        """Return how long a block is on the wire for certain; 0 where that is not known."""
+        """Return the least time that a block takes on the wire; 0 where that is not known."""
 
     def forget(self) -> None:
-        """Take note that the node was reset: what it knew of the bus is gone."""
+        """Record that the node was reset and has lost its node id."""
 
     def why_silent(self) -> Exception | None:
         """Return a better explanation than "no answer" when a node never answered at all."""
@@ -27,8 +27,8 @@ class Connector(Protocol):
         """Raise when a board that answers get_canbus_id with FOUND is not the node."""
 
     def suspect(self) -> None:
-        """Find out whether a node that is silent restarted; the bus tells the node when it did."""
+        """Check whether a silent node restarted; if it did, the bus notifies the node."""
 
 
 BuildConfig = Callable[[Dictionary], NodeConfig]
-"""Makes a node's configuration when its dictionary is known; called again at every restart."""
+"""Builds a node's configuration from its dictionary; called again at every restart."""

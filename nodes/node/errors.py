@@ -1,4 +1,4 @@
-"""Why a node cannot be used."""
+"""Errors of nodes that cannot be used."""
 
 from typing import Final
 
@@ -6,19 +6,19 @@ from nodes.support.errors import CanductorError
 
 
 class NodeError(CanductorError):
-    """A node cannot be used, and why."""
+    """A node cannot be used; the sentence states the reason."""
 
 
 class NodeLost(NodeError):  # noqa: N818
-    """A node is gone: it does not answer, or see NodeRestarted."""
+    """A node is lost: it does not answer, or it restarted (NodeRestarted)."""
 
 
 class NodeRestarted(NodeLost):
-    """A node restarted by itself: it has forgotten its configuration, and where its steppers stand."""
+    """A node restarted by itself: its configuration and the positions of its steppers are lost."""
 
 
 class NodeShutdown(NodeError):  # noqa: N818
-    """A node stopped itself; what it reported is part of the sentence."""
+    """A node shut itself down; the sentence contains the reason that it reported."""
 
 
 _ADVICE: Final = {
@@ -27,10 +27,10 @@ _ADVICE: Final = {
         "let only one host assign ids, and restart the board"
     ),
 }
-"""What to do about a shutdown whose own words do not tell."""
+"""Advice for shutdowns whose reason does not suggest one."""
 
 
 def shutdown_sentence(node: str, reason: str) -> str:
-    """Return the sentence for a shutdown of NODE that it gave REASON for."""
+    """Return the sentence for a shutdown of NODE with the REASON that it reported."""
     advice = _ADVICE.get(reason)
     return f"node {node} shut down: {reason}" + (f": {advice}" if advice else "")

@@ -1,11 +1,11 @@
-"""Learning a node's dictionary: recognised by three pieces when it is cached, else downloaded.
+"""Identification of a node's dictionary: recognised by three pieces when it is cached, else downloaded.
 
 A dictionary is identified by its first bytes, its last bytes, and that nothing comes after them. The first
 piece holds the compressor's code tables, which depend on the whole text; the last holds the Adler-32 of the
-whole text; and the length is right to the byte. Two builds of one firmware differ at least in their version
-text, and all three to agree by chance takes one build in 2^32 for the checksum alone. Were it to happen, the
-node would be talked to with another build's ids: those the machine depends on are checked against it as
-usual, and a node does not execute a command whose parameters it cannot read.
+whole text; and the length must be exact. Two builds of one firmware differ at least in their version text,
+and the checksum alone agrees by chance for one build in 2^32. If it did, the node would get commands with
+another build's ids: the commands that the machine needs are checked against that dictionary as usual, and a
+node does not execute a command whose parameters it cannot read.
 """
 
 from collections.abc import Callable
@@ -19,8 +19,8 @@ from nodes.node.request_reply import QueryTimeout, RequestReply
 
 IDENTIFY_PIECE: Final = 40
 PIECE_TRIES: Final = 16
-"""A piece takes seven frames, and a dictionary some sixty pieces: where one frame in twenty gets lost, with
-the tries of other queries one start in twenty would fail. Of a node that is silent the link knows sooner."""
+"""A piece takes seven frames and a dictionary about sixty pieces: where one frame in twenty is lost, one
+start in twenty would fail with the tries of other queries. The link detects a silent node sooner."""
 MAX_CANDIDATES: Final = 4
 """Dictionaries with the same beginning that are compared, at two queries each, before downloading."""
 
@@ -30,8 +30,8 @@ async def identify(
 ) -> Dictionary:
     """Return the dictionary of the node that TALK talks with.
 
-    Raises DictionaryError when it cannot be used, what WHY_SILENT knows when the node never answered, and
-    what RequestReply.ask raises.
+    Raises DictionaryError when it cannot be used, the error from WHY_SILENT when the node never answered, and
+    whatever RequestReply.ask raises.
     """
     try:
         beginning = await _piece(talk, 0)
@@ -46,7 +46,7 @@ async def identify(
     if known is not None:
         return known
     async with cache.downloading(beginning):
-        # One that begins alike may have been downloaded while this one waited.
+        # A dictionary with the same beginning may have been downloaded during the wait.
         known = await _recognised(talk, cache, beginning)
         if known is not None:
             return known
@@ -68,7 +68,7 @@ async def _recognised(talk: RequestReply, cache: DictionaryCache, beginning: byt
 
 
 async def _has(talk: RequestReply, cached: CachedDictionary, piece_size: int) -> bool:
-    """Tell whether the node's dictionary ends as this one does, and there."""
+    """Return whether the node's dictionary ends as this one does, at the same length."""
     size = len(cached.compressed)
     tail_at = max(0, size - piece_size)
     if await _piece(talk, tail_at) != cached.compressed[tail_at:]:

@@ -1,4 +1,4 @@
-"""How busy a node's processor is."""
+"""Load of a node's processor."""
 
 import math
 from dataclasses import dataclass
@@ -7,19 +7,19 @@ from typing import Final
 from nodes.dictionary.message_format import Message
 
 STATS_INTERVAL_S: Final = 5.0
-"""Firmware reports so often."""
+"""Interval of the firmware's reports."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeLoad:
-    """How busy a node's processor is, from its ``stats``."""
+    """Load of a node's processor, from its ``stats``."""
 
     awake: float
     """Share of the time since the last report spent in tasks, 0..1."""
     task_s: float
-    """Mean time of one round of all tasks."""
+    """Mean duration of one round of all tasks."""
     task_spread_s: float
-    """Standard deviation of it."""
+    """Standard deviation of that duration."""
 
 
 def load_of(stats: Message, freq_hz: int, sumsq_base: int) -> NodeLoad:

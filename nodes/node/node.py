@@ -1,4 +1,4 @@
-"""One node through its life: identified, configured, kept in time, and left in a known state."""
+"""One node over its life cycle: identified, configured, synchronized, and left in a known state."""
 
 import asyncio
 import contextlib
@@ -27,14 +27,14 @@ from nodes.node.watchdog import NodeWatchdog, get_config, restarted
 from nodes.support.errors import CanductorError
 
 MAX_STARTS: Final = 3
-"""How often a node is connected anew in one start because only a reset rids it of an old configuration."""
+"""Most connections in one start: only a reset makes some nodes drop an old configuration."""
 CONFIG_RESET_TRIES: Final = 4
 RESET_SETTLE_S: Final = 0.3
-"""For the reset command to arrive, repeated if need be, and the node to come up again."""
+"""Time for the reset command to arrive, repeated if necessary, and for the node to boot again."""
 ALIVE_TIMEOUT_S: Final = 0.1
-"""For a node of which another board claims to be it to show that it lives."""
+"""Time for a node to prove that it is alive when another board claims its identity."""
 CLOCK_TIMEOUT_S: Final = 15.0
-"""On a bus that loses one frame in twenty every fourth sample is lost or of no use."""
+"""On a bus that loses one frame in twenty, every fourth sample is lost or unusable."""
 
 
 ClockSource = Literal["pulse", "exchange"]
@@ -50,8 +50,8 @@ class Node:
     """Node NAME, reached through CONNECTOR and configured as BUILD_CONFIG says.
 
     ON_STATE is called after every change of ``state``, ON_CLOCK with every new estimate of its clock, both on
-    the control loop. ``failure`` says why it is lost or shut down. Without a CACHE every start downloads the
-    dictionary.
+    the control loop. ``failure`` states why it is lost or shut down. Without a CACHE every start downloads
+    the dictionary.
     """
 
     def __init__(
@@ -70,12 +70,12 @@ class Node:
         self.move_count = 0
         """Queue slots shared by all steppers and timed outputs; known when READY."""
         self.step_slots = 0
-        """Those of them that the steppers have."""
+        """The slots that the steppers have."""
         self.output_slots = 0
-        """Those that each timed output has."""
+        """The slots that each timed output has."""
         self.load: NodeLoad | None = None
         self.pulse_clock: PulseClock | None = None
-        """The node's clock by sync pulses, while its bus has such; kept by the bus."""
+        """The node's clock by sync pulses, while its bus has them; updated by the bus."""
         self.reset_first = False
         """Whether the next start resets the node even when it is configured as it should be."""
         self._connector = connector
@@ -86,7 +86,7 @@ class Node:
         self._talk = RequestReply(name)
         self._keeper: ClockKeeper | None = None
         self._watchdog = NodeWatchdog(self._talk, 0)
-        self._starting_over = True  # until an old configuration is judged, old news mean nothing
+        self._starting_over = True  # messages count only once an old configuration was checked
         self._generation = 0
         for response, handler in (
             ("stats", self._stats_came),
@@ -96,11 +96,11 @@ class Node:
         ):
             self._talk.on(response, None, handler)
 
-    # ------------------------------------------------------------------------------------------- looking at
+    # ------------------------------------------------------------------------------------------- inspection
 
     @property
     def dictionary(self) -> Dictionary:
-        """The node's dictionary; before it is read, one that knows only how to ask for it."""
+        """The node's dictionary; before it is read, one with only the messages that request it."""
         return self._talk.dictionary
 
     @property
@@ -112,28 +112,28 @@ class Node:
 
     @property
     def talks(self) -> bool:
-        """Whether commands can be sent to it now."""
+        """Whether commands can be sent to the node now."""
         return self.failure is None and self.state in (NodeState.CONFIGURING, NodeState.READY)
 
     @property
     def best_clock(self) -> EstimatedClock:
-        """The node's clock as well as it is known: by sync pulses, else by exchanges; NodeError before."""
+        """The best estimate of the node's clock: by sync pulses, else by exchanges; NodeError before."""
         pulses = self.pulse_clock
-        # Interrupts of some boards come so unevenly that exchanges tell more.
+        # The interrupts of some boards jitter so much that exchanges are more accurate.
         if pulses is not None and pulses.error_s <= self.clock.estimate().bound_s:
             return pulses
         return self.clock
 
     @property
     def clock_source(self) -> ClockSource:
-        """What ``best_clock`` rests on; NodeError before the first sample."""
+        """The source of ``best_clock``; NodeError before the first sample."""
         return "pulse" if isinstance(self.best_clock, PulseClock) else "exchange"
 
     @property
     def clock_error_s(self) -> float | None:
         """Bound of the error of ``best_clock``; None while that is not known.
 
-        By pulses it is against the reference node's clock, by exchanges against host time.
+        With pulses it is relative to the reference node's clock, with exchanges to host time.
         """
         if self._keeper is None or not self._keeper.estimator.accepted:
             return None
@@ -156,7 +156,7 @@ class Node:
         """Responses dropped because nothing in the dictionary fits them."""
         return self._talk.undecodable
 
-    # ---------------------------------------------------------------------------------------------- talking
+    # ---------------------------------------------------------------------------------------------- messages
 
     def send(self, name: str, /, *, min_clock: int = 0, req_clock: int = 0, **args: Value | str) -> None:
         """Send a command (clocks: ``nodes/link/batch.h``); NodeError when the node cannot take it."""
@@ -173,7 +173,7 @@ class Node:
         tries: int = QUERY_TRIES,
         **args: Value | str,
     ) -> Message:
-        """Send a command and return its RESPONSE (of the same oid), asking again when it gets lost.
+        """Send a command and return its RESPONSE (of the same oid); repeat the command when it gets lost.
 
         Raises QueryTimeout, or NodeLost or NodeShutdown when that happens meanwhile.
         """
@@ -182,26 +182,26 @@ class Node:
         return answer.message
 
     def on(self, response: str, oid: int | None, callback: Callback) -> Callable[[], None]:
-        """Call CALLBACK for every RESPONSE (of OID, unless None); returns what ends it."""
+        """Call CALLBACK for every RESPONSE (of OID, unless None); return a function that ends it."""
         return self._talk.on(response, oid, callback)
 
     def emergency_stop(self) -> None:
-        """Stop the node ahead of everything queued for it; without effect on one that cannot be reached."""
+        """Stop the node ahead of everything queued for it; no effect on a node that cannot be reached."""
         if self._talk.connected and "emergency_stop" in self.dictionary.commands:
-            # The link may know already what the loop has yet to hear: that the node is gone.
+            # The link may already have lost the node without the loop having been notified.
             with contextlib.suppress(CanductorError):
                 self._talk.link.send_urgent(self.dictionary.encode("emergency_stop"))
 
     def lose(self, cause: str) -> None:
-        """Take note that the node can no longer be reached."""
+        """Record that the node can no longer be reached."""
         self._fail(NodeEvent.LOST, NodeLost(f"lost node {self.name}: {cause}"))
 
     def restarted(self, how: str) -> None:
-        """Take note that the node restarted by itself; HOW that is known."""
+        """Record that the node restarted by itself; HOW: the evidence for that."""
         self._fail(NodeEvent.RESTARTED, restarted(self.name, how))
 
     async def lives(self) -> bool:
-        """Tell whether the node answers at once, and has its configuration."""
+        """Return whether the node answers at once and has its configuration."""
         try:
             answer = await self._talk.ask(
                 "get_config", "config", tries=1, timeout_s=ALIVE_TIMEOUT_S, survives_shutdown=True
@@ -227,7 +227,7 @@ class Node:
             if self.failure is None:
                 self._fail(NodeEvent.LOST, failure)
             elif self.state is NodeState.LOST:
-                self.failure = failure  # says more than its link, which only found it silent
+                self.failure = failure  # a better reason than that of its link, which only found it silent
             raise
 
     async def _start(self) -> None:
@@ -260,9 +260,9 @@ class Node:
         await self.start()
 
     async def sleep(self) -> None:
-        """Let go of the node, so that its power can be switched off: it is neither talked to nor missed.
+        """Disconnect the node, so that its power can be switched off: it gets no messages and is not watched.
 
-        A start that was under way must have been cancelled. Raises NodeError when it sleeps or is closed.
+        A running start must have been cancelled before. Raises NodeError when the node sleeps or is closed.
         """
         if following(self.state, NodeEvent.SLEEP) is None:
             raise NodeError(f"node {self.name} is {self.state.value} and cannot be put to sleep")
@@ -279,7 +279,7 @@ class Node:
         await self.start()
 
     async def close(self) -> None:
-        """End the conversation; the node itself is left as it is."""
+        """Close the connection; the node itself keeps its state."""
         await self._disconnect()
         self._enter(NodeEvent.CLOSE)
 
@@ -304,7 +304,7 @@ class Node:
         await self._check_identity()
 
     async def _check_identity(self) -> None:
-        """Make sure that the board that answers is the one that was given the node's id."""
+        """Check that the board that answers is the one to which the node's id was assigned."""
         if carries_identity(self.dictionary):
             answer = await self._talk.ask("get_canbus_id", "canbus_id", survives_shutdown=True)
             self._connector.check_identity(answer.message.data("canbus_uuid"))
@@ -312,12 +312,12 @@ class Node:
     # ------------------------------------------------------------------------------------------ configuring
 
     async def _configure(self, wanted: NodeConfig) -> bool:
-        """Make the node what WANTED says; False when it had to be reset and must be connected anew."""
+        """Configure the node as WANTED; return False when it had to be reset and must be connected again."""
         found = await get_config(self._talk)
         other = bool(found.integer("is_config")) and found.integer("crc") != wanted.crc
         reset_first, self.reset_first = self.reset_first, False
         if other or reset_first or found.integer("is_shutdown"):
-            # Preferred to a reset of the whole board, with which a USB device or a CAN bridge would vanish.
+            # Preferred to a reset of the whole board, which makes a USB device or CAN bridge disappear.
             if "config_reset" not in self.dictionary.commands:
                 await self._reset()
                 return False
@@ -337,9 +337,9 @@ class Node:
         return True
 
     async def _finalized(self) -> Message:
-        """Ask for the configuration state after its last command.
+        """Query the configuration state after its last command.
 
-        Answers have no numbers: where one came late and was asked for again, the others come now.
+        Answers carry no numbers: answers to an earlier query that was repeated may arrive now.
         """
         for _ in range(QUERY_TRIES):
             found = await get_config(self._talk)
@@ -351,19 +351,19 @@ class Node:
         if self.failure is not None:
             raise self.failure.with_traceback(None)
         if found.integer("is_shutdown"):
-            raise NodeShutdown(f"node {self.name} shut down while being configured; see its pins and limits")
+            raise NodeShutdown(f"node {self.name} shut down during configuration; check its pins and limits")
         if not found.integer("is_config") or found.integer("crc") != wanted.crc:
-            raise NodeError(f"node {self.name} did not take its configuration; restart it and try again")
+            raise NodeError(f"node {self.name} did not accept its configuration; restart it and try again")
 
     async def _reset(self) -> None:
         if "reset" not in self.dictionary.commands:
             raise NodeError(f"node {self.name} has another configuration and no way to reset; power-cycle it")
-        self._generation += 1  # that this link breaks is what we want
+        self._generation += 1  # the link is expected to break
         self._talk.send("reset")
         await asyncio.sleep(RESET_SETTLE_S)
 
     async def _config_reset(self) -> Message:
-        """Rid the node of its configuration. Firmware takes config_reset only when shut down."""
+        """Clear the node's configuration. Firmware accepts config_reset only when shut down."""
         for _ in range(CONFIG_RESET_TRIES):
             self._talk.send("emergency_stop")
             self._talk.send("config_reset")
@@ -373,7 +373,7 @@ class Node:
                 found = await get_config(self._talk)
             if not found.integer("is_config") and not found.integer("is_shutdown"):
                 return found
-        raise NodeError(f"node {self.name} does not let go of its old configuration; power-cycle it")
+        raise NodeError(f"node {self.name} does not clear its old configuration; power-cycle it")
 
     # ------------------------------------------------------------------------------------------------ clock
 
@@ -388,7 +388,7 @@ class Node:
         return self._keeper
 
     async def _look(self) -> None:
-        """Notice what the node said only once, should that have been lost."""
+        """Detect a restart or shutdown whose only message was lost."""
         trouble = await self._watchdog.look() if self.state is NodeState.READY else None
         if trouble is not None:
             shutdown = isinstance(trouble, NodeShutdown)
@@ -400,12 +400,12 @@ class Node:
                 await keeper.ready.wait()
         except TimeoutError:
             raise self.failure or NodeError(
-                f"node {self.name} answers too seldom to learn its clock; check the bus for errors and load"
+                f"node {self.name} answers too rarely to estimate its clock; check the bus load and errors"
             ) from None
         if self.failure is not None:
             raise self.failure.with_traceback(None)
 
-    # ------------------------------------------------------------------------------------------- what comes
+    # ------------------------------------------------------------------------------------------- responses
 
     def _enter(self, event: NodeEvent) -> None:
         after = following(self.state, event)
@@ -420,7 +420,7 @@ class Node:
         self._enter(event)
         self._talk.fail(failure, shutdown=event is NodeEvent.SHUTDOWN)
         if self._keeper is not None:
-            self._keeper.ready.set()  # nobody needs to wait for it any more
+            self._keeper.ready.set()  # waiting for it is pointless now
 
     def _link_lost(self, generation: int) -> Callable[[str], None]:
         def lost(cause: str) -> None:
@@ -437,7 +437,7 @@ class Node:
         self.shut_down_for(message.integer("static_string_id"))
 
     def shut_down_for(self, static_string_id: int) -> None:
-        """Take note that the node shut down, and which text it gives as reason."""
+        """Record that the node shut down, and the text that it gives as the reason."""
         if self._starting_over or self.failure is not None or self.state not in _SHUTDOWN_MEANS:
             return
         text = self.dictionary.enum_name("static_string_id", static_string_id)
@@ -445,7 +445,7 @@ class Node:
 
     def _starting_came(self, _: Message) -> None:
         if not self._starting_over:
-            self.restarted("it said so")
+            self.restarted("it reported that")
 
 
 _SHUTDOWN_MEANS: Final = (NodeState.CONFIGURING, NodeState.READY)

@@ -1,6 +1,6 @@
-"""Talking with one node: queries matched with their answers, and listeners for what it says by itself.
+"""Messages to and from one node: queries matched with their answers, and listeners for unsolicited responses.
 
-Used on the control loop only. Responses can get lost, so a query asks again.
+Used on the control loop only. Responses can get lost, so a query is repeated.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from nodes.support.errors import CanductorError
 QUERY_TIMEOUT_S: Final = 0.25
 QUERY_TRIES: Final = 6
 MAX_WAITERS: Final = 256
-"""Queries under way at once; more is a programming error, not load."""
+"""Most queries in flight at once; more is a programming error, not load."""
 
 
 class QueryTimeout(CanductorError):  # noqa: N818
@@ -25,13 +25,13 @@ class QueryTimeout(CanductorError):  # noqa: N818
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A message and when it was asked for and received (HostTime; sent_ns 0: not known)."""
+    """A message, when it was requested and when it was received (HostTime; sent_ns 0: not known)."""
 
     message: Message
     sent_ns: int
     received_ns: int
     asked_bytes: int
-    """Content of the question's block, and of the answer's."""
+    """Content of the query's block and of the answer's."""
     answered_bytes: int
 
 
@@ -61,7 +61,7 @@ class RequestReply:
         self.undecodable = 0
         """Responses that no format of the dictionary fits: damaged, or from other firmware."""
         self.heard = 0
-        """Responses received, whatever they were."""
+        """All responses received."""
         self._link: LinkInterface | None = None
         self._waiters: list[_Waiter] = []
         self._listeners: dict[tuple[str, int | None], list[Callback]] = {}
@@ -69,12 +69,12 @@ class RequestReply:
     # ------------------------------------------------------------------------------------------------ link
 
     def attach(self, link: LinkInterface) -> None:
-        """Talk over LINK from now on, with nothing known of the node but how to identify it."""
+        """Use LINK from now on, with only the messages that identify a node."""
         self._link = link
         self.dictionary = BOOTSTRAP
 
     def detach(self) -> LinkInterface | None:
-        """Stop talking; returns the link, which the caller closes."""
+        """Stop using the link and return it; the caller closes it."""
         link, self._link = self._link, None
         return link
 
@@ -121,10 +121,10 @@ class RequestReply:
         tries: int = QUERY_TRIES,
         survives_shutdown: bool = False,
     ) -> Answer:
-        """Send a command with ARGS until its RESPONSE comes, with the values of MATCHING (the oid, if None).
+        """Send a command with ARGS until its RESPONSE arrives with the values of MATCHING (the oid, if None).
 
         Raises QueryTimeout after TRIES times TIMEOUT_S, MessageError when the firmware lacks either message,
-        and whatever ``fail`` is told meanwhile. With SURVIVES_SHUTDOWN a shutdown does not end the wait.
+        and any error given to ``fail`` meanwhile. With SURVIVES_SHUTDOWN a shutdown does not end the wait.
         """
         args = args or {}
         content = self.encode(name, **args)
@@ -152,7 +152,7 @@ class RequestReply:
     # --------------------------------------------------------------------------------------------- receive
 
     def on(self, response: str, oid: int | None, callback: Callback) -> Callable[[], None]:
-        """Call CALLBACK for every RESPONSE (of OID, unless None); returns what ends it."""
+        """Call CALLBACK for every RESPONSE (of OID, unless None); return a function that ends it."""
         callbacks = self._listeners.setdefault((response, oid), [])
         callbacks.append(callback)
 
@@ -163,7 +163,7 @@ class RequestReply:
         return end
 
     def receive(self, responses: Sequence[ResponseLike]) -> None:
-        """Take what the link received."""
+        """Handle the responses that the link received."""
         self.heard += len(responses)
         for response in responses:
             message = self.dictionary.decode(response.content)
@@ -184,7 +184,7 @@ class RequestReply:
                 callback(message)
 
     def fail(self, error: CanductorError, *, shutdown: bool = False) -> None:
-        """End all waiting with ERROR; on a SHUTDOWN, only what does not survive it."""
+        """End all queries with ERROR; after a SHUTDOWN, only those that do not survive it."""
         for waiter in self._waiters:
             if not waiter.answered.done() and not (shutdown and waiter.survives_shutdown):
                 waiter.answered.set_exception(error)

@@ -1,4 +1,4 @@
-"""The life of a node as a table: the only place that says what may follow what.
+"""The life cycle of a node as a table: the only place that defines which state may follow which.
 
 docs/node-states.md is generated from it: ``python -m nodes.node.states > docs/node-states.md``.
 """
@@ -9,10 +9,10 @@ from typing import Final
 
 
 class NodeState(Enum):
-    """Where a node is in its life; the value says it in a sentence's words."""
+    """State of a node; the value is the phrase that messages use for it."""
 
     CONNECTING = "being connected"
-    IDENTIFYING = "telling its dictionary"
+    IDENTIFYING = "sending its dictionary"
     CONFIGURING = "being configured"
     READY = "ready"
     SHUTDOWN = "shut down"
@@ -22,12 +22,12 @@ class NodeState(Enum):
 
 
 class NodeEvent(Enum):
-    """What moves a node from one state to another."""
+    """Event that moves a node from one state to another."""
 
     CONNECTED = "link open"
     IDENTIFIED = "dictionary read"
     CONFIGURED = "configuration finalized, clock known"
-    RESET = "reset, to start again"
+    RESET = "reset, to be started again"
     SHUTDOWN = "shutdown reported"
     LOST = "no answer"
     RESTARTED = "it restarted by itself"
@@ -74,7 +74,7 @@ TRANSITIONS: Final = {
 
 
 def following(state: NodeState, event: NodeEvent) -> NodeState | None:
-    """Return the state after EVENT in STATE, or None when the event means nothing there."""
+    """Return the state after EVENT in STATE, or None when the event has no effect there."""
     return TRANSITIONS.get((state, event))
 
 

@@ -1,4 +1,4 @@
-"""Looks whether a node is still the one that was configured, should the one message that said so be lost."""
+"""Detection of a node that restarted or shut down although its one message about that was lost."""
 
 import asyncio
 from typing import Final
@@ -8,11 +8,11 @@ from nodes.node.errors import NodeError, NodeRestarted, NodeShutdown, shutdown_s
 from nodes.node.request_reply import QUERY_TRIES, RequestReply
 
 SHUTDOWN_GRACE_S: Final = 0.05
-"""For a node that is seen to be shut down to say why."""
+"""Time given to a node that is found shut down to report the reason."""
 
 
 def restarted(node: str, how: str) -> NodeRestarted:
-    """Return the failure of NODE, which restarted by itself; HOW that is known."""
+    """Return the failure of NODE, which restarted by itself; HOW: the evidence for that."""
     return NodeRestarted(f"node {node} restarted by itself ({how}); check its power supply")
 
 
@@ -22,7 +22,7 @@ async def get_config(talk: RequestReply, tries: int = QUERY_TRIES) -> Message:
 
 
 class NodeWatchdog:
-    """Watches the node that TALK talks with, since it took the configuration with CRC."""
+    """Watches the node that TALK reaches, from the time it took the configuration with CRC."""
 
     def __init__(self, talk: RequestReply, crc: int) -> None:
         self._talk = talk
@@ -30,10 +30,10 @@ class NodeWatchdog:
         self._uptime_ticks = 0
 
     async def look(self) -> NodeError | None:
-        """Return what happened to the node, or None. Raises QueryTimeout and what ends the conversation.
+        """Return the failure of the node, or None. Raises QueryTimeout and what RequestReply.ask raises.
 
-        Its configuration is gone after a restart, and its uptime ran backwards; the latter even shows when
-        another host has configured it meanwhile, in the same words.
+        After a restart the configuration is gone and the uptime has run backwards. The uptime shows a restart
+        even when another host has meanwhile configured the node identically.
         """
         name = self._talk.name
         found = await get_config(self._talk, tries=1)

@@ -1,10 +1,10 @@
-"""What a cffi module needs that contains the core of a bus, whatever its driver."""
+"""Sources and headers of a cffi module with the core of a bus, for any driver."""
 
 CORE_HEADERS = (
     "firmware/wire/wire.h",
     *(f"nodes/link/{name}.h" for name in ("queue", "link", "schedule", "io_core", "io_api")),
 )
-"""In this order."""
+"""Headers, in the order of inclusion."""
 CORE_SOURCES = (
     *(f"firmware/wire/{name}.c" for name in ("vlq", "message", "block")),
     *(f"nodes/link/{name}.c" for name in ("queue", "link", "link_states", "link_pack", "link_receive")),

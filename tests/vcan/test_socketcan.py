@@ -316,7 +316,7 @@ def test_bus_learns_that_its_interface_was_set_down_and_nodes_live_on(
                 await asyncio.sleep(0)
                 lost = [node.state is NodeState.LOST for node in bench.nodes]
         said = str(bench.nodes[0].failure)
-        assert f"{INTERFACE}: the connection ended (Network is down); somebody set the interface down" in said
+        assert f"{INTERFACE}: the connection ended (Network is down); the interface was set down" in said
         assert "\n" not in said
 
     bench.run(check)

@@ -242,7 +242,7 @@ def test_a_node_on_a_serial_line_confirms(table: Table, stage: CanStage) -> None
         (("send", "--device", "can0", "--stepper", "1", "--link"), "--link is for a serial line"),
         (("send", "--device", "/dev/tty", "--stepper", "1", "--node", "4"), "--node is for a CAN bus"),
         (("send", "--device", "socket://h:1", "--stepper", "1", "--link"), "--link needs a serial device"),
-        (("send", "--device", "can 0", "--stepper", "1"), "'can 0' is no device; give a CAN interface"),
+        (("send", "--device", "can 0", "--stepper", "1"), "'can 0' is not a device; give a CAN interface"),
         (("send", "--device", "can0", "--stepper", "1", "--delay", "0"), "--delay"),
         (("send", "--device", "can0", "--stepper", "1", "--share", "0"), "--share is 0"),
         (("send", "--device", "can0", "--stepper", "1", "--can-id", "0x800"), "--can-id is '0x800'"),

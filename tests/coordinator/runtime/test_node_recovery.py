@@ -169,7 +169,7 @@ def test_an_optional_node_that_reboots_is_recognised_and_taken_back(stage: Stage
         stage.host.light.reboot()
         await stage.until("light", NodeState.LOST)
         await stage.until("light", NodeState.READY)
-        assert "node light restarted by itself (its uuid asks for an id again)" in stage.said[0]
+        assert "node light restarted by itself (its uuid requests an id again)" in stage.said[0]
 
     stage.run(check)
 

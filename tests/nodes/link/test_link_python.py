@@ -373,7 +373,7 @@ def test_counters_are_those_of_the_c_core() -> None:
         (errno.EIO, "Input/output error); check cable and device"),
         (
             errno.ENETDOWN,
-            "Network is down); somebody set the interface down: set it up with 'ip link set by hand up'",
+            "Network is down); the interface was set down: set it up with 'ip link set by hand up'",
         ),
     ],
 )
@@ -394,7 +394,7 @@ def test_a_handle_refuses_in_words_and_is_closed_once() -> None:
     assert handle.open
     assert handle.live() == driver.bus
     handle.check(lib.IO_OK, "by hand node 4")
-    with pytest.raises(LinkError, match="by hand node 4: no memory for a further link"):
+    with pytest.raises(LinkError, match="by hand node 4: no memory for another link"):
         handle.check(lib.IO_NO_MEMORY, "by hand node 4")
     with pytest.raises(LinkError, match=rf"by hand node 4: refused by the bus \(status {lib.IO_INVALID}\)"):
         handle.check(lib.IO_INVALID, "by hand node 4")

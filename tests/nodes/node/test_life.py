@@ -34,7 +34,7 @@ def test_a_node_that_asks_for_an_id_again_is_known_to_have_restarted_before_its_
         assert now_s() - before_s < 0.9843 + 0.25 + 0.1 + 0.05
         assert isinstance(machine.node.failure, NodeRestarted)
         assert str(machine.node.failure) == (
-            "node mainboard restarted by itself (its uuid asks for an id again); check its power supply"
+            "node mainboard restarted by itself (its uuid requests an id again); check its power supply"
         )
         await machine.node.restart()
         assert (machine.twin.nodeid, machine.twin.configured) == (4, True)
@@ -56,7 +56,7 @@ def test_commands_without_an_answer_raise_the_suspicion_too() -> None:
         before_s = now_s()
         await machine.changed_to(NodeState.LOST)
         assert now_s() - before_s < 0.7
-        assert "asks for an id again" in str(machine.node.failure)
+        assert "requests an id again" in str(machine.node.failure)
 
     machine.run(machine.bus.start, check)
 
@@ -130,7 +130,7 @@ def test_a_board_that_answers_in_anothers_place_is_found_out() -> None:
     machine = Machine(TwinNode(source=with_canbus_id(), says_uuid=uuid(2)))
     with pytest.raises(
         NodeError,
-        match=r"two boards answer on node id 4 of bus can0: 010203040501, .* is 010203040502; switch",
+        match=r"two boards answer on node id 4 of bus can0: 010203040501, .* reports 010203040502; switch",
     ):
         machine.run(machine.bus.start)
 

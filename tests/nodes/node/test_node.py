@@ -283,7 +283,7 @@ def test_a_node_that_restarts_by_itself_is_lost_for_that_reason() -> None:
         machine.io.links[0].say(machine.twin.response("starting"))
         await machine.changed_to(NodeState.LOST)
         assert str(machine.node.failure) == (
-            "node mainboard restarted by itself (it said so); check its power supply"
+            "node mainboard restarted by itself (it reported that); check its power supply"
         )
 
     machine.run(machine.bus.start, check)
