@@ -16,6 +16,10 @@ export class Refusal extends Error {
   }
 }
 
+function unreachable() {
+  return new Refusal("offline", "the machine cannot be reached at the moment");
+}
+
 export class Link extends EventTarget {
   #client;
   #key;
@@ -66,7 +70,7 @@ export class Link extends EventTarget {
 
   /** Ask; resolves to the result, rejects with a Refusal. */
   call(method, params = {}) {
-    if (!this.#up) return Promise.reject(new Refusal("offline", "the machine cannot be reached at the moment"));
+    if (!this.#up) return Promise.reject(unreachable());
     return this.#request(method, params);
   }
 
@@ -99,6 +103,7 @@ export class Link extends EventTarget {
   }
 
   #request(method, params) {
+    if (this.#socket?.readyState !== WebSocket.OPEN) return Promise.reject(unreachable()); // its close event is on the way
     if (this.#open.size >= REQUESTS_MAX) return Promise.reject(new Refusal("busy", "too many requests wait"));
     const id = this.#next_id++;
     return new Promise((resolve, reject) => {

@@ -26,6 +26,16 @@ FORBIDDEN: Final = "status of 403"
 WEBSOCKET_REFUSED: Final = "WebSocket connection to "
 UNREACHED: Final = "ERR_CONNECTION"
 NO_METHOD: Final = "there is no method"
+
+KEEP_SOCKETS: Final = """
+globalThis.sockets = [];
+globalThis.WebSocket = class extends WebSocket {
+    constructor(url) {
+        super(url);
+        sockets.push(this);
+    }
+};
+"""
 """Words that the browser, and the server without a machine, have for what is meant to fail."""
 
 
@@ -125,6 +135,27 @@ def test_getting_in(browser: Browser, paged: Paged) -> None:
         visitor.page.get_by_text("Open the link that canductor prints").wait_for()
     tab.close(FORBIDDEN, NOT_SIGNED_IN, WEBSOCKET_REFUSED, NO_METHOD)
     other.close(NOT_SIGNED_IN, WEBSOCKET_REFUSED, NO_METHOD)
+
+
+def test_a_request_on_a_closing_connection_is_refused(browser: Browser, paged: Paged) -> None:
+    """Between the begin of a close and its event a request fails at once; nothing is sent."""
+    tab = Visitor(browser)
+    tab.page.add_init_script(KEEP_SOCKETS)
+    tab.page.goto(link(paged, Scope.WATCH))
+    tab.until("document.body.dataset.offline === 'false'")
+    code = tab.page.evaluate(
+        """async () => {
+            const {Link} = await import("/link.js");
+            const link = new Link("a test");
+            const up = new Promise((done) => link.addEventListener("up", done));
+            link.connect(localStorage.getItem("canductor.key"));
+            await up;
+            globalThis.sockets.at(-1).close();
+            return link.call("api.ping").then(() => "answered", (refusal) => refusal.code);
+        }"""
+    )
+    assert code == "offline"
+    tab.close(NO_METHOD)
 
 
 # -------------------------------------------------------------------------------------------------- the stop
