@@ -7,9 +7,9 @@ from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.bus.talk import LISTEN_S, BusTalk
 from canbus_tools.discovery.node_discovery import ROUNDS, DiscoveredNodes, NodeDiscovery
 from nodes.link import Frame
+from nodes.support.can_protocol import BUS_OFF
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import decimal
-from nodes.transport.frame import BUS_OFF
 
 _CAUSE_S: Final = 0.2
 """The sentence why a bus ended comes from another thread, maybe a little after sending fails."""

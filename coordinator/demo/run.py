@@ -9,7 +9,8 @@ from pathlib import Path
 from coordinator.assembly.load import load_machine
 from coordinator.demo.report import DemoReport, report_of
 from coordinator.gcode.program import Program
-from coordinator.runtime.host import Computer, LinuxHost
+from coordinator.runtime.host import Computer
+from coordinator.runtime.linux_host import LinuxHost
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.job_runner import OnProgress, run_job
 from coordinator.streaming.pipeline import PlanRecord

@@ -21,7 +21,7 @@ from coordinator.ipc.server.tcp_listener import raise_files_limit
 from coordinator.ipc.server.uploads import upload_method
 from coordinator.klippy_api.gateway import Gateway
 from coordinator.metrics.server import MetricsServer, MetricsSettings
-from coordinator.runtime.host import LinuxHost
+from coordinator.runtime.linux_host import LinuxHost
 from coordinator.service.api.methods import add_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.core.typed import Typed

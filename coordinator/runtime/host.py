@@ -1,19 +1,16 @@
 """What the machine needs of the computer it runs on: its time, its ports, and the loop its time passes in.
 
-`LinuxHost` is the real one; a simulation takes its place with virtual time and simulated wires.
+`runtime.linux_host` has the real one; a simulation takes its place with virtual time and simulated wires.
 """
 
 import asyncio
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 from coordinator.config.model import CanConnection, UartConnection
 from nodes.clock.clock import HostTime
-from nodes.link import LinkIO
-from nodes.link.interfaces import IoFactory, LinkIoInterface, OnFrame, OnLost
-from nodes.transport import ByteTransport, CanTransport, open_can, open_uart
+from nodes.link.interfaces import IoFactory
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,30 +46,3 @@ class Computer(Host, Protocol):
     def make_loop(self) -> asyncio.AbstractEventLoop:
         """Return a new event loop in which this host's time passes."""
         ...
-
-
-class LinuxHost:
-    """This computer: CLOCK_MONOTONIC, its CAN interfaces and its serial lines."""
-
-    def make_loop(self) -> asyncio.AbstractEventLoop:
-        """Return asyncio's own loop."""
-        return asyncio.new_event_loop()
-
-    def now(self) -> HostTime:
-        """Return CLOCK_MONOTONIC."""
-        return HostTime(time.monotonic_ns())
-
-    def open_can(self, connection: CanConnection) -> Port:
-        """Open SocketCAN, a virtual bus, or whatever the interface's name stands for."""
-        return _port(open_can(connection.interface))
-
-    def open_uart(self, connection: UartConnection) -> Port:
-        """Open a device file."""
-        return _port(open_uart(connection.path, connection.baud))
-
-
-def _port(transport: CanTransport | ByteTransport) -> Port:
-    def start(*, on_frame: OnFrame | None, on_closed: OnLost) -> LinkIoInterface:
-        return LinkIO(transport, asyncio.get_running_loop(), on_frame=on_frame, on_closed=on_closed)
-
-    return Port(transport.name, start, transport.close)

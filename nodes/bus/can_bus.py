@@ -18,9 +18,8 @@ from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeError, NodeLost
 from nodes.node.node import Node, OnClock, OnState
 from nodes.node.states import NodeState
-from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, BUS_STOP_ID, QUERY_UNASSIGNED
+from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID, BUS_OFF, BUS_STOP_ID, QUERY_UNASSIGNED
 from nodes.support.errors import CanductorError
-from nodes.transport.frame import BUS_OFF
 
 SUSPECT_INTERVAL_S: Final = 0.1
 """Least interval between queries for nodes that wait for an id."""

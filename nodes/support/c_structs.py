@@ -3,15 +3,14 @@
 from dataclasses import fields
 from typing import Any, TypeVar
 
-from cffi import FFI
+from _cffi_backend import typeof  # not cffi.FFI: that imports a parser of C
 
 T = TypeVar("T")
-_FFI = FFI()
 
 
 def field_names(struct: Any) -> list[str]:
     """Return the names of the fields of a struct, or of what a pointer points to."""
-    kind = _FFI.typeof(struct)
+    kind = typeof(struct)
     kind = kind.item if kind.kind == "pointer" else kind
     return [name for name, _ in kind.fields or ()]
 

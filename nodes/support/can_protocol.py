@@ -1,4 +1,4 @@
-"""The fixed CAN ids of the protocol, and the commands of its admin frames."""
+"""The fixed CAN ids of the protocol, one of the kernel's, and the commands of the admin frames."""
 
 from typing import Final
 
@@ -15,6 +15,8 @@ ADMIN_ID: Final = 0x3F0
 ADMIN_RESPONSE_ID: Final = 0x3F1
 MT_CAN_ID: Final = 0x3F2
 """Table downloads, from the host to all nodes."""
+BUS_OFF: Final = 0x2000_0040
+"""The kernel's error frame (CAN_ERR_FLAG | CAN_ERR_BUSOFF): the controller took itself off the bus."""
 
 QUERY_UNASSIGNED: Final = 0x00
 SET_NODEID: Final = 0x01

@@ -8,10 +8,9 @@ import pytest
 from canbus_tools.bus.talk import BusTalk
 from canbus_tools.discovery.ask_bus import discover_nodes
 from nodes.link import Frame
-from nodes.support.can_protocol import ADMIN_ID
+from nodes.support.can_protocol import ADMIN_ID, BUS_OFF
 from nodes.support.errors import CanductorError
 from nodes.transport import CanFrame
-from nodes.transport.frame import BUS_OFF
 from tests.canbus_tools.command import Command
 from tests.stages.can_stage import CanStage
 

@@ -28,7 +28,7 @@ from coordinator.ipc.server.settings import IpcSettings, TcpSettings
 from coordinator.ipc.server.state import StateTree
 from coordinator.ipc.server.uploads import upload_method
 from coordinator.motion.trapezoid_array import TRAPEZOID
-from coordinator.runtime.host import LinuxHost
+from coordinator.runtime.linux_host import LinuxHost
 from coordinator.service.api.methods import add_methods
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.core.motion_lead import MotionLead

@@ -20,7 +20,8 @@ import numpy as np
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription, RailDescription
 from coordinator.modules.module_set import build_modules
-from coordinator.runtime.host import Host, LinuxHost
+from coordinator.runtime.host import Host
+from coordinator.runtime.linux_host import LinuxHost
 from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.homing import CYCLE_S, HomingMove
 from coordinator.runtime.moves.single import Ramp, SingleMove, ratio_of

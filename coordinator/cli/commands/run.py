@@ -13,7 +13,8 @@ from coordinator.cli.arguments.serving import declare_serving, is_asked_to_serve
 from coordinator.config.model import MachineDescription
 from coordinator.front_ends.serve import serve_machine
 from coordinator.gcode.program import Program
-from coordinator.runtime.host import Computer, LinuxHost
+from coordinator.runtime.host import Computer
+from coordinator.runtime.linux_host import LinuxHost
 from coordinator.service.core.job_runner import run_job
 from coordinator.service.jobs.outcome import NodeOutcome, Outcome
 from coordinator.support.examples import machine_name

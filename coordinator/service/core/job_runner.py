@@ -6,7 +6,8 @@ from pathlib import Path
 from coordinator.config.model import MachineDescription
 from coordinator.gcode.program import Program
 from coordinator.ipc.server.state import StateTree
-from coordinator.runtime.host import Host, LinuxHost
+from coordinator.runtime.host import Host
+from coordinator.runtime.linux_host import LinuxHost
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from coordinator.service.jobs.outcome import Outcome

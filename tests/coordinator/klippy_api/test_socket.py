@@ -12,7 +12,7 @@ import pytest
 from coordinator.cli import main as cli
 from coordinator.ipc.server.state import StateTree
 from coordinator.klippy_api.gateway import CLIENTS_MAX, Gateway
-from coordinator.runtime.host import LinuxHost
+from coordinator.runtime.linux_host import LinuxHost
 from coordinator.service.core.machine_service import MachineService, ServiceSettings
 from nodes.support.errors import CanductorError
 from tests.stages.jump_loop import run

@@ -16,7 +16,7 @@ from coordinator.ipc.server.state import StateTree
 from coordinator.modules.module_set import build_modules
 from coordinator.motion.steps.shapers import Impulses, shaper_impulses
 from coordinator.motion.steps.steps import TABLE_POINTS_MAX, StepError, StepGenerator
-from coordinator.runtime.host import LinuxHost
+from coordinator.runtime.linux_host import LinuxHost
 from coordinator.runtime.machine import Machine
 from coordinator.service.core.tables import TableService
 from coordinator.streaming.compensation import NO_CORRECTION, Compensation

@@ -8,8 +8,8 @@ from nodes.bus.can_bus import CanBus
 from nodes.link.interfaces import OnFrame, OnLost
 from nodes.node.errors import NodeError, NodeRestarted
 from nodes.node.states import NodeState
+from nodes.support.can_protocol import BUS_OFF
 from nodes.support.errors import CanductorError
-from nodes.transport.frame import BUS_OFF
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
 from tests.nodes.twin_bus import Frame, TwinIO, TwinNode, source_of, with_canbus_id

@@ -7,7 +7,7 @@ from coordinator.assembly.load import load_machine
 from coordinator.gcode.commands import Call, Synchronized
 from coordinator.gcode.parser import parse
 from coordinator.modules.module_set import build_modules
-from coordinator.runtime.host import LinuxHost
+from coordinator.runtime.linux_host import LinuxHost
 from coordinator.runtime.machine import Machine
 
 
