@@ -34,6 +34,12 @@ def builder(module: str, headers: Sequence[str], sources: Iterable[str], *, cdef
         "\n".join(f'#include "{header}"' for header in headers),
         # Relative paths: setuptools refuses absolute ones.
         sources=list(sources),
+        # Else a changed header would leave the module as it is; which ones it includes is not worth asking.
+        depends=sorted(
+            str(header.relative_to(ROOT))
+            for package in ("coordinator", "nodes", "firmware")
+            for header in (ROOT / package).rglob("*.h")
+        ),
         include_dirs=[".", "firmware"],
         extra_compile_args=[
             "-std=gnu11",
