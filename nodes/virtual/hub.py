@@ -6,18 +6,14 @@ client that does not read stops the bus instead of losing frames. The work is do
 ``hub_loop.h``) in a thread of its own that never needs the interpreter.
 """
 
-import argparse
 import contextlib
 import errno
-import json
 import os
-import signal
 import socket
 import stat
-import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -315,45 +311,3 @@ def _in_use(path: Path) -> CanductorError:
     return CanductorError(
         f"virtual bus {path}: a bus is already running there; stop it or choose another path"
     )
-
-
-def _parse_arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m nodes.virtual.hub",
-        description="Carries a virtual CAN bus until SIGTERM or SIGINT. Prints one JSON line when it is"
-        " ready and one with its counters at the end.",
-    )
-    parser.add_argument("path", metavar="PATH", help="the Unix socket to which clients connect")
-    parser.add_argument("--bitrate", type=int, default=1_000_000, help="bit/s; 0: no limit (default 1000000)")
-    parser.add_argument(
-        "--loss", type=float, default=0.0, help="share of frames that reach nobody (default 0)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="which frames are lost (default 0)")
-    return parser.parse_args(arguments)
-
-
-def _print_json(value: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(value) + "\n")
-    sys.stdout.flush()
-
-
-def main(arguments: list[str]) -> int:
-    """Run a bus as a process of its own; returns the exit status."""
-    options = _parse_arguments(arguments)
-    ending = {signal.SIGTERM, signal.SIGINT}
-    signal.pthread_sigmask(signal.SIG_BLOCK, ending)  # before the thread starts, which inherits it
-    try:
-        bus = VirtualBus(options.path, bitrate=options.bitrate, loss=options.loss, seed=options.seed).start()
-        _print_json({"ready": True, "address": bus.address})
-        while bus.running and signal.sigtimedwait(ending, 0.5) is None:
-            pass
-        bus.close()
-    except CanductorError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    _print_json(asdict(bus.stats))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

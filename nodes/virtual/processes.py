@@ -13,7 +13,6 @@ import os
 import select
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -245,14 +244,3 @@ class NodeProcess(ChildProcess):
             if value is not None:
                 command += [option, str(value)]
         super().__init__(name, command)
-
-
-class BusProcess(ChildProcess):
-    """The virtual bus as a process of its own; stop() returns its BusStats as a dictionary."""
-
-    def __init__(
-        self, path: str | Path, *, bitrate: int | None = 1_000_000, loss: float = 0.0, seed: int = 0
-    ) -> None:
-        """Start the bus; the arguments are those of VirtualBus."""
-        options = ["--bitrate", str(bitrate or 0), "--loss", str(loss), "--seed", str(seed)]
-        super().__init__(f"virtual bus {path}", [sys.executable, "-m", "nodes.virtual.hub", path, *options])

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from nodes.support.errors import CanductorError
-from nodes.virtual.processes import BusProcess, ChildProcess, NodeProcess
+from nodes.virtual.processes import ChildProcess, NodeProcess
+from tests.stages.bus_process import BusProcess
 
 WAIT_S = 20.0
 READY = "import json, signal, sys; print(json.dumps({'ready': True, 'argv': sys.argv[1:]}), flush=True)\n"
@@ -107,7 +108,7 @@ def test_processes_outlive_the_thread_that_started_them() -> None:
 def test_processes_die_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     parent_code = (
         "import signal, sys\n"
-        "from nodes.virtual.processes import BusProcess\n"
+        "from tests.stages.bus_process import BusProcess\n"
         "bus = BusProcess(sys.argv[1]); bus.wait_ready()\n"
         "print(bus.pid, flush=True); signal.pause()\n"
     )

@@ -18,11 +18,11 @@ from nodes.virtual.plant import (
     Term,
 )
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
-from nodes.virtual.sim import SimNode
 from nodes.virtual.sim_plant import connect_plants
 from nodes.virtual.world import NodeSettings, World
 from tests.firmware.host import Host
 from tests.nodes.virtual.plants import HOT
+from tests.stages.sim_node import SimNode
 
 START_CLOCK = 2**32 - 1000
 TANK = NodePlant(

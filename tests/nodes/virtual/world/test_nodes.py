@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from nodes.node.states import NodeState
-from nodes.virtual.sim import SimNode
 from nodes.virtual.world import (
     CanState,
     Latency,
@@ -19,6 +18,7 @@ from nodes.virtual.world import (
     run,
 )
 from tests.nodes.virtual.world.machines import CanMachine, UartMachine, uuid
+from tests.stages.sim_node import SimNode
 
 HZ = 168_000_000
 S = 1_000_000_000
