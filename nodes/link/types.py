@@ -31,8 +31,8 @@ class LinkTransport(Protocol):
         """Name in messages to the user, for example ``can0`` or ``/dev/ttyACM0``."""
 
     @property
-    def kind(self) -> int:
-        """One of TransportKind."""
+    def kind(self) -> TransportKind:
+        """How to read and write the file descriptor."""
 
     def fileno(self) -> int:
         """Return the file descriptor, open until close()."""
@@ -275,6 +275,3 @@ class Forecast:
     def warning_s(self) -> float | None:
         """Time from this forecast to the first late command; None: nothing would be late."""
         return None if self.late_ns is None else (self.late_ns - self.now_ns) * 1e-9
-
-
-FrameHandler = Callable[[Frame], None]

@@ -9,14 +9,14 @@ RECORD_SIZE = 16
 ID_MAX = 0x7FF
 DATA_MAX = 8
 BUS_OFF = 0x2000_0040
-"""Id of the kernel's error frame (CAN_ERR_FLAG | CAN_ERR_BUSOFF): the controller took itself off the bus."""
+"""Id of the kernel's error frame (CAN_ERR_FLAG | CAN_ERR_BUSOFF): the controller left the bus."""
 
 _RECORD = struct.Struct("=IB3x8s")
 
 
 @dataclass(frozen=True, slots=True)
 class CanFrame:
-    """A CAN 2.0A data frame: 11-bit id, at most 8 bytes. Raises ValueError when it is not one."""
+    """A CAN 2.0A data frame: 11-bit id, at most 8 bytes; ValueError for anything else."""
 
     id: int
     data: bytes = b""
@@ -33,7 +33,7 @@ class CanFrame:
 
     @classmethod
     def from_record(cls, record: bytes) -> Self | None:
-        """Read a record; None when it is not a data frame with an 11-bit id (so are the flags of others)."""
+        """Read a record; None unless it is a data frame with an 11-bit id (others have flags in the id)."""
         if len(record) != RECORD_SIZE:
             return None
         can_id, length, data = _RECORD.unpack(record)
