@@ -11,8 +11,6 @@
 // bits (here 12: others add their own to the first), a delimiter of 8, and 3 of space behind it.
 enum { ATTEMPTS = 256 / 8, RECOVERY_BITS = 128 * 11, ERROR_BITS = 12 + 8 + 3, UNPROTECTED_BITS = 7 + 3 };
 
-_Static_assert((int)HUB_SENDERS == (int)HUB_CLIENTS, "cffi wants the number itself in both headers");
-
 static const uint64_t NS_PER_S = 1000000000;
 
 // ------------------------------------------------------------------------------------------------- clients

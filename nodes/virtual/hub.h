@@ -21,7 +21,7 @@
 #include <stdint.h>
 
 // cffi: begin
-enum { HUB_RECORD = 16, HUB_CLIENTS = 64, HUB_INPUT = 256, HUB_OUTPUT = 1024 };
+enum { HUB_RECORD = 16, HUB_INPUT = 256, HUB_OUTPUT = 1024 };
 
 struct hub_config {
     uint32_t bitrate;        // bit/s; 0: frames take no time

@@ -45,7 +45,7 @@ static uint64_t mix(uint64_t z) {
 // Two independent words for the n-th frame that a rule picked of a sender.
 static uint64_t draw(const struct hub_faults *faults, uint32_t rule, int sender, uint64_t nth) {
     static const uint64_t STEP = 0x9E3779B97F4A7C15;
-    uint64_t stream = mix(faults->seed + STEP * (rule * (uint64_t)HUB_SENDERS + (uint64_t)sender + 1));
+    uint64_t stream = mix(faults->seed + STEP * (rule * (uint64_t)HUB_CLIENTS + (uint64_t)sender + 1));
     return mix(stream + STEP * nth);
 }
 

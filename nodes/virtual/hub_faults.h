@@ -16,7 +16,7 @@
 #include <stdint.h>
 
 // cffi: begin
-enum { HUB_RULES = 32, HUB_SENDERS = 64 };
+enum { HUB_RULES = 32, HUB_CLIENTS = 64 };
 
 enum hub_fault_kind {
     HUB_LOSE,      // the receiver does not get the frame, the sender believes it did
@@ -53,7 +53,7 @@ struct hub_rule_counters {
 struct hub_faults {
     struct hub_rule rules[HUB_RULES];
     uint64_t thresholds[HUB_RULES]; // share of 2^32
-    uint64_t picked[HUB_RULES][HUB_SENDERS];
+    uint64_t picked[HUB_RULES][HUB_CLIENTS];
     struct hub_rule_counters counters[HUB_RULES];
     uint32_t count;
     uint32_t kinds; // bit set of those there are rules for

@@ -23,11 +23,6 @@ static const uint64_t NS_PER_S = 1000000000;
 // Without file descriptors, connections wait; trying at once again would only burn time.
 static const uint64_t ACCEPT_PAUSE_NS = 100000000;
 
-_Static_assert(HUB_RULES == sizeof(((struct hub_report *)0)->rules) / sizeof(struct hub_rule_counters),
-               "cffi wants the number itself in hub_loop.h");
-_Static_assert(HUB_CLIENTS == sizeof(((struct hub_report *)0)->clients) / sizeof(struct hub_client_report),
-               "cffi wants the number itself in hub_loop.h");
-
 struct hub_loop {
     pthread_mutex_t mutex; // over all below but wake_fd; free while the thread sleeps
     int wake_fd, listen_fd;

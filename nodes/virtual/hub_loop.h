@@ -16,11 +16,11 @@ struct hub_client_report {
 
 struct hub_report {
     struct hub_counters counters;
-    struct hub_rule_counters rules[32]; // HUB_RULES; as many as were set
-    uint64_t late_ns_max;               // the latest the thread ever woke for the end of a frame
-    bool realtime;                      // whether the thread was granted real-time priority
+    struct hub_rule_counters rules[HUB_RULES]; // as many as were set
+    uint64_t late_ns_max;                      // the latest the thread ever woke for the end of a frame
+    bool realtime;                             // whether the thread was granted real-time priority
     int32_t client_count;
-    struct hub_client_report clients[64]; // HUB_CLIENTS
+    struct hub_client_report clients[HUB_CLIENTS];
 };
 
 // Makes a bus whose clients connect to LISTEN_FD, a listening non-blocking stream socket that stays the

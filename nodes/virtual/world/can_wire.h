@@ -27,7 +27,7 @@ enum {
 
 enum can_state { CAN_ACTIVE, CAN_WARN, CAN_PASSIVE, CAN_OFF };
 
-// What may be changed at any time; it counts from then on.
+// Settings that may be changed at any time, with effect from then on.
 struct can_wire_settings {
     uint32_t bitrate;  // bits per second
     double bit_errors; // probability that a bit is disturbed for all
@@ -60,6 +60,11 @@ struct can_controller_counters {
     uint64_t passive, off; // how often it became so
     uint64_t queue_max;
 };
+struct can_controller;
+// Starts the recovery of a controller that is bus-off.
+void can_restart(struct can_controller *controller);
+// Moves the controller's end of the cable to SEGMENT (below CAN_SEGMENTS_MAX).
+void can_cut(struct can_controller *controller, uint32_t segment);
 // cffi: end
 
 struct can_bits {
@@ -135,12 +140,8 @@ int can_offer(struct can_controller *controller, const struct can_bits *frame);
 void can_clear(struct can_controller *controller);
 // Unpowered controllers are not there at all. Power on: counters are zero and nothing waits.
 void can_power(struct can_controller *controller, int on);
-// A controller that is off begins to recover.
-void can_restart(struct can_controller *controller);
 // Sends FRAME back to back until UNTIL_NS.
 void can_babble(struct can_controller *controller, const struct can_bits *frame, uint64_t until_ns);
-// The controller's end of the cable is now part of SEGMENT.
-void can_cut(struct can_controller *controller, uint32_t segment);
 enum can_state can_state_of(const struct can_controller *controller);
 
 // ------------------------------------------------------------------------------------------ within the wire

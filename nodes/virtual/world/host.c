@@ -299,6 +299,6 @@ struct can_controller *world_port_controller(struct world_port *port) {
     return port->can ? &port->controller : NULL;
 }
 
-void world_port_counters(const struct world_port *port, struct world_port_counters *out) {
-    *out = port->counters;
+const struct world_port_counters *world_port_counters(const struct world_port *port) {
+    return &port->counters;
 }

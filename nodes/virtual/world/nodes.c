@@ -169,7 +169,6 @@ static void edge(void *context, uint64_t clock, uint32_t pin, int level) {
     };
     remember_edge(node, &edge);
     agenda_note(&node->world->agenda, clock << 16 | pin << 1 | (uint64_t)level);
-    axes_edge(node, clock, pin, level);
 }
 
 static uint64_t true_ns(void *context, uint64_t clock) {

@@ -65,9 +65,6 @@ struct world_node {
     uint32_t frame_first, frame_count;
     struct world_edge *edges;
     size_t edge_room;
-    struct world_axis axes[WORLD_AXES_MAX];
-    int axis_count;
-    uint8_t step_level[WORLD_PINS];
     uint8_t driven[WORLD_PINS], input[WORLD_PINS], adc_set[WORLD_PINS];
     uint16_t adc[WORLD_PINS];
 };
@@ -125,7 +122,6 @@ void actions_start(struct world *world);
 // Changes an input at once, as the world's doing: it outlives resets.
 void node_drive(struct world_node *node, uint32_t pin, uint16_t value, int adc);
 void node_reapply_inputs(struct world_node *node);
-void axes_edge(struct world_node *node, uint64_t clock, uint32_t pin, int level);
 int action_plan(struct world_node *node, uint32_t pin, uint16_t value, int adc, uint64_t at_ns);
 
 // uart.c. How many bytes were taken.

@@ -25,11 +25,9 @@ class CanState(IntEnum):
     OFF = 3
 
 
-def counters(struct: str, read: Callable[[Any], None]) -> dict[str, int]:
-    """Return a C struct of counters, which READ fills, by its fields' names."""
-    found = ffi.new(f"{struct} *")
-    read(found)
-    return {name: int(getattr(found, name)) for name in field_names(found)}
+def counters(struct: Any) -> dict[str, int]:
+    """Return the counters of the C struct at STRUCT by name."""
+    return {name: int(getattr(struct, name)) for name in field_names(struct)}
 
 
 class CanController:
@@ -42,15 +40,13 @@ class CanController:
 
     def set_faults(self, *, loss: float | None = None, corruption: float | None = None) -> None:
         """Change the probabilities that a received frame is lost, or has an unnoticed wrong bit."""
-        settings = lib.world_can_controller_settings(self._raw)
-        if loss is not None:
-            settings.loss = check_probability(loss, "a loss")
-        if corruption is not None:
-            settings.corruption = check_probability(corruption, "a corruption")
+        _set_faults(lib.world_can_controller_settings(self._raw), loss, corruption)
 
     def status(self) -> dict[str, int]:
         """Return tec, rec, retries, queued frames and state (CanState)."""
-        return counters("struct can_controller_status", lambda out: lib.world_can_status(self._raw, out))
+        status = ffi.new("struct can_controller_status *")
+        lib.world_can_status(self._raw, status)
+        return counters(status)
 
     @property
     def state(self) -> CanState:
@@ -59,8 +55,7 @@ class CanController:
 
     def counters(self) -> dict[str, int]:
         """Return what it has counted since it was made."""
-        struct = "struct can_controller_counters"
-        return counters(struct, lambda out: lib.world_can_controller_counters(self._raw, out))
+        return counters(lib.world_can_controller_counters(self._raw))
 
     def send(self, can_id: int, data: bytes = b"") -> bool:
         """Queue a frame by hand; False when the queue is full."""
@@ -77,11 +72,18 @@ class CanController:
         """Cut the cable so that this end is on SEGMENT (0..3); all begin on 0."""
         if not 0 <= segment < lib.CAN_SEGMENTS_MAX:
             raise WorldError(f"a simulated cable has no segment {segment}; cut it into segments 0..3")
-        lib.world_can_cut(self._raw, segment)
+        lib.can_cut(self._raw, segment)
 
     def restart(self) -> None:
         """Begin the recovery from bus-off."""
-        lib.world_can_restart(self._raw)
+        lib.can_restart(self._raw)
+
+
+def _set_faults(settings: Any, loss: float | None, corruption: float | None) -> None:
+    if loss is not None:
+        settings.loss = check_probability(loss, "a loss")
+    if corruption is not None:
+        settings.corruption = check_probability(corruption, "a corruption")
 
 
 def _check_frame(can_id: int, data: bytes) -> None:
@@ -104,7 +106,7 @@ class CanWire:
 
     def counters(self) -> dict[str, int]:
         """Return what was on the wire."""
-        return counters("struct can_wire_counters", lambda out: lib.world_can_counters(self.raw, out))
+        return counters(lib.world_can_counters(self.raw))
 
 
 class Uart:
@@ -118,15 +120,11 @@ class Uart:
 
     def set_faults(self, *, loss: float | None = None, corruption: float | None = None) -> None:
         """Change the probabilities that a byte is lost, or has a wrong bit."""
-        settings = lib.world_uart_settings(self.raw)
-        if loss is not None:
-            settings.loss = check_probability(loss, "a loss")
-        if corruption is not None:
-            settings.corruption = check_probability(corruption, "a corruption")
+        _set_faults(lib.world_uart_settings(self.raw), loss, corruption)
 
     def counters(self) -> dict[str, int]:
         """Return what went over the line."""
-        return counters("struct world_uart_counters", lambda out: lib.world_uart_counters(self.raw, out))
+        return counters(lib.world_uart_counters(self.raw))
 
 
 class Port:
@@ -154,7 +152,7 @@ class Port:
 
     def counters(self) -> dict[str, int]:
         """Return what the kernel's queues and the I/O thread have counted."""
-        return counters("struct world_port_counters", lambda out: lib.world_port_counters(self._raw, out))
+        return counters(lib.world_port_counters(self._raw))
 
 
 class CanPort(Port):

@@ -154,6 +154,6 @@ struct world_uart_settings *world_uart_settings(struct world_uart *uart) {
     return &uart->settings;
 }
 
-void world_uart_counters(const struct world_uart *uart, struct world_uart_counters *out) {
-    *out = uart->counters;
+const struct world_uart_counters *world_uart_counters(const struct world_uart *uart) {
+    return &uart->counters;
 }

@@ -26,13 +26,11 @@ struct world_can;
 struct world_uart;
 struct world_node;
 struct world_port;
-struct can_controller;
 
 enum {
     WORLD_PORTS_MAX = 64,
     WORLD_PINS = 144,
     WORLD_RATES_MAX = 64,      // changes of a clock's rate, its start included
-    WORLD_AXES_MAX = 32,       // per node
     WORLD_ACTIONS_MAX = 4096,  // planned changes of inputs
     WORLD_EDGES_MAX = 1 << 24, // remembered per node
     WORLD_RECEIVE_MAX = 4096,  // longest receive queue of a port, in frames
@@ -65,7 +63,7 @@ uint64_t world_events(const struct world *world);
 
 struct world_can *world_add_can(struct world *world, const struct can_wire_settings *settings);
 struct can_wire_settings *world_can_settings(struct world_can *can);
-void world_can_counters(const struct world_can *can, struct can_wire_counters *out);
+const struct can_wire_counters *world_can_counters(const struct world_can *can);
 
 // ------------------------------------------------------------------------------------------------- UART
 
@@ -82,7 +80,7 @@ struct world_uart_counters {
 };
 struct world_uart *world_add_uart(struct world *world, const struct world_uart_settings *settings);
 struct world_uart_settings *world_uart_settings(struct world_uart *uart);
-void world_uart_counters(const struct world_uart *uart, struct world_uart_counters *out);
+const struct world_uart_counters *world_uart_counters(const struct world_uart *uart);
 
 // ------------------------------------------------------------------------------------------------- nodes
 
@@ -105,7 +103,7 @@ struct world_node *world_add_node(struct world *world, const struct sim_options 
 struct world_node_settings *world_node_settings(struct world_node *node);
 struct sim_board *world_node_board(struct world_node *node);
 struct can_controller *world_node_controller(struct world_node *node); // NULL on a UART
-void world_node_counters(const struct world_node *node, struct world_node_counters *out);
+const struct world_node_counters *world_node_counters(const struct world_node *node);
 void world_node_reset(struct world_node *node);
 void world_node_power_off(struct world_node *node);
 void world_node_power_on(struct world_node *node, uint64_t start_clock);
@@ -129,24 +127,6 @@ struct world_edge {
 };
 const struct world_edge *world_node_edges(const struct world_node *node, size_t *count);
 
-// A mechanical axis: counts the steps of a stepper, and holds an input at 1 while its position is at or
-// beyond AT (>= AT for direction 1, <= AT for -1), else at 0; the input follows DELAY_NS after the step.
-struct world_axis {
-    uint32_t step_pin, dir_pin;
-    int dir_inverted;  // forward is dir = 0
-    int step_inverted; // a step is a fall of its pin, not a rise
-    int both_edges;    // each change of the step pin is a step, not only its rise
-    int64_t position, at;
-    int direction;
-    int input_inverted;
-    struct world_node *target;
-    uint32_t target_pin;
-    uint64_t delay_ns;
-};
-// Returns the axis's number, or -1. Its state can be read at any time.
-int world_node_add_axis(struct world_node *node, const struct world_axis *axis);
-const struct world_axis *world_node_axis(const struct world_node *node, int number);
-
 // ------------------------------------------------------------------------------------------------- the host
 
 struct world_port_settings {
@@ -166,7 +146,7 @@ struct world_port *world_add_uart_port(struct world *world, struct world_uart *u
                                        const struct world_port_settings *settings);
 struct world_port_settings *world_port_settings(struct world_port *port);
 struct can_controller *world_port_controller(struct world_port *port);
-void world_port_counters(const struct world_port *port, struct world_port_counters *out);
+const struct world_port_counters *world_port_counters(const struct world_port *port);
 // Starts a bus on the port, ends it. NULL: no memory, or there is one.
 struct io_bus *world_port_open(struct world_port *port, const struct io_settings *settings);
 void world_port_close(struct world_port *port);
@@ -179,14 +159,11 @@ struct can_controller_status {
     int state; // enum can_state
 };
 void world_can_status(const struct can_controller *controller, struct can_controller_status *out);
-void world_can_controller_counters(const struct can_controller *controller,
-                                   struct can_controller_counters *out);
+const struct can_controller_counters *world_can_controller_counters(const struct can_controller *controller);
 struct can_controller_settings *world_can_controller_settings(struct can_controller *controller);
 int world_can_send(struct can_controller *controller, uint32_t id, const uint8_t *data, size_t size);
 void world_can_babble(struct can_controller *controller, uint32_t id, const uint8_t *data, size_t size,
                       uint64_t until_ns);
-void world_can_cut(struct can_controller *controller, uint32_t segment);
-void world_can_restart(struct can_controller *controller);
 // cffi: end
 
 #endif

@@ -256,49 +256,12 @@ class WorldNode:
                 f"node {self.uuid}: no such pin or value ({pin}), or {limit} changes wait already"
             )
 
-    def add_axis(
-        self,
-        step_pin: int,
-        dir_pin: int,
-        *,
-        target: "WorldNode",
-        target_pin: int,
-        at: int,
-        position: int = 0,
-        direction: int = 1,
-        dir_inverted: bool = False,
-        step_inverted: bool = False,
-        both_edges: bool = False,
-        input_inverted: bool = False,
-        delay_s: float = 0.0,
-    ) -> int:
-        """Couple a stepper with an endstop (``struct world_axis``); returns the axis's number.
-
-        TARGET's input TARGET_PIN is 1 while the position is at or beyond AT in DIRECTION (1 or -1).
-        """
-        fields = {"step_pin": step_pin, "dir_pin": dir_pin, "target_pin": target_pin, "target": target.raw}
-        fields |= {"at": at, "position": position, "direction": direction}
-        fields |= {"dir_inverted": dir_inverted, "step_inverted": step_inverted}
-        fields |= {"both_edges": both_edges, "input_inverted": input_inverted}
-        fields["delay_ns"] = to_ns(delay_s, "an endstop's delay")
-        number = lib.world_node_add_axis(self.raw, ffi.new("struct world_axis *", fields))
-        if number < 0:
-            raise WorldError(f"node {self.uuid}: no such pin, or more than {lib.WORLD_AXES_MAX} axes")
-        return int(number)
-
     def start_plant(self, plant: NodePlant) -> SimPlant:
         """Connect the pins with PLANT from now on; raises CanductorError.
 
-        It goes before inputs and axes of the same pins. `connect_plants` lets several see each other.
+        Its pins no longer follow set_input and set_adc. `connect_plants` lets several see each other.
         """
         return SimPlant(lib.world_node_board(self.raw), plant, lambda: self._world.now_ns)
-
-    def axis_position(self, number: int) -> int:
-        """Return where axis NUMBER is, in steps."""
-        axis = lib.world_node_axis(self.raw, number)
-        if axis == ffi.NULL:
-            raise WorldError(f"node {self.uuid} has no axis {number}")
-        return int(axis.position)
 
     # ----------------------------------------------------------------------------------------------- truth
 
@@ -335,10 +298,9 @@ class WorldNode:
 
     def counters(self) -> dict[str, int]:
         """Return what the world and the firmware have counted (the firmware's begin anew at a reset)."""
-        board = lib.world_node_board(self.raw)
-        return counters(
-            "struct world_node_counters", lambda out: lib.world_node_counters(self.raw, out)
-        ) | counters("struct sim_counters", lambda out: lib.sim_counters(board, out))
+        firmware = ffi.new("struct sim_counters *")
+        lib.sim_counters(lib.world_node_board(self.raw), firmware)
+        return counters(lib.world_node_counters(self.raw)) | counters(firmware)
 
 
 def _made(raw: Any) -> Any:
