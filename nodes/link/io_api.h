@@ -178,7 +178,7 @@ struct io_depth {
 struct io_link_stats {
     struct link_stats link;
     uint64_t pending;
-    uint64_t flying_bytes, flying_blocks;
+    uint64_t in_flight_bytes, in_flight_blocks;
     struct io_depth queues[LINK_CLASSES];
     struct io_flow flows[LINK_CLASSES], received; // received.blocks: see link
 };

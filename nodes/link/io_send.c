@@ -160,7 +160,7 @@ size_t io_next(struct io_bus *bus, uint64_t now, uint64_t queued, uint8_t *out, 
     schedule_advance(&bus->schedule, now);
     bus->allowed = schedule_allowed(&bus->schedule);
     struct outlet outlet = {.out = out, .room = room, .left = schedule_room(&bus->schedule, queued)};
-    if (schedule_breathe(&bus->schedule, unanswered_since(bus)))
+    if (schedule_pause(&bus->schedule, unanswered_since(bus)))
         outlet.left = 0;
     if (bus->kind == IO_BYTES)
         send_bytes(bus, &outlet, now);

@@ -44,8 +44,8 @@ static void publish_link(struct io_link *node) {
     const struct link *link = &node->link;
     struct io_link_stats stats = {
         .pending = link_pending(link),
-        .flying_bytes = link->flying_bytes,
-        .flying_blocks = link->next - link->first,
+        .in_flight_bytes = link->in_flight_bytes,
+        .in_flight_blocks = link->next - link->first,
         .received = node->received,
     };
     link_get_stats(link, &stats.link);

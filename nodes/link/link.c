@@ -97,7 +97,7 @@ static uint64_t queued_commands(const struct link *link) {
 }
 
 uint64_t link_pending(const struct link *link) {
-    return queued_commands(link) + link->flying_commands;
+    return queued_commands(link) + link->in_flight_commands;
 }
 
 // -------------------------------------------------------------------------------------------- transmission
@@ -128,7 +128,7 @@ static int make_block(struct link *link, uint64_t now, unsigned allowed) {
     block->length =
         (uint8_t)wire_block_finish(block->bytes, block->length, (unsigned)(link->next % LINK_SLOTS));
     link->stats.commands_sent += block->commands;
-    link->flying_commands += block->commands;
+    link->in_flight_commands += block->commands;
     if (link->first == link->next && link->state != LINK_CONFIRMING) // probing as a whole has to end in time
         link->progress_ns = now;
     link->next++;
@@ -163,7 +163,7 @@ size_t link_next_block(struct link *link, uint64_t now, unsigned allowed, uint8_
     link->lead_in = LEAD_NONE;
     block->sent_ns = now ? now : 1; // 0 means never sent
     block->wire_length = (uint8_t)size;
-    link->flying_bytes += size;
+    link->in_flight_bytes += size;
     link->cursor++;
     return size;
 }
@@ -176,7 +176,7 @@ static int offer_repeat(const struct link *link, struct link_offer *out) {
     const struct link_queue *motion = &link->queues[LINK_MOTION];
     if (motion->commands)
         link_queue_peek(motion, motion->head, &head);
-    out->pressing = block->leads > 0 || head.req_clock || link->urgent;
+    out->urgent = block->leads > 0 || head.req_clock || link->urgent;
     return link_fits(link, lead_in_bytes(link) + block->length);
 }
 
@@ -208,12 +208,12 @@ void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in) {
     // A node answers each block that it has already (or that comes out of order) with its expected sequence:
     // as many naks may still come as blocks were sent, and they tell nothing about a loss after this repeat.
     // Acting on them would repeat good blocks, cause the same naks again, and so on for ever.
-    uint64_t owed = link->naks_owed + (link->cursor - link->first);
-    link->naks_owed = owed < 2UL * LINK_BLOCKS_MAX ? owed : 2UL * LINK_BLOCKS_MAX;
-    link->owed_until_ns = now + link_rto(link);
-    link->owed_until_seq = link->next;
+    uint64_t outstanding = link->naks_outstanding + (link->cursor - link->first);
+    link->naks_outstanding = outstanding < 2UL * LINK_BLOCKS_MAX ? outstanding : 2UL * LINK_BLOCKS_MAX;
+    link->outstanding_until_ns = now + link_rto(link);
+    link->outstanding_until_seq = link->next;
     link->cursor = link->first;
-    link->flying_bytes = 0;
+    link->in_flight_bytes = 0;
     link->lead_in = (uint8_t)lead_in;
 }
 

@@ -110,16 +110,17 @@ struct link {
     struct link_queue queues[LINK_CLASSES];
     struct link_block blocks[LINK_SLOTS];
     uint64_t first, cursor, next; // first unacknowledged <= next to transmit (again) <= next new block
-    uint64_t flying_bytes;        // transmitted since the last rewind and not acknowledged
-    uint64_t flying_commands;     // in blocks [first, next)
+    uint64_t in_flight_bytes;     // transmitted since the last rewind and not acknowledged
+    uint64_t in_flight_commands;  // in blocks [first, next)
     uint64_t motion_content;      // content bytes of motion commands sent so far, once each
     uint64_t progress_ns;         // last acknowledgement, or when the line began to be busy
     uint64_t heard_ns;            // last sound block
     uint64_t last_ack;            // sequence of the last empty block
-    uint64_t naks_owed, owed_until_ns, owed_until_seq; // naks that the last repeats may still cause
-    uint64_t backoff;                                  // doublings of the timeout
-    uint8_t lead_in; // sync bytes before the next transmission: 0, 1, or LINK_FLUSH
-    double clock_hz; // 0: unknown
+    uint64_t naks_outstanding, outstanding_until_ns,
+        outstanding_until_seq; // naks that the last repeats may still cause
+    uint64_t backoff;          // doublings of the timeout
+    uint8_t lead_in;           // sync bytes before the next transmission: 0, 1, or LINK_FLUSH
+    double clock_hz;           // 0: unknown
     uint64_t clock_at_ns, clock_at_ticks;
     uint8_t rx[LINK_RX_MAX];
     size_t rx_used;
@@ -179,14 +180,14 @@ int link_receive(struct link *link, const uint8_t **data, size_t *size, uint64_t
 // Acts on what time brings: repeats and the loss of the link (once: state becomes LINK_LOST, with a cause).
 void link_handle_timer(struct link *link, uint64_t now);
 
-// What a link would send next. Smaller due_ns first, pressing ones before all others.
+// What a link would send next. Smaller due_ns first, urgent ones before all others.
 struct link_offer {
-    uint64_t due_ns;  // host time by which it should go, what a repeat may take already deducted
-    uint8_t kind;     // enum link_class of its first command
-    uint8_t pressing; // motion whose due_ns has come, its repeat, or an urgent command
+    uint64_t due_ns; // host time by which it should go, what a repeat may take already deducted
+    uint8_t kind;    // enum link_class of its first command
+    uint8_t urgent;  // motion whose due_ns has come, its repeat, or an urgent command
 };
 
-// What the link would send now of the classes in the set ALLOWED (repeats and pressing motion always may go);
+// What the link would send now of the classes in the set ALLOWED (repeats and urgent motion always may go);
 // returns 0: nothing.
 int link_next_offer(const struct link *link, uint64_t now, unsigned allowed, struct link_offer *out);
 

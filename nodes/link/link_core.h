@@ -42,7 +42,7 @@ uint64_t link_partial_deadline(const struct link *link);
 
 // Whether BYTES more fit into the node's receive window.
 static inline int link_fits(const struct link *link, size_t bytes) {
-    return link->flying_bytes == 0 || link->flying_bytes + bytes <= link->settings.receive_window;
+    return link->in_flight_bytes == 0 || link->in_flight_bytes + bytes <= link->settings.receive_window;
 }
 
 // The records at the front of a queue that may go now and fit together.

@@ -86,7 +86,7 @@ static struct link_offer offer_of(const struct link *link, enum link_class kind,
     uint64_t due_ns = kind == LINK_BULK ? 0 : link_motion_due(link, head->req_clock);
     if (kind == LINK_MOTION) {
         offer.due_ns = due_ns ? due_ns : now; // nothing is known: at once, but not before what waited longer
-        offer.pressing = due_ns && due_ns <= now;
+        offer.urgent = due_ns && due_ns <= now;
         return offer;
     }
     offer.due_ns = head->queued_ns + (kind == LINK_BULK ? BULK_DUE_NS : CONTROL_DUE_NS);
@@ -94,13 +94,13 @@ static struct link_offer offer_of(const struct link *link, enum link_class kind,
         offer.due_ns = due_ns;
     if (kind == LINK_CONTROL && link->urgent) {
         offer.due_ns = 0;
-        offer.pressing = 1;
+        offer.urgent = 1;
     }
     return offer;
 }
 
 static int is_before(const struct link_offer *a, const struct link_offer *b) {
-    return a->pressing != b->pressing ? a->pressing : a->due_ns < b->due_ns;
+    return a->urgent != b->urgent ? a->urgent : a->due_ns < b->due_ns;
 }
 
 // Finds which classes have something to go now, and orders them.
@@ -120,7 +120,7 @@ static void order_classes(const struct link *link, uint64_t now, unsigned allowe
             continue;
         }
         offers[kind] = offer_of(link, kind, &head, now);
-        if (!(allowed & 1u << kind) && !offers[kind].pressing) { // motion may not be sent ahead
+        if (!(allowed & 1u << kind) && !offers[kind].urgent) { // motion may not be sent ahead
             // Motion whose time is unknown waits for the budget alone; its due_ns is now, and a plan for now
             // without a command would be an empty block.
             if (offers[kind].due_ns > now && offers[kind].due_ns < plan->at_ns)
@@ -145,9 +145,9 @@ static uint64_t hold_motion(const struct link *link, const struct link_front *fr
     link_queue_peek(motion, motion->head, &head);
     // Where there is a gate the clock is known.
     uint64_t due_ns = head.req_clock ? link_clock_to_ns(link, head.req_clock) : 0;
-    uint64_t pressing_ns = due_ns > PACK_LEAD_NS ? due_ns - PACK_LEAD_NS : 0;
+    uint64_t urgent_ns = due_ns > PACK_LEAD_NS ? due_ns - PACK_LEAD_NS : 0;
     uint64_t full_ns = filled_at(link, front);
-    return full_ns < pressing_ns ? full_ns : pressing_ns;
+    return full_ns < urgent_ns ? full_ns : urgent_ns;
 }
 
 static struct link_plan plan_allowed(const struct link *link, uint64_t now, unsigned allowed) {

@@ -52,8 +52,8 @@ static void acknowledge(struct link *link, uint64_t sequence, uint64_t now) {
     for (; link->first < sequence; link->first++) {
         const struct link_block *block = block_of(link, link->first);
         if (link->first < link->cursor)
-            link->flying_bytes -= block->wire_length;
-        link->flying_commands -= block->commands;
+            link->in_flight_bytes -= block->wire_length;
+        link->in_flight_commands -= block->commands;
         if (link->clock_hz > 0)
             for (size_t i = 0; i < block->leads; i++)
                 note_lead(link, block->req_clock[i], now);
@@ -61,16 +61,16 @@ static void acknowledge(struct link *link, uint64_t sequence, uint64_t now) {
     if (link->cursor < sequence)
         link->cursor = sequence;
     link->progress_ns = now;
-    if (sequence > link->owed_until_seq) // a block behind the repeats was answered: so were they
-        link->naks_owed = 0;
+    if (sequence > link->outstanding_until_seq) // a block behind the repeats was answered: so were they
+        link->naks_outstanding = 0;
 }
 
 static void handle_nak(struct link *link, uint64_t now) {
     link->stats.naks++;
     if (link->cursor == link->first)
         return; // the repeat is on its way already
-    if (link->naks_owed && now < link->owed_until_ns) {
-        link->naks_owed--;
+    if (link->naks_outstanding && now < link->outstanding_until_ns) {
+        link->naks_outstanding--;
         return;
     }
     link_rewind(link, now, LEAD_SYNC);
@@ -80,7 +80,7 @@ static void handle_nak(struct link *link, uint64_t now) {
 
 static void adopt(struct link *link, uint64_t sequence) {
     link->first = link->cursor = link->next = sequence;
-    link->flying_bytes = link->naks_owed = 0;
+    link->in_flight_bytes = link->naks_outstanding = 0;
 }
 
 // The first answer to an empty block tells the node's expected sequence: it was taken, or refused with that
@@ -95,7 +95,7 @@ static void handle_probe_answer(struct link *link, unsigned answer, uint64_t now
     link->state = link_following(link->state, behind == 1 ? LINK_EVENT_TAKEN : LINK_EVENT_REFUSED);
     if (link->state == LINK_RUNNING) {
         acknowledge(link, link->first + 1, now);
-        link->naks_owed = 0;
+        link->naks_outstanding = 0;
         link->last_ack = link->first;
     } else {
         adopt(link, link->first + behind);

@@ -25,7 +25,7 @@ enum {
 #define SLOT_NS (100 * NS_PER_MS)
 // An acknowledgement that is awaited for so long may be waiting for the line; a third of the least timeout. A
 // pause of a frame each time costs a line that is never idle 4 % at 500 kbit/s.
-#define BREATH_NS (7 * NS_PER_MS)
+#define PAUSE_INTERVAL_NS (7 * NS_PER_MS)
 
 static int64_t line_ns(const struct schedule *schedule, uint64_t bits) {
     return schedule->bitrate ? (int64_t)(bits * NS_PER_S / schedule->bitrate) : 0;
@@ -177,7 +177,7 @@ uint64_t schedule_room(const struct schedule *schedule, uint64_t queued) {
     return waiting < schedule->queue_frames ? schedule->queue_frames - waiting : 0;
 }
 
-int schedule_breathe(struct schedule *schedule, uint64_t since_ns) {
+int schedule_pause(struct schedule *schedule, uint64_t since_ns) {
     uint64_t now = schedule->now_ns;
     if (!schedule->bitrate || schedule->serial)
         return 0;
@@ -188,7 +188,7 @@ int schedule_breathe(struct schedule *schedule, uint64_t since_ns) {
         schedule->paused_ns = now;
     }
     uint64_t last_ns = since_ns > schedule->paused_ns ? since_ns : schedule->paused_ns;
-    if (since_ns == UINT64_MAX || now < last_ns + BREATH_NS)
+    if (since_ns == UINT64_MAX || now < last_ns + PAUSE_INTERVAL_NS)
         return 0;
     uint64_t free_ns = schedule->line_free_ns > now ? schedule->line_free_ns : now;
     schedule->pause_ns = free_ns + unit_ns(schedule);
@@ -205,15 +205,15 @@ uint64_t schedule_room_at(const struct schedule *schedule) {
 // --------------------------------------------------------------------------------------------------- order
 
 static uint64_t key_of(const struct link_offer *offer, uint64_t now) {
-    int late_alike = !offer->pressing && offer->kind != LINK_MOTION && offer->due_ns < now;
+    int late_alike = !offer->urgent && offer->kind != LINK_MOTION && offer->due_ns < now;
     return late_alike ? now : offer->due_ns;
 }
 
 // Strictly by deadline, who queued a flood first would keep the others waiting for all of it. Motion has true
 // deadlines; for the rest, overdue is overdue, and the turn goes round.
 int schedule_before(const struct link_offer *a, const struct link_offer *b, uint64_t now) {
-    if (a->pressing != b->pressing)
-        return a->pressing;
+    if (a->urgent != b->urgent)
+        return a->urgent;
     return key_of(a, now) < key_of(b, now);
 }
 

@@ -9,7 +9,7 @@
 //     while there is credit, which is capped at about one block: no bursts
 // Sending ahead below the ceiling is what keeps the nodes' acknowledgements alive: the host's frames to a
 // node win arbitration over the frames of all nodes with a higher id, and a host that never pauses is never
-// answered by those. Where motion is pressing and there are no pauses by themselves, schedule_breathe() makes
+// answered by those. Where motion is urgent and there are no pauses by themselves, schedule_pause() makes
 // them.
 //
 // Received data and motion may take all there is for ever. So that the others get through nevertheless, each
@@ -71,7 +71,7 @@ void schedule_held(struct schedule *schedule, int held);
 
 // An acknowledgement is awaited since SINCE. Returns whether the line has to be left alone now, so that
 // frames of others get through; until when tells schedule_room_at().
-int schedule_breathe(struct schedule *schedule, uint64_t since_ns);
+int schedule_pause(struct schedule *schedule, uint64_t since_ns);
 
 // How many frames wait, when QUEUED are said to sit in the kernel (UINT64_MAX: unknown).
 uint64_t schedule_queued(const struct schedule *schedule, uint64_t queued);

@@ -168,8 +168,8 @@ class LinkStats:
     """Timeout in use."""
     pending: int = 0
     """Commands queued or not acknowledged."""
-    flying_bytes: int = 0
-    flying_blocks: int = 0
+    in_flight_bytes: int = 0
+    in_flight_blocks: int = 0
     control_commands: int = 0
     control_commands_max: int = 0
     control_bytes: int = 0

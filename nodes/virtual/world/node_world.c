@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the world does to a node and reads of it: inputs, axes, clock, counters.
+// Access to a node: inputs, clock, counters.
 #include "nodes/virtual/world/parts.h"
 
-_Static_assert((int)WORLD_RATES_MAX == (int)CLOCK_PIECES_MAX, "the world tells its users");
+_Static_assert((int)WORLD_RATES_MAX == (int)CLOCK_PIECES_MAX, "the limit is part of the interface");
 
 // ------------------------------------------------------------------------------------------------- inputs
 
@@ -12,7 +12,7 @@ static void catch_up(struct world_node *node) {
 }
 
 void node_drive(struct world_node *node, uint32_t pin, uint16_t value, int adc) {
-    catch_up(node); // what was due before reads the old value
+    catch_up(node); // events due before read the old value
     if (adc) {
         node->adc_set[pin] = 1;
         node->adc[pin] = value;
@@ -48,7 +48,7 @@ int world_node_set_rate(struct world_node *node, double ppm, double ppm_per_s) {
     catch_up(node);
     if (crystal_change(&node->crystal, agenda->now_ns, ppm, ppm_per_s))
         return -1;
-    if (event_planned(&node->timer)) // it looks again when it is due
+    if (event_planned(&node->timer)) // its time is computed again when it fires
         agenda_plan(agenda, &node->timer, agenda->now_ns);
     return 0;
 }

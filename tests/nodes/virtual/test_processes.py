@@ -48,9 +48,7 @@ def test_bus_process_comes_up_and_reports(tmp_path: Path) -> None:
 def test_what_a_process_says_when_it_fails_is_passed_on(tmp_path: Path) -> None:
     (tmp_path / "bus").touch()
     bus = BusProcess(tmp_path / "bus")
-    with pytest.raises(
-        CanductorError, match=r"did not become ready: ended with status 1: .* than a socket"
-    ):
+    with pytest.raises(CanductorError, match=r"did not become ready: ended with status 1: .* than a socket"):
         bus.wait_ready()
 
 
