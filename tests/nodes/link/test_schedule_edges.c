@@ -256,8 +256,9 @@ static void deadlines_order_what_is_not_overdue(void) {
     CHECK(schedule_before(&late_motion, &later_motion, now)); // motion has true deadlines
     struct link_offer urgent = {now + 50, LINK_CONTROL, 1};   // an urgent command
     CHECK(schedule_before(&urgent, &late_motion, now) && !schedule_before(&late_motion, &urgent, now));
-    struct link_offer urgent = {now - 9, LINK_CONTROL, 1}, urgent_later = {now - 8, LINK_CONTROL, 1};
-    CHECK(schedule_before(&urgent, &urgent_later, now) && !schedule_before(&urgent_later, &urgent, now));
+    struct link_offer early_urgent = {now - 9, LINK_CONTROL, 1}, late_urgent = {now - 8, LINK_CONTROL, 1};
+    CHECK(schedule_before(&early_urgent, &late_urgent, now) &&
+          !schedule_before(&late_urgent, &early_urgent, now));
 }
 
 // -------------------------------------------------------------------------------------------------- figures
