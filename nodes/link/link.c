@@ -7,7 +7,7 @@
 
 #include "nodes/link/batch.h"
 
-#define RTO_MIN_NS (20 * NS_PER_MS)    // below, a busy host or node would cause needless repeats
+#define RTO_MIN_NS (20 * NS_PER_MS)    // with less, a busy host or node would cause needless repeats
 #define RTO_FIRST_NS (100 * NS_PER_MS) // until a round trip was measured
 
 // -------------------------------------------------------------------------------------------------- set-up
@@ -40,7 +40,7 @@ uint64_t link_clock_to_ns(const struct link *link, uint64_t ticks) {
     int ahead = ticks >= link->clock_at_ticks;
     uint64_t ticks_away = ahead ? ticks - link->clock_at_ticks : link->clock_at_ticks - ticks;
     double away_ns = (double)ticks_away / link->clock_hz * 1e9;
-    if (ahead) // rounded up: never a moment too early
+    if (ahead) // rounded up: never too early
         return away_ns < 9e18 ? link->clock_at_ns + (uint64_t)ceil(away_ns) : LINK_NEVER;
     return away_ns < (double)link->clock_at_ns ? link->clock_at_ns - (uint64_t)away_ns : 0;
 }
@@ -107,8 +107,8 @@ static int may_probe(const struct link *link) {
 }
 
 // Makes the next new block, if there is one to send. While the node's expected sequence is unknown it is
-// empty: an answer that names the next sequence cannot tell whether the block was taken or was out of order,
-// and of an empty one nothing can be lost.
+// empty: an answer with the next sequence does not show whether the block was accepted or out of order, and
+// an empty block loses nothing.
 static int make_block(struct link *link, uint64_t now, unsigned allowed) {
     struct link_plan plan = {.offer = {.kind = LINK_CONTROL}};
     if (link->state == LINK_RUNNING) {
@@ -129,7 +129,7 @@ static int make_block(struct link *link, uint64_t now, unsigned allowed) {
         (uint8_t)wire_block_finish(block->bytes, block->length, (unsigned)(link->next % LINK_SLOTS));
     link->stats.commands_sent += block->commands;
     link->in_flight_commands += block->commands;
-    if (link->first == link->next && link->state != LINK_CONFIRMING) // probing as a whole has to end in time
+    if (link->first == link->next && link->state != LINK_CONFIRMING) // all of probing has to end in time
         link->progress_ns = now;
     link->next++;
     return 1;
@@ -168,7 +168,7 @@ size_t link_next_block(struct link *link, uint64_t now, unsigned allowed, uint8_
     return size;
 }
 
-// A repeat goes at once, and before everything where motion is in it or waits behind it.
+// A repeat is sent at once, and before everything else if it contains motion or motion waits for it.
 static int offer_repeat(const struct link *link, struct link_offer *out) {
     const struct link_block *block = const_block_of(link, link->cursor);
     *out = (struct link_offer){.kind = block->kind};
@@ -206,7 +206,7 @@ uint64_t link_rto(const struct link *link) {
 
 void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in) {
     // A node answers each block that it has already (or that comes out of order) with its expected sequence:
-    // as many naks may still come as blocks were sent, and they tell nothing about a loss after this repeat.
+    // as many naks may follow as blocks were sent, and they say nothing about a loss after this repeat.
     // Acting on them would repeat good blocks, cause the same naks again, and so on for ever.
     uint64_t outstanding = link->naks_outstanding + (link->cursor - link->first);
     link->naks_outstanding = outstanding < 2UL * LINK_BLOCKS_MAX ? outstanding : 2UL * LINK_BLOCKS_MAX;
@@ -234,9 +234,9 @@ static uint64_t lost_deadline(const struct link *link) {
     return waiting ? link->progress_ns + link->settings.lost_after_ns : LINK_NEVER;
 }
 
-// This computer slept much longer than it was to (a busy host of virtual machines may do that to it): nobody
-// asked meanwhile, and what was answered may wait to be read. Only a quarter of the silence counts, so that
-// the node is asked again before it is judged.
+// This computer slept much longer than it should (possible on a busy host of virtual machines): nothing was
+// sent meanwhile, and answers may wait to be read. Only a quarter of the silence counts, so that the node is
+// queried again before it counts as lost.
 static void forgive_sleep(struct link *link, uint64_t now) {
     uint64_t lost_ns = lost_deadline(link), repeat_ns = repeat_deadline(link);
     uint64_t wake_ns = lost_ns < repeat_ns ? lost_ns : repeat_ns;

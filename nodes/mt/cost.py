@@ -10,8 +10,6 @@ from nodes.support.can_protocol import MT_CAN_ID
 
 AROUND: Final = 10
 """Number of words at the beginning and end of a transmission, which are neither values nor LIT."""
-FRAME_BITS_MAX: Final = 135
-"""Most bits of a frame with two words, stuff bits and interframe space included."""
 LOAD_MAX: Final = 0.999
 
 
