@@ -160,9 +160,9 @@ class CanBus(BusBase):
         self._pulses = loop.create_task(keeper.run())
 
     def _frame_handler(self) -> OnFrame:
-        return self._frame_came
+        return self._handle_frame
 
-    def _frame_came(self, frame: Frame) -> None:
+    def _handle_frame(self, frame: Frame) -> None:
         if self._assignment is not None:
             self._assignment.frame(frame.can_id, frame.data, _ns(asyncio.get_running_loop().time()))
         if frame.can_id == BUS_STOP_ID and len(frame.data) == 2:
