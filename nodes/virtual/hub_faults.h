@@ -44,7 +44,7 @@ struct hub_rule {
 
 struct hub_rule_counters {
     uint64_t picked; // frames
-    uint64_t hits;     // of these; of a timed rule: how often it was applied
+    uint64_t hits;   // of these; of a timed rule: how often it was applied
 };
 // cffi: end
 
