@@ -10,7 +10,7 @@ _FFI = FFI()
 
 
 def field_names(struct: Any) -> list[str]:
-    """Return the field names of a struct, or of the struct that a pointer points to."""
+    """Return the names of the fields of a struct, or of what a pointer points to."""
     kind = _FFI.typeof(struct)
     kind = kind.item if kind.kind == "pointer" else kind
     return [name for name, _ in kind.fields or ()]

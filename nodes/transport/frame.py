@@ -9,7 +9,7 @@ RECORD_SIZE = 16
 ID_MAX = 0x7FF
 DATA_MAX = 8
 BUS_OFF = 0x2000_0040
-"""Id of the kernel's error frame (CAN_ERR_FLAG | CAN_ERR_BUSOFF): the controller left the bus."""
+"""Id of the kernel's error frame (CAN_ERR_FLAG | CAN_ERR_BUSOFF): the controller took itself off the bus."""
 
 _RECORD = struct.Struct("=IB3x8s")
 
