@@ -33,9 +33,21 @@ RETIRED = {
     "Desk": "Endpoint",
     "Reactions": "Engine",
     "Scanner": "Lexer",
+    "flying_bytes": "in_flight_bytes",
+    "flying_blocks": "in_flight_blocks",
+    "flying_commands": "in_flight_commands",
+    "schedule_breathe": "schedule_pause",
+    "naks_owed": "naks_outstanding",
+    "owed_until_ns": "outstanding_until_ns",
+    "lost_told": "lost_reported",
+    "FrameLike": "Frame",
+    "ResponseLike": "Response",
+    "WAY_S": "TRANSIT_S",
+    "world_axis": "a plant",
 }
 """By the name that is refused: what to write instead."""
 SEARCHED = ("coordinator", "nodes", "canbus_tools", "tests", "bench", "docs", "README.md", "CONTRIBUTING.md")
+SUFFIXES = (".py", ".md", ".c", ".h")
 
 
 def test_retired_names_are_not_used() -> None:
@@ -47,7 +59,7 @@ def test_retired_names_are_not_used() -> None:
     found = [
         f"{path}:{number}: write {RETIRED[match[1]]} instead of {match[1]}"
         for path in listed.stdout.split("\0")
-        if path.endswith((".py", ".md")) and path != "tests/test_language.py" and "adr/" not in path
+        if path.endswith(SUFFIXES) and path != "tests/test_language.py" and "adr/" not in path
         for number, line in enumerate((ROOT / path).read_text(encoding="utf-8").splitlines(), 1)
         for match in names.finditer(line)
     ]

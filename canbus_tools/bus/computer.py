@@ -15,7 +15,7 @@ from canbus_tools.bus.frame_queue import FRAMES_MAX, FrameQueue
 from canbus_tools.bus.open_bus import BusOptions, open_bus
 from canbus_tools.protocol.frame import Frame
 from nodes.link import LinkIO
-from nodes.link.types import FrameHandler
+from nodes.link.interfaces import OnFrame
 from nodes.transport import ByteTransport, CanFrame, CanTransport, open_uart
 from nodes.transport.python_can_bridge import PythonCanBridge
 from nodes.transport.socketcan import SocketCanTransport
@@ -28,7 +28,7 @@ class StartIO(Protocol):
     """Starts the links of an open port, in the running event loop; parameters as of ``LinkIO``."""
 
     def __call__(  # noqa: D102
-        self, *, on_frame: FrameHandler | None = None, on_closed: Callable[[str], None] | None = None
+        self, *, on_frame: OnFrame | None = None, on_closed: Callable[[str], None] | None = None
     ) -> LinkIO: ...
 
 
@@ -157,9 +157,7 @@ def _open_transport(options: BusOptions) -> CanTransport:
 
 
 def _port(transport: CanTransport | ByteTransport) -> Port:
-    def start(
-        *, on_frame: FrameHandler | None = None, on_closed: Callable[[str], None] | None = None
-    ) -> LinkIO:
+    def start(*, on_frame: OnFrame | None = None, on_closed: Callable[[str], None] | None = None) -> LinkIO:
         return LinkIO(transport, asyncio.get_running_loop(), on_frame=on_frame, on_closed=on_closed)
 
     return Port(transport.name, start, transport.close)

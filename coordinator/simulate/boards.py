@@ -11,12 +11,10 @@ from coordinator.simulate.scenario import NodeSetting
 from coordinator.simulate.script import ScriptedWorld
 from coordinator.simulate.truth import BoardTruth
 from coordinator.support.toml_values import Dice
-from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
-from nodes.support._wire import ffi, lib
-from nodes.virtual.sim import SimNode
+from nodes.dictionary.dictionary import Dictionary
+from nodes.virtual._sim import ffi, lib
 from nodes.virtual.world import CanWire, Latency, NodeSettings, Uart, WorldNode
 
-PIECE: Final = 40
 PS_PER_NS: Final = 1000
 
 EXTENSIONS: Final = frozenset(
@@ -121,7 +119,9 @@ def dictionary_blob(clock_hz: int, legacy: bool) -> bytes:
     LEGACY: as of firmware that does not have this project's extensions.
     """
     if not clock_hz and not legacy:
-        return _download()
+        size = ffi.new("uint32_t *")
+        found = lib.sim_dictionary(size)
+        return bytes(ffi.buffer(found, size[0]))
     words = json.loads(zlib.decompress(dictionary_blob(0, legacy=False)))
     if clock_hz:
         words["config"]["CLOCK_FREQ"] = clock_hz
@@ -134,22 +134,3 @@ def dictionary_blob(clock_hz: int, legacy: bool) -> bytes:
 @lru_cache
 def _parsed(blob: bytes) -> Dictionary:
     return Dictionary.parse(blob)
-
-
-def _download() -> bytes:
-    """Ask a board for its dictionary."""
-    node, data, sequence = SimNode(transport="uart"), b"", 0
-    node.take_bytes()
-    while True:
-        content = BOOTSTRAP.encode("identify", offset=len(data), count=PIECE)
-        block = ffi.new("uint8_t[]", lib.WIRE_BLOCK_MAX)
-        ffi.memmove(ffi.addressof(block, lib.WIRE_HEADER), content, len(content))
-        node.receive_bytes(bytes(ffi.buffer(block, lib.wire_block_finish(block, len(content), sequence))))
-        sequence += 1
-        answer = node.take_bytes()
-        content = answer[lib.WIRE_HEADER : answer[0] - lib.WIRE_TRAILER]
-        message = BOOTSTRAP.decode(content)
-        piece = b"" if message is None else message.data("data")
-        if not piece:
-            return data
-        data += piece

@@ -2,17 +2,14 @@
 
 import asyncio
 from collections.abc import Callable
-from typing import Final
 
 from nodes.dictionary.cache import DictionaryCache
 from nodes.link import LinkSettings
-from nodes.link.interfaces import FrameLike, IoFactory, LinkInterface, LinkIoInterface, OnLost, OnResponses
+from nodes.link.interfaces import IoFactory, LinkInterface, LinkIoInterface, OnFrame, OnLost, OnResponses
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeLost
 from nodes.node.node import Node, OnClock, OnState
 from nodes.support.errors import CanductorError
-
-LOST_AFTER_S: Final = 1.0
 
 
 def ignore(*_: object) -> None:
@@ -24,7 +21,6 @@ class BusBase:
 
     START_IO opens the transport; it is called again when a closed bus is reopened. The nodes share CACHE for
     their dictionaries. ON_NOTICE gets sentences about what the user should fix.
-    A node that acknowledges nothing for LOST_AFTER_S is lost.
     """
 
     def __init__(
@@ -34,7 +30,6 @@ class BusBase:
         *,
         cache: DictionaryCache | None = None,
         on_notice: Callable[[str], None] = ignore,
-        lost_after_s: float = LOST_AFTER_S,
     ) -> None:
         self.name = name
         self.nodes: list[Node] = []
@@ -42,7 +37,6 @@ class BusBase:
         self._start_io = start_io
         self._cache = cache if cache is not None else DictionaryCache()
         self._on_notice = on_notice
-        self.lost_after_s = lost_after_s
         self._may_be_absent: set[Node] = set()
         self._io: LinkIoInterface | None = None
 
@@ -127,7 +121,7 @@ class BusBase:
     def _node_started(self, node: Node) -> None:
         pass
 
-    def _frame_handler(self) -> Callable[[FrameLike], None] | None:
+    def _frame_handler(self) -> OnFrame | None:
         return None
 
     def _io_closed(self, cause: str) -> None:
@@ -178,7 +172,7 @@ class _UartConnector:
 
     async def connect(self, on_responses: OnResponses, on_lost: OnLost) -> LinkInterface:
         return self._bus.io.open_link(
-            LinkSettings(None, lost_after_s=self._bus.lost_after_s),
+            LinkSettings(None),
             on_responses=on_responses,
             on_lost=on_lost,
         )

@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from nodes.bus.assign import Assignment, IdAssignment, Uuid, number_nodes, waiting_uuid
-from nodes.bus.bus import LOST_AFTER_S, BusBase, ignore
+from nodes.bus.bus import BusBase, ignore
 from nodes.clock.clock import HostTime
 from nodes.clock.sync_pulse import CONSTANT, PulseKeeper
 from nodes.clock.wire_time import can_wire_ns
 from nodes.dictionary.cache import DictionaryCache
 from nodes.dictionary.vocabulary import KNOWS_BUS_STOP
-from nodes.link import LinkSettings
-from nodes.link.interfaces import FrameLike, IoFactory, LinkInterface, OnLost, OnResponses
+from nodes.link import Frame, LinkSettings
+from nodes.link.interfaces import IoFactory, LinkInterface, OnFrame, OnLost, OnResponses
 from nodes.node.connector import BuildConfig
 from nodes.node.errors import NodeError, NodeLost
 from nodes.node.node import Node, OnClock, OnState
@@ -37,9 +37,8 @@ class CanBus(BusBase):
         *,
         cache: DictionaryCache | None = None,
         on_notice: Callable[[str], None] = ignore,
-        lost_after_s: float = LOST_AFTER_S,
     ) -> None:
-        super().__init__(name, start_io, cache=cache, on_notice=on_notice, lost_after_s=lost_after_s)
+        super().__init__(name, start_io, cache=cache, on_notice=on_notice)
         self._nodeids: dict[Uuid, int] = {}
         self._by_uuid: dict[Uuid, Node] = {}
         self._connectors: list[_CanConnector] = []
@@ -159,10 +158,10 @@ class CanBus(BusBase):
         # From the start, so that the clocks agree when the nodes are ready.
         self._pulses = loop.create_task(keeper.run())
 
-    def _frame_handler(self) -> Callable[[FrameLike], None]:
-        return self._frame_came
+    def _frame_handler(self) -> OnFrame:
+        return self._handle_frame
 
-    def _frame_came(self, frame: FrameLike) -> None:
+    def _handle_frame(self, frame: Frame) -> None:
         if self._assignment is not None:
             self._assignment.frame(frame.can_id, frame.data, _ns(asyncio.get_running_loop().time()))
         if frame.can_id == BUS_STOP_ID and len(frame.data) == 2:
@@ -222,7 +221,7 @@ class _CanConnector:
         if self.assignment is None:
             self.assignment = await self._bus.assign([self._uuid])
         self.assignment.check_node(self._uuid, self._bus.name)
-        settings = LinkSettings(self._bus.nodeid(self._uuid), lost_after_s=self._bus.lost_after_s)
+        settings = LinkSettings(self._bus.nodeid(self._uuid))
         return self._bus.io.open_link(settings, on_responses=on_responses, on_lost=on_lost)
 
     def wire_ns(self, content_bytes: int, bitrate: int, *, answer: bool) -> int:

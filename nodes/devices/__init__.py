@@ -1,1 +1,1 @@
-"""What a node carries, as the host drives it."""
+"""Devices that a node carries, as the host configures and uses them."""

@@ -4,16 +4,15 @@ from typing import Final
 
 from nodes.devices.timed_output import TimedOutput
 from nodes.node.config import NodeConfig
-from nodes.node.errors import NodeError
 from nodes.node.node import Node
 
 COMMANDS: Final = ("config_digital_out", "queue_digital_out", "update_digital_out")
 
 
 class DigitalOut(TimedOutput):
-    """The output for NAME on PIN; INVERT: on is low. It begins with START; SHUTDOWN is for a node that stops.
+    """The output for NAME on PIN; INVERT: on is low. It begins with START and has SHUTDOWN after a shutdown.
 
-    See timed_output.py for MAX_DURATION_S.
+    MAX_DURATION_S: see timed_output.py.
     """
 
     command = "queue_digital_out"
@@ -36,24 +35,20 @@ class DigitalOut(TimedOutput):
 
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when firmware or pin do not allow it."""
-        config.require(f"the output of {self.name}", COMMANDS)
-        self.oid = config.create_oid()
-        config.timed_outputs += 1
+        self._add_to(config, COMMANDS)
         config.add_config(
             self.name,
             f"config_digital_out oid={self.oid} pin={self._pin} value={self._level(self._start)}"
             f" default_value={self._level(self._shutdown)} max_duration={self._duration_ticks(config)}",
         )
 
-    def set(self, node: "Node", clock: int, on: bool) -> None:
-        """Switch it at CLOCK (64 bits, ahead of now by the way to the node)."""
+    def set(self, node: Node, clock: int, on: bool) -> None:
+        """Switch it at CLOCK (64 bits, later than now by the transit time to the node)."""
         self._queue(node, clock, self._level(on))
 
-    def set_now(self, node: "Node", on: bool) -> None:
-        """Switch it when the command arrives; not while a value of ``set`` is still to come."""
-        if self.oid is None:
-            raise NodeError(f"the output of {self.name} is not configured on any node")
-        node.send("update_digital_out", oid=self.oid, value=self._level(on))
+    def set_now(self, node: Node, on: bool) -> None:
+        """Switch it when the command arrives; not while a value of ``set`` is pending."""
+        node.send("update_digital_out", oid=self._oid, value=self._level(on))
 
     def _level(self, on: bool) -> int:
         return int(on != self._invert)

@@ -1,4 +1,4 @@
-"""Pulse-width modulated outputs on a node: by its hardware, or by its software on any pin."""
+"""Pulse-width modulated outputs on a node: in its hardware, or in its software on any pin."""
 
 from typing import Final
 
@@ -10,14 +10,14 @@ from nodes.node.node import Node
 HARDWARE_COMMANDS: Final = ("config_pwm_out", "queue_pwm_out")
 SOFTWARE_COMMANDS: Final = ("config_digital_out", "set_digital_out_pwm_cycle", "queue_digital_out")
 SOFTWARE_FASTEST_S: Final = 0.001
-"""A shorter cycle in software would keep the node from its steps."""
+"""A shorter cycle in software would delay the node's steps."""
 
 
 class PwmOut(TimedOutput):
-    """The output for NAME on PIN; values are 0..1 of the time on, INVERT: on is low.
+    """The output for NAME on PIN; values are the ratio of the time on, 0..1; INVERT: on is low.
 
-    It begins with START and has SHUTDOWN when its node shuts down; in software and with a safety net those
-    are 0 or 1. See timed_output.py for MAX_DURATION_S.
+    It begins with START and has SHUTDOWN after a shutdown of its node; in software both must be 0 or 1.
+    MAX_DURATION_S: see timed_output.py.
     """
 
     def __init__(
@@ -39,21 +39,15 @@ class PwmOut(TimedOutput):
         self._invert = invert
         self._start, self._shutdown = start, shutdown
         self._full = 1
-        """The node's number for always on."""
+        """The node's value for always on."""
 
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when firmware or pin do not allow it."""
-        config.require(f"the output of {self.name}", self._commands)
-        self.oid = config.create_oid()
-        config.timed_outputs += 1
+        self._add_to(config, HARDWARE_COMMANDS if self._hardware else SOFTWARE_COMMANDS)
         if self._hardware:
             self._configure_hardware(config)
         else:
             self._configure_software(config)
-
-    @property
-    def _commands(self) -> tuple[str, ...]:
-        return HARDWARE_COMMANDS if self._hardware else SOFTWARE_COMMANDS
 
     def _configure_hardware(self, config: NodeConfig) -> None:
         self.command, self.value_parameter = "queue_pwm_out", "value"
@@ -62,7 +56,7 @@ class PwmOut(TimedOutput):
             self.name,
             f"config_pwm_out oid={self.oid} pin={self._pin}"
             f" cycle_ticks={ticks_for(config, self.name, self._cycle_s)}"
-            f" value={self._number(self._start)} default_value={self._number(self._shutdown)}"
+            f" value={self._scaled(self._start)} default_value={self._scaled(self._shutdown)}"
             f" max_duration={self._duration_ticks(config)}",
         )
 
@@ -85,11 +79,11 @@ class PwmOut(TimedOutput):
         )
         config.add_config(self.name, f"set_digital_out_pwm_cycle oid={self.oid} cycle_ticks={self._full}")
 
-    def set(self, node: "Node", clock: int, value: float) -> None:
-        """Have VALUE, 0..1, from CLOCK on (64 bits, ahead of now by the way to the node)."""
-        self._queue(node, clock, self._number(value))
+    def set(self, node: Node, clock: int, value: float) -> None:
+        """Set VALUE, 0..1, at CLOCK (64 bits, later than now by the transit time to the node)."""
+        self._queue(node, clock, self._scaled(value))
 
-    def _number(self, value: float) -> int:
+    def _scaled(self, value: float) -> int:
         value = min(max(value, 0.0), 1.0)
         return round((1 - value if self._invert else value) * self._full)
 

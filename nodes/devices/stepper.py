@@ -1,10 +1,10 @@
-"""A stepper motor on a node: its configuration, and where it stands."""
+"""A stepper motor on a node: its configuration and its position."""
 
 import math
 from typing import Final
 
+from nodes.devices.device import Device
 from nodes.node.config import NodeConfig, NodeConfigError
-from nodes.node.errors import NodeError
 from nodes.node.node import Node
 
 BOTH_EDGE_CONSTANTS: Final = ("STEPPER_BOTH_EDGE", "STEPPER_STEP_BOTH_EDGE")
@@ -17,11 +17,11 @@ COMMANDS: Final = (
 )
 
 
-class Stepper:
+class Stepper(Device):
     """Stepper NAME, on the pins of its node.
 
-    INVERT_STEP: a step is a falling edge. STEP_PULSE_S is how long the driver needs the step pin held, in s;
-    0 stands for a driver that is set to step on both edges, which needs no pulses.
+    INVERT_STEP: a step is a falling edge. STEP_PULSE_S: least duration of a step pulse for the driver; 0: a
+    driver that is set to step on both edges, which needs no pulses.
     """
 
     def __init__(
@@ -33,11 +33,10 @@ class Stepper:
         invert_step: bool = False,
         step_pulse_s: float = 2e-6,
     ) -> None:
+        super().__init__(f"stepper {name}")
         self.name = name
-        self.oid: int | None = None
-        """Its object id; known when its node's configuration is built."""
         self.queue_step_id = self.set_next_step_dir_id = self.reset_step_clock_id = 0
-        """Ids of the commands that move it, for the step compressor; from its node's dictionary."""
+        """Ids of the commands that move it, from its node's dictionary, for the step compressor."""
         self._step_pin = step_pin
         self._dir_pin = dir_pin
         self._invert_step = invert_step
@@ -45,7 +44,7 @@ class Stepper:
 
     @property
     def steps_on_both_edges(self) -> bool:
-        """Whether every change of the step pin is a step."""
+        """Return whether every change of the step pin is a step."""
         return self._step_pulse_s == 0
 
     def configure(self, config: NodeConfig) -> None:
@@ -70,9 +69,7 @@ class Stepper:
             f"invert_step={invert} step_pulse_ticks={pulse_ticks}",
         )
 
-    async def position(self, node: "Node") -> int:
-        """Ask NODE how many steps the stepper stands from where it began, as the node counts them."""
-        if self.oid is None:
-            raise NodeError(f"stepper {self.name} is not configured on any node")
-        answer = await node.query("stepper_get_position", "stepper_position", oid=self.oid)
+    async def position(self, node: Node) -> int:
+        """Query NODE for the stepper's position, in steps from where it began, as the node counts them."""
+        answer = await node.query("stepper_get_position", "stepper_position", oid=self._oid)
         return answer.integer("pos")

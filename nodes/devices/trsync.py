@@ -1,62 +1,61 @@
-"""Stop groups on a node (trsync): what has to stop when something triggers, anywhere on the machine."""
+"""Stop groups on a node (trsync): steppers that stop when a trigger occurs anywhere on the machine."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
+from nodes.devices.device import Device
 from nodes.dictionary.message_format import Message
 from nodes.node.config import NodeConfig
-from nodes.node.errors import NodeError
 from nodes.node.node import Node
 
 COMMANDS: Final = ("config_trsync", "trsync_start", "trsync_set_timeout", "trsync_trigger")
 GROUPS_CONSTANT: Final = "CAN_TRIGGER_GROUPS"
-"""Of the dictionary: how many trigger groups the firmware knows; 0 on others' firmware."""
+"""Constant of the dictionary: number of trigger groups of the firmware; other firmware has none."""
 NO_GROUP: Final = 255
 
 
 class TriggerReason(IntEnum):
-    """Why a stop group triggered; what the host hands out, the node only repeats."""
+    """Why a stop group triggered: defined by the host, which sends it to the node."""
 
     NONE = 0
     ENDSTOP = 1
-    """The endstop switched, here or on another node of the trigger group."""
+    """The endstop switched, on this or another node of the trigger group."""
     HOST = 2
-    """The host relayed another node's trigger, or ended the round."""
+    """The host relayed another node's trigger, or ended the homing move."""
     TIMEOUT = 3
-    """Nobody renewed the time-out: host and node had lost each other."""
+    """The timeout was not renewed: host and node had lost contact."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrsyncState:
-    """What a stop group reports."""
+    """State of a stop group, as its node reports it."""
 
     armed: bool
     reason: TriggerReason
     clock32: int
-    """When it triggered, or when it reported."""
+    """The node's clock when it triggered or, before that, when it reported."""
 
 
-class Trsync:
-    """One stop group; its name in messages is that of what it is FOR."""
+class Trsync(Device):
+    """The stop group for PURPOSE, such as "homing on node mcu"."""
 
     def __init__(self, purpose: str) -> None:
-        self.purpose = purpose
-        self.oid: int | None = None
-        """Its object id; known when its node's configuration is built."""
+        super().__init__(f"the stop group for {purpose}")
+        self._purpose = purpose
         self.groups = 0
-        """How many trigger groups its node knows."""
+        """Number of trigger groups that its node supports."""
 
     def configure(self, config: NodeConfig) -> None:
         """Add it to its node's CONFIG; NodeConfigError when the firmware has no stop groups."""
-        config.require(self.purpose, COMMANDS)
+        config.require(self._purpose, COMMANDS)
         self.groups = config.dictionary.int_constant(GROUPS_CONSTANT, 0)
         self.oid = config.create_oid()
-        config.add_config(self.purpose, f"config_trsync oid={self.oid}")
+        config.add_config(self._purpose, f"config_trsync oid={self.oid}")
 
-    def start(self, node: "Node", *, report_clock: int, report_ticks: int, timeout_clock: int) -> None:
-        """Arm it: reports come every REPORT_TICKS from REPORT_CLOCK on, and it triggers at TIMEOUT_CLOCK."""
+    def start(self, node: Node, *, report_clock: int, report_ticks: int, timeout_clock: int) -> None:
+        """Arm it: it reports every REPORT_TICKS from REPORT_CLOCK on, and triggers at TIMEOUT_CLOCK."""
         node.send(
             "trsync_start",
             oid=self._oid,
@@ -66,42 +65,36 @@ class Trsync:
         )
         self.renew(node, timeout_clock)
 
-    def renew(self, node: "Node", timeout_clock: int) -> None:
-        """Put its time-out off to TIMEOUT_CLOCK (64 or 32 bits, less than 2^31 ticks away)."""
+    def renew(self, node: Node, timeout_clock: int) -> None:
+        """Postpone its timeout to TIMEOUT_CLOCK (64 or 32 bits, less than 2^31 ticks away)."""
         node.send("trsync_set_timeout", oid=self._oid, clock=timeout_clock % 2**32)
 
-    def join(self, node: "Node", group: int) -> None:
-        """Let it trigger with all others of GROUP on its bus; NO_GROUP: alone. See ``groups``."""
+    def join(self, node: Node, group: int) -> None:
+        """Make it trigger with all others of GROUP on its bus; NO_GROUP: alone. See ``groups``."""
         node.send("trsync_set_group", oid=self._oid, group=group)
 
-    def stop_on_trigger(self, node: "Node", stepper_oid: int) -> None:
-        """Have a stepper of NODE stop when it triggers; after ``start``."""
+    def stop_on_trigger(self, node: Node, stepper_oid: int) -> None:
+        """Stop a stepper of NODE when it triggers; call it after ``start``."""
         node.send("stepper_stop_on_trigger", oid=stepper_oid, trsync_oid=self._oid)
 
-    def trigger_now(self, node: "Node") -> None:
-        """Trigger it ahead of all that is queued for NODE; what is queued and unsent is dropped."""
+    def trigger_now(self, node: Node) -> None:
+        """Trigger it ahead of everything queued for NODE; what is queued and unsent is dropped."""
         content = node.dictionary.encode("trsync_trigger", oid=self._oid, reason=int(TriggerReason.HOST))
         node.link.send_urgent(content)
 
-    async def finish(self, node: "Node") -> TrsyncState:
-        """End the round and return how it ended; triggers it when nothing did."""
+    async def finish(self, node: Node) -> TrsyncState:
+        """End the homing move and return how it ended; trigger it unless it has triggered."""
         while True:
             answer = await node.query(
                 "trsync_trigger", "trsync_state", oid=self._oid, reason=int(TriggerReason.HOST)
             )
-            # A report of before the end, held up by a repeated block, looks like the answer.
+            # An earlier report, delayed by a repeated block, looks like the answer.
             if not (state := _state(answer)).armed:
                 return state
 
-    def listen(self, node: "Node", on_state: Callable[[TrsyncState], None]) -> Callable[[], None]:
-        """Call ON_STATE for every report; returns what ends that."""
+    def listen(self, node: Node, on_state: Callable[[TrsyncState], None]) -> Callable[[], None]:
+        """Call ON_STATE for every report; return a function that ends it."""
         return node.on("trsync_state", self._oid, lambda message: on_state(_state(message)))
-
-    @property
-    def _oid(self) -> int:
-        if self.oid is None:
-            raise NodeError(f"the stop group for {self.purpose} is not configured on any node")
-        return self.oid
 
 
 _REASONS: Final = frozenset(map(int, TriggerReason))

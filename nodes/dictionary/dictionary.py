@@ -135,12 +135,6 @@ class Dictionary:
             _, _, param = param.partition("_")
         return None
 
-    def enum_value(self, enumeration: str, name: str) -> int:
-        """Return the value of NAME; MessageError names the enumeration when it has no such name."""
-        if enumeration not in self.enumerations:
-            raise MessageError(f"the node's firmware ({self.version}) has no enumeration {enumeration!r}")
-        return self.enumerations[enumeration].value_of(name)
-
     def enum_name(self, enumeration: str, value: int) -> str:
         """Return the name of VALUE, or ``?VALUE`` when the enumeration does not know it."""
         known = self.enumerations.get(enumeration)
@@ -191,11 +185,8 @@ class Dictionary:
         """Return the format of the command at AT of CONTENT and the offset of its parameters, or None."""
         return _format_at(self._commands_by_prefix, self._commands_by_id, content, at)
 
-    def decode_commands(self, content: bytes, *, as_sent: bool = False) -> list[Message] | None:
-        """Decode all commands of a block; None when any of them is unknown or cut short.
-
-        AS_SENT: decode with ``MessageFormat.decode_as_sent``, so that ``encode_commands`` restores CONTENT.
-        """
+    def decode_commands(self, content: bytes) -> list[Message] | None:
+        """Decode all commands of a block; None when any of them is unknown or cut short."""
         messages: list[Message] = []
         at = 0
         while at < len(content):
@@ -203,16 +194,12 @@ class Dictionary:
             if found is None:
                 return None
             command, start = found
-            decoded = (command.decode_as_sent if as_sent else command.decode)(content, start)
+            decoded = command.decode(content, start)
             if decoded is None:
                 return None
             messages.append(decoded[0])
             at = decoded[1]
         return messages
-
-    def encode_commands(self, messages: list[Message]) -> bytes:
-        """Encode commands that ``decode_commands(…, as_sent=True)`` returned."""
-        return b"".join(self.command(message.name).encode_as_sent(message) for message in messages)
 
 
 def encode_values(dictionary: Dictionary, command: MessageFormat, values: Mapping[str, Value | str]) -> bytes:

@@ -211,56 +211,6 @@ class MessageFormat:
                 values[i] = content[at : at + values[i]]
         return values, cursor[0] - held
 
-    # ------------------------------------------------------------------------------------- numbers as sent
-
-    def decode_as_sent(self, data: bytes, start: int) -> tuple[Message, int] | None:
-        """Decode like ``decode``, but distinguish numbers that a node reads as the same 32 bits.
-
-        Hosts send a clock in its 64-bit form, of which 35 bits reach the wire, and -1 as ``7f`` or as 2^32-1
-        in five bytes. For comparing recordings: ``encode_as_sent`` restores the same bytes.
-        """
-        values: list[Value] = []
-        at = start
-        for code in self.codes:
-            number = vlq_read(data, at)
-            if number is None:
-                return None
-            value, behind = number
-            if code.wire_type == lib.WIRE_BYTES:
-                if value > len(data) - behind:
-                    return None
-                values.append(data[behind : behind + value])
-                at = behind + value
-                continue
-            values.append(_number_as_sent(value, data[at:behind]))
-            at = behind
-        return Message(self.name, dict(zip(self.names, values, strict=True))), at
-
-    def encode_as_sent(self, message: Message) -> bytes:
-        """Encode the result of ``decode_as_sent``."""
-        out = self.prefix
-        for value in message.params.values():
-            out += vlq(len(value)) + value if isinstance(value, bytes) else _vlq_as_sent(value)
-        return out
-
-
-_FIVE_BYTES: Final = 5
-_HIGH_GROUP_SHIFT: Final = 4  # bits 28..31 are the low half of a five-byte number's first group
-
-
-def _number_as_sent(value: int, encoded: bytes) -> int:
-    if len(encoded) < _FIVE_BYTES:
-        return value - (1 << 32) if value >> 31 else value
-    return value | (encoded[0] & 0x7F) >> _HIGH_GROUP_SHIFT << 32
-
-
-def _vlq_as_sent(value: int) -> bytes:
-    if value <= _BITS32:
-        return vlq(value)
-    low = vlq(value & _BITS32 | 1 << 31)  # five bytes whatever the low bits are
-    first = low[0] & ~0x0F | value >> 28 & 0x0F | value >> 32 << _HIGH_GROUP_SHIFT
-    return bytes((first,)) + low[1:]
-
 
 def vlq(value: int) -> bytes:
     """Encode one number (-2^31..2^32-1) in the form of its sign."""

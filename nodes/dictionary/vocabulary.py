@@ -36,11 +36,9 @@ def check_vocabulary(dictionary: Dictionary) -> None:
         found = dictionary.commands.get(name)
         if found is None or found.names != params:
             raise _unusable(dictionary, "command", name, params)
-    for name, params in REQUIRED_RESPONSES.items():
+    optional = {name: p for name, p in OPTIONAL_RESPONSES.items() if name in dictionary.responses}
+    for name, params in (REQUIRED_RESPONSES | optional).items():
         if name not in dictionary.responses or not _carries(dictionary, name, params):
-            raise _unusable(dictionary, "response", name, params)
-    for name, params in OPTIONAL_RESPONSES.items():
-        if name in dictionary.responses and not _carries(dictionary, name, params):
             raise _unusable(dictionary, "response", name, params)
     _ = dictionary.clock_freq_hz, dictionary.receive_window, dictionary.int_constant("STATS_SUMSQ_BASE", 256)
 

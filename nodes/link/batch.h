@@ -1,19 +1,22 @@
 // SPDX-License-Identifier: Apache-2.0
-// Batches of timed commands: how motion hands a node's commands to the link without Python touching each.
+// Batches of timed commands: motion passes a node's commands to the link in one call from Python.
 //
-// A batch is a byte string of records, one behind the other, in the order in which the node must receive
-// them:
+// A batch is a byte string of records, in the order in which the node must receive them:
 //     <u64 min_clock> <u64 req_clock> <u8 size> <size bytes: one encoded command>
 // in the host's byte order, unaligned. Clocks are the node's ticks in 64 bits. min_clock: the node's queue
-// has no room before; do not send earlier (0: at once). req_clock: when the command is due; queues are
-// ordered by it.
+// has no room before; the command is not sent earlier (0: at once). req_clock: when the command is due;
+// queues are ordered by it.
 #ifndef LINK_BATCH_H
 #define LINK_BATCH_H
 
 #include <stdint.h>
 #include <string.h>
 
-enum { BATCH_REQ_CLOCK = 8, BATCH_SIZE = 16, BATCH_HEADER = 17 }; // where they begin; the payload behind
+enum {
+    BATCH_REQ_CLOCK = 8,
+    BATCH_SIZE = 16,
+    BATCH_HEADER = 17
+}; // offsets of the fields; the payload follows
 
 struct batch_record {
     uint64_t min_clock, req_clock;
@@ -21,8 +24,8 @@ struct batch_record {
     const uint8_t *payload;
 };
 
-// Reads the record at AT, which has ROOM bytes behind it. Returns its whole length, or 0 when it is cut
-// short.
+// Reads the record at AT, where ROOM bytes are available. Returns its total length, or 0 when it is
+// incomplete.
 static inline size_t batch_read(const uint8_t *at, size_t room, struct batch_record *out) {
     if (room < BATCH_HEADER || room - BATCH_HEADER < at[BATCH_SIZE])
         return 0;
@@ -33,7 +36,7 @@ static inline size_t batch_read(const uint8_t *at, size_t room, struct batch_rec
     return (size_t)BATCH_HEADER + out->size;
 }
 
-// Writes a record whose PAYLOAD is SIZE bytes; the caller saw to the room. Returns its whole length.
+// Writes a record whose PAYLOAD is SIZE bytes; the caller provides the room. Returns its total length.
 static inline size_t batch_write(uint8_t *at, uint64_t min_clock, uint64_t req_clock, const uint8_t *payload,
                                  uint8_t size) {
     memcpy(at, &min_clock, sizeof min_clock);

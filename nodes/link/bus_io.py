@@ -4,7 +4,8 @@ import asyncio
 from typing import Any, Self
 
 from nodes.link.handle import BusHandle
-from nodes.link.link import Link, ResponsesHandler, TextHandler
+from nodes.link.interfaces import OnFrame, OnLost, OnResponses
+from nodes.link.link import Link
 from nodes.link.thread_driver import ThreadDriver
 from nodes.link.types import (
     BusDriver,
@@ -12,7 +13,6 @@ from nodes.link.types import (
     BusSettings,
     Forecast,
     Frame,
-    FrameHandler,
     IOStats,
     LinkError,
     LinkSettings,
@@ -41,8 +41,8 @@ class LinkIO:
         transport: LinkTransport,
         loop: asyncio.AbstractEventLoop,
         *,
-        on_frame: FrameHandler | None = None,
-        on_closed: TextHandler | None = None,
+        on_frame: OnFrame | None = None,
+        on_closed: OnLost | None = None,
         settings: BusSettings | None = None,
     ) -> None:
         if settings is None:
@@ -56,17 +56,15 @@ class LinkIO:
         cls,
         driver: BusDriver,
         *,
-        on_frame: FrameHandler | None = None,
-        on_closed: TextHandler | None = None,
+        on_frame: OnFrame | None = None,
+        on_closed: OnLost | None = None,
     ) -> Self:
         """Use the bus of DRIVER, and close it with this object."""
         io = cls.__new__(cls)
         io._attach(driver, on_frame, on_closed)  # noqa: SLF001
         return io
 
-    def _attach(
-        self, driver: BusDriver, on_frame: FrameHandler | None, on_closed: TextHandler | None
-    ) -> None:
+    def _attach(self, driver: BusDriver, on_frame: OnFrame | None, on_closed: OnLost | None) -> None:
         self._serial = driver.serial
         self._on_frame = on_frame
         self._on_closed = on_closed
@@ -82,9 +80,7 @@ class LinkIO:
         """The transport's name."""
         return self._bus.name
 
-    def open_link(
-        self, settings: LinkSettings, *, on_responses: ResponsesHandler, on_lost: TextHandler
-    ) -> Link:
+    def open_link(self, settings: LinkSettings, *, on_responses: OnResponses, on_lost: OnLost) -> Link:
         """Add a node's link to the bus.
 
         ON_RESPONSES gets what arrived since its last call, in order; ON_LOST one sentence, once, after which

@@ -6,32 +6,11 @@
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from nodes.link import BusLoad, Forecast, IOStats, LinkSettings
+from nodes.link.types import BusLoad, Forecast, Frame, IOStats, LinkSettings, Response
 
-
-class ResponseLike(Protocol):
-    """One message from a node. Times are HostTime; sent_ns 0: not known which transmission it answers."""
-
-    @property
-    def content(self) -> bytes: ...  # noqa: D102
-    @property
-    def sent_ns(self) -> int: ...  # noqa: D102
-    @property
-    def received_ns(self) -> int: ...  # noqa: D102
-
-
-class FrameLike(Protocol):
-    """A CAN frame that belongs to no link."""
-
-    @property
-    def can_id(self) -> int: ...  # noqa: D102
-    @property
-    def data(self) -> bytes: ...  # noqa: D102
-
-
-OnResponses = Callable[[Sequence[ResponseLike]], None]
+OnResponses = Callable[[Sequence[Response]], None]
 OnLost = Callable[[str], None]
-OnFrame = Callable[[FrameLike], None]
+OnFrame = Callable[[Frame], None]
 
 
 class LinkInterface(Protocol):

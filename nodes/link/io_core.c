@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Life of a bus's core, its timers, and what waits for Python.
+// Creation and end of a bus's core, its timers, and events for Python.
 #include "nodes/link/io_core.h"
 
 #include <stdlib.h>
@@ -97,7 +97,7 @@ void io_handle_time(struct io_bus *bus, uint64_t now) {
         link_handle_timer(&node->link, now);
         node->changed |= node->link.stats.timeouts != timeouts;
     }
-    if (bus->hold_ns <= now) // io_next() follows, or the driver waits for something else
+    if (bus->hold_ns <= now) // io_next() follows, or the driver waits for another event
         bus->hold_ns = UINT64_MAX;
     io_publish(bus);
     io_note_states(bus);
@@ -137,8 +137,8 @@ void io_push(struct io_bus *bus, struct io_ring *ring, const struct io_event *ev
 void io_note_states(struct io_bus *bus) {
     for (size_t i = 0; i < bus->link_count; i++) {
         struct io_link *node = bus->links[i];
-        if (node->link.state == LINK_LOST && !node->lost_told) {
-            node->lost_told = node->lost_pending = 1;
+        if (node->link.state == LINK_LOST && !node->lost_reported) {
+            node->lost_reported = node->lost_pending = 1;
             io_notify(bus);
         }
         if (node->watch_drained && link_pending(&node->link) == 0) {
@@ -158,7 +158,7 @@ static size_t take_ring(struct io_ring *ring, struct io_event *out, size_t room)
     return taken;
 }
 
-// Moves what is pending out as an event, if there is room; returns how many events that makes.
+// Moves a pending notice to OUT, if there is room; returns the number of events.
 static size_t take_notice(uint8_t *pending, struct io_event *out, size_t room, struct io_event event) {
     if (!*pending || room == 0)
         return 0;

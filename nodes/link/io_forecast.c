@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
-// Whether queued motion will be in time. Each link keeps its motion queue as a short list of segments: what
-// is due when, in the node's own ticks, by position in the queue, so that nothing has to be undone when
-// commands are sent or the clock is estimated anew. A forecast puts the segments of all links into bins of
-// host time and lets the bus serve them in the order in which they are due.
+// Forecasts whether queued motion will be in time. Each link describes its motion queue by a short list of
+// segments: due times in the node's own ticks by position in the queue, so that nothing has to be changed
+// when commands are sent or the clock is estimated again. A forecast puts the segments of all links into bins
+// of host time and lets the bus serve them in the order in which they are due.
 #include <string.h>
 
 #include "nodes/link/batch.h"
 #include "nodes/link/io_bus.h"
 #include "nodes/link/link_core.h"
 
-#define BIN_NS 10000000ULL // short against a look-ahead, long against a block
+#define BIN_NS 10000000ULL // short compared with the look-ahead, long compared with a block
 #define SEGMENT_S 0.005
 
 enum {
@@ -91,7 +91,7 @@ static void fill_bins(struct io_bus *bus, uint64_t now, struct bin *bins, struct
             uint64_t due_ns = link_clock_to_ns(&node->link, segment->req_clock);
             uint64_t at = due_ns > now ? (due_ns - now) / BIN_NS : 0;
             if (!segment->req_clock || at >= BINS)
-                continue; // no deadline, or far away
+                continue; // no deadline, or beyond the bins
             struct bin *bin = &bins[at];
             uint64_t ready_ns = link_clock_to_ns(&node->link, segment->min_clock);
             bin->bits += bits;
@@ -101,8 +101,8 @@ static void fill_bins(struct io_bus *bus, uint64_t now, struct bin *bins, struct
     }
 }
 
-// Serves bin by bin. START is when the stretch without idle time began that the line is in: demand that comes
-// after idle time must not be weighed against time that has passed unused.
+// Serves bin by bin. START: the beginning of the current interval without idle time; demand after idle time
+// must not be compared with time that passed unused.
 static void serve(const struct bin *bins, uint64_t now, struct io_forecast *out) {
     uint64_t start_ns = now;
     double needed_ns = 0, all_ns = 0; // since then; since now

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What Python asks of the links of a bus: open, close, send, read counters.
+// Functions of the links of a bus for Python: open, close, send, read counters.
 #include <stdlib.h>
 #include <string.h>
 
@@ -73,7 +73,7 @@ void io_close_link(struct io_bus *bus, uint32_t number) {
     io_unlock(bus);
 }
 
-// Locks the bus and finds the link; NULL (and *status): it cannot be used.
+// Locks the bus and returns the link; NULL (and *status) when it cannot be used.
 static struct io_link *enter(struct io_bus *bus, uint32_t number, enum io_status *status) {
     io_lock(bus);
     size_t at = index_of(bus, number);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What comes from the wire: frames out of bytes, and to whom they belong.
+// Reception: frames from bytes, and their links.
 #include <string.h>
 
 #include "nodes/link/io_bus.h"
@@ -17,7 +17,8 @@ void io_deliver(struct io_bus *bus, struct io_link *node, const uint8_t *data, s
         memcpy(event.content, response.content, response.size);
         io_push(bus, &bus->responses, &event, &bus->stats.responses_dropped, &bus->stats.responses_max);
     }
-    node->changed |= node->link.rx_used != waiting; // without new bytes: what time has given up is counted
+    node->changed |=
+        node->link.rx_used != waiting; // also without new bytes: an incomplete block may have been given up
 }
 
 // An acknowledgement is one frame of one empty block; what motion costs includes those.
@@ -51,7 +52,7 @@ static void receive_frame(struct io_bus *bus, const struct can_frame *frame, uin
     io_push(bus, &bus->unclaimed, &event, &bus->stats.frames_dropped, &bus->stats.unclaimed_max);
 }
 
-// The first bytes of a frame may have come before.
+// The first bytes of a frame may have been received before.
 static void receive_stream(struct io_bus *bus, const uint8_t *data, size_t size, uint64_t now) {
     while (bus->rest_size + size >= IO_FRAME_SIZE) {
         struct can_frame frame;
@@ -77,6 +78,6 @@ void io_received(struct io_bus *bus, const uint8_t *data, size_t size, uint64_t 
     } else if (bus->kind == IO_CAN_STREAM || size == IO_FRAME_SIZE) {
         receive_stream(bus, data, size, now);
     } else {
-        bus->stats.frames_malformed++; // a packet is a frame, and this one is not
+        bus->stats.frames_malformed++; // a packet has to be one frame
     }
 }

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
-// Whose turn it is on a bus, and what a frame costs.
+// Order of the links of a bus, and the cost of a frame.
 #include "nodes/link/io_bus.h"
 #include "nodes/support/can_bits.h"
 
 enum { BITS_PER_BYTE = 10 }; // of a serial line: start, eight, stop
 
-// Earliest deadline first over all nodes; among equals the turn goes round.
+// Earliest deadline first over all nodes; equals take turns.
 struct io_link *io_next_link(const struct io_bus *bus, uint64_t now, unsigned allowed,
                              const struct io_link *ending, struct link_offer *best) {
     struct io_link *chosen = NULL;

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-// What goes to the wire: blocks of links cut into frames, admin frames before them.
+// Transmission: blocks of links split into frames, admin frames before them.
 #include <string.h>
 
 #include "nodes/link/io_bus.h"
 
-// Where the next bytes for the wire go.
+// Destination of the next bytes for the wire.
 struct outlet {
     uint8_t *out;
     size_t size, room;
-    uint64_t left; // frames (a serial line: bytes) that the kernel's queue may still take
+    uint64_t left; // frames (a serial line: bytes) for which the kernel's queue has room
 };
 
 static int has_room(const struct outlet *outlet) {
@@ -51,7 +51,7 @@ static void count_sent(struct io_bus *bus, struct io_link *node, uint64_t frames
         bus->motion_bits += bits;
 }
 
-// The next block of NODE, which was offered, at OUT; returns its size.
+// Writes the next block of NODE, as offered, to OUT; returns its size.
 static size_t take_block(struct io_bus *bus, struct io_link *node, const struct link_offer *offer,
                          uint64_t now, uint8_t *out) {
     uint64_t content = node->link.motion_content;
@@ -64,7 +64,7 @@ static size_t take_block(struct io_bus *bus, struct io_link *node, const struct 
     return size;
 }
 
-// Puts NODE's next block behind what is left to cut of the one before; returns 0 when it has none, or another
+// Appends NODE's next block to the remainder of the previous one; returns 0 when it has none, or when another
 // node is due earlier.
 static int append_block(struct io_bus *bus, struct io_link *node, uint64_t now) {
     struct link_offer offer;
@@ -77,8 +77,8 @@ static int append_block(struct io_bus *bus, struct io_link *node, uint64_t now) 
     return 1;
 }
 
-// Cuts blocks of one link into frames while no other link is due earlier. A frame holds the end of one block
-// and the start of the next where both are ready.
+// Splits blocks of one link into frames while no other link is due earlier. A frame contains the end of one
+// block and the start of the next where both are ready.
 static void send_from(struct io_bus *bus, struct io_link *node, struct outlet *outlet, uint64_t now) {
     uint32_t can_id = IO_DATA_ID + 2u * node->nodeid;
     while (has_room(outlet)) {
@@ -123,7 +123,7 @@ static void send_bytes(struct io_bus *bus, struct outlet *outlet, uint64_t now) 
     }
 }
 
-// When what could not go now may: the kernel's queue is shorter then, or the budget has grown.
+// Returns when delayed data may be sent: when the kernel's queue is shorter, or the budget has grown.
 static void note_holds(struct io_bus *bus, const struct outlet *outlet, uint64_t now) {
     struct link_offer offer;
     bus->hold_ns = UINT64_MAX;
@@ -143,7 +143,7 @@ static void note_holds(struct io_bus *bus, const struct outlet *outlet, uint64_t
     }
 }
 
-// Since when the node that has waited longest has not acknowledged.
+// Returns since when the oldest transmission of any node is unacknowledged.
 static uint64_t unanswered_since(const struct io_bus *bus) {
     uint64_t oldest_ns = UINT64_MAX;
     for (size_t i = 0; i < bus->link_count; i++) {
@@ -160,7 +160,7 @@ size_t io_next(struct io_bus *bus, uint64_t now, uint64_t queued, uint8_t *out, 
     schedule_advance(&bus->schedule, now);
     bus->allowed = schedule_allowed(&bus->schedule);
     struct outlet outlet = {.out = out, .room = room, .left = schedule_room(&bus->schedule, queued)};
-    if (schedule_breathe(&bus->schedule, unanswered_since(bus)))
+    if (schedule_pause(&bus->schedule, unanswered_since(bus)))
         outlet.left = 0;
     if (bus->kind == IO_BYTES)
         send_bytes(bus, &outlet, now);

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// Counters that can be read at any time without making the driver wait: at the end of a round what changed is
-// copied under a sequence counter that is odd meanwhile, and readers copy until they saw it even and the
-// same.
+// Counters that can be read at any time without making the driver wait: at the end of a round the changed
+// ones are copied under a sequence counter that is odd meanwhile; readers copy until it is even and
+// unchanged.
 #include <string.h>
 
 #include "nodes/link/io_bus.h"
 
-// Word by word and atomic, so that a torn copy is a retry and no data race. Whoever reads a word that was
-// written after the sequence became odd sees that it did; neither costs anything on common processors.
+// Copies word by word and atomically, so that a torn copy is a retry, not a data race. A reader of a word
+// that was written after the sequence became odd sees the odd sequence; this is free on common processors.
 static void copy_words(void *to, const void *from, size_t size) {
     uint64_t *out = to;
     const uint64_t *in = from;
@@ -44,8 +44,8 @@ static void publish_link(struct io_link *node) {
     const struct link *link = &node->link;
     struct io_link_stats stats = {
         .pending = link_pending(link),
-        .flying_bytes = link->flying_bytes,
-        .flying_blocks = link->next - link->first,
+        .in_flight_bytes = link->in_flight_bytes,
+        .in_flight_blocks = link->next - link->first,
         .received = node->received,
     };
     link_get_stats(link, &stats.link);
@@ -88,7 +88,7 @@ enum io_status io_get_link_stats(const struct io_bus *bus, uint32_t number, stru
             continue;
         read_snapshot(&snapshot->sequence, out, &snapshot->stats, sizeof *out);
         if (__atomic_load_n(&snapshot->number, __ATOMIC_RELAXED) == number)
-            return IO_OK; // else the place was given to another meanwhile
+            return IO_OK; // otherwise the place was given to another link meanwhile
     }
     return IO_GONE;
 }

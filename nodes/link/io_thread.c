@@ -17,8 +17,8 @@
 #include <unistd.h>
 
 #define NS_PER_S 1000000000ULL
-// SocketCAN answers ENOBUFS while the interface's queue is full, but calls the socket writable: only time
-// helps. A full frame lasts 111 µs and more.
+// SocketCAN returns ENOBUFS while the interface's queue is full, but reports the socket as writable: wait. A
+// full frame lasts 111 µs and more.
 #define NO_BUFFERS_NS 300000ULL
 #define OVERSLEPT_NS 2000000ULL
 
@@ -31,14 +31,14 @@ struct io_thread {
     pthread_t thread;
     pthread_mutex_t mutex;
     uint8_t stopping;
-    uint8_t sleeping;        // the thread sleeps, or is about to, and nobody has woken it
+    uint8_t sleeping;        // the thread sleeps, or is about to, and was not woken
     uint8_t kernel_full;     // wait until the descriptor is writable
-    uint64_t retry_ns;       // the kernel has no buffers; try again then. 0: it has
+    uint64_t retry_ns;       // when to try again after ENOBUFS; 0: not now
     uint64_t sleep_until_ns; // when the sleeping thread wakes by itself
     uint8_t out[IO_OUT_FRAMES * FRAME];
     size_t out_at, out_size;
     uint8_t in[64 * FRAME];
-    uint8_t write_frames[WRITES]; // of the last writes, to tell frames from the kernel's buffers
+    uint8_t write_frames[WRITES]; // of the last writes, to convert the kernel's buffers to frames
     unsigned writes;
 };
 
@@ -51,15 +51,15 @@ static uint64_t monotonic_ns(void) {
 // ------------------------------------------------------------------------------------------------ transfer
 
 static void read_all(struct io_thread *thread, uint64_t now) {
-    // Bounded, so that a flood cannot keep the thread from sending; what is left wakes it again at once.
-    // Enough for all that waits after a stall of the host, lest an acknowledgement in there count as late.
+    // Bounded, so that a flood cannot prevent sending; the remainder wakes the thread again at once. Enough
+    // for everything that waits after a stall of the host, so that no acknowledgement counts as late.
     for (int rounds = 0; rounds < 1024 && !io_ended(thread->bus); rounds++) {
         size_t room = thread->kind == IO_CAN_PACKET ? FRAME : sizeof thread->in;
         ssize_t size = read(thread->fd, thread->in, room);
         if (size > 0) {
             io_received(thread->bus, thread->in, (size_t)size, now);
             if (thread->kind != IO_CAN_PACKET && (size_t)size < room)
-                return; // a stream gave less than there was room for: it is empty
+                return; // a stream returned less than requested: it is empty
         } else if (size == 0) {
             io_end(thread->bus, 0);
         } else if (errno == EAGAIN) {
@@ -70,7 +70,7 @@ static void read_all(struct io_thread *thread, uint64_t now) {
     }
 }
 
-// Hands bytes to the kernel; returns 0 when it takes no more.
+// Writes bytes to the kernel; returns 0 when it accepts no more.
 static int flush(struct io_thread *thread, uint64_t now) {
     while (thread->out_at < thread->out_size) {
         size_t size = thread->kind == IO_CAN_PACKET ? FRAME : thread->out_size - thread->out_at;
@@ -94,10 +94,10 @@ static int flush(struct io_thread *thread, uint64_t now) {
     return 1;
 }
 
-// How many frames the kernel still has, as far as it tells; a serial line: bytes. It counts buffers,
+// Returns how many frames (a serial line: bytes) the kernel reports as queued. It counts buffers,
 // SKB_BYTES for a write of up to some ten frames (measured on x86-64: AF_UNIX, and vcan, where a frame has
-// one of its own). Whether frames wait behind the kernel, in an adapter or in the virtual bus, nobody tells:
-// the core estimates that from the bit rate, so the greater of the two counts.
+// one of its own). Frames that wait in an adapter or in the virtual bus are not reported: the core estimates
+// them from the bit rate, and the greater of both counts.
 static uint64_t queued(const struct io_thread *thread) {
     if (!io_bounds_queue(thread->bus))
         return IO_QUEUED_UNKNOWN;
@@ -110,7 +110,7 @@ static uint64_t queued(const struct io_thread *thread) {
         return IO_QUEUED_UNKNOWN;
     uint64_t frames = 0;
     unsigned buffers = memory[SK_MEMINFO_WMEM_ALLOC] / SKB_BYTES;
-    for (unsigned i = 1; i <= buffers && i <= WRITES; i++) // a write that never was has no frames
+    for (unsigned i = 1; i <= buffers && i <= WRITES; i++) // unused entries have no frames
         frames += thread->write_frames[(thread->writes - i) % WRITES];
     return frames;
 }
@@ -134,14 +134,14 @@ static uint64_t next_deadline(const struct io_thread *thread, uint64_t now) {
     return thread->retry_ns && !io_ended(thread->bus) && thread->retry_ns < at_ns ? thread->retry_ns : at_ns;
 }
 
-// Makes an eventfd unreadable; nobody else reads it.
+// Makes an eventfd unreadable; there is no other reader.
 static void drain(int fd) {
     uint64_t count;
     ssize_t done = read(fd, &count, sizeof count);
     (void)done;
 }
 
-// Sleeps until the descriptor, a caller or time asks for work; returns what poll saw on the descriptor.
+// Sleeps until the descriptor, a caller or the deadline wakes it; returns the descriptor's events.
 static short sleep_unlocked(struct io_thread *thread, uint64_t now) {
     struct pollfd fds[2] = {{.fd = io_ended(thread->bus) ? -1 : thread->fd, .events = POLLIN},
                             {.fd = thread->wake_fd, .events = POLLIN}};
@@ -152,7 +152,7 @@ static short sleep_unlocked(struct io_thread *thread, uint64_t now) {
     struct timespec wait = {.tv_sec = (time_t)(wait_ns / NS_PER_S), .tv_nsec = (long)(wait_ns % NS_PER_S)};
     thread->sleeping = 1;
     pthread_mutex_unlock(&thread->mutex);
-    ppoll(fds, 2, thread->sleep_until_ns == UINT64_MAX ? NULL : &wait, NULL); // fails: nothing was seen
+    ppoll(fds, 2, thread->sleep_until_ns == UINT64_MAX ? NULL : &wait, NULL); // on failure: no events
     if (fds[1].revents & POLLIN)
         drain(thread->wake_fd);
     pthread_mutex_lock(&thread->mutex);
@@ -167,14 +167,14 @@ static int overslept(const struct io_thread *thread, uint64_t now) {
 
 static void *run(void *argument) {
     struct io_thread *thread = argument;
-    prctl(PR_SET_TIMERSLACK, 1000UL); // the default of 50 µs would show in every timed send
+    prctl(PR_SET_TIMERSLACK, 1000UL); // the default of 50 µs would delay every timed send
     pthread_mutex_lock(&thread->mutex);
     short seen = POLLIN;
     while (!thread->stopping) {
         uint64_t now = monotonic_ns();
         if (seen & POLLOUT)
             thread->kernel_full = 0;
-        // Whoever slept too long, on a busy computer, reads what came meanwhile before he judges by the time.
+        // After sleeping too long, on a busy computer, read what has arrived before timers are evaluated.
         if ((seen & ~POLLOUT) || overslept(thread, now))
             read_all(thread, now);
         io_handle_time(thread->bus, now);
@@ -206,12 +206,12 @@ static void unlock(void *context) {
     pthread_mutex_unlock(&((struct io_thread *)context)->mutex);
 }
 
-// The caller sends what it queued by itself, which saves a query the thread's wake-up on its way out; the
-// thread is woken only when it has to wait for something that it does not yet know of.
+// The caller sends what it queued itself, which saves the latency of waking the thread; the thread is woken
+// only when it has to wait for something new.
 static void kick(void *context) {
     struct io_thread *thread = context;
     if (!thread->sleeping)
-        return; // the thread is at work, or on its way to it, and will find what was queued
+        return; // the thread is running, or about to, and will find what was queued
     uint64_t now = monotonic_ns();
     write_all(thread, now);
     if (io_ended(thread->bus) || thread->kernel_full || next_deadline(thread, now) < thread->sleep_until_ns)
@@ -242,7 +242,7 @@ static void forget(struct io_thread *thread) {
     free(thread);
 }
 
-// What sits in the kernel cannot be overtaken by something more urgent. A small send buffer bounds it, and
+// What waits in the kernel cannot be overtaken by something more urgent. A small send buffer bounds it, and
 // makes a full SocketCAN queue show as "not writable" instead of as ENOBUFS. The kernel accounts some 768
 // bytes for a frame (or for a short run of them on a stream) and doubles the figure it is given. No socket:
 // no such buffer.

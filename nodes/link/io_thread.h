@@ -2,8 +2,8 @@
 // The I/O thread of a bus: drives its core (io_core.h) over a transport's file descriptor. The manual is in
 // io_api.h.
 //
-// One mutex guards everything of one bus; the thread holds it while it works and never while it sleeps, and
-// nothing blocks under it. The file descriptor io_notice_fd() becomes readable when io_take() has something.
+// One mutex guards everything of one bus; the thread holds it except while it sleeps, and nothing blocks
+// under it. The file descriptor io_notice_fd() becomes readable when io_take() has something.
 #ifndef LINK_IO_THREAD_H
 #define LINK_IO_THREAD_H
 
@@ -12,11 +12,11 @@
 // cffi: begin
 struct io_thread;
 
-// Opens no file: FD stays the caller's, is non-blocking, and outlives the bus. Starts the thread. NULL: no
-// memory, or no thread.
+// Starts the thread. FD belongs to the caller, is non-blocking, and outlives the bus. NULL: no memory, or no
+// thread.
 struct io_thread *io_start(int fd, enum io_kind kind, const struct io_settings *settings);
 
-// Ends and joins the thread, and forgets the bus with its links.
+// Ends and joins the thread, and frees the bus with its links.
 void io_stop(struct io_thread *thread);
 
 struct io_bus *io_thread_bus(struct io_thread *thread);

@@ -7,7 +7,7 @@
 
 #include "nodes/link/batch.h"
 
-#define RTO_MIN_NS (20 * NS_PER_MS)    // below, a busy host or node would cause needless repeats
+#define RTO_MIN_NS (20 * NS_PER_MS)    // with less, a busy host or node would cause needless repeats
 #define RTO_FIRST_NS (100 * NS_PER_MS) // until a round trip was measured
 
 // -------------------------------------------------------------------------------------------------- set-up
@@ -40,7 +40,7 @@ uint64_t link_clock_to_ns(const struct link *link, uint64_t ticks) {
     int ahead = ticks >= link->clock_at_ticks;
     uint64_t ticks_away = ahead ? ticks - link->clock_at_ticks : link->clock_at_ticks - ticks;
     double away_ns = (double)ticks_away / link->clock_hz * 1e9;
-    if (ahead) // rounded up: never a moment too early
+    if (ahead) // rounded up: never too early
         return away_ns < 9e18 ? link->clock_at_ns + (uint64_t)ceil(away_ns) : LINK_NEVER;
     return away_ns < (double)link->clock_at_ns ? link->clock_at_ns - (uint64_t)away_ns : 0;
 }
@@ -97,7 +97,7 @@ static uint64_t queued_commands(const struct link *link) {
 }
 
 uint64_t link_pending(const struct link *link) {
-    return queued_commands(link) + link->flying_commands;
+    return queued_commands(link) + link->in_flight_commands;
 }
 
 // -------------------------------------------------------------------------------------------- transmission
@@ -107,8 +107,8 @@ static int may_probe(const struct link *link) {
 }
 
 // Makes the next new block, if there is one to send. While the node's expected sequence is unknown it is
-// empty: an answer that names the next sequence cannot tell whether the block was taken or was out of order,
-// and of an empty one nothing can be lost.
+// empty: an answer with the next sequence does not show whether the block was accepted or out of order, and
+// an empty block loses nothing.
 static int make_block(struct link *link, uint64_t now, unsigned allowed) {
     struct link_plan plan = {.offer = {.kind = LINK_CONTROL}};
     if (link->state == LINK_RUNNING) {
@@ -128,8 +128,8 @@ static int make_block(struct link *link, uint64_t now, unsigned allowed) {
     block->length =
         (uint8_t)wire_block_finish(block->bytes, block->length, (unsigned)(link->next % LINK_SLOTS));
     link->stats.commands_sent += block->commands;
-    link->flying_commands += block->commands;
-    if (link->first == link->next && link->state != LINK_CONFIRMING) // probing as a whole has to end in time
+    link->in_flight_commands += block->commands;
+    if (link->first == link->next && link->state != LINK_CONFIRMING) // all of probing has to end in time
         link->progress_ns = now;
     link->next++;
     return 1;
@@ -163,12 +163,12 @@ size_t link_next_block(struct link *link, uint64_t now, unsigned allowed, uint8_
     link->lead_in = LEAD_NONE;
     block->sent_ns = now ? now : 1; // 0 means never sent
     block->wire_length = (uint8_t)size;
-    link->flying_bytes += size;
+    link->in_flight_bytes += size;
     link->cursor++;
     return size;
 }
 
-// A repeat goes at once, and before everything where motion is in it or waits behind it.
+// A repeat is sent at once, and before everything else if it contains motion or motion waits for it.
 static int offer_repeat(const struct link *link, struct link_offer *out) {
     const struct link_block *block = const_block_of(link, link->cursor);
     *out = (struct link_offer){.kind = block->kind};
@@ -176,7 +176,7 @@ static int offer_repeat(const struct link *link, struct link_offer *out) {
     const struct link_queue *motion = &link->queues[LINK_MOTION];
     if (motion->commands)
         link_queue_peek(motion, motion->head, &head);
-    out->pressing = block->leads > 0 || head.req_clock || link->urgent;
+    out->urgent = block->leads > 0 || head.req_clock || link->urgent;
     return link_fits(link, lead_in_bytes(link) + block->length);
 }
 
@@ -206,14 +206,14 @@ uint64_t link_rto(const struct link *link) {
 
 void link_rewind(struct link *link, uint64_t now, enum lead_in lead_in) {
     // A node answers each block that it has already (or that comes out of order) with its expected sequence:
-    // as many naks may still come as blocks were sent, and they tell nothing about a loss after this repeat.
+    // as many naks may follow as blocks were sent, and they say nothing about a loss after this repeat.
     // Acting on them would repeat good blocks, cause the same naks again, and so on for ever.
-    uint64_t owed = link->naks_owed + (link->cursor - link->first);
-    link->naks_owed = owed < 2UL * LINK_BLOCKS_MAX ? owed : 2UL * LINK_BLOCKS_MAX;
-    link->owed_until_ns = now + link_rto(link);
-    link->owed_until_seq = link->next;
+    uint64_t outstanding = link->naks_outstanding + (link->cursor - link->first);
+    link->naks_outstanding = outstanding < 2UL * LINK_BLOCKS_MAX ? outstanding : 2UL * LINK_BLOCKS_MAX;
+    link->outstanding_until_ns = now + link_rto(link);
+    link->outstanding_until_seq = link->next;
     link->cursor = link->first;
-    link->flying_bytes = 0;
+    link->in_flight_bytes = 0;
     link->lead_in = (uint8_t)lead_in;
 }
 
@@ -234,9 +234,9 @@ static uint64_t lost_deadline(const struct link *link) {
     return waiting ? link->progress_ns + link->settings.lost_after_ns : LINK_NEVER;
 }
 
-// This computer slept much longer than it was to (a busy host of virtual machines may do that to it): nobody
-// asked meanwhile, and what was answered may wait to be read. Only a quarter of the silence counts, so that
-// the node is asked again before it is judged.
+// This computer slept much longer than it should (possible on a busy host of virtual machines): nothing was
+// sent meanwhile, and answers may wait to be read. Only a quarter of the silence counts, so that the node is
+// queried again before it counts as lost.
 static void forgive_sleep(struct link *link, uint64_t now) {
     uint64_t lost_ns = lost_deadline(link), repeat_ns = repeat_deadline(link);
     uint64_t wake_ns = lost_ns < repeat_ns ? lost_ns : repeat_ns;

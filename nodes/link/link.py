@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from nodes.link.handle import BusHandle
+from nodes.link.interfaces import OnLost, OnResponses
 from nodes.link.types import Flow, LinkError, LinkSettings, LinkStats, Response
 from nodes.support.c_structs import from_struct
 
@@ -13,9 +14,6 @@ if TYPE_CHECKING:
     from typing_extensions import Buffer  # comes with mypy
 
 _S_PER_NS = 1e-9
-
-ResponsesHandler = Callable[[Sequence[Response]], None]
-TextHandler = Callable[[str], None]
 
 
 class Link:
@@ -27,8 +25,8 @@ class Link:
         number: int,
         settings: LinkSettings,
         *,
-        on_responses: ResponsesHandler,
-        on_lost: TextHandler,
+        on_responses: OnResponses,
+        on_lost: OnLost,
         on_close: Callable[[int], object],
     ) -> None:
         self._on_close = on_close
@@ -210,8 +208,8 @@ def _convert(raw: Any, lib: Any) -> LinkStats:
         LinkStats,
         link,
         pending=raw.pending,
-        flying_bytes=raw.flying_bytes,
-        flying_blocks=raw.flying_blocks,
+        in_flight_bytes=raw.in_flight_bytes,
+        in_flight_blocks=raw.in_flight_blocks,
         **depths,
         srtt_s=link.srtt_ns * _S_PER_NS,
         rttvar_s=link.rttvar_ns * _S_PER_NS,

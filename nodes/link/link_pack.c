@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-// What goes into a link's next block, and when: classes by urgency, clocks, packing.
+// Contents and time of a link's next block: classes by urgency, clocks, packing.
 #include "nodes/link/link_core.h"
 
 // No command whose req_clock lies further ahead is sent: its 32-bit clocks would be ambiguous from 2^31 ticks
-// on, and the other half of that range is left to times inside the command that lie behind req_clock.
+// on, and the other half of that range is left to times inside the command that are later than req_clock.
 #define CLOCK_REACH ((uint64_t)1 << 30)
 // A block that could still be filled by commands whose min_clock comes soon waits for them, but not when its
 // first command is due within this time: fewer, fuller blocks cost less of the bus.
 #define PACK_LEAD_NS (100 * NS_PER_MS)
-// What a class may wait for others that are due earlier. Control: a person or a control loop waits for the
-// answer, and 5 ms are a few blocks of all others. Bulk: long enough to give way to whatever a plan does,
-// short of the seconds after which those who transfer it give up.
+// Longest time that a class waits for others that are due earlier. Control: a person or a control loop waits
+// for the answer, and 5 ms are a few blocks of all others. Bulk: long enough to give way to whatever a plan
+// does, below the seconds after which a transfer is given up.
 #define CONTROL_DUE_NS (5 * NS_PER_MS)
 #define BULK_DUE_NS (1000 * NS_PER_MS)
 #define MARGIN_MAX_NS (100 * NS_PER_MS)
@@ -19,7 +19,7 @@
 
 // ------------------------------------------------------------------------------------------------- packing
 
-// When a node whose queue has room at MIN_CLOCK (0: now) has it for certain.
+// Returns when a node whose queue has room at MIN_CLOCK (0: now) certainly has it.
 static uint64_t free_at(const struct link *link, uint64_t min_clock) {
     uint64_t free_ns = min_clock ? link_clock_to_ns(link, min_clock) : 0;
     return free_ns && free_ns < LINK_NEVER - GATE_MARGIN_NS ? free_ns + GATE_MARGIN_NS : free_ns;
@@ -53,7 +53,7 @@ static struct link_front ready(const struct link *link, const struct link_queue 
     return front;
 }
 
-// When the last of the motion commands that fit into the block may go.
+// Returns when the last of the motion commands that fit into the block may be sent.
 static uint64_t filled_at(const struct link *link, const struct link_front *front) {
     const struct link_queue *motion = &link->queues[LINK_MOTION];
     uint64_t latest = front->gate_ns;
@@ -85,8 +85,9 @@ static struct link_offer offer_of(const struct link *link, enum link_class kind,
     struct link_offer offer = {.kind = (uint8_t)kind};
     uint64_t due_ns = kind == LINK_BULK ? 0 : link_motion_due(link, head->req_clock);
     if (kind == LINK_MOTION) {
-        offer.due_ns = due_ns ? due_ns : now; // nothing is known: at once, but not before what waited longer
-        offer.pressing = due_ns && due_ns <= now;
+        offer.due_ns =
+            due_ns ? due_ns : now; // the clock is unknown: at once, but not before what waited longer
+        offer.urgent = due_ns && due_ns <= now;
         return offer;
     }
     offer.due_ns = head->queued_ns + (kind == LINK_BULK ? BULK_DUE_NS : CONTROL_DUE_NS);
@@ -94,16 +95,16 @@ static struct link_offer offer_of(const struct link *link, enum link_class kind,
         offer.due_ns = due_ns;
     if (kind == LINK_CONTROL && link->urgent) {
         offer.due_ns = 0;
-        offer.pressing = 1;
+        offer.urgent = 1;
     }
     return offer;
 }
 
 static int is_before(const struct link_offer *a, const struct link_offer *b) {
-    return a->pressing != b->pressing ? a->pressing : a->due_ns < b->due_ns;
+    return a->urgent != b->urgent ? a->urgent : a->due_ns < b->due_ns;
 }
 
-// Finds which classes have something to go now, and orders them.
+// Finds the classes that have something to send now, in order.
 static void order_classes(const struct link *link, uint64_t now, unsigned allowed, struct link_plan *plan) {
     static const enum link_class ranks[LINK_CLASSES] = {LINK_CONTROL, LINK_MOTION, LINK_BULK}; // if equal
     struct link_offer offers[LINK_CLASSES];
@@ -120,7 +121,7 @@ static void order_classes(const struct link *link, uint64_t now, unsigned allowe
             continue;
         }
         offers[kind] = offer_of(link, kind, &head, now);
-        if (!(allowed & 1u << kind) && !offers[kind].pressing) { // motion may not be sent ahead
+        if (!(allowed & 1u << kind) && !offers[kind].urgent) { // motion may not be sent ahead
             // Motion whose time is unknown waits for the budget alone; its due_ns is now, and a plan for now
             // without a command would be an empty block.
             if (offers[kind].due_ns > now && offers[kind].due_ns < plan->at_ns)
@@ -143,11 +144,11 @@ static uint64_t hold_motion(const struct link *link, const struct link_front *fr
     struct link_command head;
     const struct link_queue *motion = &link->queues[LINK_MOTION];
     link_queue_peek(motion, motion->head, &head);
-    // Where there is a gate the clock is known.
+    // With a gate, the clock is known.
     uint64_t due_ns = head.req_clock ? link_clock_to_ns(link, head.req_clock) : 0;
-    uint64_t pressing_ns = due_ns > PACK_LEAD_NS ? due_ns - PACK_LEAD_NS : 0;
+    uint64_t urgent_ns = due_ns > PACK_LEAD_NS ? due_ns - PACK_LEAD_NS : 0;
     uint64_t full_ns = filled_at(link, front);
-    return full_ns < pressing_ns ? full_ns : pressing_ns;
+    return full_ns < urgent_ns ? full_ns : urgent_ns;
 }
 
 static struct link_plan plan_allowed(const struct link *link, uint64_t now, unsigned allowed) {

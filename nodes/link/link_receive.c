@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
-// The listening half of a link: blocks out of bytes, acknowledgements, naks, round trips, first contact.
+// The receiving half of a link: blocks from bytes, acknowledgements, naks, round trips, first contact.
 #include <string.h>
 
 #include "nodes/link/link_core.h"
 
-// A block whose bytes stop coming for so long was cut off or has a damaged length byte. It is given up so
-// that the sound blocks in its bytes, often the acknowledgement just waited for, do not wait for it to fill
-// up. Not sooner, though: a bus without room (other nodes' frames first, ENOBUFS at the sender) holds the
-// rest of a sound block back for tens of milliseconds, and a response given up is never sent again.
+// A block without new bytes for this time is incomplete or has a damaged length byte. It is given up so that
+// valid blocks in its bytes, often the expected acknowledgement, do not wait for its end. Not sooner, though:
+// a bus without room (other nodes' frames first, ENOBUFS at the sender) holds the rest of a sound block back
+// for tens of milliseconds, and a response given up is never sent again.
 #define GAP_NS (100 * NS_PER_MS)
-// Who looks so much later than he was to stood still, as may have who sends the rest: that has as long again.
+// A check that is so late means that this computer stood still, as the sender may have: wait once more.
 #define LATE_NS (10 * NS_PER_MS)
 
 // ----------------------------------------------------------------------------------------- acknowledgement
@@ -41,8 +41,8 @@ static void measure_round_trip(struct link *link, const struct link_block *block
         stats->srtt_ns = sample_ns;
         stats->rttvar_ns = sample_ns / 2;
     }
-    // Only now: were the doublings undone by any progress, a round trip that grew beyond the timeout would
-    // have every block repeated, and so never be measured.
+    // Only now: if any progress reset the doublings, every block would be repeated once the round trip
+    // exceeds the timeout, and it would never be measured.
     link->backoff = 0;
 }
 
@@ -52,8 +52,8 @@ static void acknowledge(struct link *link, uint64_t sequence, uint64_t now) {
     for (; link->first < sequence; link->first++) {
         const struct link_block *block = block_of(link, link->first);
         if (link->first < link->cursor)
-            link->flying_bytes -= block->wire_length;
-        link->flying_commands -= block->commands;
+            link->in_flight_bytes -= block->wire_length;
+        link->in_flight_commands -= block->commands;
         if (link->clock_hz > 0)
             for (size_t i = 0; i < block->leads; i++)
                 note_lead(link, block->req_clock[i], now);
@@ -61,16 +61,16 @@ static void acknowledge(struct link *link, uint64_t sequence, uint64_t now) {
     if (link->cursor < sequence)
         link->cursor = sequence;
     link->progress_ns = now;
-    if (sequence > link->owed_until_seq) // a block behind the repeats was answered: so were they
-        link->naks_owed = 0;
+    if (sequence > link->outstanding_until_seq) // a block after the repeats was answered, and so were they
+        link->naks_outstanding = 0;
 }
 
 static void handle_nak(struct link *link, uint64_t now) {
     link->stats.naks++;
     if (link->cursor == link->first)
         return; // the repeat is on its way already
-    if (link->naks_owed && now < link->owed_until_ns) {
-        link->naks_owed--;
+    if (link->naks_outstanding && now < link->outstanding_until_ns) {
+        link->naks_outstanding--;
         return;
     }
     link_rewind(link, now, LEAD_SYNC);
@@ -80,22 +80,22 @@ static void handle_nak(struct link *link, uint64_t now) {
 
 static void adopt(struct link *link, uint64_t sequence) {
     link->first = link->cursor = link->next = sequence;
-    link->flying_bytes = link->naks_owed = 0;
+    link->in_flight_bytes = link->naks_outstanding = 0;
 }
 
-// The first answer to an empty block tells the node's expected sequence: it was taken, or refused with that
-// answer. The node may still take a late repeat of the first one, so a second empty block, with the adopted
-// sequence, makes sure before commands are trusted to it.
+// The first answer to an empty block reports the node's expected sequence: the block was accepted, or refused
+// with that answer. The node may still accept a late repeat of the first one, so a second empty block, with
+// the reported sequence, confirms it before commands are sent.
 static void handle_probe_answer(struct link *link, unsigned answer, uint64_t now) {
     if (link->cursor == link->first)
-        return; // nothing asked: a left-over from before
+        return; // not an answer to this link: from before
     unsigned behind = (answer - (unsigned)link->first) & WIRE_SEQ_MASK;
     if (link->state == LINK_CONFIRMING && behind == 0)
         return; // a further answer to the first one
     link->state = link_following(link->state, behind == 1 ? LINK_EVENT_TAKEN : LINK_EVENT_REFUSED);
     if (link->state == LINK_RUNNING) {
         acknowledge(link, link->first + 1, now);
-        link->naks_owed = 0;
+        link->naks_outstanding = 0;
         link->last_ack = link->first;
     } else {
         adopt(link, link->first + behind);
@@ -122,7 +122,7 @@ static void handle_sequence(struct link *link, unsigned answer, int empty, uint6
         handle_nak(link, now);
     else if (empty && link->last_ack == sequence)
         link->stats.acks_duplicate++;
-    // A response and the acknowledgement behind it carry the same sequence: only a second *empty* block is a
+    // A response and the acknowledgement after it have the same sequence: only a second *empty* block is a
     // nak.
     if (empty)
         link->last_ack = sequence;

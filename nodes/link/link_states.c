@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The life of a link as a table: the only place that says which state follows which. docs/link-states.md is
-// generated from it.
+// The states of a link as a table: the only place that defines which state follows which. docs/link-states.md
+// is generated from it.
 #include "nodes/link/link.h"
 
 enum link_state link_following(enum link_state state, enum link_event event) {

@@ -53,7 +53,7 @@ int link_queue_put_stamped(struct link_queue *queue, const struct link_command *
 }
 
 uint64_t link_queue_peek(const struct link_queue *queue, uint64_t at, struct link_command *out) {
-    uint8_t header[BATCH_HEADER + STAMP]; // a fixed size, since this is the hottest line of sending
+    uint8_t header[BATCH_HEADER + STAMP]; // a fixed size, for speed: executed for every command
     size_t start = at & (queue->size - 1);
     if (queue->size - start >= sizeof header)
         memcpy(header, queue->memory + start, sizeof header);

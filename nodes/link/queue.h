@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// A bounded queue of commands in the format of batch.h, in memory that the owner hands in.
+// A bounded queue of commands in the format of batch.h, in memory of the owner.
 #ifndef LINK_QUEUE_H
 #define LINK_QUEUE_H
 
@@ -13,9 +13,9 @@
 struct link_queue {
     uint8_t *memory;
     uint64_t size, head, tail;
-    uint64_t stamped;                 // records carry, behind the header, when they were queued
-    uint64_t commands;                // records inside now
-    uint64_t bytes_max, commands_max; // most that ever were inside
+    uint64_t stamped;                 // records contain, after the header, when they were queued
+    uint64_t commands;                // records in the queue
+    uint64_t bytes_max, commands_max; // largest numbers so far
 };
 // cffi: end
 
@@ -28,17 +28,17 @@ struct link_command {
 
 void link_queue_init(struct link_queue *queue, uint8_t *memory, size_t size, int stamped);
 
-// Appends COUNT whole records of SIZE bytes in all; returns 0 and changes nothing when they do not fit.
+// Appends COUNT complete records, SIZE bytes in total; returns 0 and changes nothing when they do not fit.
 int link_queue_put(struct link_queue *queue, const uint8_t *batch, size_t size, uint64_t count);
 
 // Appends one command to a stamped queue; returns as link_queue_put.
 int link_queue_put_stamped(struct link_queue *queue, const struct link_command *command,
                            const uint8_t *payload);
 
-// Reads the record at position AT (head <= AT < tail) and returns the position behind it.
+// Reads the record at position AT (head <= AT < tail) and returns the next position.
 uint64_t link_queue_peek(const struct link_queue *queue, uint64_t at, struct link_command *out);
 
-// Copies the payload of the record at position AT, of which COMMAND was peeked.
+// Copies the payload of the record at position AT, of which COMMAND was read.
 void link_queue_payload(const struct link_queue *queue, uint64_t at, const struct link_command *command,
                         uint8_t *out);
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Budget and order of a bus. Every figure has its reason beside it.
+// Budget and order of a bus. The reason for each constant is stated with it.
 #include "nodes/link/schedule.h"
 
 #include <string.h>
@@ -12,20 +12,20 @@ enum {
     FULL_FRAME_BITS = 120,     // 8 data bytes and the stuff bits of ordinary data: 111..135
     FULL_BLOCK_BITS = 9 * 135, // 64 bytes that begin within a frame, at worst
     BYTE_BITS = 10,            // on a serial line
-    CEILING_PPM = 900000,      // beyond, arbitration alone makes a frame wait for many others
-    CONTROL_SHARE_PPM = 50000, // at 500 kbit/s: 25 kbit/s, some 80 questions with their answers a second
+    CEILING_PPM = 900000,      // above, arbitration alone makes a frame wait for many others
+    CONTROL_SHARE_PPM = 50000, // at 500 kbit/s: 25 kbit/s, some 80 queries with their answers a second
     BULK_SHARE_PPM = 20000,    // at 500 kbit/s: a full block each 0.12 s; both fit above the ceiling
-    QUEUE_NS = 1500000,        // what sits in the kernel cannot be overtaken: short against a margin
+    QUEUE_NS = 1500000,        // what waits in the kernel cannot be overtaken: short compared with leads
     QUEUE_FRAMES_MIN = 3,      // one on the wire, one behind it, one while the thread wakes up
 };
 
 #define OVERDRAFT_NS (20 * NS_PER_MS) // of control and motion sent ahead: a dozen full blocks at 500 kbit/s
 #define DEBT_MAX_NS (50 * NS_PER_MS)  // older debt is forgiven: the bus was busy then, it is not now
-#define CREDIT_MIN_NS (2 * NS_PER_MS) // a thread that slept for so long loses nothing
+#define CREDIT_MIN_NS (2 * NS_PER_MS) // a thread that slept for this time loses no credit
 #define SLOT_NS (100 * NS_PER_MS)
-// An acknowledgement that is awaited for so long may be waiting for the line; a third of the least timeout. A
-// pause of a frame each time costs a line that is never idle 4 % at 500 kbit/s.
-#define BREATH_NS (7 * NS_PER_MS)
+// An acknowledgement outstanding for this time may be waiting for the line; a third of the shortest timeout.
+// These pauses of one frame cost 4 % of a line that is never idle at 500 kbit/s.
+#define PAUSE_INTERVAL_NS (7 * NS_PER_MS)
 
 static int64_t line_ns(const struct schedule *schedule, uint64_t bits) {
     return schedule->bitrate ? (int64_t)(bits * NS_PER_S / schedule->bitrate) : 0;
@@ -143,10 +143,10 @@ void schedule_received(struct schedule *schedule, unsigned flow, uint32_t bits) 
         return;
     schedule->received_bits += bits;
     schedule->slots[schedule->slot % SCHEDULE_SLOTS][flow] += bits;
-    if (schedule->serial) // a line for each direction
+    if (schedule->serial) // each direction has its own line
         return;
     pay(schedule, line_ns(schedule, bits));
-    if (schedule->line_free_ns > schedule->now_ns) // it was on the line while ours waited
+    if (schedule->line_free_ns > schedule->now_ns) // it was on the line while our frames waited
         schedule->line_free_ns += (uint64_t)line_ns(schedule, bits);
 }
 
@@ -160,8 +160,8 @@ static uint64_t unit_ns(const struct schedule *schedule) {
     return (uint64_t)line_ns(schedule, schedule->unit_bits);
 }
 
-// What waits in an adapter or in a virtual bus does not show in the kernel: the greater of report and
-// estimate counts.
+// The kernel does not report what waits in an adapter or in a virtual bus: the greater of report and estimate
+// counts.
 uint64_t schedule_queued(const struct schedule *schedule, uint64_t queued) {
     int busy = schedule->bitrate && schedule->line_free_ns > schedule->now_ns;
     uint64_t expected = 0;
@@ -177,7 +177,7 @@ uint64_t schedule_room(const struct schedule *schedule, uint64_t queued) {
     return waiting < schedule->queue_frames ? schedule->queue_frames - waiting : 0;
 }
 
-int schedule_breathe(struct schedule *schedule, uint64_t since_ns) {
+int schedule_pause(struct schedule *schedule, uint64_t since_ns) {
     uint64_t now = schedule->now_ns;
     if (!schedule->bitrate || schedule->serial)
         return 0;
@@ -188,7 +188,7 @@ int schedule_breathe(struct schedule *schedule, uint64_t since_ns) {
         schedule->paused_ns = now;
     }
     uint64_t last_ns = since_ns > schedule->paused_ns ? since_ns : schedule->paused_ns;
-    if (since_ns == UINT64_MAX || now < last_ns + BREATH_NS)
+    if (since_ns == UINT64_MAX || now < last_ns + PAUSE_INTERVAL_NS)
         return 0;
     uint64_t free_ns = schedule->line_free_ns > now ? schedule->line_free_ns : now;
     schedule->pause_ns = free_ns + unit_ns(schedule);
@@ -205,15 +205,15 @@ uint64_t schedule_room_at(const struct schedule *schedule) {
 // --------------------------------------------------------------------------------------------------- order
 
 static uint64_t key_of(const struct link_offer *offer, uint64_t now) {
-    int late_alike = !offer->pressing && offer->kind != LINK_MOTION && offer->due_ns < now;
+    int late_alike = !offer->urgent && offer->kind != LINK_MOTION && offer->due_ns < now;
     return late_alike ? now : offer->due_ns;
 }
 
-// Strictly by deadline, who queued a flood first would keep the others waiting for all of it. Motion has true
-// deadlines; for the rest, overdue is overdue, and the turn goes round.
+// Strictly by deadline, a link that queued a flood first would make the others wait for all of it. Motion has
+// true deadlines; all other overdue offers are equal and take turns.
 int schedule_before(const struct link_offer *a, const struct link_offer *b, uint64_t now) {
-    if (a->pressing != b->pressing)
-        return a->pressing;
+    if (a->urgent != b->urgent)
+        return a->urgent;
     return key_of(a, now) < key_of(b, now);
 }
 
@@ -230,8 +230,8 @@ uint64_t schedule_recent(const struct schedule *schedule, unsigned flow) {
     return bits * (NS_PER_S / 1000) / (span_ns / 1000);
 }
 
-// Received data and control take what they take; bulk gives way, and so do frames of higher ids.
-// Acknowledgements are part of what motion costs.
+// Received data and control cannot be reduced; bulk and frames of higher ids give way. Acknowledgements are
+// part of the cost of motion.
 double schedule_left_for_motion(const struct schedule *schedule) {
     uint64_t others = schedule_recent(schedule, LINK_CONTROL);
     others += schedule->serial ? 0 : schedule_recent(schedule, SCHEDULE_DATA);

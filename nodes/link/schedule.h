@@ -1,19 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
-// The budget and the order of one bus, sans-IO: which classes may send now, which of two offers goes first,
-// and how much may sit in the kernel. The owner provides memory and time.
+// Budget and order of one bus, sans-IO: which classes may send now, which of two offers goes first, and how
+// much may wait in the kernel. The owner provides memory and time.
 //
-// Time on the line is the currency: a frame costs its true bits, counted in ns. Credit comes in at the
-// ceiling (a share of the bit rate) and everything that is on the bus, sent or received, is paid from it.
-//     motion   whose time has come always may go, and what it overdraws the others lack; sent ahead, as
-//     control control  overdraws by up to OVERDRAFT_NS, so that a question never waits for data bulk     only
-//     while there is credit, which is capped at about one block: no bursts
-// Sending ahead below the ceiling is what keeps the nodes' acknowledgements alive: the host's frames to a
-// node win arbitration over the frames of all nodes with a higher id, and a host that never pauses is never
-// answered by those. Where motion is pressing and there are no pauses by themselves, schedule_breathe() makes
-// them.
+// The budget is time on the line: a frame costs its true bits, counted in ns. Credit accrues at the ceiling
+// (a share of the bit rate), and everything on the bus, sent or received, is deducted from it.
 //
-// Received data and motion may take all there is for ever. So that the others get through nevertheless, each
-// has a share of its own that nobody else can spend (CONTROL_SHARE, BULK_SHARE).
+// - Motion whose time has come may always be sent; what it overdraws, the others lack.
+// - Control, and motion sent ahead, may overdraw by up to OVERDRAFT_NS, so that a query never waits for data.
+// - Bulk is sent only while there is credit, which is capped at about one block: no bursts.
+//
+// Sending ahead below the ceiling keeps the acknowledgements of nodes possible: the host's frames to a node
+// win arbitration over the frames of all nodes with a higher id, which could never answer a host that never
+// pauses. Where motion is urgent and there are no other pauses, schedule_pause() makes them.
+//
+// Received data and motion may use the whole line for any time. Therefore each of the other classes has a
+// share of its own that no other can use (CONTROL_SHARE, BULK_SHARE).
 #ifndef LINK_SCHEDULE_H
 #define LINK_SCHEDULE_H
 
@@ -21,71 +22,71 @@
 
 // cffi: begin
 enum {
-    SCHEDULE_SLOTS = 11, // of 100 ms: ten whole ones and the one that is being filled
+    SCHEDULE_SLOTS = 11, // of 100 ms: ten complete ones and the current one
     SCHEDULE_FLOWS = 6,  // what was sent, by enum link_class; then:
     SCHEDULE_ACKS = 3,   // received: acknowledgements without content
     SCHEDULE_DATA = 4,   // received: everything else
-    SCHEDULE_WEAK = 5,   // received: of ids so high that it gives way to all of ours
+    SCHEDULE_WEAK = 5,   // received: of ids above all of ours, with lower priority
 };
 
-// All fields are the scheduler's own, but for reading.
+// All fields are read only for users.
 struct schedule {
-    uint32_t bitrate; // 0: unknown or unlimited, everything may go
+    uint32_t bitrate; // 0: unknown or unlimited, everything may be sent
     uint32_t queue_frames;
     uint32_t unit_bits; // of a frame, or of a serial line's byte
     uint64_t ceiling_ppm;
     int64_t credit_ns;
     int64_t share_ns[LINK_CLASSES]; // guaranteed to a class and not yet used
-    int64_t block_ns;               // what a full block lasts
+    int64_t block_ns;               // duration of a full block
     uint64_t now_ns, begun_ns;      // last refill; the start
-    uint8_t serial;                 // each direction has a line of its own
-    uint64_t line_free_ns;          // when all that was handed over will have left, as far as is known
-    uint64_t pause_ns, paused_ns;   // the line is left alone until then; when it last was
-    uint64_t held_ns;               // time for which the budget held something back
-    uint64_t held_since_ns;         // 0: it does not, now
+    uint8_t serial;                 // each direction has its own line
+    uint64_t line_free_ns;          // when everything passed to the kernel will have been sent, as estimated
+    uint64_t pause_ns, paused_ns;   // end of the current pause; end of the last pause
+    uint64_t held_ns;               // time for which the budget delayed something
+    uint64_t held_since_ns;         // 0: it delays nothing now
     uint64_t sent_bits[LINK_CLASSES], received_bits;
-    uint64_t slot; // number of the slot that is being filled
+    uint64_t slot; // number of the current slot
     uint64_t slots[SCHEDULE_SLOTS][SCHEDULE_FLOWS];
 };
 
 // BITRATE 0: nothing is budgeted. CEILING 0 and QUEUE_FRAMES 0: the defaults. A SERIAL line counts bytes
-// where CAN counts frames, and its queue is bounded only if asked for: the node's receive window does it.
+// where CAN counts frames, and its queue is bounded only on request: the node's receive window bounds it.
 void schedule_init(struct schedule *schedule, uint32_t bitrate, double ceiling, uint32_t queue_frames,
                    int serial, uint64_t now);
 
-// Lets time pass: refills. NOW never steps back.
+// Advances time, which adds credit. NOW never steps back.
 void schedule_advance(struct schedule *schedule, uint64_t now);
 
-// The set of classes that may send now (see LINK_ALL).
+// Returns the set of classes that may send now (see LINK_ALL).
 unsigned schedule_allowed(const struct schedule *schedule);
 
-// When a class that may not send now may again, if nothing else is sent or received.
+// Returns when a class that may not send now may send again, if nothing else is sent or received.
 uint64_t schedule_opens_at(const struct schedule *schedule, enum link_class kind);
 
-// Something of BITS was handed over, or was received, now. FLOW: SCHEDULE_ACKS, _DATA or _WEAK.
+// Records that BITS were passed to the kernel, or received, now. FLOW: SCHEDULE_ACKS, _DATA or _WEAK.
 void schedule_sent(struct schedule *schedule, enum link_class kind, uint32_t bits);
 void schedule_received(struct schedule *schedule, unsigned flow, uint32_t bits);
 
-// The budget holds something back from now on, or holds nothing.
+// Records whether the budget delays something from now on.
 void schedule_held(struct schedule *schedule, int held);
 
-// An acknowledgement is awaited since SINCE. Returns whether the line has to be left alone now, so that
-// frames of others get through; until when tells schedule_room_at().
-int schedule_breathe(struct schedule *schedule, uint64_t since_ns);
+// Returns whether to pause sending now, so that frames of others get through, until schedule_room_at(). An
+// acknowledgement has been outstanding since SINCE_NS.
+int schedule_pause(struct schedule *schedule, uint64_t since_ns);
 
-// How many frames wait, when QUEUED are said to sit in the kernel (UINT64_MAX: unknown).
+// Returns how many frames wait, when the kernel reports QUEUED (UINT64_MAX: unknown).
 uint64_t schedule_queued(const struct schedule *schedule, uint64_t queued);
 
-// How many frames may be handed over when QUEUED sit in the kernel (UINT64_MAX: unknown, it is estimated).
+// Returns how many frames may be passed on when QUEUED wait in the kernel (UINT64_MAX: unknown, estimated).
 uint64_t schedule_room(const struct schedule *schedule, uint64_t queued);
 
-// When a frame of a full queue should have left, or a pause ends.
+// Returns when a frame of a full queue should have been sent, or a pause ends.
 uint64_t schedule_room_at(const struct schedule *schedule);
 
-// Whether offer A goes before B when both could go at NOW. What is overdue and not motion is overdue alike.
+// Returns whether offer A goes before B at NOW. Overdue offers other than motion rank equally.
 int schedule_before(const struct link_offer *a, const struct link_offer *b, uint64_t now);
 
-// Bits of a flow within the last second; the share of the line that is left for motion, 0.02..ceiling.
+// Return the bits of a flow within the last second; the share of the line left for motion, 0.02..ceiling.
 uint64_t schedule_recent(const struct schedule *schedule, unsigned flow);
 double schedule_left_for_motion(const struct schedule *schedule);
 // cffi: end

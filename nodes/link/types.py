@@ -31,8 +31,8 @@ class LinkTransport(Protocol):
         """Name in messages to the user, for example ``can0`` or ``/dev/ttyACM0``."""
 
     @property
-    def kind(self) -> int:
-        """One of TransportKind."""
+    def kind(self) -> TransportKind:
+        """How to read and write the file descriptor."""
 
     def fileno(self) -> int:
         """Return the file descriptor, open until close()."""
@@ -168,8 +168,8 @@ class LinkStats:
     """Timeout in use."""
     pending: int = 0
     """Commands queued or not acknowledged."""
-    flying_bytes: int = 0
-    flying_blocks: int = 0
+    in_flight_bytes: int = 0
+    in_flight_blocks: int = 0
     control_commands: int = 0
     control_commands_max: int = 0
     control_bytes: int = 0
@@ -275,6 +275,3 @@ class Forecast:
     def warning_s(self) -> float | None:
         """Time from this forecast to the first late command; None: nothing would be late."""
         return None if self.late_ns is None else (self.late_ns - self.now_ns) * 1e-9
-
-
-FrameHandler = Callable[[Frame], None]

@@ -10,8 +10,6 @@ from nodes.support.can_protocol import MT_CAN_ID
 
 AROUND: Final = 10
 """Number of words at the beginning and end of a transmission, which are neither values nor LIT."""
-FRAME_BITS_MAX: Final = 135
-"""Most bits of a frame with two words, stuff bits and interframe space included."""
 LOAD_MAX: Final = 0.999
 
 
@@ -103,10 +101,10 @@ class CanCost:
 
     def text(self) -> str:
         """Return it for a reader."""
-        told = (
+        text = (
             f"{self.bits} bits: {self.alone_s * 1e3:.1f} ms of {self.bitrate} bit/s, "
             f"{self.paced_s * 1e3:.1f} ms within a share of {self.share:.0%}"
         )
         if self.load:
-            told += f", {self.free_s * 1e3:.1f} ms with all that others leave ({1 - self.load:.0%})"
-        return told
+            text += f", {self.free_s * 1e3:.1f} ms with all that others leave ({1 - self.load:.0%})"
+        return text

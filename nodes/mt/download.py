@@ -131,10 +131,10 @@ class DownloadReport:
 
     def text(self) -> str:
         """Return the cost as text for a user."""
-        told = [f"{self.words} words in {self.elapsed_s:.3f} s", *(cast.text() for cast in self.casts)]
+        parts = [f"{self.words} words in {self.elapsed_s:.3f} s", *(cast.text() for cast in self.casts)]
         if self.casts:
-            told.append(f"asking the nodes took {self.asking_s:.3f} s, links {self.links_s:.3f} s")
-        return "; ".join(told)
+            parts.append(f"querying the nodes took {self.asking_s:.3f} s, links {self.links_s:.3f} s")
+        return "; ".join(parts)
 
 
 class _Aim:
@@ -176,14 +176,14 @@ class _Aim:
 def _why(place: DownloadTarget, state: TableState, *, fresh: bool) -> str:
     table, node = place.table, place.node
     if state.status is MtStatus.LENGTH_ERROR:
-        told = f"values were lost, or it has room for {table.capacity} points only"
+        reason = f"values were lost, or it has room for {table.capacity} points only"
     elif state.status is MtStatus.CHECKSUM_ERROR:
-        told = "values arrived damaged"
+        reason = "values arrived damaged"
     elif state.status is MtStatus.TRANSMITTING:
-        told = "the end did not arrive"
+        reason = "the end did not arrive"
     else:
-        told = "it has another table" if fresh else "the transmission did not reach it"
-    return f"{table.name} on node {node.name}: {told} ({state.status.name.lower()}); send it again"
+        reason = "it has another table" if fresh else "the transmission did not reach it"
+    return f"{table.name} on node {node.name}: {reason} ({state.status.name.lower()}); send it again"
 
 
 async def download(

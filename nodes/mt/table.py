@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Protocol
 
+from nodes.devices.device import Device
 from nodes.devices.stepper import Stepper
 from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
@@ -28,9 +29,9 @@ class TableNode(Protocol):
     @property
     def name(self) -> str: ...  # noqa: D102
     @property
-    def dictionary(self) -> "Dictionary": ...  # noqa: D102
+    def dictionary(self) -> Dictionary: ...  # noqa: D102
     @property
-    def link(self) -> "LinkInterface": ...  # noqa: D102
+    def link(self) -> LinkInterface: ...  # noqa: D102
     async def query(  # noqa: D102
         self,
         name: str,
@@ -39,8 +40,8 @@ class TableNode(Protocol):
         *,
         timeout_s: float = ...,
         tries: int = ...,
-        **args: "Value | str",
-    ) -> "Message": ...
+        **args: Value | str,
+    ) -> Message: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +58,7 @@ class TableState:
     words: int
     """Number of MT words it has received, modulo 2^32."""
 
-    def holds(self, pairs: "Sequence[Pair]") -> bool:
+    def holds(self, pairs: Sequence[Pair]) -> bool:
         """Return whether the kept table is PAIRS for certain."""
         found = (self.length, self.checksum, self.digest)
         return self.generation > 0 and found == (len(pairs), checksum(pairs), digest(pairs))
@@ -89,24 +90,23 @@ class ActiveTable:
     """The node's clock at which it came into use."""
 
 
-class AxleTable:
+class AxleTable(Device):
     """The table for AXLE (1..28) with room for CAPACITY pairs; activated only while STEPPER stands still.
 
     NAME is for messages, such as "axis x forward". Raises NodeConfigError for an axle or capacity out of
     range.
     """
 
-    def __init__(self, name: str, axle: int, capacity: int, stepper: "Stepper | None" = None) -> None:
+    def __init__(self, name: str, axle: int, capacity: int, stepper: Stepper | None = None) -> None:
         if axle not in AXLES or not 1 <= capacity <= CAPACITY_MAX:
             raise NodeConfigError(
                 f"{name}: a table of axle {axle} with {capacity} points; give an axle of {AXLES[0]}.."
                 f"{AXLES[-1]} and 1..{CAPACITY_MAX} points"
             )
+        super().__init__(name)
         self.name = name
         self.axle = axle
         self.capacity = capacity
-        self.oid: int | None = None
-        """Its object id; known when its node's configuration is built."""
         self._stepper = stepper
 
     def configure(self, config: NodeConfig) -> None:
@@ -125,8 +125,9 @@ class AxleTable:
         self, node: TableNode, *, timeout_s: float = ANSWER_S, tries: int = ANSWER_TRIES
     ) -> TableState:
         """Query NODE for the table that it keeps, TRIES times; raises QueryTimeout, NodeError."""
-        oid = self._oid()
-        answer = await node.query("table_query", "table_state", timeout_s=timeout_s, tries=tries, oid=oid)
+        answer = await node.query(
+            "table_query", "table_state", timeout_s=timeout_s, tries=tries, oid=self._oid
+        )
         status = answer.integer("table_status")
         if status not in tuple(MtStatus):
             raise NodeError(f"{self.name}: node {node.name} answered with an unknown status {status}")
@@ -141,7 +142,7 @@ class AxleTable:
 
     async def active(self, node: TableNode) -> ActiveTable:
         """Query NODE for the table in use; raises NodeError."""
-        answer = await node.query("table_query_active", "table_active", oid=self._oid())
+        answer = await node.query("table_query_active", "table_active", oid=self._oid)
         activation = answer.integer("table_activation")
         if activation not in tuple(Activation):
             raise NodeError(f"{self.name}: node {node.name} answered with an unknown activation {activation}")
@@ -159,11 +160,6 @@ class AxleTable:
         """
         node.link.send(
             node.dictionary.encode(
-                "table_activate", oid=self._oid(), clock=clock & 0xFFFFFFFF, generation=generation
+                "table_activate", oid=self._oid, clock=clock & 0xFFFFFFFF, generation=generation
             )
         )
-
-    def _oid(self) -> int:
-        if self.oid is None:
-            raise NodeError(f"{self.name}: its node is not configured yet")
-        return self.oid

@@ -89,10 +89,10 @@ class Node:
         self._starting_over = True  # messages count only once an old configuration was checked
         self._generation = 0
         for response, handler in (
-            ("stats", self._stats_came),
-            ("shutdown", self._shutdown_came),
-            ("is_shutdown", self._shutdown_came),
-            ("starting", self._starting_came),
+            ("stats", self._handle_stats),
+            ("shutdown", self._handle_shutdown),
+            ("is_shutdown", self._handle_shutdown),
+            ("starting", self._handle_starting),
         ):
             self._talk.on(response, None, handler)
 
@@ -429,11 +429,11 @@ class Node:
 
         return lost
 
-    def _stats_came(self, stats: Message) -> None:
+    def _handle_stats(self, stats: Message) -> None:
         base = self.dictionary.int_constant("STATS_SUMSQ_BASE", 256)
         self.load = load_of(stats, self.dictionary.clock_freq_hz, base)
 
-    def _shutdown_came(self, message: Message) -> None:
+    def _handle_shutdown(self, message: Message) -> None:
         self.shut_down_for(message.integer("static_string_id"))
 
     def shut_down_for(self, static_string_id: int) -> None:
@@ -443,7 +443,7 @@ class Node:
         text = self.dictionary.enum_name("static_string_id", static_string_id)
         self._fail(NodeEvent.SHUTDOWN, NodeShutdown(shutdown_sentence(self.name, text)))
 
-    def _starting_came(self, _: Message) -> None:
+    def _handle_starting(self, _: Message) -> None:
         if not self._starting_over:
             self.restarted("it reported that")
 

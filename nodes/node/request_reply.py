@@ -10,7 +10,8 @@ from typing import Final
 
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
 from nodes.dictionary.message_format import Message, MessageError, Value
-from nodes.link.interfaces import LinkInterface, ResponseLike
+from nodes.link.interfaces import LinkInterface
+from nodes.link.types import Response
 from nodes.support.errors import CanductorError
 
 QUERY_TIMEOUT_S: Final = 0.25
@@ -162,7 +163,7 @@ class RequestReply:
 
         return end
 
-    def receive(self, responses: Sequence[ResponseLike]) -> None:
+    def receive(self, responses: Sequence[Response]) -> None:
         """Handle the responses that the link received."""
         self.heard += len(responses)
         for response in responses:
@@ -172,7 +173,7 @@ class RequestReply:
             else:
                 self._deliver(message, response)
 
-    def _deliver(self, message: Message, response: ResponseLike) -> None:
+    def _deliver(self, message: Message, response: Response) -> None:
         for waiter in self._waiters:
             if waiter.wants(message) and not waiter.answered.done():
                 times = response.sent_ns, response.received_ns

@@ -1,9 +1,8 @@
 """The life cycle of a node as a table: the only place that defines which state may follow which.
 
-docs/node-states.md is generated from it: ``python -m nodes.node.states > docs/node-states.md``.
+docs/node-states.md is generated from it (tests/nodes/state_pages.py).
 """
 
-import sys
 from enum import Enum
 from typing import Final
 
@@ -76,21 +75,3 @@ TRANSITIONS: Final = {
 def following(state: NodeState, event: NodeEvent) -> NodeState | None:
     """Return the state after EVENT in STATE, or None when the event has no effect there."""
     return TRANSITIONS.get((state, event))
-
-
-def page() -> str:
-    """Return docs/node-states.md."""
-    arrows = "\n".join(
-        f"    {before.name} --> {after.name}: {event.value}" for (before, event), after in TRANSITIONS.items()
-    )
-    states = "\n".join(f"* **{state.name}**: {state.value}" for state in NodeState)
-    return (
-        "# The life of a node\n\n"
-        "Generated from `nodes/node/states.py` by `python -m nodes.node.states`; a test fails when stale.\n\n"
-        f"{states}\n\n```mermaid\nstateDiagram-v2\n    [*] --> CONNECTING\n"
-        f"{arrows}\n    CLOSED --> [*]\n```\n"
-    )
-
-
-if __name__ == "__main__":
-    sys.stdout.write(page())

@@ -1,1 +1,1 @@
-"""Small helpers of all rooms of nodes: errors, option values, files with secrets, the C wire codec."""
+"""Helpers for all packages: errors, option values, files with secrets, charts, the C wire codec."""

@@ -1,4 +1,4 @@
-"""From structs of C to frozen dataclasses: what to copy is what the cffi declaration has."""
+"""Conversion of C structs to dataclasses, by the fields of the cffi declaration."""
 
 from dataclasses import fields
 from typing import Any, TypeVar
@@ -16,7 +16,7 @@ def field_names(struct: Any) -> list[str]:
 
 
 def from_struct(kind: type[T], struct: Any, **others: Any) -> T:
-    """Return the dataclass KIND with the values of equally named fields of STRUCT; OTHERS has the rest.
+    """Return a dataclass KIND with the values of the fields of the same names in STRUCT, and with OTHERS.
 
     Raises TypeError when a field without a default is in neither.
     """

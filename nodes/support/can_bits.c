@@ -12,10 +12,10 @@ enum {
 
 struct bit_writer {
     uint32_t crc;
-    uint32_t bits;   // on the wire so far, stuff bits included
+    uint32_t bits;   // so far, stuff bits included
     uint32_t level;  // of the last one
-    uint32_t run;    // how many bits the wire has had this level
-    uint8_t *levels; // where they are written to, or null
+    uint32_t run;    // number of bits with this level so far
+    uint8_t *levels; // destination of the levels, or null
 };
 
 static void count(struct bit_writer *writer, uint32_t bit) {
@@ -29,7 +29,7 @@ static void put_bit(struct bit_writer *writer, uint32_t bit) {
     writer->run = bit == writer->level ? writer->run + 1 : 1;
     writer->level = bit;
     if (writer->run == RUN_MAX) {
-        // The stuff bit itself begins the next run.
+        // The stuff bit begins the next run.
         writer->run = 1;
         writer->level = !bit;
         count(writer, writer->level);

@@ -3,12 +3,12 @@
 from typing import Final
 
 BUS_STOP_ID: Final = 0x010
-"""Frame ``<reason> <node id of the origin>``: every node of this project's firmware shuts down at once."""
+"""Frame ``<reason> <node id of the sender>``: every node with this project's firmware shuts down at once."""
 TRIGGER_ID: Final = 0x020
-"""The first of TRIGGER_GROUPS ids: an endstop of this group triggered."""
+"""First of TRIGGER_GROUPS ids: an endstop of that group triggered."""
 TRIGGER_GROUPS: Final = 16
 FIRST_DATA_ID: Final = 0x100
-"""Bytes to node N travel in FIRST_DATA_ID + 2 N, bytes from it in the id above."""
+"""Id of frames to node N: FIRST_DATA_ID + 2 N; frames from it have the next id."""
 DATA_NODEID_MAX: Final = 255
 ADMIN_ID: Final = 0x3F0
 """From the host to all nodes; the first byte is the command."""

@@ -1,4 +1,4 @@
-"""Sources and headers of a cffi module with the core of a bus, for any driver."""
+"""Sources and headers of the core of a bus, for a cffi module with any driver."""
 
 CORE_HEADERS = (
     "firmware/wire/wire.h",

@@ -1,7 +1,7 @@
-"""Shared by the ``build_*.py`` scripts: makes a cffi builder whose declarations come from the C headers.
+"""Helper of the ``build_*.py`` scripts: a cffi builder whose declarations come from the C headers.
 
-What a header shows to Python stands between the lines ``// cffi: begin`` and ``// cffi: end``; there is no
-second copy of a declaration that could go stale.
+The declarations for Python are between the lines ``// cffi: begin`` and ``// cffi: end`` of a header, so that
+there is no second copy.
 """
 
 import re
@@ -15,7 +15,7 @@ _SECTION = re.compile(r"^// cffi: begin\n(.*?)^// cffi: end$", re.MULTILINE | re
 
 
 def declarations(header: Path) -> str:
-    """Return the parts of HEADER that cffi may see; raises ValueError when it marks none."""
+    """Return the parts of HEADER for cffi; raises ValueError when there are none."""
     sections = _SECTION.findall(header.read_text())
     if not sections:
         raise ValueError(f"{header} has no '// cffi: begin' section")
@@ -23,16 +23,16 @@ def declarations(header: Path) -> str:
 
 
 def builder(module: str, headers: Sequence[str], sources: Iterable[str], *, cdef: str = "") -> FFI:
-    """Describe the extension MODULE made of SOURCES (paths from the project's root).
+    """Return the builder of the extension MODULE of SOURCES (paths relative to the project's root).
 
-    HEADERS are included in this order, and their marked sections declared, after the extra CDEF.
+    HEADERS are included in this order; their sections for cffi are declared after CDEF.
     """
     ffi = FFI()
     ffi.cdef(cdef + "\n".join(declarations(ROOT / header) for header in headers))
     ffi.set_source(
         module,
         "\n".join(f'#include "{header}"' for header in headers),
-        # Relative paths: setuptools refuses absolute ones.
+        # Relative paths, since setuptools refuses absolute ones.
         sources=list(sources),
         # Else a changed header would leave the module as it is; which ones it includes is not worth asking.
         depends=sorted(
@@ -48,7 +48,7 @@ def builder(module: str, headers: Sequence[str], sources: Iterable[str], *, cdef
             "-Wextra",
             "-Wno-psabi",
             "-fno-math-errno",
-            "-ffp-contract=off",  # the same numbers on every processor
+            "-ffp-contract=off",  # equal results on every processor
             "-pthread",
         ],
         extra_link_args=["-pthread"],

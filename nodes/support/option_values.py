@@ -1,7 +1,7 @@
 """Options of command lines: argparse with errors as exceptions, converters for ``type=``, option dataclasses.
 
 A converter takes the text of a value and returns the value. It raises UsageError with a sentence without its
-subject ("is 'x', must be ..."): ``Parser`` puts the option's name in front. Elsewhere, NAME is the subject.
+subject ("is 'x', must be ..."): ``Parser`` adds the option's name. For other callers NAME is the subject.
 """
 
 import argparse
@@ -21,11 +21,11 @@ class UsageError(Exception):
     """The command line is not valid; the sentence says why."""
 
     command = ""
-    """The command that was not understood, such as "canductor run", once a Parser knows it."""
+    """The command with the error, such as "canductor run", once a Parser has set it."""
 
 
 class ParserExit(Exception):  # noqa: N818 (no failure: --help or --version was given)
-    """The parser has printed what was asked for; there is nothing left to do."""
+    """The parser has printed the requested help or version; exit."""
 
 
 class Help(argparse.HelpFormatter):
@@ -47,7 +47,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(**{"allow_abbrev": False, "formatter_class": Help, **settings})
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse as argparse does; an error names the innermost command that was reached."""
+        """Parse as argparse does; an error names the innermost command that was parsed."""
         try:
             return super().parse_known_args(args, namespace)
         except UsageError as error:
@@ -76,9 +76,9 @@ def _name_of(action: argparse.Action) -> str:
 
 
 class Assignments(argparse.Action):
-    """Collects pairs, repeated and converted as by ``parse_assignment``, in a dictionary.
+    """Collects repeated pairs, converted by ``parse_assignment``, in a dictionary.
 
-    EVERYTHING is what a pair without a name is for.
+    EVERYTHING describes a pair without a name in messages.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Assignments(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        """Add one; raises UsageError for a name that was given before."""
+        """Add a pair; raises UsageError for a name that was given before."""
         del parser
         name, value = values
         before = getattr(namespace, self.dest)
@@ -105,7 +105,7 @@ class Assignments(argparse.Action):
 
 
 def parse_assignment(text: str, convert: Callable[[str], T]) -> tuple[str, T]:
-    """Return the name of NAME=VALUE and what CONVERT makes of the value.
+    """Return the name of NAME=VALUE and the value, converted by CONVERT.
 
     CONVERT raises ValueError with a phrase that follows "must be", UsageError or CanductorError.
     """
@@ -225,6 +225,6 @@ def _summary(text: str) -> dict[str, str]:
 
 
 def options_from(kind: type[T], given: argparse.Namespace, **computed: Any) -> T:
-    """Return a dataclass KIND: each field from COMPUTED or, if GIVEN has it, from the option of that name."""
+    """Return a dataclass KIND with fields from COMPUTED and, by name, from the options GIVEN."""
     names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
     return kind(**{name: value for name, value in vars(given).items() if name in names} | computed)

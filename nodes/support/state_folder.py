@@ -1,4 +1,4 @@
-"""Where this user's machines keep what survives a restart."""
+"""Folder of the persistent state of this user's machines."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Line charts as SVG text: panels one below the other over a common x axis, with grid, ticks and legend."""
+"""Line charts as SVG text: stacked panels with a common x axis, grid, ticks and legend."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -8,7 +8,7 @@ from typing import Final
 COLOURS: Final = ("#1f6fb4", "#d1495b", "#2e8b57", "#8e5bb5", "#c77d0a", "#4a4a4a")
 WIDTH, LEFT, RIGHT, TOP, GAP, BOTTOM = 1000, 80, 20, 52, 50, 44
 COLUMNS_MAX: Final = 1000
-"""The picture has no more pixels."""
+"""Most points of a curve: the picture has no more pixels."""
 _TICK_STEPS: Final = (1, 2, 5, 10)
 
 Point = tuple[float, float]
@@ -20,7 +20,7 @@ class Series:
 
     points: Sequence[Point]
     name: str = ""
-    """For the legend; empty: none."""
+    """Text of the legend; empty: none."""
     colour: str = COLOURS[0]
     filled: bool = False
     """Whether POINTS are the outline of an area."""
@@ -33,14 +33,14 @@ class Panel:
     heading: str
     series: Sequence[Series]
     y_ticks: Sequence[float]
-    """Rising; the first and the last are the panel's borders."""
+    """Rising; the first and the last are the limits of the panel."""
     height: int = 170
 
 
 def draw_chart(
     title: str, x_label: str, x_range: Point, x_ticks: Sequence[float], panels: list[Panel]
 ) -> str:
-    """Return the picture; texts may be any. X_RANGE: what the left and the right border are."""
+    """Return the picture; texts are escaped. X_RANGE: values at the left and the right border."""
     height = TOP + sum(panel.height + GAP for panel in panels) - GAP + BOTTOM
     size = f'width="{WIDTH}" height="{height}"'
     lines = [
@@ -61,16 +61,16 @@ def draw_chart(
 
 
 def ticks(low: float, high: float, count: int = 6) -> list[float]:
-    """Return about COUNT round numbers, equally far apart, from LOW or below to HIGH or above."""
-    room = high - low or abs(high) or 1.0
-    power = 10.0 ** math.floor(math.log10(room / count))
-    step = next(factor * power for factor in _TICK_STEPS if factor * power * count >= room * 0.999)
+    """Return about COUNT equidistant round numbers, from LOW or below to HIGH or above."""
+    span = high - low or abs(high) or 1.0
+    power = 10.0 ** math.floor(math.log10(span / count))
+    step = next(factor * power for factor in _TICK_STEPS if factor * power * count >= span * 0.999)
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
     return [float(f"{number * step:.12g}") for number in range(first, max(last, first + 1) + 1)]
 
 
 def staircase(values: Sequence[float], bin_width: float) -> list[Point]:
-    """Return a curve of VALUES that each hold for BIN_WIDTH; of too many the highest of several is shown."""
+    """Return a step curve of VALUES, each BIN_WIDTH wide; of too many values, the maximum of each group."""
     group = -(-len(values) // COLUMNS_MAX) or 1
     points = []
     for first in range(0, len(values), group):
@@ -80,7 +80,7 @@ def staircase(values: Sequence[float], bin_width: float) -> list[Point]:
 
 
 def escape(text: str) -> str:
-    """Return TEXT as SVG has it, without control characters."""
+    """Return TEXT escaped for SVG, without control characters."""
     shown = "".join(c if c.isprintable() else "?" for c in text)
     return shown.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
 

@@ -1,7 +1,8 @@
-"""Ways to a bus or a board: each is a file descriptor the link's C thread takes over (see ``base``)."""
+"""Transports to a bus or a board: file descriptors that the link's C thread reads and writes."""
 
 from pathlib import Path
 
+from nodes.link.types import TransportKind
 from nodes.support.errors import CanductorError
 from nodes.transport.base import (
     ByteTransport,
@@ -9,7 +10,6 @@ from nodes.transport.base import (
     Transport,
     TransportBusyError,
     TransportClosedError,
-    TransportKind,
 )
 from nodes.transport.frame import CanFrame
 from nodes.transport.python_can_bridge import PythonCanBridge
@@ -35,13 +35,13 @@ def open_can(spec: str, *, bitrate: int | None = None) -> CanTransport:
     """Open the CAN bus that SPEC names; raises CanductorError.
 
     ``can0``: the SocketCAN interface; ``virtual:PATH``: the project's virtual bus; ``INTERFACE:CHANNEL``: a
-    backend of python-can. BITRATE in bit/s: backends of python-can are set to it; the others are as they are
-    and are only believed to have it.
+    backend of python-can. BITRATE in bit/s: backends of python-can are set to it; for the others it only
+    states the rate that they already have.
     """
     interface, colon, channel = spec.partition(":")
     if not interface or (colon and not channel):
         raise CanductorError(
-            f"CAN bus '{spec}': not a bus; write an interface (can0), virtual:PATH, or INTERFACE:CHANNEL of"
+            f"CAN bus '{spec}': not a bus; give an interface (can0), virtual:PATH, or INTERFACE:CHANNEL of"
             " python-can"
         )
     if not colon:

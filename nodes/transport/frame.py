@@ -14,7 +14,7 @@ _RECORD = struct.Struct("=IB3x8s")
 
 @dataclass(frozen=True, slots=True)
 class CanFrame:
-    """A CAN 2.0A data frame: 11-bit id, at most 8 bytes. Raises ValueError when it is not one."""
+    """A CAN 2.0A data frame: 11-bit id, at most 8 bytes; ValueError for anything else."""
 
     id: int
     data: bytes = b""
@@ -31,7 +31,7 @@ class CanFrame:
 
     @classmethod
     def from_record(cls, record: bytes) -> Self | None:
-        """Read a record; None when it is not a data frame with an 11-bit id (so are the flags of others)."""
+        """Read a record; None unless it is a data frame with an 11-bit id (others have flags in the id)."""
         if len(record) != RECORD_SIZE:
             return None
         can_id, length, data = _RECORD.unpack(record)

@@ -1,15 +1,16 @@
-"""Records of CAN frames over a stream socket: common to the virtual bus and the python-can bridge."""
+"""Records of CAN frames over a stream socket, for the virtual bus and the python-can bridge."""
 
 import select
 import socket
 import time
 
-from nodes.transport.base import SEND_TIMEOUT_S, TransportBusyError, TransportClosedError, TransportKind
+from nodes.link.types import TransportKind
+from nodes.transport.base import SEND_TIMEOUT_S, TransportBusyError, TransportClosedError
 from nodes.transport.frame import RECORD_SIZE, CanFrame
 
 SEND_BUFFER = 16_384
-"""Bytes asked of the kernel for what waits in the socket: some 40 frames sent one by one. Enough to keep a
-bus busy for milliseconds; more would only make what is sent now older when it arrives."""
+"""Bytes requested for the kernel's send buffer: some 40 frames sent one by one. Enough to keep a bus busy for
+milliseconds; more would only delay the frames sent last."""
 READ_SIZE = 256 * RECORD_SIZE
 
 
@@ -21,17 +22,17 @@ def wait_for(fd: int, event: int, timeout_s: float) -> bool:
 
 
 class RecordStream:
-    """A CAN transport (kind CAN_STREAM) over the connected stream socket SOCK, which becomes its own."""
+    """A CAN transport (kind CAN_STREAM) over the connected stream socket SOCK, which it owns."""
 
     kind = TransportKind.CAN_STREAM
 
     def __init__(
         self, sock: socket.socket, name: str, *, bitrate: int | None = None, read_size: int = READ_SIZE
     ) -> None:
-        """Take SOCK over. NAME is for messages, BITRATE for those who budget bandwidth.
+        """Use SOCK. NAME is for messages, BITRATE for budgeting bandwidth.
 
-        READ_SIZE: bytes to ask of the kernel at once. With RECORD_SIZE no frame is ever held here while the
-        file descriptor says that there is nothing, as those who wait for it (asyncio) need.
+        READ_SIZE: bytes to read at once. With RECORD_SIZE no frame is ever buffered here while the file
+        descriptor is not readable, as users that wait for it (asyncio) need.
         """
         self.name = name
         self._read_size = read_size
@@ -53,13 +54,13 @@ class RecordStream:
             self._socket = None
 
     def why_closed(self) -> str:
-        """Say why the other end is gone; transports that know more override it."""
+        """Return why the other end is gone; transports that know more override it."""
         return "the other end closed the connection; is its process still running?"
 
     def send(self, frame: CanFrame, timeout_s: float = SEND_TIMEOUT_S) -> None:
         """See CanTransport.send()."""
         deadline_s = time.monotonic() + timeout_s
-        # A record of which the kernel took only a part is completed before the next one may begin.
+        # A record that the kernel accepted only in part is completed before the next one begins.
         while self._unsent:
             self._unsent = self._unsent[self._send_some(self._unsent, deadline_s) :]
         record = frame.to_record()
@@ -73,7 +74,7 @@ class RecordStream:
             except BlockingIOError:
                 if not wait_for(sock.fileno(), select.POLLOUT, deadline_s - time.monotonic()):
                     raise TransportBusyError(
-                        f"{self.name}: frames are not taken; a client of the bus may have stopped reading"
+                        f"{self.name}: frames are not accepted; a client of the bus may have stopped reading"
                     ) from None
             except OSError as error:
                 raise TransportClosedError(f"{self.name}: {self.why_closed()}") from error
@@ -91,12 +92,12 @@ class RecordStream:
                 return None
 
     def _fill(self, deadline_s: float) -> bool:
-        """Read what there is; False when there is nothing until the deadline."""
+        """Read what has arrived; False when nothing arrives until the deadline."""
         sock = self._open_socket()
         try:
             data = sock.recv(self._read_size - len(self._received))
         except BlockingIOError:
-            # The deadline may have passed: then poll() only looks, and the caller's next try ends it.
+            # After the deadline poll() only checks, and the caller's next call returns.
             return wait_for(sock.fileno(), select.POLLIN, deadline_s - time.monotonic())
         except OSError as error:
             raise TransportClosedError(f"{self.name}: {self.why_closed()}") from error

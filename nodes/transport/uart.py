@@ -1,4 +1,4 @@
-"""Transport over a UART (or a USB or pseudo-terminal that looks like one)."""
+"""Transport over a UART (or a USB device or pseudo-terminal that acts like one)."""
 
 import contextlib
 import os
@@ -9,8 +9,9 @@ from pathlib import Path
 
 import serial
 
+from nodes.link.types import TransportKind
 from nodes.support.errors import CanductorError
-from nodes.transport.base import SEND_TIMEOUT_S, TransportBusyError, TransportClosedError, TransportKind
+from nodes.transport.base import SEND_TIMEOUT_S, TransportBusyError, TransportClosedError
 from nodes.transport.stream import wait_for
 
 BAUD_DEFAULT = 250_000
@@ -18,7 +19,7 @@ _READ_SIZE = 4096
 
 
 class UartTransport:
-    """The serial device at PATH: 8 data bits, no parity, 1 stop bit, no flow control, for this program alone.
+    """The serial device at PATH: 8 data bits, no parity, 1 stop bit, no flow control, opened exclusively.
 
     pyserial opens and configures the device; from then on only the file descriptor is used. ``dtr`` and
     ``rts`` are the levels of the control lines (some boards reset when DTR goes up).
@@ -40,12 +41,12 @@ class UartTransport:
         try:
             port.baudrate = baud
             port.open()
-            _let_empty_differ_from_ended(port.fd)
+            _report_empty_reads(port.fd)
             port.reset_input_buffer()
         except (OSError, ValueError, OverflowError, termios.error) as error:  # SerialException is an OSError
             port.close()
             raise _cannot_open(path, baud, error) from error
-        # USB adapters else hold received bytes back for up to 16 ms; what cannot do it needs it not.
+        # USB adapters otherwise delay received bytes for up to 16 ms; others do not need this.
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             port.set_low_latency_mode(low_latency_settings=True)
         self._port = port
@@ -69,7 +70,7 @@ class UartTransport:
                 return os.write(fd, data)
             except BlockingIOError:
                 if not wait_for(fd, select.POLLOUT, deadline_s - time.monotonic()):
-                    raise TransportBusyError(f"UART {self.name}: bytes are not taken") from None
+                    raise TransportBusyError(f"UART {self.name}: bytes are not accepted") from None
             except OSError as error:
                 raise self._gone() from error
 
@@ -82,12 +83,11 @@ class UartTransport:
                 data = os.read(fd, _READ_SIZE)
             except BlockingIOError:
                 data = b""
-            except OSError as error:  # EIO: a pseudo-terminal without its other end
+            except OSError as error:  # EIO: the other end of a pseudo-terminal is closed
                 raise self._gone() from error
             if data:
                 return data
-            # A terminal in raw mode with VMIN 0 reads as empty when nothing is there, and also after a
-            # hang-up.
+            # A terminal in raw mode with VMIN 0 returns nothing without data, and also after a hang-up.
             if self._hung_up(fd):
                 raise self._gone()
             if not wait_for(fd, select.POLLIN, deadline_s - time.monotonic()):
@@ -105,8 +105,8 @@ class UartTransport:
         )
 
 
-def _let_empty_differ_from_ended(fd: int) -> None:
-    """With VMIN 0, as pyserial leaves it, a read of nothing looks like the end; with 1 it says EAGAIN."""
+def _report_empty_reads(fd: int) -> None:
+    """Set VMIN to 1: with 0, as pyserial leaves it, reading nothing looks like the end, not like EAGAIN."""
     attributes = termios.tcgetattr(fd)
     characters = attributes[6]
     characters[termios.VMIN], characters[termios.VTIME] = 1, 0
@@ -116,11 +116,9 @@ def _let_empty_differ_from_ended(fd: int) -> None:
 def _cannot_open(path: str | Path, baud: int, error: Exception) -> CanductorError:
     where = f"UART {path}: cannot open it at {baud} baud: "
     if not Path(path).exists():
-        return CanductorError(
-            where + "there is no such device; list those there are with 'ls /dev/serial/by-id'"
-        )
+        return CanductorError(where + "there is no such device; list the devices with 'ls /dev/serial/by-id'")
     if isinstance(error, PermissionError) or (isinstance(error, OSError) and error.errno == 13):
-        return CanductorError(where + "this user may not; add the user to the group 'dialout'")
+        return CanductorError(where + "permission denied; add the user to the group 'dialout'")
     if isinstance(error, OSError) and "exclusively lock" in str(error):
-        return CanductorError(where + "another program is using it; stop that one first")
-    return CanductorError(where + f"{error}; is it a serial device, and does it know this rate?")
+        return CanductorError(where + "another program uses it; stop that program first")
+    return CanductorError(where + f"{error}; is it a serial device, and does it support this rate?")

@@ -16,8 +16,8 @@ class VirtualTransport(RecordStream):
         super().__init__(connect(path), f"virtual:{path}", bitrate=bitrate, read_size=read_size)
 
     def why_closed(self) -> str:
-        """Say what ends a connection to a bus."""
-        return "the bus ended the connection: it was stopped, or this program had not read for too long"
+        """Return what ends a connection to a bus."""
+        return "the bus ended the connection: it was stopped, or this program did not read for too long"
 
 
 def connect(path: str | Path) -> socket.socket:
@@ -27,7 +27,7 @@ def connect(path: str | Path) -> socket.socket:
         sock.connect(os.fspath(path))
     except OSError as error:
         sock.close()
-        reason = error.strerror or str(error)  # a path too long has no errno
+        reason = error.strerror or str(error)  # a path that is too long gives no errno
         raise CanductorError(
             f"virtual:{path}: no virtual CAN bus answers there ({reason});"
             f" start one with 'canductor can inject -c {path}'"

@@ -21,7 +21,7 @@ SOURCES = [
 
 
 def generate() -> None:
-    """Write the tables; they count as new when a header is, as setuptools looks at sources only."""
+    """Write the tables; mark them as new when a header is newer, as setuptools checks sources only."""
     generator = "firmware/tools/gen_dictionary.py"
     options = ["--version", "0.1.0", "--build-versions", "sim", "-I", "firmware"]
     subprocess.run(
@@ -48,6 +48,6 @@ ffibuilder = builder(
         *("nodes/support/can_bits.h", "firmware/objects/mt.h", "firmware/boards/sim/sim.h"),
         *("nodes/virtual/world/can_wire.h", "nodes/virtual/world/world.h"),
     ],
-    # The wire codec is in both, and linked once.
+    # The wire codec is in both lists; it is linked once.
     sources=list(dict.fromkeys([*map(str, SOURCES), str(TABLES), *CORE_SOURCES, *WORLD])),
 )

@@ -1,4 +1,4 @@
-"""Reads what a virtual node wrote down about its pins: each change of level and the clock at that time.
+"""Reads the log that a virtual node writes of its pins: each change of level, with the clock at that time.
 
 Layout: a header of 64 bytes, then 8-byte records ``clock << 16 | pin << 1 | level`` (little-endian).
 """
@@ -28,13 +28,13 @@ Directions = npt.NDArray[np.int8]
 
 
 class EdgeLog:
-    """The log at PATH, perhaps still being written: each call of steps() sees what is there when it begins.
+    """The log at PATH; it may still grow: each call of steps() reads what it contains when the call begins.
 
-    Memory is bounded whatever the length of the log. Clocks have 48 bits, years at any real rate.
+    Memory is bounded for any length of the log. Clocks have 48 bits, enough for years.
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Read the header; raises CanductorError when PATH is no such log."""
+        """Read the header; raises CanductorError when PATH is not an edge log."""
         self.path = Path(path)
         try:
             with self.path.open("rb") as file:
@@ -42,9 +42,7 @@ class EdgeLog:
         except OSError as error:
             raise CanductorError(f"edge log {path}: cannot be read: {error.strerror}") from error
         if len(header) < HEADER_SIZE or not header.startswith(MAGIC):
-            raise CanductorError(
-                f"edge log {path}: this is no edge log of a virtual node; was the node started?"
-            )
+            raise CanductorError(f"edge log {path}: not an edge log of a virtual node; was the node started?")
         _, self.clock_freq, self.ticks_per_second, self.start_monotonic_ns, self.start_clock = (
             _HEADER.unpack_from(header)
         )
@@ -55,17 +53,17 @@ class EdgeLog:
 
     @property
     def record_count(self) -> int:
-        """Complete records now in the file."""
+        """Number of complete records now in the file."""
         return max(0, self.path.stat().st_size - HEADER_SIZE) // RECORD_SIZE
 
     def ticks_to_monotonic_ns(self, clock: int | Clocks) -> npt.NDArray[np.int64]:
-        """Return when (host's CLOCK_MONOTONIC, ns) the node's clock stood at CLOCK: the truth of that node.
+        """Return the true time (host's CLOCK_MONOTONIC, ns) at which the node's clock was CLOCK.
 
-        Takes one clock or an array; of clocks, the lowest 48 bits count.
+        CLOCK is one clock or an array, of which the lowest 48 bits count.
         """
         start = np.uint64(self.start_clock % _CLOCK_MODULO)
         ticks = (np.asarray(clock, np.uint64) - start) & np.uint64(_CLOCK_MODULO - 1)
-        # Clocks before the start come out as negative.
+        # Clocks before the start become negative.
         signed = (ticks << np.uint64(64 - CLOCK_BITS)).view(np.int64) >> np.int64(64 - CLOCK_BITS)
         elapsed_ns = np.rint(signed * (1e9 / self.ticks_per_second)).astype(np.int64)
         return np.asarray(elapsed_ns + np.int64(self.start_monotonic_ns))
@@ -73,7 +71,7 @@ class EdgeLog:
     def edges(
         self, *pins: int, chunk_records: int = CHUNK_RECORDS
     ) -> Iterator[tuple[Clocks, npt.NDArray[np.uint16], npt.NDArray[np.uint8]]]:
-        """Yield the changes of PINS in the order written: chunks of clock, pin and level."""
+        """Yield the changes of PINS in order: chunks of clock, pin and level."""
         left, offset = self.record_count, HEADER_SIZE
         while left > 0:
             records = np.fromfile(self.path, "<u8", min(left, chunk_records), offset=offset)
@@ -96,8 +94,8 @@ class EdgeLog:
         """Yield the steps of one stepper: chunks of clock and direction (+1: the direction pin was high).
 
         A step is every change of the step pin if BOTH_EDGES, else every change away from STEP_IDLE_LEVEL.
-        Pins are at their idle level (the direction pin: low) before the log mentions them; a record that
-        repeats a level is none.
+        Before its first record, a pin is at its idle level (the direction pin: low); a record that repeats a
+        level is not a change.
         """
         chunks = self.edges(step_pin, dir_pin, chunk_records=chunk_records)
         yield from steps_of(chunks, step_pin, both_edges=both_edges, step_idle_level=step_idle_level)
@@ -119,7 +117,7 @@ def steps_of(
         stepped = levels != before
         if not both_edges:
             stepped &= levels != step_idle_level
-        # The direction pin's level after each record, carried on from one record to the next.
+        # The direction pin's level after each record.
         last_dir = np.maximum.accumulate(np.where(is_step_pin, -1, np.arange(len(pin))))
         directions = np.where(last_dir < 0, dir_level, level[last_dir])[is_step_pin][stepped]
         if len(levels):

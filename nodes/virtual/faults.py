@@ -1,8 +1,8 @@
-"""What goes wrong on a virtual bus on purpose: rules as Python has them.
+"""Fault rules of a virtual bus.
 
-A rule picks frames by id, sender and time, and hits a share of them, or of each sender the n-th. What it hits
-depends on the seed and on the sender's own frames only: the same program under test meets the same faults
-again, however its threads and processes are scheduled (``hub_faults.h``).
+A rule selects frames by id, sender and time, and affects a share of them, or the n-th of each sender. Which
+frames depends only on the seed and on the sender's own frames: the same program under test meets the same
+faults again, however its threads and processes are scheduled (``hub_faults.h``).
 """
 
 from dataclasses import dataclass
@@ -19,48 +19,48 @@ TIME_S_MAX: Final = 1e8
 
 
 class BusFaultKind(IntEnum):
-    """What happens to a frame that is hit; the numbers are those of ``enum hub_fault_kind``."""
+    """What happens to an affected frame; the numbers are those of ``enum hub_fault_kind``."""
 
     LOSE = 0
-    """The receivers do not get it, the sender believes they did."""
+    """The receivers do not get it; the sender assumes that they did."""
     CORRUPT = 1
     """The receivers get it with one bit of its data changed."""
     DUPLICATE = 2
-    """The receivers get it; the sender believes they did not and repeats it."""
+    """The receivers get it; the sender assumes that they did not, and repeats it."""
     ERROR = 3
-    """It is destroyed by an error frame: that costs bus time, and the sender tries again. After 32 failures
-    in a row the sender is bus-off until it has seen 128 times 11 bits."""
+    """An error frame destroys it: that takes bus time, and the sender tries again. After 32 consecutive
+    failures the sender is bus-off until it has seen 128 times 11 bits."""
     DELAY = 4
-    """It comes later, and what its sender has behind it waits too."""
+    """It is sent later, and so are the frames that its sender queued after it."""
     BUS_OFF = 5
-    """Its sender leaves the bus for a time: it hears nothing; this frame and all it sends are gone."""
+    """Its sender leaves the bus for a time: it receives nothing; all that it sends is lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusFault:
-    """One rule. Times count from the moment the bus gets its rules."""
+    """One rule. Times count from the moment at which the rules are set."""
 
     kind: BusFaultKind
     share: float = 1.0
-    """0..1 of the frames picked."""
+    """0..1 of the selected frames."""
     nth: int | None = None
-    """Instead of a share: of each sender the n-th frame picked, counted from 1."""
+    """Instead of a share: the n-th selected frame of each sender, counted from 1."""
     can_id: int = 0
     mask: int = 0
-    """Picks frames whose id has the bits of ``can_id`` where ``mask`` has ones."""
+    """Selects frames whose id has the bits of ``can_id`` where ``mask`` has ones."""
     sender: int | None = None
-    """Place of the client on the bus, 0..63 in the order of connecting; None: anyone."""
+    """Place of the client on the bus, 0..63 in the order of connecting; None: all clients."""
     receiver: int | None = None
-    """Who is hit by a loss or corruption; None: everyone."""
+    """The client affected by a loss or corruption; None: all clients."""
     from_s: float = 0.0
     until_s: float | None = None
-    """Picks frames from the one until the other; None: without end."""
+    """Selects frames between these times; None: without end."""
     time_s: float = 0.0
-    """How long a delay or bus-off lasts."""
+    """Duration of a delay or bus-off."""
     jitter_s: float = 0.0
-    """A delay gets up to this more, evenly spread."""
+    """Uniformly distributed addition to a delay: at most this."""
     timed: bool = False
-    """Only of BUS_OFF: picks no frames; at ``from_s`` the sender, or everybody, goes off."""
+    """Only with BUS_OFF: selects no frames; at ``from_s`` the sender (or all clients) leaves the bus."""
 
     def __post_init__(self) -> None:
         """Check the ranges; raises CanductorError."""
@@ -77,11 +77,11 @@ class BusFault:
         _check(name, "time", self.time_s, 0, TIME_S_MAX)
         _check(name, "jitter", self.jitter_s, 0, TIME_S_MAX)
         if self.receiver is not None and self.kind not in (BusFaultKind.LOSE, BusFaultKind.CORRUPT):
-            raise CanductorError(f"{name}: only a loss or corruption can hit a single receiver")
+            raise CanductorError(f"{name}: only a loss or corruption can have a receiver")
         if self.kind is BusFaultKind.BUS_OFF and self.time_s == 0:
-            raise CanductorError(f"{name}: needs to last for some time")
+            raise CanductorError(f"{name}: its time must be above 0 s")
         if self.timed and self.kind is not BusFaultKind.BUS_OFF:
-            raise CanductorError(f"{name}: only bus-off can happen without a frame")
+            raise CanductorError(f"{name}: only bus-off can be timed")
 
     def to_c(self) -> dict[str, Any]:
         """Return the fields of ``struct hub_rule``."""

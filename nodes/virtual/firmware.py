@@ -1,4 +1,4 @@
-"""The project's own firmware as it was built for virtual nodes: executables and their dictionaries."""
+"""The project's firmware built for virtual nodes: executables and their dictionaries."""
 
 from pathlib import Path
 from typing import Final
@@ -13,7 +13,7 @@ UART: Final = "canductor-node-uart"
 
 
 def firmware_path(build: str) -> Path:
-    """Return the executable of BUILD; raises CanductorError when it is not there."""
+    """Return the executable of BUILD; raises CanductorError when it is missing."""
     path = BIN / build
     if not path.is_file():
         raise CanductorError(f"the firmware {path} is missing; install the project again (make setup)")

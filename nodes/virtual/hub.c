@@ -6,12 +6,10 @@
 
 #include <string.h>
 
-// A controller whose transmissions fail so often in a row has its error counter (8 each) at 256: bus-off.
-// It may come back when it has seen the bus free for 128 times 11 bits. An error frame has a flag of 6 to 12
-// bits (here 12: others add their own to the first), a delimiter of 8, and 3 of space behind it.
+// After ATTEMPTS consecutive failures the error counter of a controller (8 each) is 256: bus-off. It recovers
+// when it has seen the bus free for 128 times 11 bits. An error frame has a flag of 6 to 12 bits (here 12:
+// others add their own to the first), a delimiter of 8, and 3 of interframe space.
 enum { ATTEMPTS = 256 / 8, RECOVERY_BITS = 128 * 11, ERROR_BITS = 12 + 8 + 3, UNPROTECTED_BITS = 7 + 3 };
-
-_Static_assert((int)HUB_SENDERS == (int)HUB_CLIENTS, "cffi wants the number itself in both headers");
 
 static const uint64_t NS_PER_S = 1000000000;
 
@@ -44,7 +42,7 @@ int hub_connect(struct hub *hub) {
     return -1;
 }
 
-// CLIENT stops the bus no longer, which does not make up for the time it stood still.
+// CLIENT no longer stops the bus; the time for which the bus stood still is not made up for.
 static void unstick(struct hub *hub, struct hub_client *client, uint64_t now_ns) {
     if (client->stuck_ns == 0)
         return;
@@ -74,7 +72,7 @@ static bool is_connected(const struct hub_client *client) {
     return client->state == HUB_PRESENT || client->state == HUB_LEAVING;
 }
 
-// What it has waiting is gone; what it has on the wire is cut off.
+// Drops what the client has waiting and aborts what it has on the wire.
 static void go_off(struct hub *hub, int i, uint64_t now_ns, uint64_t duration_ns) {
     struct hub_client *client = &hub->clients[i];
     uint32_t kept = hub->on_wire == i;
@@ -89,8 +87,8 @@ static void go_off(struct hub *hub, int i, uint64_t now_ns, uint64_t duration_ns
         client->off_ns = now_ns + duration_ns;
 }
 
-// Lets timed rules act whose time is up to NOW_NS; returns whether one did.
-static bool act_in_time(struct hub *hub, uint64_t now_ns) {
+// Applies the timed rules that are due up to NOW_NS; returns whether there was one.
+static bool apply_timed_rules(struct hub *hub, uint64_t now_ns) {
     bool acted = false;
     for (int i; (i = hub_faults_due(&hub->faults, now_ns)) >= 0; acted = true) {
         const struct hub_rule *rule = &hub->faults.rules[i];
@@ -138,9 +136,9 @@ void hub_receive(struct hub *hub, int client, const uint8_t *data, size_t size, 
     struct hub_client *from = &hub->clients[client];
     if (!is_connected(from))
         return;
-    if (hub->faults.next_off_ns <= now_ns) // what it had sent before it goes off, or comes back, is another's
+    if (hub->faults.next_off_ns <= now_ns) // frames from before it leaves or rejoins are judged first
         hub_run(hub, now_ns);
-    // What had no room last time was ready then: it must not lose its place because of a late reader.
+    // What had no room last time was ready then: a late reader must not cost it its place.
     uint64_t ready_ns = from->backlog_ns ? from->backlog_ns : now_ns;
     bool fills = size == hub_room(hub, client);
     while (size > 0) {
@@ -160,7 +158,7 @@ void hub_receive(struct hub *hub, int client, const uint8_t *data, size_t size, 
 
 // ------------------------------------------------------------------------------------------------- the bus
 
-// splitmix64: every seed is a good one.
+// splitmix64: any seed is suitable.
 static uint32_t next_random(struct hub *hub) {
     uint64_t z = hub->random += 0x9E3779B97F4A7C15;
     z = (z ^ z >> 30) * 0xBF58476D1CE4E5B9;
@@ -201,7 +199,7 @@ static int arbitrate(const struct hub *hub, uint64_t start_ns) {
     return winner;
 }
 
-// Whether every receiver has room. Those who have not are held responsible from now on.
+// Returns whether every receiver has room; those without are recorded as stopping the bus.
 static bool all_have_room(struct hub *hub, int sender, uint64_t now_ns) {
     bool room = true;
     for (int i = 0; i < hub->places; i++) {
@@ -231,7 +229,7 @@ static void start_frame(struct hub *hub, int client, uint64_t start_ns) {
         bits = 1 + (uint32_t)((uint64_t)verdict.error_at * (bits - UNPROTECTED_BITS) >> 32) + ERROR_BITS;
     uint64_t duration_ns = 0;
     if (hub->config.bitrate) {
-        // The rest of the division is carried on, so that no rate drifts by its rounding.
+        // The remainder of the division is carried over, so that rounding causes no drift of the rate.
         uint64_t carry = start_ns == hub->free_ns ? hub->bit_carry : 0;
         uint64_t scaled = bits * NS_PER_S + carry;
         duration_ns = scaled / hub->config.bitrate;
@@ -244,7 +242,7 @@ static void start_frame(struct hub *hub, int client, uint64_t start_ns) {
     hub->counters.busy_ns += duration_ns;
 }
 
-// Sends the frame to everybody else but those whom the verdict or their being off spares.
+// Delivers the frame to all other clients, except where the verdict or bus-off prevents it.
 static void deliver(struct hub *hub, const uint8_t *record, const struct hub_verdict *verdict) {
     uint8_t corrupted[HUB_RECORD];
     memcpy(corrupted, record, HUB_RECORD);
@@ -266,7 +264,7 @@ static void deliver(struct hub *hub, const uint8_t *record, const struct hub_ver
     hub->counters.corrupted += changed;
 }
 
-// The head of the sender's queue reached its last bit; returns whether it has been sent.
+// Completes the head of the sender's queue, at its last bit; returns whether it was sent.
 static bool complete_frame(struct hub *hub, struct hub_client *sender) {
     const uint8_t *record = input_head(sender)->record;
     uint32_t kinds = 1u << HUB_LOSE | 1u << HUB_CORRUPT | 1u << HUB_BUS_OFF;
@@ -318,19 +316,19 @@ static uint64_t earlier(uint64_t a_ns, uint64_t b_ns) {
 void hub_run(struct hub *hub, uint64_t now_ns) {
     for (;;) {
         if (hub->on_wire >= 0) {
-            act_in_time(hub, earlier(hub->free_ns, now_ns));
+            apply_timed_rules(hub, earlier(hub->free_ns, now_ns));
             if (hub->free_ns > now_ns)
                 return;
             end_frame(hub);
         }
         uint64_t start_ns = next_start(hub);
-        if (act_in_time(hub, earlier(start_ns, now_ns)))
-            continue; // perhaps what was to start is gone
+        if (apply_timed_rules(hub, earlier(start_ns, now_ns)))
+            continue; // the frame that was to start may be dropped
         if (start_ns > now_ns)
             return;
         int winner = arbitrate(hub, start_ns);
         if (!all_have_room(hub, winner, now_ns)) {
-            if (act_in_time(hub, now_ns)) // the bus stands still, time does not
+            if (apply_timed_rules(hub, now_ns)) // timed rules apply although the bus stands still
                 continue;
             return;
         }

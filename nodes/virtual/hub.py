@@ -1,23 +1,19 @@
-"""A virtual CAN bus: firmware processes and hosts meet at a Unix socket, without root or a kernel module.
+"""A virtual CAN bus: connects firmware processes and hosts by a Unix socket, without root or a kernel module.
 
 Every client connects to the bus's socket and exchanges 16-byte ``struct can_frame`` records. The bus
-arbitrates by id, takes the true time of each frame at its bit rate, and delivers in one order to everybody; a
-client that does not read stops the bus instead of losing frames. The work is done in C (``hub.h``,
-``hub_loop.h``) in a thread of its own that never needs the interpreter.
+arbitrates by id, takes the true time of each frame at its bit rate, and delivers in the same order to all
+clients; a client that does not read stops the bus instead of losing frames. It is implemented in C
+(``hub.h``, ``hub_loop.h``), in a thread that never needs the interpreter.
 """
 
-import argparse
 import contextlib
 import errno
-import json
 import os
-import signal
 import socket
 import stat
-import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -28,36 +24,36 @@ from nodes.virtual._hub import ffi, lib
 from nodes.virtual.faults import RULES_MAX, BusFault
 
 STUCK_LIMIT_S = 2.0
-"""How long a client may stop the bus by not reading before it is disconnected."""
+"""Time for which a client may stop the bus by not reading, before it is disconnected."""
 
 BITRATE_MIN, BITRATE_MAX = 1_000, 1_000_000_000
 BACKLOG = 64
 SOCKET_PATH_MAX = 107
-"""Bytes; the kernel's ``sun_path`` less its closing zero."""
+"""Bytes: the kernel's ``sun_path`` without its terminating zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClientStats:
-    """What one connected client did."""
+    """Counters of one connected client."""
 
     place: int
     """Number of its connection, 0..63; reused after it leaves."""
     sent: int
-    """Frames it sent that went over the bus."""
+    """Its frames that were transferred."""
     received: int
-    """Frames of others that were queued for it."""
+    """Frames of others queued for it."""
     rejected: int
-    """Its records that were no data frame with an 11-bit id."""
+    """Its records other than data frames with an 11-bit id."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaultStats:
-    """What one rule did."""
+    """Counters of one rule."""
 
     picked: int
-    """Frames it looked at."""
+    """Frames it selected."""
     hits: int
-    """Of these; of a timed bus-off: how often it happened."""
+    """Affected frames; of a timed bus-off: how often it happened."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,51 +61,51 @@ class BusStats:
     """Counters of a bus since its start."""
 
     frames: int
-    """Frames that went over the bus, lost ones and repetitions included."""
+    """Frames transferred, lost ones and repetitions included."""
     bits: int
     """Their true length, stuff bits and interframe space included, and the length of error frames."""
     lost: int
-    """Frames taken away from everybody on purpose."""
+    """Frames lost for all clients by a rule."""
     busy_ns: int
-    """Time in which the bus was taken."""
+    """Time for which the bus was busy."""
     rejected: int
-    """Records that were no data frame with an 11-bit id."""
+    """Records other than data frames with an 11-bit id."""
     expelled: int
-    """Clients disconnected because they had stopped the bus for too long."""
+    """Clients disconnected because they stopped the bus for too long."""
     refused: int
     """Connections beyond the 64 places."""
     lost_copies: int
-    """Frames that single receivers did not get, on purpose."""
+    """Copies of frames lost for single receivers by a rule."""
     corrupted: int
-    """Frames that someone got with a bit changed."""
+    """Frames that a client received with a changed bit."""
     duplicated: int
-    """Frames that went over the bus once more although all had got them."""
+    """Frames repeated although all clients had received them."""
     errors: int
     """Attempts that ended in an error frame."""
     delayed: int
-    """Frames that came later than their sender wanted."""
+    """Frames delayed by a rule."""
     bus_offs: int
-    """Times that a client left the bus and came back."""
+    """How often a client left the bus."""
     unsent: int
-    """Frames that clients wanted to send while they were off, or had waiting."""
+    """Frames dropped because their sender was off the bus."""
     unheard: int
-    """Frames times clients that did not hear them because they were off."""
+    """Copies of frames not delivered because their receiver was off the bus."""
     late_ns_max: int
-    """The latest the bus ever woke for the end of a frame."""
+    """Greatest delay of the bus at the end of a frame."""
     realtime: bool
-    """Whether the bus was granted real-time priority; without, more latency jitter is to be expected."""
+    """Whether the bus has real-time priority; without it, expect more latency jitter."""
     clients: tuple[ClientStats, ...]
-    """Who is connected now."""
+    """The clients that are connected now."""
     faults: tuple[FaultStats, ...]
-    """What each rule did since it was set."""
+    """Counters of each rule since it was set."""
 
 
 class VirtualBus:
     """A virtual CAN bus at the Unix socket PATH.
 
-    ``bitrate`` in bit/s, or None for frames that take no time. ``loss`` (0..1) is the share of frames that
-    reach nobody; which ones is decided by ``seed``, as for the ``faults``. ``stuck_limit_s``: see
-    STUCK_LIMIT_S. Use it as a context manager, or call start() and close(); methods are for one thread.
+    ``bitrate`` in bit/s, or None for frames that take no time. ``loss`` (0..1): share of frames that
+    reach no client; ``seed`` decides which ones, also for the ``faults``. ``stuck_limit_s``: see
+    STUCK_LIMIT_S. Use it as a context manager, or call start() and close(); use its methods in one thread.
     """
 
     def __init__(
@@ -122,7 +118,7 @@ class VirtualBus:
         faults: Sequence[BusFault] = (),
         stuck_limit_s: float = STUCK_LIMIT_S,
     ) -> None:
-        """Check the arguments; raises CanductorError. Nothing happens before start()."""
+        """Check the arguments; raises CanductorError. start() starts the bus."""
         self.path = Path(path)
         self.bitrate = bitrate or None
         if len(os.fsencode(self.path)) > SOCKET_PATH_MAX:
@@ -164,13 +160,13 @@ class VirtualBus:
 
     @property
     def faults(self) -> tuple[BusFault, ...]:
-        """The rules that hold now."""
+        """The current rules."""
         return self._faults
 
     def set_faults(self, faults: Sequence[BusFault]) -> None:
-        """Let these rules, and no others, hold from now on; raises CanductorError if there are too many.
+        """Replace the rules; raises CanductorError if there are too many.
 
-        Their times count from now, and so do their figures.
+        Their times and counters start now.
         """
         self._faults = self._checked(faults)
         if self._loop != ffi.NULL:
@@ -182,16 +178,16 @@ class VirtualBus:
 
     @property
     def address(self) -> str:
-        """How a transport is told to connect to this bus."""
+        """The bus as the option of a transport."""
         return f"virtual:{self.path}"
 
     @property
     def running(self) -> bool:
-        """Whether frames are being carried."""
+        """Whether the bus transfers frames."""
         return self._thread is not None and self._thread.is_alive()
 
     def start(self) -> Self:
-        """Open the socket and begin to carry frames; raises CanductorError when the path cannot be had."""
+        """Open the socket and start the bus; raises CanductorError when the path cannot be used."""
         if self._thread is not None or self._final is not None:
             raise CanductorError(f"virtual bus {self.path}: started twice; make a new VirtualBus instead")
         self._listener = _listen(self.path)
@@ -212,17 +208,17 @@ class VirtualBus:
 
     @property
     def stats(self) -> BusStats:
-        """The counters now, or after close() those of the end."""
+        """The counters so far; after close(), the last ones."""
         if self._final is not None:
             return self._final
         if self._loop == ffi.NULL:
-            raise CanductorError(f"virtual bus {self.path}: not started, so it has no figures yet")
+            raise CanductorError(f"virtual bus {self.path}: not started, so it has no counters yet")
         return _read_stats(self._loop, len(self._faults))
 
     def close(self) -> None:
-        """Disconnect everybody and remove the socket; doing it again is harmless.
+        """Disconnect all clients and remove the socket; further calls do nothing.
 
-        Raises CanductorError when the bus had died before.
+        Raises CanductorError when the bus had failed before.
         """
         if self._thread is None:
             return
@@ -234,11 +230,11 @@ class VirtualBus:
         self._loop = ffi.NULL
         self._close_listener()
         if self._error:
-            raise CanductorError(f"virtual bus {self.path}: stopped by itself: {os.strerror(self._error)}")
+            raise CanductorError(f"virtual bus {self.path}: failed: {os.strerror(self._error)}")
 
     def _close_listener(self) -> None:
         assert self._listener is not None
-        # Only our own socket: someone may have put another bus in its place.
+        # Only our own socket: another bus may have replaced it.
         with contextlib.suppress(FileNotFoundError):
             if self.path.stat().st_ino == self._inode:
                 self.path.unlink()
@@ -270,7 +266,7 @@ def _read_stats(loop: object, fault_count: int) -> BusStats:
 
 
 def _listen(path: Path) -> socket.socket:
-    """Open a listening socket at PATH; a file left by a bus that died is replaced."""
+    """Open a listening socket at PATH; the file of a bus that failed is replaced."""
     _remove_stale(path)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
@@ -281,10 +277,10 @@ def _listen(path: Path) -> socket.socket:
         listener.close()
         if error.errno == errno.EADDRINUSE:
             raise CanductorError(
-                f"virtual bus {path}: another bus took this path just now; choose another"
+                f"virtual bus {path}: another bus has just taken this path; choose another"
             ) from error
         raise CanductorError(
-            f"virtual bus {path}: cannot make the socket: {error.strerror}; the folder must exist and be"
+            f"virtual bus {path}: cannot create the socket: {error.strerror}; the folder must exist and be"
             " writable"
         ) from error
     return listener
@@ -294,7 +290,7 @@ def _remove_stale(path: Path) -> None:
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
             raise CanductorError(
-                f"virtual bus {path}: a file that is no socket is in the way; choose another path"
+                f"virtual bus {path}: the path is a file other than a socket; choose another path"
             )
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
             probe.setblocking(False)  # a bus whose backlog is full is in use too
@@ -315,45 +311,3 @@ def _in_use(path: Path) -> CanductorError:
     return CanductorError(
         f"virtual bus {path}: a bus is already running there; stop it or choose another path"
     )
-
-
-def _parse_arguments(arguments: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m nodes.virtual.hub",
-        description="Carries a virtual CAN bus until SIGTERM or SIGINT. Prints one JSON line when it is"
-        " ready and one with its counters at the end.",
-    )
-    parser.add_argument("path", metavar="PATH", help="the Unix socket to which clients connect")
-    parser.add_argument("--bitrate", type=int, default=1_000_000, help="bit/s; 0: no limit (default 1000000)")
-    parser.add_argument(
-        "--loss", type=float, default=0.0, help="share of frames that reach nobody (default 0)"
-    )
-    parser.add_argument("--seed", type=int, default=0, help="which frames are lost (default 0)")
-    return parser.parse_args(arguments)
-
-
-def _print_json(value: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(value) + "\n")
-    sys.stdout.flush()
-
-
-def main(arguments: list[str]) -> int:
-    """Run a bus as a process of its own; returns the exit status."""
-    options = _parse_arguments(arguments)
-    ending = {signal.SIGTERM, signal.SIGINT}
-    signal.pthread_sigmask(signal.SIG_BLOCK, ending)  # before the thread starts, which inherits it
-    try:
-        bus = VirtualBus(options.path, bitrate=options.bitrate, loss=options.loss, seed=options.seed).start()
-        _print_json({"ready": True, "address": bus.address})
-        while bus.running and signal.sigtimedwait(ending, 0.5) is None:
-            pass
-        bus.close()
-    except CanductorError as error:
-        sys.stderr.write(f"{error}\n")
-        return 1
-    _print_json(asdict(bus.stats))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

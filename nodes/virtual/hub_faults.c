@@ -42,10 +42,10 @@ static uint64_t mix(uint64_t z) {
     return z ^ z >> 31;
 }
 
-// Two independent words for the n-th frame that a rule picked of a sender.
+// Returns two independent words for the n-th frame of a sender that a rule selected.
 static uint64_t draw(const struct hub_faults *faults, uint32_t rule, int sender, uint64_t nth) {
     static const uint64_t STEP = 0x9E3779B97F4A7C15;
-    uint64_t stream = mix(faults->seed + STEP * (rule * (uint64_t)HUB_SENDERS + (uint64_t)sender + 1));
+    uint64_t stream = mix(faults->seed + STEP * (rule * (uint64_t)HUB_CLIENTS + (uint64_t)sender + 1));
     return mix(stream + STEP * nth);
 }
 
@@ -81,11 +81,11 @@ static void apply(const struct hub_rule *rule, struct hub_verdict *verdict, uint
     }
 }
 
-static bool picks(const struct hub_rule *rule, int sender, uint32_t id, uint32_t length,
-                  uint64_t elapsed_ns) {
+static bool selects(const struct hub_rule *rule, int sender, uint32_t id, uint32_t length,
+                    uint64_t elapsed_ns) {
     return ((id ^ rule->id) & rule->mask) == 0 && (rule->sender < 0 || rule->sender == sender) &&
            elapsed_ns >= rule->from_ns && elapsed_ns < rule->until_ns && !is_timed(rule) &&
-           (rule->kind != HUB_CORRUPT || length > 0); // without data there is nothing to change
+           (rule->kind != HUB_CORRUPT || length > 0); // a frame without data cannot be corrupted
 }
 
 struct hub_verdict hub_faults_judge(struct hub_faults *faults, uint32_t kinds, int sender, uint32_t id,
@@ -94,7 +94,7 @@ struct hub_verdict hub_faults_judge(struct hub_faults *faults, uint32_t kinds, i
     uint64_t elapsed_ns = now_ns > faults->start_ns ? now_ns - faults->start_ns : 0;
     for (uint32_t i = 0; i < faults->count; i++) {
         const struct hub_rule *rule = &faults->rules[i];
-        if (!(kinds >> rule->kind & 1) || !picks(rule, sender, id, length, elapsed_ns))
+        if (!(kinds >> rule->kind & 1) || !selects(rule, sender, id, length, elapsed_ns))
             continue;
         uint64_t nth = ++faults->picked[i][sender], random = draw(faults, i, sender, nth);
         faults->counters[i].picked++;

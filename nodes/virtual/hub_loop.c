@@ -14,28 +14,23 @@
 #include <time.h>
 #include <unistd.h>
 
-// Places in the poll set: the event that wakes the thread, the listening socket, then the clients.
+// Indices of the poll set: the event that wakes the thread, the listening socket, then the clients.
 enum { AT_WAKE, AT_LISTEN, AT_CLIENTS, POLL_SIZE = AT_CLIENTS + HUB_CLIENTS };
 
 enum { REALTIME_PRIORITY = 10 };
 
 static const uint64_t NS_PER_S = 1000000000;
-// Without file descriptors, connections wait; trying at once again would only burn time.
+// Without free file descriptors, connections wait; immediate retries would only use CPU.
 static const uint64_t ACCEPT_PAUSE_NS = 100000000;
 
-_Static_assert(HUB_RULES == sizeof(((struct hub_report *)0)->rules) / sizeof(struct hub_rule_counters),
-               "cffi wants the number itself in hub_loop.h");
-_Static_assert(HUB_CLIENTS == sizeof(((struct hub_report *)0)->clients) / sizeof(struct hub_client_report),
-               "cffi wants the number itself in hub_loop.h");
-
 struct hub_loop {
-    pthread_mutex_t mutex; // over all below but wake_fd; free while the thread sleeps
+    pthread_mutex_t mutex; // guards everything below except wake_fd; unlocked while the thread sleeps
     int wake_fd, listen_fd;
     bool realtime, stopping;
     uint64_t late_ns_max;
     uint64_t accept_ns; // earliest time of the next accept()
     int fds[HUB_CLIENTS];
-    bool input_closed[HUB_CLIENTS]; // the client said that it sends no more, and may still listen
+    bool input_closed[HUB_CLIENTS]; // the client has ended its output and may still read
     bool output_blocked[HUB_CLIENTS];
     struct hub hub;
 };
@@ -83,7 +78,7 @@ void hub_loop_set_rules(struct hub_loop *loop, const struct hub_rule *rules, siz
     pthread_mutex_lock(&loop->mutex);
     hub_set_rules(&loop->hub, rules, count, monotonic_ns());
     pthread_mutex_unlock(&loop->mutex);
-    eventfd_write(loop->wake_fd, 1); // a rule may want to act sooner than the thread would wake
+    eventfd_write(loop->wake_fd, 1); // a rule may be due before the thread would wake
 }
 
 // ------------------------------------------------------------------------------------------------- sockets
@@ -146,8 +141,8 @@ static void release_finished(struct hub_loop *loop) {
 
 // ------------------------------------------------------------------------------------------------- the loop
 
-// Room for half a queue before reading again: many frames for one system call, and never an empty queue
-// while the client has more.
+// Reads again when half a queue is free: many frames per system call, and the queue never runs empty while
+// the client has more.
 static short client_events(const struct hub_loop *loop, int i) {
     bool room = hub_room(&loop->hub, i) >= (size_t)HUB_INPUT / 2 * HUB_RECORD;
     bool blocked = loop->output_blocked[i] && loop->hub.clients[i].state == HUB_PRESENT;
@@ -163,7 +158,7 @@ static uint64_t fill_poll_set(const struct hub_loop *loop, struct pollfd *set, u
     set[AT_LISTEN] = (struct pollfd){.fd = accepting ? loop->listen_fd : -1, .events = POLLIN};
     for (int i = 0; i < HUB_CLIENTS; i++) {
         short events = (short)(loop->fds[i] >= 0 ? client_events(loop, i) : 0);
-        // Whose peer is gone would wake us all the time while the bus has not room for all that it had sent.
+        // A client whose peer is gone would wake the thread all the time while its frames still wait.
         bool idle = events == 0 && loop->hub.clients[i].state != HUB_PRESENT;
         set[AT_CLIENTS + i] = (struct pollfd){.fd = idle ? -1 : loop->fds[i], .events = events};
     }
@@ -177,7 +172,7 @@ static int wait_for_work(struct pollfd *set, uint64_t now_ns, uint64_t wake_ns) 
     return ready < 0 && errno != EINTR ? errno : 0;
 }
 
-// Reads come first, then new connections: whoever was connected before a frame was sent gets that frame.
+// Reads come first, then new connections: a client that connected before a frame was sent gets that frame.
 static void work(struct hub_loop *loop, const struct pollfd *set, uint64_t now_ns) {
     struct hub *hub = &loop->hub;
     eventfd_t woken;

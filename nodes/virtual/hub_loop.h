@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Runs a virtual CAN bus (hub.h) on sockets: one thread, ppoll, precise to what the kernel's scheduler
+// Runs a virtual CAN bus (hub.h) on sockets: one thread with ppoll, as precise as the kernel's scheduler
 // allows.
 #ifndef VIRTUAL_HUB_LOOP_H
 #define VIRTUAL_HUB_LOOP_H
@@ -16,30 +16,30 @@ struct hub_client_report {
 
 struct hub_report {
     struct hub_counters counters;
-    struct hub_rule_counters rules[32]; // HUB_RULES; as many as were set
-    uint64_t late_ns_max;               // the latest the thread ever woke for the end of a frame
-    bool realtime;                      // whether the thread was granted real-time priority
+    struct hub_rule_counters rules[HUB_RULES]; // as many as were set
+    uint64_t late_ns_max;                      // greatest delay of the thread at the end of a frame
+    bool realtime;                             // whether the thread was granted real-time priority
     int32_t client_count;
-    struct hub_client_report clients[64]; // HUB_CLIENTS
+    struct hub_client_report clients[HUB_CLIENTS];
 };
 
-// Makes a bus whose clients connect to LISTEN_FD, a listening non-blocking stream socket that stays the
-// caller's. Returns NULL when there is no memory or no file descriptor (errno tells).
+// Makes a bus whose clients connect to LISTEN_FD, a listening non-blocking stream socket which the
+// caller owns. Returns NULL, and errno, when there is no memory or no file descriptor.
 struct hub_loop *hub_loop_new(int listen_fd, const struct hub_config *config);
 
-// Works until hub_loop_stop(); one thread. Returns 0, or the errno that ended it.
+// Runs until hub_loop_stop(), in one thread. Returns 0, or the errno that ended it.
 int hub_loop_run(struct hub_loop *loop);
 
 // Makes hub_loop_run() return; from any thread.
 void hub_loop_stop(struct hub_loop *loop);
 
-// From now on these rules of hub_faults.h hold, and no earlier ones; from any thread, also before the run.
+// Replaces the rules (hub_faults.h); from any thread, also before hub_loop_run().
 void hub_loop_set_rules(struct hub_loop *loop, const struct hub_rule *rules, size_t count);
 
-// The figures up to now; from any thread.
+// Reads the counters; from any thread.
 void hub_loop_report(struct hub_loop *loop, struct hub_report *report);
 
-// Closes the clients' connections and frees all. Not while hub_loop_run() is at work.
+// Closes the clients' connections and frees everything; not while hub_loop_run() is running.
 void hub_loop_free(struct hub_loop *loop);
 // cffi: end
 

@@ -24,7 +24,7 @@ static inline bool is_frame(const uint8_t *record) {
     return record_id(record) <= ID_MAX && record[LENGTH_AT] <= DATA_MAX;
 }
 
-// Receivers see the fields of a frame and zeros, never what else the sender's memory held.
+// Copies the fields of a frame and zeros elsewhere, never other contents of the sender's memory.
 static inline void copy_frame(uint8_t *out, const uint8_t *record) {
     memset(out, 0, HUB_RECORD);
     memcpy(out, record, LENGTH_AT + 1);
@@ -47,7 +47,7 @@ static inline bool output_full(const struct hub_client *client) {
 }
 
 static inline void output_push(struct hub_client *client, const uint8_t *record) {
-    // The tail is always at the begin of a record, so none is split by the end of the ring.
+    // The tail is always at the start of a record, so the end of the ring splits none.
     memcpy(client->output + client->output_tail % OUTPUT_BYTES, record, HUB_RECORD);
     client->output_tail += HUB_RECORD;
     client->counters.received++;

@@ -1,6 +1,6 @@
-"""Describes the plant of a virtual node: what its pins are connected with, as the node's process reads it.
+"""Description of the plant of a virtual node: what its pins are connected to, as the firmware reads it.
 
-Parts are named; names are words without blanks of at most 63 characters. Lengths are in mm (of an angle:
+Parts have names of at most 63 characters without blanks. Lengths are in mm (of an angle:
 rad), temperatures in °C, powers in W, capacities in J/K, conductances in W/K, resistances in ohm, times in s.
 The text's format and what each part does: docs/plant.md.
 """
@@ -28,14 +28,14 @@ class Stepper:
     """None: the driver is always on."""
     step_inverted: bool = False
     dir_inverted: bool = False
-    """Whether a low direction pin counts up."""
+    """Whether the stepper counts up while its direction pin is low."""
     enable_inverted: bool = False
     both_edges: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """What the stepper of that name on NODE adds to an axis with each step."""
+    """Movement of an axis by each step of STEPPER on NODE."""
 
     node: str
     stepper: str
@@ -44,9 +44,9 @@ class Term:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Axis:
-    """A place along a line that steppers of any nodes move: ORIGIN with all counts at 0.
+    """Position along a line, moved by steppers of any nodes; ORIGIN: with all counts at 0.
 
-    A step that would bring it beyond a limit is lost, when the plant of that step's node knows the axis.
+    A step that would move it beyond a limit is lost if the plant of that stepper's node contains the axis.
     """
 
     name: str
@@ -58,9 +58,9 @@ class Axis:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Switch:
-    """An endstop: pressed while its axis is at AT or beyond, in DIRECTION (1 or -1).
+    """An endstop: pressed while its axis is at or beyond AT, in DIRECTION (1 or -1).
 
-    It is released HYSTERESIS before AT; each approach finds it up to NOISE beside where it is.
+    It is released HYSTERESIS before AT; each approach triggers it up to NOISE away from AT.
     """
 
     name: str
@@ -71,14 +71,14 @@ class Switch:
     hysteresis: float = 0.0
     noise: float = 0.0
     inverted: bool = False
-    """Pressed is a low level."""
+    """Whether pressed is a low level."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tmc:
-    """The driver of a stepper of the same node, CHIP (tmc2208, tmc2209), on a UART.
+    """The driver CHIP (tmc2208, tmc2209) of a stepper of the same node, on a UART.
 
-    The axes of its stepper count MICROSTEPS to a full step, whatever it is set to.
+    For the axes of its stepper a full step has MICROSTEPS, independent of its registers.
     """
 
     name: str
@@ -89,12 +89,12 @@ class Tmc:
     microsteps: int
     address: int = 0
     free_load: float = 300.0
-    """SG_RESULT while nothing holds the motor."""
+    """SG_RESULT while the motor is not blocked."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Diag:
-    """A pin that DIAG of a driver of any node is wired to."""
+    """A pin wired to DIAG of a driver of any node."""
 
     pin: str
     node: str
@@ -103,19 +103,19 @@ class Diag:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Body:
-    """Something that gets warm."""
+    """A thermal mass."""
 
     name: str
     capacity: float
     loss: float
-    """To the surroundings."""
+    """To the environment."""
     start: float | None = None
-    """None: as warm as the surroundings."""
+    """None: ambient temperature."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Couple:
-    """Two bodies that heat flows between."""
+    """Thermal conductance between two bodies."""
 
     a: str
     b: str
@@ -124,7 +124,7 @@ class Couple:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Heater:
-    """Full power while its pin is on; with hardware PWM in proportion."""
+    """A heater: full power while its pin is on, or in proportion to its hardware PWM."""
 
     name: str
     pin: str
@@ -135,7 +135,7 @@ class Heater:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fan:
-    """A fan, at full duty with RPM turns per minute, which it follows with a lag; perhaps a tachometer."""
+    """A fan: RPM at full duty, reached with a lag; it may have a tachometer."""
 
     name: str
     pin: str
@@ -144,12 +144,12 @@ class Fan:
     lag: float = 0.3
     tach_pin: str | None = None
     pulses: float = 2.0
-    """Per turn."""
+    """Per revolution."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cooling:
-    """A fan (on any node) that blows at a body: loss at full duty, beside the body's own."""
+    """Cooling of a body by a fan on any node: additional loss at full duty."""
 
     body: str
     node: str
@@ -179,7 +179,7 @@ class Steinhart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rtd:
-    """A resistor r0·(1 + a·T + b·T²) below a pull-up resistor; by default a PT1000."""
+    """A resistance r0·(1 + a·T + b·T²) below a pull-up resistor; by default a PT1000."""
 
     r0: float = 1000.0
     a: float = 3.9083e-3
@@ -189,7 +189,7 @@ class Rtd:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Linear:
-    """An amplifier: ZERO + SLOPE·T as a share of the converter's full scale."""
+    """An amplifier: ZERO + SLOPE·T as a ratio of the converter's full scale."""
 
     zero: float
     slope: float
@@ -197,19 +197,19 @@ class Linear:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """At most 64 points of °C (rising) and share of the converter's full scale; straight between them."""
+    """At most 64 points of °C (rising) and ratio of the converter's full scale, interpolated linearly."""
 
     points: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sensor:
-    """A sensor in a body of any node; it follows with a lag, and has noise in steps of the converter."""
+    """A sensor in a body of any node, with a lag, and with noise in steps of the converter."""
 
     name: str
     pin: str
     node: str
-    """Of its body."""
+    """Node of its body."""
     body: str
     curve: Beta | Steinhart | Rtd | Linear | Table
     lag: float = 0.0
@@ -226,12 +226,12 @@ _FIELD_NAMES: Final = {
     "tx_pin": "tx",
     "rx_pin": "rx",
 }
-"""Where a field is named otherwise in the text."""
+"""Names in the text, where they differ from those of the fields."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodePlant:
-    """All that stands around one node; the text and its file are made from it."""
+    """The plant of one node."""
 
     node: str
     seed: int = 1
@@ -249,18 +249,18 @@ class NodePlant:
     sensors: tuple[Sensor, ...] = ()
 
     def text(self) -> str:
-        """Return the description as the firmware reads it; CanductorError for a name that cannot be."""
+        """Return the description as the firmware reads it; CanductorError for an invalid name."""
         return "".join(f"{line}\n" for line in self._lines())
 
     def write(self, folder: Path) -> Path:
-        """Write the description into FOLDER, which all plants of a machine share; return its path."""
+        """Write the description to FOLDER, which all plants of a machine share; return its path."""
         path = folder / f"{self.node}.plant"
         path.write_text(self.text())
         return path
 
     @property
     def peers(self) -> tuple[str, ...]:
-        """The other nodes whose steppers, fans or bodies it needs."""
+        """Names of the other nodes whose steppers, fans or bodies it uses."""
         named = [term.node for axis in self.axes for term in axis.terms]
         named += [cooling.node for cooling in self.coolings]
         named += [sensor.node for sensor in self.sensors]
@@ -275,14 +275,12 @@ class NodePlant:
             for term in axis.terms:
                 fields = {"axis": axis.name, "node": self._short(term.node), "stepper": term.stepper}
                 yield _line("term", fields | {"mm": term.mm_per_step})
-        yield from self._parts("switch", self.switches)
-        yield from self._parts("tmc", self.tmcs)
-        yield from self._parts("diag", self.diags)
-        yield from self._parts("body", self.bodies)
-        yield from self._parts("couple", self.couples)
-        yield from self._parts("fan", self.fans)
-        yield from self._parts("cooling", self.coolings)
-        yield from self._parts("heater", self.heaters)
+        for kind, parts in (
+            *(("switch", self.switches), ("tmc", self.tmcs), ("diag", self.diags), ("body", self.bodies)),
+            *(("couple", self.couples), ("fan", self.fans), ("cooling", self.coolings)),
+            ("heater", self.heaters),
+        ):
+            yield from self._parts(kind, parts)
         for sensor in self.sensors:
             curve = {"curve": type(sensor.curve).__name__.lower()} | _fields(sensor.curve, ("points",))
             yield _line("sensor", self._own(_fields(sensor, without=("curve",))) | curve)
@@ -317,6 +315,6 @@ def _word(name: str, value: Any) -> str:
     if not word or len(word) > NAME_MAX or len(word.split()) != 1 or not word.isascii():
         raise CanductorError(
             f"the plant of a virtual node cannot have {name} {word!r}; "
-            f"use 1 to {NAME_MAX} characters without blanks"
+            f"give 1 to {NAME_MAX} characters without blanks"
         )
     return word

@@ -1,7 +1,7 @@
-"""Reads the log of a process's plant: what its heaters and fans did and how warm its bodies were, and when.
+"""Reads the log of a process's plant: heaters, fans, switches, faults and temperatures over time.
 
-One line each: true time (CLOCK_MONOTONIC in ns), kind, name, value, with tabs between. Kinds: ``power`` (W,
-whenever a heater's changes), ``fan`` (duty), ``switch`` (1: pressed), ``lost`` (a stepper's first lost step),
+Each line has, separated by tabs: true time (CLOCK_MONOTONIC in ns), kind, name, value. Kinds: ``power`` (W,
+at each change of a heater), ``fan`` (duty), ``switch`` (1: pressed), ``lost`` (a stepper's first lost step),
 ``fault`` (its number), ``body`` (°C, every 50 ms).
 """
 
@@ -14,7 +14,7 @@ from nodes.support.errors import CanductorError
 
 @dataclass(frozen=True, slots=True)
 class PlantEvent:
-    """One line."""
+    """One line of the log."""
 
     at_ns: int
     kind: str
@@ -23,9 +23,9 @@ class PlantEvent:
 
 
 def plant_log(folder: Path, node: str) -> Iterator[PlantEvent]:
-    """Yield what the log of NODE holds now, oldest first; a line that is still being written is left out.
+    """Yield the events in the log of NODE, oldest first; a line that is still being written is left out.
 
-    FOLDER: where the node's description lies. Raises CanductorError.
+    FOLDER contains the node's description. Raises CanductorError.
     """
     path = folder / f"{node}.plantlog"
     try:
@@ -43,4 +43,4 @@ def _event(path: Path, number: int, line: str) -> PlantEvent:
         at_ns, kind, name, value = line.split("\t")
         return PlantEvent(int(at_ns), kind, name, float(value))
     except ValueError:
-        raise CanductorError(f"{path}:{number}: this is no line of a plant's log") from None
+        raise CanductorError(f"{path}:{number}: not a line of a plant's log") from None

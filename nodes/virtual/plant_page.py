@@ -1,4 +1,4 @@
-"""Reads the page of a running plant, which is the truth about it, and switches faults in it.
+"""Reads the page of a running plant, which contains its true state, and sets faults in it.
 
 The layout is that of firmware/plant/plant_page.h.
 """
@@ -38,7 +38,7 @@ _PAGE: Final = np.dtype(
 
 
 class PlantItemKind(IntEnum):
-    """What an item of a plant is."""
+    """Kind of an item of a plant."""
 
     BODY = 1
     HEATER = 2
@@ -50,29 +50,29 @@ class PlantItemKind(IntEnum):
 
 
 class PlantFault(IntEnum):
-    """What may be wrong with an item."""
+    """Fault of an item."""
 
     SOUND = 0
     OPEN = 1
-    """A sensor's wire is broken, or that of a driver's UART."""
+    """The wire of a sensor, or of a driver's UART, is broken."""
     SHORTED = 2
-    """A sensor's wires touch, or those of a motor: its driver switched off."""
+    """The wires of a sensor, or of a motor (its driver switched off), are shorted."""
     FALLEN = 3
-    """A sensor fell out of its body: it gets as warm as the surroundings, as fast as its lag lets it."""
+    """A sensor fell out of its body: it takes ambient temperature, with its lag."""
     STUCK_ON = 4
-    """A heater that is on whatever its pin says."""
+    """A heater that is on whatever the level of its pin."""
     DEAD = 5
-    """A heater or a fan that does nothing, a driver without supply: with that back it has forgotten all."""
+    """A heater or fan without function; a driver without supply, which loses its registers."""
     NEVER = 6
     """A switch that never closes."""
     ALWAYS = 7
     """A switch that is always closed."""
     GARBLED = 8
-    """A driver whose answers are damaged on the way."""
+    """A driver whose answers arrive damaged."""
     WARM = 9
-    """A driver that gives warning."""
+    """A driver that reports its overtemperature warning."""
     OVERHEATED = 10
-    """A driver that switched off."""
+    """A driver that switched off because of its temperature."""
 
 
 _FAULTS: Final[Mapping[PlantItemKind, tuple[PlantFault, ...]]] = {
@@ -94,47 +94,45 @@ _FAULTS: Final[Mapping[PlantItemKind, tuple[PlantFault, ...]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Motor:
-    """Where a stepper truly is."""
+    """True position of a stepper."""
 
     count: int
     steps: int
-    """Made in all."""
+    """Number of all steps."""
     lost: int
-    """Steps that moved nothing: the driver was off, or the axis stood against its stop."""
+    """Steps without movement: the driver was off, or the axis was at its limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A part of the plant as it was last worked out."""
+    """A part of the plant as last computed."""
 
     kind: PlantItemKind
     fault: PlantFault
     value: float
-    """Of a body °C; of a heater or fan its duty, 0 to 1; of a sensor its own °C; of a switch 1: pressed; of
-    a driver the true time (ns) until which its DIAG is high if no step follows."""
+    """Body: °C; heater, fan: duty, 0 to 1; sensor: its own °C; switch: 1: pressed; driver: true time (ns)
+    until which its DIAG is high if no step follows."""
     extra: float
-    """Of a heater J given in all; of a fan turns; of a sensor its last sample; of a switch its changes;
-    of a driver its SG_RESULT."""
+    """Heater: J delivered so far; fan: revolutions; sensor: last sample; switch: number of changes; driver:
+    SG_RESULT."""
 
 
 class PlantPage:
     """The page in BUFFER (of a simulated board), or with `at` that of a process. NAME is for messages.
 
-    It is a view: each reading is of the moment. A process works its plant out every 50 ms, or when its
-    firmware looks; a simulated board's has to be updated.
+    It is a view: each access reads the present state. A process computes its plant every 50 ms and when its
+    firmware reads a pin; the plant of a simulated board has to be updated.
     """
 
     def __init__(self, name: str, buffer: Any) -> None:
         self._name = name
         self._page = np.frombuffer(buffer, _PAGE, 1)
         if int(self._head["magic"]) != _MAGIC:
-            raise CanductorError(
-                f"{name}: this is no page of a running plant; was its node started with one?"
-            )
+            raise CanductorError(f"{name}: not the page of a running plant; was its node started with one?")
 
     @classmethod
     def at(cls, folder: Path, node: str) -> Self:
-        """Open the page of NODE, whose description lies in FOLDER; raises CanductorError."""
+        """Open the page of NODE, whose description is in FOLDER; raises CanductorError."""
         path = folder / f"{node}.page"
         try:
             with path.open("r+b") as file:
@@ -148,7 +146,7 @@ class PlantPage:
 
     @property
     def updated_ns(self) -> int:
-        """True time (of a process: CLOCK_MONOTONIC) at which the items were worked out."""
+        """True time (of a process: CLOCK_MONOTONIC) at which the items were computed."""
         return int(self._head["updated_ns"])
 
     @property
@@ -165,7 +163,7 @@ class PlantPage:
         return Item(kind, PlantFault(int(row["fault"])), float(row["value"]), float(row["extra"]))
 
     def temperature(self, body: str) -> float:
-        """Return how warm BODY truly is, °C."""
+        """Return the true temperature of BODY, °C."""
         return self.item(PlantItemKind.BODY, body).value
 
     def names(self, kind: PlantItemKind) -> tuple[str, ...]:
@@ -173,9 +171,9 @@ class PlantPage:
         return tuple(row["name"].decode() for row in self._rows() if row["kind"] == kind)
 
     def set_fault(self, kind: PlantItemKind, name: str, fault: PlantFault) -> None:
-        """Let FAULT be so from now on; SOUND repairs. Raises CanductorError for what cannot be.
+        """Set a fault, or SOUND to repair it; raises CanductorError for a fault that the kind cannot have.
 
-        The plant takes it to heart when it is worked out next.
+        It takes effect when the plant is computed next.
         """
         row = self._row(kind, name)
         if fault is not PlantFault.SOUND and fault not in _FAULTS[kind]:

@@ -1,9 +1,9 @@
-"""Starts and ends the processes of virtual hardware: firmware nodes, and the bus as a process of its own.
+"""Starts and ends the processes of virtual hardware, such as firmware nodes.
 
-They print one JSON line when they are ready and, on SIGTERM, one with their counters. They die with this
+They print one JSON line when they are ready and, on SIGTERM, one with their counters. They end with this
 process, however it ends: the kernel sends them SIGKILL (PR_SET_PDEATHSIG, set by util-linux's ``setpriv``
-between fork and exec, where Python code would not be safe). The kernel watches the *thread* that forked, so
-all are started from one thread that lives as long as the interpreter. They are in a session of their own:
+between fork and exec, where Python code would not be safe). The kernel monitors the *thread* that forked, so
+all are started from one thread that lives as long as the interpreter. They have a session of their own:
 Ctrl-C at the terminal reaches only this process, which ends them in order.
 """
 
@@ -13,7 +13,6 @@ import os
 import select
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -27,13 +26,13 @@ from nodes.support.errors import CanductorError
 BIN_DIR = Path(__file__).parent / "bin"
 READY_TIMEOUT_S = 30.0
 STOP_TIMEOUT_S = 20.0
-"""Patience for a busy computer; both take some hundredths of a second."""
-ENDING_S = 2.0
-"""From the end of a process's output to its own, on a busy computer."""
+"""Long enough for a busy computer; both take some hundredths of a second."""
+EXIT_TIMEOUT_S = 2.0
+"""From the end of a process's output to its exit, on a busy computer."""
 LINE_MAX = 65_536
-"""Bytes a line of a child may have."""
+"""Most bytes of a line of a child."""
 _STDERR_TAIL = 500
-"""Bytes of a child's last words that go into an error message."""
+"""Last bytes of a child's stderr that an error message quotes."""
 
 Flavour = Literal["mainboard", "toolhead", "uart"]
 
@@ -41,18 +40,17 @@ _starter = ThreadPoolExecutor(max_workers=1, thread_name_prefix="process starter
 
 
 class ChildProcess:
-    """A process that announces itself and reports at its end, both as a JSON line. NAME is for messages.
+    """A process that reports, in one JSON line each, when it is ready and when it ends. NAME is for messages.
 
-    The constructor only starts it, so that several can come up at the same time; wait_ready() completes that.
-    Methods are for one thread. As a context manager it is stopped, or killed when an exception leaves the
-    block.
+    The constructor only starts it, so that several can start at the same time; call wait_ready() then. Use it
+    in one thread. As a context manager it is stopped, or killed when an exception leaves the block.
     """
 
     def __init__(self, name: str, command: Sequence[str | Path]) -> None:
-        """Start COMMAND; raises CanductorError when that is impossible."""
+        """Start COMMAND; raises CanductorError when that fails."""
         self.name = name
         self.ready: dict[str, Any] | None = None
-        """What the process said when it was ready."""
+        """The line that the process printed when it was ready."""
         self._statistics: dict[str, Any] | None = None
         self._received = b""
         setpriv = shutil.which("setpriv")
@@ -60,7 +58,7 @@ class ChildProcess:
             raise CanductorError(
                 f"{name}: cannot be started without 'setpriv'; install the package util-linux"
             )
-        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (a pipe nobody reads would stop the process)
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  (a pipe that nobody reads would block the process)
         try:
             self._process: subprocess.Popen[bytes] = _starter.submit(
                 subprocess.Popen,
@@ -76,7 +74,7 @@ class ChildProcess:
 
     @property
     def pid(self) -> int:
-        """The process's id."""
+        """The process id."""
         return self._process.pid
 
     @property
@@ -85,7 +83,7 @@ class ChildProcess:
         return self._process.poll() is None
 
     def wait_ready(self, timeout_s: float = READY_TIMEOUT_S) -> dict[str, Any]:
-        """Return what the process says when it is ready; else kill it and raise CanductorError."""
+        """Return the line of a ready process; if there is none, kill it and raise CanductorError."""
         if self.ready is None:
             line = self._read_line(timeout_s)
             if line is None or line.get("ready") is not True:
@@ -94,9 +92,9 @@ class ChildProcess:
         return self.ready
 
     def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> dict[str, Any]:
-        """Ask the process to end and return its counters; doing it again returns them again.
+        """End the process and return its counters; further calls return them again.
 
-        Raises CanductorError when it had died before, does not end in time (it is killed), or ends with an
+        Raises CanductorError when it had ended before, does not end in time (it is killed), or ends with an
         error.
         """
         if self._statistics is not None:
@@ -105,12 +103,12 @@ class ChildProcess:
             self._process.terminate()
         deadline_s = time.monotonic() + timeout_s
         line = self._read_line(timeout_s)
-        if line is not None and line.get("ready") is True:  # it was stopped before anybody waited for it
+        if line is not None and line.get("ready") is True:  # it was stopped before wait_ready()
             line = self._read_line(deadline_s - time.monotonic())
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(max(0.0, deadline_s - time.monotonic()))
         if line is None or self._process.returncode != 0:
-            raise self._failure("did not end in order", timeout_s)
+            raise self._failure("did not end correctly", timeout_s)
         self._close()
         self._statistics = line
         return line
@@ -120,7 +118,7 @@ class ChildProcess:
         self._process.send_signal(number)
 
     def kill(self) -> None:
-        """End the process at once, without counters; harmless when it has ended."""
+        """Kill the process, without counters; no effect when it has ended."""
         self._process.kill()
         self._process.wait()
         self._close()
@@ -131,7 +129,7 @@ class ChildProcess:
         self._stderr.close()
 
     def _read_line(self, timeout_s: float) -> dict[str, Any] | None:
-        """Return the process's next JSON line; None when none comes, or something else."""
+        """Return the process's next JSON line; None when there is none, or another line."""
         deadline_s = time.monotonic() + timeout_s
         assert self._process.stdout is not None
         if self._process.stdout.closed:
@@ -154,12 +152,12 @@ class ChildProcess:
         return value if isinstance(value, dict) else None
 
     def _failure(self, what: str, timeout_s: float) -> CanductorError:
-        """Say why, and make sure that the process has ended."""
+        """Return the error with its cause, and make sure that the process has ended."""
         if self._process.stdout is not None and self._process.stdout.closed:
-            return CanductorError(f"{self.name} {what}: it had been killed before")
-        # Its output may end a moment before the process itself does.
+            return CanductorError(f"{self.name} {what}: it was killed before")
+        # Its output may end shortly before the process itself.
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(min(timeout_s, ENDING_S))
+            self._process.wait(min(timeout_s, EXIT_TIMEOUT_S))
         status = self._process.poll()
         if status is None:
             reason = f"no answer in {timeout_s:g} s; it was killed"
@@ -189,13 +187,13 @@ class ChildProcess:
 class NodeProcess(ChildProcess):
     """A virtual node: the project's firmware as a process.
 
-    FLAVOUR is the board it plays. Exactly one of ``can`` (a virtual bus's socket), ``socketcan`` (an
-    interface) and ``uart`` (where to put the link to the node's pseudo-terminal) says how it is reached.
-    ``rate_ppm``: by how much its clock is too fast; ``start_clock``: where its clock starts. ``jitter_us``,
-    ``slice_us`` and ``seed``: see the firmware. ``legacy``: it plays a board with Klipper firmware, which
-    knows none of this project's extensions of the CAN protocol. ``plant``: the file that describes what its
-    pins are connected with (plant.py); beside it the process writes its page and, if
-    ``plant_log``, its log, which grows as long as it runs.
+    FLAVOUR is its kind of board. Exactly one of ``can`` (a virtual bus's socket), ``socketcan`` (an
+    interface) and ``uart`` (path of the link to the node's pseudo-terminal) defines its connection.
+    ``rate_ppm``: rate error of its clock; ``start_clock``: its clock at the start. ``jitter_us``,
+    ``slice_us`` and ``seed``: see the firmware. ``legacy``: it behaves as a board with Klipper firmware,
+    without this project's extensions of the CAN protocol. ``plant``: the description of its plant (plant.py),
+    in whose folder the process writes its page and, with ``plant_log``, its log, which grows as long as it
+    runs.
     """
 
     def __init__(
@@ -218,16 +216,14 @@ class NodeProcess(ChildProcess):
         name: str | None = None,
         bin_dir: Path = BIN_DIR,
     ) -> None:
-        """Start the node; raises CanductorError. Options left at None are the firmware's own choice."""
+        """Start the node; raises CanductorError. None: the firmware's default."""
         name = name or f"virtual node {flavour}"
         links = {"--can": can, "--socketcan": socketcan, "--uart": uart}
         if sum(link is not None for link in links.values()) != 1:
-            raise CanductorError(f"{name}: needs exactly one of can, socketcan and uart to be reached")
+            raise CanductorError(f"{name}: give exactly one of can, socketcan and uart")
         executable = bin_dir / f"canductor-node-{flavour}"
         if not executable.is_file():
-            raise CanductorError(
-                f"{name}: its firmware {executable} is not there; build it with 'make setup'"
-            )
+            raise CanductorError(f"{name}: its firmware {executable} is missing; build it with 'make setup'")
         options = links | {
             "--uuid": uuid,
             "--rate-ppm": rate_ppm,
@@ -245,14 +241,3 @@ class NodeProcess(ChildProcess):
             if value is not None:
                 command += [option, str(value)]
         super().__init__(name, command)
-
-
-class BusProcess(ChildProcess):
-    """The virtual bus as a process of its own; stop() returns its BusStats as a dictionary."""
-
-    def __init__(
-        self, path: str | Path, *, bitrate: int | None = 1_000_000, loss: float = 0.0, seed: int = 0
-    ) -> None:
-        """Start the bus; the arguments are those of VirtualBus."""
-        options = ["--bitrate", str(bitrate or 0), "--loss", str(loss), "--seed", str(seed)]
-        super().__init__(f"virtual bus {path}", [sys.executable, "-m", "nodes.virtual.hub", path, *options])

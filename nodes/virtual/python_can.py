@@ -1,6 +1,6 @@
 """The virtual CAN bus as a backend of python-can: ``can.Bus(interface="canductor", channel=PATH)``.
 
-Registered under the entry point group ``can.interface``, so that every tool made for python-can works on it.
+Registered under the entry point group ``can.interface``, so that every tool based on python-can can use it.
 """
 
 import time
@@ -16,16 +16,15 @@ from nodes.transport.python_can_bridge import is_plain, to_message
 from nodes.transport.virtual import VirtualTransport
 
 _LONG_S = 3600.0
-"""One wait of a recv() without timeout; it is repeated."""
+"""Length of one wait of a recv() without timeout, which is repeated."""
 
 
 class CanductorBus(can.BusABC):
     """A client of the virtual bus whose Unix socket is CHANNEL. CAN 2.0A data frames only."""
 
     def __init__(self, channel: str, can_filters: CanFilters | None = None, **kwargs: Any) -> None:
-        """Connect; raises can.CanInitializationError when no bus is there."""
-        # can.Bus() passes on what its configuration files hold; of that, only the channel means anything
-        # here.
+        """Connect; raises can.CanInitializationError when there is no bus."""
+        # can.Bus() passes the options of its configuration files; only the channel has a meaning here.
         try:
             self._transport = VirtualTransport(channel, read_size=RECORD_SIZE)
         except CanductorError as error:
@@ -38,8 +37,8 @@ class CanductorBus(can.BusABC):
         """Send MSG, waiting at most TIMEOUT seconds (None: 1) for room; raises can.CanOperationError."""
         if not is_plain(msg):
             raise can.CanOperationError(
-                f"{self.channel_info} carries only data frames with 11-bit ids, no extended, remote or FD"
-                " frames"
+                f"{self.channel_info} carries only data frames with 11-bit ids, not extended, remote or"
+                " FD frames"
             )
         try:
             frame = CanFrame(msg.arbitration_id, bytes(msg.data))
@@ -66,6 +65,6 @@ class CanductorBus(can.BusABC):
         return self._transport.fileno()
 
     def shutdown(self) -> None:
-        """Disconnect from the bus; doing it again is harmless."""
+        """Disconnect from the bus; further calls do nothing."""
         super().shutdown()
         self._transport.close()

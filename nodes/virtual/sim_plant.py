@@ -1,4 +1,4 @@
-"""The plant of a simulated board (firmware/boards/sim): started, connected with others, read."""
+"""The plant of a simulated board (firmware/boards/sim)."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -10,9 +10,9 @@ from nodes.virtual.plant_page import PlantPage
 
 
 class SimPlant:
-    """PLANT around BOARD (``struct sim_board *``, which outlives this), from now on and over its resets.
+    """PLANT of BOARD (``struct sim_board *``, which outlives this), from now on; it survives resets.
 
-    NOW_NS: true time; without it, that of the board's last event.
+    NOW_NS returns true time; by default that of the board's last event.
     """
 
     def __init__(self, board: Any, plant: NodePlant, now_ns: Callable[[], int] = lambda: 0) -> None:
@@ -21,26 +21,26 @@ class SimPlant:
         self._now_ns = now_ns
         text, error = plant.text().encode(), ffi.new("char[]", lib.SIM_ERROR)
         if lib.sim_plant_start(board, now_ns(), text, len(text), error):
-            said = ffi.string(error)
-            assert isinstance(said, bytes)
-            raise CanductorError(f"the plant of node {plant.node}: {said.decode()}")
+            reason = ffi.string(error)
+            assert isinstance(reason, bytes)
+            raise CanductorError(f"the plant of node {plant.node}: {reason.decode()}")
         size = ffi.new("size_t *")
         page = lib.sim_plant_page(board, size)
         self._page = PlantPage(f"the plant of node {plant.node}", ffi.buffer(page, size[0]))
 
     @property
     def page(self) -> PlantPage:
-        """The truth about it, as of now."""
+        """Its true state now."""
         lib.sim_plant_update(self.board, self._now_ns())
         return self._page
 
 
 def connect_plants(plants: Mapping[str, SimPlant]) -> None:
-    """Let the plants of boards that live together see each other; CanductorError when one is missing."""
+    """Connect the plants of the boards of a machine; CanductorError when one is missing."""
     for plant in plants.values():
         for name in plant.description.peers:
             if name not in plants:
                 raise CanductorError(
-                    f"the plant of node {plant.description.node} speaks of node '{name}', which has no plant"
+                    f"the plant of node {plant.description.node} refers to node '{name}', which has no plant"
                 )
             lib.sim_plant_peer(plant.board, name.encode(), plants[name].board)

@@ -5,9 +5,9 @@ from typing import Literal, TypedDict, Unpack
 import numpy as np
 import numpy.typing as npt
 
-from nodes.virtual.sim import SimNode, edge_clocks
 from tests import wire_twin
 from tests.firmware import twin
+from tests.stages.sim_node import SimNode, edge_clocks
 
 NODE_ID = 4
 TO_NODE, FROM_NODE = NODE_ID * 2 + 0x100, NODE_ID * 2 + 0x101

@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import pytest
 
-from nodes.virtual.sim import SimNode
 from tests.firmware.host import NODE_ID, Host
+from tests.stages.sim_node import SimNode
 
 ROLLOVER = 1 << 32
 FREQ = 168_000_000

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from nodes.support.errors import CanductorError
-from nodes.virtual.sim import SimNode, edge_clocks
 from tests import wire_twin
 from tests.firmware import twin
 from tests.firmware.host import FROM_NODE, NODE_ID, TO_NODE, Host
+from tests.stages.sim_node import SimNode, edge_clocks
 
 ROLLOVER = 1 << 32
 FREQ = 168_000_000

@@ -6,10 +6,10 @@ import zlib
 
 import pytest
 
-from nodes.virtual.sim import SimNode
 from tests import real_dictionaries, wire_twin
 from tests.firmware import twin
 from tests.firmware.host import Host
+from tests.stages.sim_node import SimNode
 
 CODES = {"%u", "%i", "%hu", "%hi", "%c", "%s", "%*s", "%.*s"}
 

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.virtual.sim import edge_clocks
 from tests.firmware.board_process import (
     BIN,
     FREQUENCIES_HZ,
@@ -24,6 +23,7 @@ from tests.firmware.board_process import (
     BoardProcess,
 )
 from tests.firmware.host import NODE_ID
+from tests.stages.sim_node import edge_clocks
 
 TO_ROLLOVER_S = 4
 """From the start of a node on: a busy computer takes a part of it to set the nodes up."""

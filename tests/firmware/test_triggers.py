@@ -2,9 +2,9 @@
 
 import pytest
 
-from nodes.virtual.sim import SimNode
 from tests.firmware.host import NODE_ID, Host
 from tests.firmware.wire import Signal, Wire
+from tests.stages.sim_node import SimNode
 
 ROLLOVER = 1 << 32
 STEPPER = "config_stepper oid=0 step_pin=3 dir_pin=4 invert_step=255 step_pulse_ticks=0"

@@ -6,8 +6,8 @@ The firmware's receiver is the one that virtual nodes run. fuzz_mt.c looks at it
 from typing import Any, Final
 
 from nodes.mt.mt import AXLES, MtStatus, digest, transmission
-from nodes.mt.receiver import ByteWords, MtReceiver, PolledRegister
 from nodes.virtual._sim import ffi, lib
+from tests.nodes.mt.receiver import ByteWords, MtReceiver, PolledRegister
 from tests.nodes.mt.receivers import FirmwareReceiver
 
 GAP: Final = 100

@@ -16,7 +16,7 @@ from typing import Any
 from nodes.bus.assign import Uuid
 from nodes.dictionary.dictionary import Dictionary
 from nodes.dictionary.message_format import Message, Value
-from nodes.link import BusLoad, Forecast, IOStats, LinkSettings
+from nodes.link import BusLoad, Forecast, Frame, IOStats, LinkSettings, Response
 from nodes.link.interfaces import OnFrame, OnLost, OnResponses
 from nodes.support.can_protocol import ADMIN_ID, ADMIN_RESPONSE_ID
 
@@ -33,20 +33,6 @@ SURVIVING = {
     "config_reset",
 }
 """Commands that a node takes when it is shut down."""
-
-
-@dataclass(frozen=True)
-class Response:
-    content: bytes
-    sent_ns: int
-    received_ns: int
-
-
-@dataclass(frozen=True)
-class Frame:
-    can_id: int
-    data: bytes
-    received_ns: int = 0
 
 
 def source_of(**parts: Any) -> dict[str, Any]:
@@ -308,7 +294,8 @@ class TwinIO:
         for node in self.nodes:
             answer = node.admin(data) if self.source.random() >= self.loss else None
             if answer is not None and self.source.random() >= self.loss:
-                asyncio.get_running_loop().call_later(DELAY_S, self._frame, Frame(ADMIN_RESPONSE_ID, answer))
+                frame = Frame(ADMIN_RESPONSE_ID, answer, 0)
+                asyncio.get_running_loop().call_later(DELAY_S, self._frame, frame)
 
     def _frame(self, frame: Frame) -> None:
         if self.on_frame is not None and not self.closed:

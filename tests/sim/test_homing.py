@@ -29,6 +29,7 @@ from coordinator.simulate.stage import Stage
 from nodes.link import Link
 from nodes.support.errors import CanductorError
 from tests.profiles import examples
+from tests.stages.motor_switches import MotorSwitch, place_switches
 from tests.stages.printer_text import MCU, TOOLHEAD, printer_section, section, stepper_section
 
 if TYPE_CHECKING:
@@ -84,16 +85,15 @@ class Home:
         text = f'about = "Homing."\nmachine = "home.cfg"\n{self.settings}'
         (self.folder / "home.toml").write_text(text)
         self.stage = Stage(scenarios.find(str(self.folder / "home.toml")), self.seed)
-        mcu, toolhead = (self.stage._boards[name].node for name in ("mcu", "toolhead"))
-        pins = self.stage.pins("mcu")
-        self.axis = mcu.add_axis(
-            pins["PB0"],
-            pins["PB1"],
-            target=toolhead if "toolhead" in self.endstop else mcu,
-            target_pin=pins["PC5"],
+        switch = MotorSwitch(
+            "PB0",
+            "PB1",
+            node="toolhead" if "toolhead" in self.endstop else "mcu",
+            pin="PC5",
             at=self.switch_at if self.switch_at is not None else self.direction * 10**6,
             direction=self.direction,
         )
+        self.plants = place_switches(self.stage, [switch])
         with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
             return runner.run(self._main())
 
@@ -144,7 +144,7 @@ class Home:
         return np.asarray(edges["true_ps"][chosen] // PS_PER_US, np.int64)
 
     def position(self) -> int:
-        return self.stage._boards["mcu"].node.axis_position(self.axis)
+        return self.plants["mcu"].page.motors["PB0"].count
 
     def microseconds_to_stop(self) -> int:
         """Return the true time from the switch to the last step behind it."""

@@ -171,7 +171,7 @@ def test_afterwards_the_drivers_are_as_they_were(tmp_path: Path) -> None:
             PlantFault.OPEN,
             "does not answer; check that its motor supply is on, and uart_pin and uart_address",
         ),
-        (PlantFault.GARBLED, "gives answers that are damaged; check its UART's wiring and for other drivers"),
+        (PlantFault.GARBLED, "sends damaged answers; check its UART's wiring and for other drivers"),
         (PlantFault.SHORTED, "reports a short circuit to ground at coil A; check motor and cable"),
     ],
 )
@@ -187,7 +187,7 @@ def test_a_driver_that_cannot_be_set_ends_the_start(tmp_path: Path, fault: Plant
     ("faults", "sentence"),
     [
         ((PlantFault.OVERHEATED,), "is too hot and switched itself off; lower run_current, cool it"),
-        ((PlantFault.GARBLED,), "gives answers that are damaged"),
+        ((PlantFault.GARBLED,), "sends damaged answers"),
         ((PlantFault.DEAD, PlantFault.SOUND), "has lost its settings: its motor supply was off for a moment"),
     ],
 )

@@ -11,6 +11,7 @@ from coordinator.runtime.machine import Machine
 from coordinator.runtime.moves.homing import LOOK_S, HomingMove, HomingResult
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
+from tests.stages.motor_switches import MotorSwitch, place_switches
 
 MACHINE = """
 [mcu]
@@ -85,20 +86,12 @@ class Switches:
         (folder / "home.toml").write_text(f'about = "Homing."\nmachine = "home.cfg"\n{legacy}')
         self.at = {"stepper_x": at} if second_at is None else {"stepper_x": at, "stepper_x1": second_at}
         self.stage = Stage(scenarios.find(str(folder / "home.toml")), 0)
-        mcu, toolhead = (self.stage._boards[name].node for name in ("mcu", "toolhead"))
-        pins = self.stage.pins("mcu")
-        mcu.add_axis(
-            pins["PB0"],
-            pins["PB1"],
-            target=toolhead if "toolhead" in endstop else mcu,
-            target_pin=pins["PC5"],
-            at=-at,
-            direction=-1,
-        )
+        node = "toolhead" if "toolhead" in endstop else "mcu"
+        switches = [MotorSwitch("PB0", "PB1", node, "PC5", at=-at, direction=-1)]
         if second_at is not None:
-            second_pins = (pins["PB3"], pins["PB4"])
-            target = toolhead if "toolhead" in second_switch else mcu
-            mcu.add_axis(*second_pins, target=target, target_pin=pins["PC6"], at=-second_at, direction=-1)
+            node = "toolhead" if "toolhead" in second_switch else "mcu"
+            switches.append(MotorSwitch("PB3", "PB4", node, "PC6", at=-second_at, direction=-1))
+        place_switches(self.stage, switches)
 
     def run(self, speed: float) -> tuple[HomingResult, ...]:
         """Home at SPEED, mm/s."""

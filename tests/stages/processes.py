@@ -12,7 +12,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any, Self
 
-from nodes.virtual.processes import BusProcess, ChildProcess, NodeProcess
+from nodes.virtual.processes import ChildProcess, NodeProcess
+from tests.stages.bus_process import BusProcess
 from tests.stages.printer_text import DEMO_CFG, without_endstops
 
 ROOT = Path(__file__).parents[2]

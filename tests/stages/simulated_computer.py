@@ -12,8 +12,8 @@ from canbus_tools.bus.frame_queue import FRAMES_MAX
 from canbus_tools.bus.open_bus import BusOptions
 from canbus_tools.protocol.frame import Frame, FrameKind
 from nodes.link import BusSettings, LinkIO
+from nodes.link.interfaces import OnFrame
 from nodes.link.types import Frame as LinkFrame
-from nodes.link.types import FrameHandler
 from nodes.support.errors import CanductorError
 from nodes.transport import CanFrame
 from nodes.virtual.world import CanPort, CanWire, ControllerSettings, Uart, UartPort, World, run
@@ -81,7 +81,7 @@ class SimulatedComputer:
         port = self._take(options)
 
         def start(
-            *, on_frame: FrameHandler | None = None, on_closed: Callable[[str], None] | None = None
+            *, on_frame: OnFrame | None = None, on_closed: Callable[[str], None] | None = None
         ) -> LinkIO:
             settings = BusSettings(bitrate=options.bitrate or 0)
             return LinkIO.driven_by(port.open(settings), on_frame=on_frame, on_closed=on_closed)
@@ -97,7 +97,7 @@ class SimulatedComputer:
         opened = port
 
         def start(
-            *, on_frame: FrameHandler | None = None, on_closed: Callable[[str], None] | None = None
+            *, on_frame: OnFrame | None = None, on_closed: Callable[[str], None] | None = None
         ) -> LinkIO:
             return LinkIO.driven_by(opened.open(BusSettings()), on_frame=on_frame, on_closed=on_closed)
 
@@ -116,7 +116,7 @@ class SimulatedComputer:
         for port in self._used:
             port.fail(cause)
 
-    def open_io(self, options: BusOptions, on_frame: FrameHandler, on_closed: Callable[[str], None]) -> Port:
+    def open_io(self, options: BusOptions, on_frame: OnFrame, on_closed: Callable[[str], None]) -> Port:
         """Open an adapter and start its I/O; closing the port ends both."""
         port = self.open_can(options)
         io = port.start_io(on_frame=on_frame, on_closed=on_closed)

@@ -10,6 +10,7 @@ from coordinator.service.jobs.outcome import Outcome
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.stage import Stage
 from coordinator.streaming.move_source import ProgramOutput
+from tests.stages.motor_switches import MotorSwitch, place_switches
 from tests.stages.printer_text import SWITCHES_CFG
 
 STEPS_PER_MM = {"x": 80, "y": 80, "z": 400}
@@ -32,20 +33,20 @@ class SwitchPrinter:
         (self.folder / "home.cfg").write_text(self.machine)
         (self.folder / "home.toml").write_text(f'about = "G28."\nmachine = "home.cfg"\n{self.settings}')
         self.stage = Stage(scenarios.find(str(self.folder / "home.toml")), self.seed)
-        mcu, toolhead = (self.stage._boards[name].node for name in ("mcu", "toolhead"))
-        pins = self.stage.pins("mcu")
-        self.axes = {}
+        switches = []
         for axis, mm in self.distance_mm.items():
             step, direction, sign = PINS[axis]
-            at = round(mm * STEPS_PER_MM[axis])
-            self.axes[axis] = mcu.add_axis(
-                pins[step],
-                pins[direction],
-                target=toolhead if axis == "x" else mcu,
-                target_pin=pins[{"x": "PC5", "y": "PC6", "z": "PC7"}[axis]],
-                at=sign * at,
-                direction=sign * (1 if mm > 0 else -1),
+            switches.append(
+                MotorSwitch(
+                    step,
+                    direction,
+                    node="toolhead" if axis == "x" else "mcu",
+                    pin={"x": "PC5", "y": "PC6", "z": "PC7"}[axis],
+                    at=sign * round(mm * STEPS_PER_MM[axis]),
+                    direction=sign * (1 if mm > 0 else -1),
+                )
             )
+        place_switches(self.stage, switches)
         with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
             return runner.run(self._main(lines))
 

@@ -118,6 +118,11 @@ static void configure(struct sim_board *board, const struct sim_options *options
     memcpy(board->config.uuid, options->uuid, sizeof(board->config.uuid));
 }
 
+const uint8_t *sim_dictionary(uint32_t *size) {
+    *size = node_tables.dictionary_size;
+    return node_tables.dictionary;
+}
+
 struct sim_board *sim_new_with(const struct sim_options *options) {
     struct sim_board *board = calloc(1, sizeof(*board));
     if (!board)

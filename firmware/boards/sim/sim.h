@@ -77,6 +77,9 @@ struct sim_counters {
     uint32_t is_shutdown; // 1 from a shutdown to the restart or clear_shutdown that ends it
 };
 void sim_counters(const struct sim_board *board, struct sim_counters *out);
+
+// The dictionary of the build, zlib-compressed, and its SIZE.
+const uint8_t *sim_dictionary(uint32_t *size);
 // cffi: end
 
 // ------------------------------------------------------------------------------------ within a simulated

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// What happens when: the one queue of events of a simulated world, and its time.
+// The event queue of a simulated world, and its time.
 //
 // Time is true time in integer ns; it moves only from event to event. Events of one instant fire in the order
-// in which they were put in, so that a run depends on nothing but its seed.
+// in which they were planned, so that a run depends on its seed only.
 #ifndef WORLD_AGENDA_H
 #define WORLD_AGENDA_H
 
@@ -24,13 +24,13 @@ struct agenda {
     struct event **heap;
     uint32_t count, room, reserved;
     uint64_t now_ns, order, fired;
-    uint64_t trace; // a hash of all that was noted
+    uint64_t trace; // hash of everything that was noted
 };
 
-// Makes sure that COUNT further events can always be planned. 0, or -1: no memory.
+// Reserves memory for COUNT more events. Returns 0, or -1: no memory.
 int agenda_reserve(struct agenda *agenda, uint32_t count);
 void agenda_free(struct agenda *agenda);
-// Plans EVENT, or plans it anew. A time that has passed is now.
+// Plans EVENT, or changes its time. A time in the past means now.
 void agenda_plan(struct agenda *agenda, struct event *event, uint64_t at_ns);
 void agenda_cancel(struct agenda *agenda, struct event *event);
 // Fires the next event, if it is due up to and including UNTIL_NS; returns whether it did.
@@ -40,7 +40,7 @@ static inline int event_planned(const struct event *event) {
     return event->place != 0;
 }
 
-// Adds something that happened to the trace: two runs with equal traces did the same at the same times.
+// Adds WHAT to the trace: two runs with equal traces did the same at the same times.
 static inline void agenda_note(struct agenda *agenda, uint64_t what) {
     uint64_t mixed = (agenda->trace ^ what ^ agenda->now_ns << 20) * UINT64_C(0x9E3779B97F4A7C15);
     agenda->trace = mixed ^ mixed >> 29;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The wire between the controllers: who sends when, and how it ends. See can_wire.h.
+// The wire between the controllers: arbitration and the outcome of frames. See can_wire.h.
 #include "nodes/virtual/world/can_wire.h"
 
 #include "nodes/support/can_bits.h"
@@ -11,7 +11,7 @@ enum outcome { GOOD, COLLISION, DISTURBED, UNACKNOWLEDGED };
 
 enum {
     GAP_BITS = 3,        // intermission, the last part of a frame
-    AFTER_ACK_BITS = 11, // of a frame behind its acknowledge slot
+    AFTER_ACK_BITS = 11, // of a frame, after its acknowledge slot
     TEC_STEP = 8,
     TEC_PASSIVE = 128,
 };
@@ -22,8 +22,8 @@ uint64_t can_wire_bits_ns(const struct can_wire *wire, uint64_t bits) {
     return bits * NS_PER_S / wire->settings.bitrate;
 }
 
-// When bit N of what began at start_ns begins. The rest of the division is carried on from frame to frame,
-// so that no rate drifts by its rounding.
+// Returns when bit BITS of the frame that began at start_ns begins. The remainder of the division is carried
+// over from frame to frame, so that rounding causes no drift of the rate.
 static uint64_t bit_time(const struct can_segment *segment, uint64_t bits, uint64_t *rest) {
     uint64_t scaled = bits * NS_PER_S + segment->start_carry, bitrate = segment->wire->settings.bitrate;
     if (rest)
@@ -37,7 +37,7 @@ static int is_on(const struct can_controller *controller, const struct can_segme
 
 // --------------------------------------------------------------------------------------------- beginning
 
-// When the first of those who wait can start.
+// Returns when the first waiting controller can start.
 static uint64_t next_start(const struct can_segment *segment) {
     const struct can_wire *wire = segment->wire;
     uint64_t now = wire->agenda->now_ns, start_ns = AGENDA_NEVER, number;
@@ -56,7 +56,7 @@ static void plan(struct can_segment *segment) {
     struct agenda *agenda = segment->wire->agenda;
     int started = segment->phase == CAN_STARTING && agenda->now_ns >= segment->start_ns;
     if (segment->phase == CAN_BUSY || started)
-        return; // who comes now takes part in the arbitration that is going on, or waits
+        return; // a new frame takes part in the current arbitration, or waits
     uint64_t start_ns = next_start(segment);
     if (start_ns == AGENDA_NEVER) {
         segment->phase = CAN_IDLE;
@@ -73,8 +73,8 @@ void can_wire_plan(struct can_controller *controller) {
     plan(&controller->wire->segments[controller->segment]);
 }
 
-// The frame of CONTROLLER that takes part in the arbitration now, or NULL. A suspended one lost its chance
-// when another began.
+// Returns the frame of CONTROLLER that takes part in the arbitration now, or NULL. A suspended controller
+// cannot take part once another has begun.
 static const struct can_bits *contender(const struct can_controller *controller,
                                         const struct can_segment *segment, uint64_t *number) {
     if (!is_on(controller, segment) || controller->ready_ns > segment->start_ns)
@@ -82,7 +82,7 @@ static const struct can_bits *contender(const struct can_controller *controller,
     return can_controller_offer(controller, segment->start_ns, number);
 }
 
-// Lets everyone with the lowest id begin to send; returns how many, the first one's frame in the segment.
+// Starts all controllers with the lowest id; returns their number. The segment's frame is that of the first.
 static uint32_t arbitrate(struct can_segment *segment) {
     struct can_wire *wire = segment->wire;
     uint32_t lowest = UINT32_MAX, senders = 0;
@@ -131,16 +131,16 @@ static void find_rivals(const struct can_segment *segment, struct rivals *rivals
     }
 }
 
-// An error-passive sender of a recessive bit that is overruled cannot disturb the others: it gives up, and
-// hears nothing of the frame that goes on.
+// An error-passive sender whose recessive bit is overwritten cannot disturb the others: it gives up, and does
+// not receive the frame that continues.
 static void give_up(struct can_segment *segment, struct can_controller *controller) {
     can_controller_send_failed(controller, TEC_STEP);
     controller->joined_ns = segment->wire->agenda->now_ns;
     segment->wire->counters.yielded++;
 }
 
-// Judges BIT: those who send recessive while another sends dominant see it. Returns whether an active error
-// flag follows; passive ones leave the rivals.
+// Evaluates BIT: senders of a recessive bit detect a dominant one. Returns whether an active error flag
+// follows; error-passive senders leave the rivals.
 static int collide(struct can_segment *segment, struct rivals *rivals, uint32_t bit) {
     uint32_t dominant = 0, left = 0;
     for (uint32_t i = 0; i < rivals->count; i++)
@@ -163,21 +163,21 @@ static int collide(struct can_segment *segment, struct rivals *rivals, uint32_t 
     return 0;
 }
 
-// The bit at which senders of one id destroy each other's frames, or UINT32_MAX; then the segment's frame is
-// the one that survives.
+// Returns the bit at which senders of one id destroy each other's frames; UINT32_MAX: none, the segment's
+// frame is the one that survives.
 static uint32_t first_collision(struct can_segment *segment) {
     struct rivals rivals;
     find_rivals(segment, &rivals);
     for (uint32_t bit = 0; bit < CAN_LEVELS_MAX && rivals.count > 1; bit++)
         if (collide(segment, &rivals, bit))
             return bit;
-    // One there is: arbitration found it. NOLINTNEXTLINE(clang-analyzer-core.NullDereference)
+    // There is one: arbitration found it. NOLINTNEXTLINE(clang-analyzer-core.NullDereference)
     segment->frame = *rivals.frames[0];
     segment->wire->counters.same += rivals.count > 1;
     return UINT32_MAX;
 }
 
-// The first disturbed bit of BITS, or UINT32_MAX: geometrically distributed.
+// Returns the first disturbed bit of BITS (geometrically distributed), or UINT32_MAX.
 static uint32_t first_disturbed(struct can_wire *wire, uint32_t bits) {
     double probability = wire->settings.bit_errors;
     if (!(probability > 0))
@@ -188,7 +188,7 @@ static uint32_t first_disturbed(struct can_wire *wire, uint32_t bits) {
     return bit < bits ? (uint32_t)bit : UINT32_MAX;
 }
 
-static int anyone_answers(const struct can_segment *segment) {
+static int is_acknowledged(const struct can_segment *segment) {
     const struct can_wire *wire = segment->wire;
     for (uint32_t i = 0; i < wire->count; i++)
         if (is_on(wire->controllers[i], segment) && !wire->controllers[i]->on_wire &&
@@ -197,7 +197,7 @@ static int anyone_answers(const struct can_segment *segment) {
     return 0;
 }
 
-// What will become of the frame that begins; returns the bits until it is known.
+// Determines the outcome of the frame that begins; returns the number of bits until it is known.
 static uint32_t decide(struct can_segment *segment, uint32_t senders) {
     uint32_t wrong = senders > 1 ? first_collision(segment) : UINT32_MAX;
     const struct can_bits *frame = &segment->frame;
@@ -209,7 +209,7 @@ static uint32_t decide(struct can_segment *segment, uint32_t senders) {
         wrong = disturbed;
     }
     uint32_t ack_bits = bits - AFTER_ACK_BITS;
-    if (wrong >= ack_bits && !anyone_answers(segment)) {
+    if (wrong >= ack_bits && !is_acknowledged(segment)) {
         segment->outcome = UNACKNOWLEDGED;
         segment->free_bits = ack_bits + CAN_LONELY_ERROR_BITS;
         return ack_bits;
@@ -225,7 +225,7 @@ static uint32_t decide(struct can_segment *segment, uint32_t senders) {
 static void begin(struct can_segment *segment) {
     struct can_wire *wire = segment->wire;
     uint32_t senders = arbitrate(segment);
-    if (senders == 0) { // who wanted to send is gone
+    if (senders == 0) { // the controllers that wanted to send are gone
         segment->phase = CAN_IDLE;
         plan(segment);
         return;
@@ -253,7 +253,7 @@ static void count(struct can_wire *wire, const struct can_segment *segment) {
     agenda_note(wire->agenda, data);
 }
 
-// Error-passive senders give the others the first chance.
+// Error-passive senders suspend transmission, so that others can start first.
 static void suspend(struct can_controller *controller, uint64_t free_ns) {
     if (can_state_of(controller) == CAN_PASSIVE)
         controller->ready_ns = free_ns + can_wire_bits_ns(controller->wire, CAN_SUSPEND_BITS);
@@ -269,7 +269,7 @@ static void end_badly(struct can_segment *segment) {
             can_controller_receive_failed(controller);
             continue;
         }
-        // Alone on the bus, a sender stays error-passive: it cannot know that it is its own fault.
+        // Alone on the bus, a sender stays error-passive (ISO 11898-1).
         int stays = segment->outcome == UNACKNOWLEDGED && controller->tec >= TEC_PASSIVE;
         can_controller_send_failed(controller, stays ? 0 : TEC_STEP);
         suspend(controller, segment->free_ns);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Chance: every component has a generator of its own, derived from the world's seed, its kind and its number;
-// so one component more does not change what happens to the others.
+// Random numbers: every component has its own generator, derived from the world's seed, its kind and its
+// number, so that adding a component does not change the others.
 #ifndef WORLD_CHANCE_H
 #define WORLD_CHANCE_H
 
@@ -13,7 +13,7 @@ struct chance {
     uint64_t state;
 };
 
-// splitmix64: every seed is a good one.
+// splitmix64: any seed is suitable.
 static inline uint64_t chance_bits(struct chance *chance) {
     uint64_t z = chance->state += UINT64_C(0x9E3779B97F4A7C15);
     z = (z ^ z >> 30) * UINT64_C(0xBF58476D1CE4E5B9);
@@ -34,7 +34,7 @@ static inline double chance_fraction(struct chance *chance) {
     return (double)(chance_bits(chance) >> 11) * 0x1p-53;
 }
 
-// Draws only when there is something to decide: probability 0 costs nothing.
+// Draws no number for probability 0.
 static inline int chance_happens(struct chance *chance, double probability) {
     return probability > 0 && chance_fraction(chance) < probability;
 }

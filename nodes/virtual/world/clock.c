@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// See clock.h. Doubles hold differences only: within a piece of three hours at 168 MHz the rounding is below
-// a thousandth of a tick.
+// See clock.h. Doubles contain differences only: within a piece of three hours at 168 MHz the rounding error
+// is below a thousandth of a tick.
 #include "nodes/virtual/world/clock.h"
 
 #include <math.h>
@@ -27,7 +27,7 @@ static double advance(const struct clock_piece *piece, double passed_ns) {
     return piece->fraction + (piece->rate + piece->bend * passed_ns) * passed_ns;
 }
 
-// Before the first piece its rate is continued backwards, which only happens by the rounding of one ns.
+// Before the first piece its rate is extrapolated, which only occurs for the rounding of one ns.
 static double passed(const struct clock_piece *piece, uint64_t at_ns) {
     return at_ns >= piece->at_ns ? (double)(at_ns - piece->at_ns) : -(double)(piece->at_ns - at_ns);
 }
@@ -68,11 +68,11 @@ static const struct clock_piece *piece_of_ticks(const struct crystal *crystal, u
     return &crystal->pieces[i];
 }
 
-// ns since the begin of PIECE at which the clock becomes TICKS.
+// Returns the ns since the start of PIECE at which the clock becomes TICKS.
 static double time_in_piece(const struct clock_piece *piece, uint64_t ticks) {
     double wanted = (double)(int64_t)(ticks - piece->ticks) - piece->fraction;
     double passed_ns = wanted / piece->rate;
-    // Two Newton steps: the ramp bends the line by some ppm.
+    // Newton's method: the ramp changes the rate by some ppm.
     for (int i = 0; piece->bend != 0 && i < 3; i++)
         passed_ns -= (advance(piece, passed_ns) - piece->fraction - wanted) /
                      (piece->rate + 2 * piece->bend * passed_ns);

@@ -44,8 +44,7 @@ static void forget_queue(struct can_controller *controller) {
     controller->on_wire = 0;
 }
 
-// Urgent frames go before all others that are not being sent; where a chip has mailboxes, one is kept for
-// them.
+// Urgent frames go before all others; where a chip has mailboxes, one is reserved for them.
 static uint32_t place_for(const struct can_controller *controller, const struct can_bits *frame) {
     uint32_t at = controller->count;
     if (frame->id >= URGENT_END)
@@ -121,7 +120,7 @@ void can_controller_sent(struct can_controller *controller) {
         }
 }
 
-// A flipped bit that the checksum does not show: in the payload, where there is one.
+// Flips a bit of the payload, undetected by the checksum.
 static void corrupt(struct can_controller *controller, struct can_bits *frame) {
     if (frame->size == 0)
         return;
@@ -161,7 +160,7 @@ void can_restart(struct can_controller *controller) {
     controller->recovering = 1;
     controller->left = CAN_RECOVERY_SEQUENCES;
     controller->counts_from_ns = now > segment->free_ns ? now : segment->free_ns;
-    // While the bus is busy its sequences are counted as they come.
+    // While the bus is busy, sequences are counted as they occur.
     if (segment->phase != CAN_BUSY)
         plan_recovery(controller, controller->counts_from_ns);
 }
@@ -184,7 +183,7 @@ void can_controller_sequence(struct can_controller *controller, uint64_t free_ns
     plan_recovery(controller, free_ns);
 }
 
-// Either the time until the recovery begins is over, or the recovery.
+// The delay before the recovery is over, or the recovery itself.
 static void recovery_due(void *owner) {
     struct can_controller *controller = owner;
     if (!controller->recovering) {
@@ -195,7 +194,7 @@ static void recovery_due(void *owner) {
     controller->tec = controller->rec = 0;
     controller->ready_ns = 0;
     can_wire_plan(controller);
-    controller->on_sent(controller->owner); // its owner can use it again
+    controller->on_sent(controller->owner); // the owner can use it again
 }
 
 static void go_off(struct can_controller *controller) {
@@ -253,7 +252,7 @@ void can_cut(struct can_controller *controller, uint32_t segment) {
     if (controller->recovering) {
         agenda_cancel(agenda_of(controller), &controller->recovery);
         controller->recovering = 0;
-        can_restart(controller); // the sequences it has seen were another wire's
+        can_restart(controller); // sequences seen on the other wire do not count
     }
     can_wire_plan(controller);
 }

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-// The host's end of a wire: the adapter's queues in the kernel, and the I/O thread that drives a bus's core.
+// The host's port on a wire: the adapter's queues in the kernel, and the I/O thread of a bus.
 #include "nodes/virtual/world/parts.h"
 
 #include <linux/can.h>
 #include <stdlib.h>
 #include <string.h>
 
-#define NO_BUFFERS_NS UINT64_C(300000) // as the I/O thread waits when the kernel has no buffers
+#define NO_BUFFERS_NS UINT64_C(300000) // delay of the I/O thread after ENOBUFS
 
 enum { EVENTS = 2, PORT_MAILBOXES = 1, RECORDS = 64 };
 
@@ -16,7 +16,7 @@ static uint64_t now_of(const struct world_port *port) {
 
 // ------------------------------------------------------------------------------------------- waking up
 
-// The thread is called for AT_NS, if nothing wakes it earlier.
+// Wakes the thread at AT_NS, or earlier if that is planned.
 static void wake_at(struct world_port *port, uint64_t at_ns) {
     if (event_planned(&port->wake) && port->wake.at_ns <= at_ns)
         return;
@@ -43,7 +43,7 @@ static void plan_deadline(struct world_port *port) {
 static void frame_came(void *owner, const struct can_bits *frame) {
     struct world_port *port = owner;
     if (!port->bus)
-        return; // nobody has opened the interface
+        return; // the interface is not open
     uint32_t room = port->settings.receive_queue;
     if (port->received_count >= (room < WORLD_RECEIVE_MAX ? room : WORLD_RECEIVE_MAX)) {
         port->counters.overflow++;
@@ -82,7 +82,7 @@ void port_uart_bytes(struct world_port *port) {
 
 // --------------------------------------------------------------------------------------------- sending
 
-// One write(); returns how many bytes were taken.
+// One write(); returns how many bytes were accepted.
 static size_t write_some(struct world_port *port) {
     const uint8_t *data = port->out + port->out_at;
     size_t size = port->out_size - port->out_at;
@@ -91,7 +91,7 @@ static size_t write_some(struct world_port *port) {
     struct can_frame record;
     memcpy(&record, data, sizeof(record));
     if (record.can_id > CAN_SFF_MASK || record.can_dlc > CAN_MAX_DLEN)
-        return sizeof(record); // no adapter here sends such frames; the core makes none
+        return sizeof(record); // the core sends no such frames
     return world_can_send(&port->controller, record.can_id, record.data, record.can_dlc) ? 0 : sizeof(record);
 }
 
@@ -142,21 +142,20 @@ static void wake_due(void *owner) {
 }
 
 static void frame_left(void *owner) {
-    (void)owner; // the kernel does not tell a socket whose buffer was not full
+    (void)owner; // the kernel notifies only sockets whose buffer was full
 }
 
-// ----------------------------------------------------------------------------------------- what the core
-// asks
+// ---------------------------------------------------------------------------- functions for the core
 
 static uint64_t driver_now(void *context) {
     return now_of(context);
 }
 
 static void driver_lock(void *context) {
-    (void)context; // one thread does everything
+    (void)context; // there is only one thread
 }
 
-// The caller sends what it queued by itself, as with a real thread: without the latency of waking one.
+// Sends what the caller queued without the latency of waking a thread, as with a real thread.
 static void driver_kick(void *context) {
     struct world_port *port = context;
     wake_at(port, now_of(port));
@@ -182,7 +181,7 @@ static void notice_due(void *owner) {
 }
 
 struct world_port *world_noticed(struct world *world) {
-    // The oldest port first: a list is built from its end.
+    // The oldest port first: new ports are inserted at the head of the list.
     struct world_port *found = NULL;
     for (struct world_port *port = world->ports; port; port = port->next)
         if (port->noticed)
@@ -201,7 +200,7 @@ struct io_bus *world_port_open(struct world_port *port, const struct io_settings
         return NULL;
     port->bus = io_new(port->uart ? IO_BYTES : IO_CAN_STREAM, settings, &driver, port);
     if (port->bus && port->can && !port->controller.powered)
-        can_power(&port->controller, 1); // it was plugged in again
+        can_power(&port->controller, 1); // it was connected again
     if (port->bus && port->uart)
         uart_noise(port->uart);
     if (port->bus)
@@ -299,6 +298,6 @@ struct can_controller *world_port_controller(struct world_port *port) {
     return port->can ? &port->controller : NULL;
 }
 
-void world_port_counters(const struct world_port *port, struct world_port_counters *out) {
-    *out = port->counters;
+const struct world_port_counters *world_port_counters(const struct world_port *port) {
+    return &port->counters;
 }

@@ -1,4 +1,4 @@
-"""An asyncio loop in the time of a simulated world: waiting lets the world run, nothing else takes time."""
+"""An asyncio loop in the time of a simulated world: the world runs while the loop waits."""
 
 import asyncio
 import math
@@ -13,15 +13,15 @@ from nodes.virtual.world.world import World
 T = TypeVar("T")
 _NS: Final = 1_000_000_000
 IDLE_LIMIT_S: Final = 60.0
-"""Waiting so long for a message from outside, with no timer of one's own, is taken for a hang."""
+"""Time without a timer or a message from outside after which the run counts as a deadlock."""
 
 
 class Stuck(CanductorError):  # noqa: N818
-    """Nothing will ever happen any more, or not within the virtual time that was allowed."""
+    """Nothing can happen any more, or the limit of virtual time is exceeded."""
 
 
 class _WorldSelector:
-    """What the base loop calls to wait."""
+    """The selector of the loop."""
 
     def __init__(self, world: World, limit_s: float) -> None:
         self._world = world
@@ -29,7 +29,7 @@ class _WorldSelector:
         self._limit_s = limit_s
 
     def select(self, timeout_s: float | None) -> list[Callable[[], None]]:
-        """Let the world run for TIMEOUT_S at most; returns what is to be called for messages from outside."""
+        """Run the world for TIMEOUT_S at most; return the handlers to be called for messages from outside."""
         world = self._world
         if timeout_s is not None and timeout_s <= 0:
             until_ns = max(world.now_ns, world.python_stalled_ns)
@@ -45,21 +45,21 @@ class _WorldSelector:
     def _due_ns(self, timeout_s: float | None) -> int:
         now_ns = self._world.now_ns
         if now_ns > self._end_ns:
-            raise Stuck(f"still not over after {self._limit_s:g} virtual seconds")
+            raise Stuck(f"not finished after {self._limit_s:g} virtual seconds")
         if timeout_s is not None:
             return now_ns + max(1, math.ceil(timeout_s * _NS))
         if not self._world.listening:
-            raise Stuck("nothing will ever happen: no timer runs and no bus is open")
+            raise Stuck("nothing can happen: no timer runs and no bus is open")
         return now_ns + round(IDLE_LIMIT_S * _NS)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there are no resources."""
 
 
 class VirtualLoop(base_events.BaseEventLoop):
     """A loop whose time() is WORLD's; raises Stuck after LIMIT_S of virtual time, or when nothing can happen.
 
-    Functions for an executor run at once and take EXECUTOR_S of virtual time. Signals come from ``deliver``.
+    Functions for an executor run at once and take EXECUTOR_S of virtual time. ``deliver`` sends signals.
     """
 
     def __init__(self, world: World, *, limit_s: float = 3600.0, executor_s: float = 0.0) -> None:
@@ -82,22 +82,22 @@ class VirtualLoop(base_events.BaseEventLoop):
         future: asyncio.Future[T] = self.create_future()
         try:
             result = func(*args)
-        except Exception as error:  # noqa: BLE001 - whatever it is belongs to who awaits the future
+        except Exception as error:  # noqa: BLE001 - raised where the future is awaited
             self.call_later(self._executor_s, _finish, future, None, error)
         else:
             self.call_later(self._executor_s, _finish, future, result, None)
         return future
 
     def add_signal_handler(self, sig: int, callback: Callable[..., object], *args: Any) -> None:  # type: ignore[override]
-        """Let ``deliver`` of SIG call CALLBACK."""
+        """Call CALLBACK on ``deliver`` of SIG."""
         self._signal_handlers[sig] = partial(callback, *args)
 
     def remove_signal_handler(self, sig: int) -> bool:
-        """Forget the handler of SIG; return whether there was one."""
+        """Remove the handler of SIG; return whether there was one."""
         return self._signal_handlers.pop(sig, None) is not None
 
     def deliver(self, sig: int) -> None:
-        """Call the handler of signal SIG, as the kernel would; without a handler nothing happens."""
+        """Call the handler of signal SIG, as the kernel would; no effect without a handler."""
         if sig in self._signal_handlers:
             self.call_soon(self._signal_handlers[sig])
 
@@ -106,7 +106,7 @@ class VirtualLoop(base_events.BaseEventLoop):
             self.call_soon(handler)
 
     def _write_to_self(self) -> None:
-        """Nobody sleeps who would have to be woken."""
+        """Do nothing: the loop never sleeps."""
 
 
 def _finish(future: "asyncio.Future[Any]", result: object, error: Exception | None) -> None:
@@ -119,7 +119,7 @@ def _finish(future: "asyncio.Future[Any]", result: object, error: Exception | No
 
 
 def run(world: World, main: Coroutine[Any, Any, T], *, limit_s: float = 3600.0, executor_s: float = 0.0) -> T:
-    """Run MAIN in WORLD's time; whatever it leaves running is an error."""
+    """Run MAIN in WORLD's time; tasks that it leaves running are an error."""
     with asyncio.Runner(
         loop_factory=lambda: VirtualLoop(world, limit_s=limit_s, executor_s=executor_s)
     ) as runner:

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// What the world does to a node and reads of it: inputs, axes, clock, counters.
+// Access to a node: inputs, clock, counters.
 #include "nodes/virtual/world/parts.h"
 
-_Static_assert((int)WORLD_RATES_MAX == (int)CLOCK_PIECES_MAX, "the world tells its users");
+_Static_assert((int)WORLD_RATES_MAX == (int)CLOCK_PIECES_MAX, "the limit is part of the interface");
 
 // ------------------------------------------------------------------------------------------------- inputs
 
@@ -12,7 +12,7 @@ static void catch_up(struct world_node *node) {
 }
 
 void node_drive(struct world_node *node, uint32_t pin, uint16_t value, int adc) {
-    catch_up(node); // what was due before reads the old value
+    catch_up(node); // events due before read the old value
     if (adc) {
         node->adc_set[pin] = 1;
         node->adc[pin] = value;
@@ -41,46 +41,6 @@ int world_node_set_adc(struct world_node *node, uint32_t pin, uint16_t value, ui
     return value > 4095 ? -1 : action_plan(node, pin, value, 1, at_ns);
 }
 
-// --------------------------------------------------------------------------------------------------- axes
-
-static int reached(const struct world_axis *axis) {
-    int there = axis->direction >= 0 ? axis->position >= axis->at : axis->position <= axis->at;
-    return there != (axis->input_inverted != 0);
-}
-
-static void move(struct world_node *node, struct world_axis *axis, uint64_t clock, int forward) {
-    int before = reached(axis);
-    axis->position += forward ? 1 : -1;
-    int now = reached(axis);
-    if (now == before)
-        return;
-    uint64_t at_ns = crystal_time(&node->crystal, clock) + axis->delay_ns;
-    if (action_plan(axis->target, axis->target_pin, (uint16_t)now, 0, at_ns))
-        node->counters.edges_lost++; // an input that cannot be planned must not go unnoticed
-}
-
-void axes_edge(struct world_node *node, uint64_t clock, uint32_t pin, int level) {
-    node->step_level[pin] = (uint8_t)level;
-    for (int i = 0; i < node->axis_count; i++) {
-        struct world_axis *axis = &node->axes[i];
-        if (axis->step_pin == pin && (axis->both_edges || (level != 0) != (axis->step_inverted != 0)))
-            move(node, axis, clock, node->step_level[axis->dir_pin] != (axis->dir_inverted != 0));
-    }
-}
-
-int world_node_add_axis(struct world_node *node, const struct world_axis *axis) {
-    if (node->axis_count == WORLD_AXES_MAX || axis->step_pin >= WORLD_PINS || axis->dir_pin >= WORLD_PINS ||
-        axis->target_pin >= WORLD_PINS)
-        return -1;
-    node->axes[node->axis_count] = *axis;
-    node_drive(axis->target, axis->target_pin, (uint16_t)reached(axis), 0);
-    return node->axis_count++;
-}
-
-const struct world_axis *world_node_axis(const struct world_node *node, int number) {
-    return number >= 0 && number < node->axis_count ? &node->axes[number] : NULL;
-}
-
 // -------------------------------------------------------------------------------------------------- clock
 
 int world_node_set_rate(struct world_node *node, double ppm, double ppm_per_s) {
@@ -88,7 +48,7 @@ int world_node_set_rate(struct world_node *node, double ppm, double ppm_per_s) {
     catch_up(node);
     if (crystal_change(&node->crystal, agenda->now_ns, ppm, ppm_per_s))
         return -1;
-    if (event_planned(&node->timer)) // it looks again when it is due
+    if (event_planned(&node->timer)) // its time is computed again when it fires
         agenda_plan(agenda, &node->timer, agenda->now_ns);
     return 0;
 }
@@ -120,6 +80,6 @@ struct can_controller *world_node_controller(struct world_node *node) {
     return node->can ? &node->controller : NULL;
 }
 
-void world_node_counters(const struct world_node *node, struct world_node_counters *out) {
-    *out = node->counters;
+const struct world_node_counters *world_node_counters(const struct world_node *node) {
+    return &node->counters;
 }

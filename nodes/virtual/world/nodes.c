@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Nodes of the world: the firmware on its simulated board, with a crystal, interrupts and a pace.
+// Nodes of the world: the firmware on its simulated board, with a crystal, interrupts and latencies.
 #include "nodes/virtual/world/parts.h"
 
 #include "boards/board.h"
@@ -11,7 +11,7 @@
 enum {
     EVENTS = 4,
     EDGES_AT_FIRST = 1024,
-    NODE_QUEUE = 4, // a chip's three mailboxes, one of them for urgent frames, and what the driver holds
+    NODE_QUEUE = 4, // three mailboxes of the chip, one of them for urgent frames, and the driver's queue
     NODE_RESERVED = 2,
     NODE_MAILBOXES = 3,
     DATA_IDS = 0x100,
@@ -21,12 +21,12 @@ enum {
 
 // -------------------------------------------------------------------------------------------- its own time
 
-// Lets the firmware do what was due before now.
+// Runs the firmware up to now.
 static void catch_up(struct world_node *node) {
     sim_run_until(node->board, crystal_ticks(&node->crystal, node->world->agenda.now_ns));
 }
 
-// After anything that happened to the firmware: plans what it wants next.
+// Plans the next events of the firmware, after any change of its state.
 static void settle(struct world_node *node) {
     struct agenda *agenda = &node->world->agenda;
     if (!node->counters.running)
@@ -61,7 +61,7 @@ static void tasks_due(void *owner) {
 
 // ------------------------------------------------------------------------------------------------- wires
 
-// A chip's acceptance filter: of the data on the bus only the node's own ids.
+// A chip's acceptance filter: of data frames only those with the node's own ids.
 static int accepts(const struct world_node *node, uint32_t id) {
     return id < DATA_IDS || id >= DATA_IDS_END || (id - DATA_IDS) / 2 == sim_node_id(node->board);
 }
@@ -159,7 +159,7 @@ static void remember_edge(struct world_node *node, const struct world_edge *edge
 static void edge(void *context, uint64_t clock, uint32_t pin, int level) {
     struct world_node *node = context;
     if (node->driven[pin])
-        return; // an input that only looked like changing in a reset
+        return; // an input, whose level only seems to change in a reset
     struct world_edge edge = {
         .true_ps = crystal_time_ps(&node->crystal, clock),
         .clock = clock,
@@ -169,7 +169,6 @@ static void edge(void *context, uint64_t clock, uint32_t pin, int level) {
     };
     remember_edge(node, &edge);
     agenda_note(&node->world->agenda, clock << 16 | pin << 1 | (uint64_t)level);
-    axes_edge(node, clock, pin, level);
 }
 
 static uint64_t true_ns(void *context, uint64_t clock) {
@@ -182,7 +181,8 @@ const struct world_edge *world_node_edges(const struct world_node *node, size_t 
     return node->edges;
 }
 
-// -------------------------------------------------------------------------------------------- life and death
+// -------------------------------------------------------------------------------------------- power and
+// reset
 
 static void stop(struct world_node *node) {
     struct agenda *agenda = &node->world->agenda;
@@ -238,7 +238,7 @@ void world_node_power_on(struct world_node *node, uint64_t start_clock) {
     agenda_plan(agenda, &node->boot, agenda->now_ns + node->settings.boot_ns);
 }
 
-// ---------------------------------------------------------------------------------------------- being made
+// ---------------------------------------------------------------------------------------------- creation
 
 static int connect(struct world_node *node) {
     if (node->uart)

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The inside of a simulated world, shared by its files; not for others.
+// Internals of a simulated world, shared by its files.
 #ifndef WORLD_PARTS_H
 #define WORLD_PARTS_H
 
@@ -20,11 +20,11 @@ struct byte_ring {
     uint32_t first, count, room;
 };
 
-// One direction: bytes leave QUEUE one after the other.
+// One direction: bytes are sent one after the other.
 struct uart_way {
     struct world_uart *uart;
     struct byte_ring queue;
-    struct event byte; // the first one has arrived
+    struct event byte; // the first byte arrives
     void (*arrived)(struct world_uart *uart, uint8_t byte);
     uint64_t carry;
 };
@@ -36,8 +36,8 @@ struct world_uart {
     struct world_uart_counters counters;
     struct chance chance;
     struct uart_way to_node, to_host;
-    struct byte_ring received; // by the host's driver, and not handed on yet
-    struct event hand_on;
+    struct byte_ring received; // by the host's driver, not yet passed on
+    struct event pass_on;
     struct world_node *node;
     struct world_port *port;
 };
@@ -59,15 +59,12 @@ struct world_node {
     struct chance chance;
     struct crystal crystal;
     uint32_t number, life;
-    uint64_t boot_clock; // where its clock stands at power on
+    uint64_t boot_clock; // its clock at power on
     struct event timer, tasks, irq, boot;
     struct pending_frame frames[IRQ_RING];
     uint32_t frame_first, frame_count;
     struct world_edge *edges;
     size_t edge_room;
-    struct world_axis axes[WORLD_AXES_MAX];
-    int axis_count;
-    uint8_t step_level[WORLD_PINS];
     uint8_t driven[WORLD_PINS], input[WORLD_PINS], adc_set[WORLD_PINS];
     uint16_t adc[WORLD_PINS];
 };
@@ -83,11 +80,11 @@ struct world_port {
     struct can_controller controller;
     struct io_bus *bus;
     uint32_t number;
-    uint8_t noticed; // Python has not been told yet
+    uint8_t noticed; // Python has not been notified yet
     struct event wake, notice;
     struct can_bits *received;
     uint32_t received_first, received_count;
-    uint8_t out[HOST_OUT]; // what the transmit queue did not take
+    uint8_t out[HOST_OUT]; // what the transmit queue did not accept
     size_t out_at, out_size;
     uint64_t retry_ns;
 };
@@ -115,20 +112,19 @@ struct world {
     uint64_t io_stalled_ns, python_stalled_ns;
     struct world_latency python;
     struct chance python_chance;
-    uint8_t stop; // Python is to be woken
+    uint8_t stop; // Python is to be notified
 };
 
 uint64_t latency_draw(struct chance *chance, const struct world_latency *latency);
 void node_free(struct world_node *node);
 void port_free(struct world_port *port);
 void actions_start(struct world *world);
-// Changes an input at once, as the world's doing: it outlives resets.
+// Changes an input now; the change persists over resets.
 void node_drive(struct world_node *node, uint32_t pin, uint16_t value, int adc);
 void node_reapply_inputs(struct world_node *node);
-void axes_edge(struct world_node *node, uint64_t clock, uint32_t pin, int level);
 int action_plan(struct world_node *node, uint32_t pin, uint16_t value, int adc, uint64_t at_ns);
 
-// uart.c. How many bytes were taken.
+// uart.c. Return how many bytes were accepted.
 size_t uart_to_node(struct world_uart *uart, const uint8_t *data, size_t size);
 size_t uart_to_host(struct world_uart *uart, const uint8_t *data, size_t size);
 void uart_noise(struct world_uart *uart);

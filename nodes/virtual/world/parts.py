@@ -25,15 +25,13 @@ class CanState(IntEnum):
     OFF = 3
 
 
-def counters(struct: str, read: Callable[[Any], None]) -> dict[str, int]:
-    """Return a C struct of counters, which READ fills, by its fields' names."""
-    found = ffi.new(f"{struct} *")
-    read(found)
-    return {name: int(getattr(found, name)) for name in field_names(found)}
+def counters(struct: Any) -> dict[str, int]:
+    """Return the counters of the C struct at STRUCT by name."""
+    return {name: int(getattr(struct, name)) for name in field_names(struct)}
 
 
 class CanController:
-    """A controller on a CAN wire: its faults, its state, its counters."""
+    """A controller on a CAN wire: faults, state, counters."""
 
     def __init__(self, world: "World", raw: Any, name: str) -> None:
         self.name = name
@@ -42,51 +40,55 @@ class CanController:
 
     def set_faults(self, *, loss: float | None = None, corruption: float | None = None) -> None:
         """Change the probabilities that a received frame is lost, or has an unnoticed wrong bit."""
-        settings = lib.world_can_controller_settings(self._raw)
-        if loss is not None:
-            settings.loss = check_probability(loss, "a loss")
-        if corruption is not None:
-            settings.corruption = check_probability(corruption, "a corruption")
+        _set_faults(lib.world_can_controller_settings(self._raw), loss, corruption)
 
     def status(self) -> dict[str, int]:
-        """Return tec, rec, retries, queued frames and state (CanState)."""
-        return counters("struct can_controller_status", lambda out: lib.world_can_status(self._raw, out))
+        """Return tec, rec, retries, queued frames and state (a CanState)."""
+        status = ffi.new("struct can_controller_status *")
+        lib.world_can_status(self._raw, status)
+        return counters(status)
 
     @property
     def state(self) -> CanState:
-        """The state its error counters give it."""
+        """The state by its error counters."""
         return CanState(self.status()["state"])
 
     def counters(self) -> dict[str, int]:
-        """Return what it has counted since it was made."""
-        struct = "struct can_controller_counters"
-        return counters(struct, lambda out: lib.world_can_controller_counters(self._raw, out))
+        """Return its counters since it was created."""
+        return counters(lib.world_can_controller_counters(self._raw))
 
     def send(self, can_id: int, data: bytes = b"") -> bool:
-        """Queue a frame by hand; False when the queue is full."""
+        """Queue a frame; return False when the queue is full."""
         _check_frame(can_id, data)
         return bool(lib.world_can_send(self._raw, can_id, data, len(data)) == 0)
 
     def babble(self, can_id: int, data: bytes, duration_s: float) -> None:
-        """Send the frame back to back from now on, for DURATION_S."""
+        """Send the frame continuously for DURATION_S from now."""
         _check_frame(can_id, data)
         until_ns = self._world.now_ns + to_ns(duration_s, "a babble")
         lib.world_can_babble(self._raw, can_id, data, len(data), until_ns)
 
     def cut(self, segment: int) -> None:
-        """Cut the cable so that this end is on SEGMENT (0..3); all begin on 0."""
+        """Move this end of the cable to SEGMENT (0..3); all begin on 0."""
         if not 0 <= segment < lib.CAN_SEGMENTS_MAX:
             raise WorldError(f"a simulated cable has no segment {segment}; cut it into segments 0..3")
-        lib.world_can_cut(self._raw, segment)
+        lib.can_cut(self._raw, segment)
 
     def restart(self) -> None:
-        """Begin the recovery from bus-off."""
-        lib.world_can_restart(self._raw)
+        """Start the recovery from bus-off."""
+        lib.can_restart(self._raw)
+
+
+def _set_faults(settings: Any, loss: float | None, corruption: float | None) -> None:
+    if loss is not None:
+        settings.loss = check_probability(loss, "a loss")
+    if corruption is not None:
+        settings.corruption = check_probability(corruption, "a corruption")
 
 
 def _check_frame(can_id: int, data: bytes) -> None:
     if not (0 <= can_id <= ID_MAX and len(data) <= DATA_MAX):
-        raise WorldError(f"no CAN frame has id {can_id:#x} and {len(data)} bytes; use 0..0x7ff and 0..8")
+        raise WorldError(f"not a CAN frame: id {can_id:#x} with {len(data)} bytes; give 0..0x7ff and 0..8")
 
 
 class CanWire:
@@ -99,12 +101,12 @@ class CanWire:
         self.raw = raw
 
     def set_bit_errors(self, probability: float) -> None:
-        """Change the probability that a bit is disturbed for all."""
+        """Change the probability that a bit is disturbed for all controllers."""
         lib.world_can_settings(self.raw).bit_errors = check_probability(probability, "bit errors")
 
     def counters(self) -> dict[str, int]:
-        """Return what was on the wire."""
-        return counters("struct can_wire_counters", lambda out: lib.world_can_counters(self.raw, out))
+        """Return the counters of the wire."""
+        return counters(lib.world_can_counters(self.raw))
 
 
 class Uart:
@@ -118,19 +120,15 @@ class Uart:
 
     def set_faults(self, *, loss: float | None = None, corruption: float | None = None) -> None:
         """Change the probabilities that a byte is lost, or has a wrong bit."""
-        settings = lib.world_uart_settings(self.raw)
-        if loss is not None:
-            settings.loss = check_probability(loss, "a loss")
-        if corruption is not None:
-            settings.corruption = check_probability(corruption, "a corruption")
+        _set_faults(lib.world_uart_settings(self.raw), loss, corruption)
 
     def counters(self) -> dict[str, int]:
-        """Return what went over the line."""
-        return counters("struct world_uart_counters", lambda out: lib.world_uart_counters(self.raw, out))
+        """Return the counters of the line."""
+        return counters(lib.world_uart_counters(self.raw))
 
 
 class Port:
-    """A port of the host; `open` makes what ``LinkIO.driven_by`` wants."""
+    """A port of the host; `open` returns the driver for ``LinkIO.driven_by``."""
 
     serial = False
 
@@ -141,7 +139,7 @@ class Port:
         self._raw = raw
 
     def open(self, settings: BusSettings | None = None) -> "SimDriver":
-        """Start a bus here; SETTINGS: as for a real one, by default with the wire's bit rate."""
+        """Start a bus; SETTINGS: as for a real one, by default with the wire's bit rate."""
         known = settings or BusSettings(bitrate=self.bitrate)
         bus = lib.world_port_open(self._raw, ffi.new("struct io_settings *", known.as_dict()))
         if bus == ffi.NULL:
@@ -149,12 +147,12 @@ class Port:
         return SimDriver(self._world, self._raw, bus, self.name, serial=self.serial)
 
     def fail(self, cause: int = 0) -> None:
-        """Pull the adapter out: the bus ends with errno CAUSE (0: end of file)."""
+        """Remove the adapter: the bus ends with errno CAUSE (0: end of file)."""
         lib.world_port_fail(self._raw, cause)
 
     def counters(self) -> dict[str, int]:
-        """Return what the kernel's queues and the I/O thread have counted."""
-        return counters("struct world_port_counters", lambda out: lib.world_port_counters(self._raw, out))
+        """Return the counters of the kernel's queues and the I/O thread."""
+        return counters(lib.world_port_counters(self._raw))
 
 
 class CanPort(Port):
@@ -172,7 +170,7 @@ class UartPort(Port):
 
 
 class SimDriver:
-    """Drives one bus inside the world; the seam is described in nodes/link/io_core.h."""
+    """Driver of one bus inside the world; its interface is described in nodes/link/io_core.h."""
 
     def __init__(self, world: "World", raw: Any, bus: Any, name: str, *, serial: bool) -> None:
         self.name = name

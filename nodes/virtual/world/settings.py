@@ -1,4 +1,4 @@
-"""How a simulated world is set up. Times in seconds; they become integer ns of true time."""
+"""Settings of a simulated world. Times are in seconds; they become integer ns of true time."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ _NS: Final = 1_000_000_000
 
 
 class WorldError(CanductorError):
-    """A simulated world cannot be what was asked for."""
+    """A setting of a simulated world is invalid."""
 
 
 def to_ns(seconds: float, what: str) -> int:
@@ -31,7 +31,7 @@ def check_probability(value: float, what: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """A time that is MIN_S plus an exponentially distributed part of MEAN_S, at most MAX_S in all."""
+    """A random time: MIN_S plus an exponentially distributed part with mean MEAN_S, at most MAX_S in all."""
 
     min_s: float = 0.0
     mean_s: float = 0.0
@@ -46,14 +46,14 @@ class Latency:
 
 @dataclass(frozen=True, slots=True)
 class NodeSettings:
-    """How fast and how exactly a node runs."""
+    """Clock and latencies of a node."""
 
     ppm: float = 0.0
     """Rate error of its clock."""
     irq_jitter_s: float = 1e-6
-    """The receive interrupt comes up to so much after the frame."""
+    """Greatest delay of the receive interrupt after the frame."""
     task: Latency = Latency(5e-6, 15e-6, 1e-3)
-    """From the wish to run to the running of tasks."""
+    """Delay from the request to run tasks until they run."""
     boot_s: float = 0.002
     """From power or reset to the first instruction of the firmware."""
 
@@ -84,16 +84,16 @@ class PortSettings:
 
 @dataclass(frozen=True, slots=True)
 class ControllerSettings:
-    """The host's CAN controller, as SocketCAN shows it."""
+    """The host's CAN controller and its SocketCAN interface."""
 
     queue: int = 10
     """Frames in the interface's transmit queue (txqueuelen) and the adapter, 1..1024."""
     loss: float = 0.0
-    """Probability that a good frame is not seen by the software."""
+    """Probability that the software does not get a good frame."""
     corruption: float = 0.0
-    """Probability that a received frame has a wrong bit that no checksum shows."""
+    """Probability that a received frame has a wrong bit that the checksum does not reveal."""
     restart_s: float | None = 0.1
-    """restart-ms of the interface; None: bus-off lasts until somebody restarts it."""
+    """restart-ms of the interface; None: bus-off lasts until restart()."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields for cffi."""
@@ -113,12 +113,12 @@ class UartSettings:
 
     baud: int = 250_000
     loss: float = 0.0
-    """Probability that a byte is lost, in either direction; corruption: has one wrong bit."""
+    """Probability that a byte is lost, in either direction; corruption: that it has one wrong bit."""
     corruption: float = 0.0
     noise_bytes: int = 0
-    """Both ends hear so many when the line is opened, 0..4096."""
+    """Number of bytes that both ends receive when the line is opened, 0..4096."""
     read: Latency = field(default=Latency(30e-6, 30e-6, 2e-3))
-    """For how long the host's driver gathers bytes before it hands them on."""
+    """Time for which the host's driver collects bytes before it passes them on."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields for cffi."""

@@ -26,7 +26,7 @@ size_t ring_take(struct byte_ring *ring, uint8_t *out, size_t size) {
 
 // ----------------------------------------------------------------------------------------------- the line
 
-// The next byte has arrived ten bits from FROM_NS on; the rest of the division is carried on.
+// Plans the arrival of the next byte, ten bits after FROM_NS; the remainder of the division is carried over.
 static void plan_byte(struct uart_way *way, uint64_t from_ns) {
     uint64_t scaled = BITS_PER_BYTE * NS_PER_S + way->carry, baud = way->uart->settings.baud;
     way->carry = scaled % baud;
@@ -77,9 +77,9 @@ static void at_host(struct world_uart *uart, uint8_t byte) {
         return;
     }
     uart->counters.to_host++;
-    // The driver gathers bytes for a while and hands them on together.
-    if (!event_planned(&uart->hand_on))
-        agenda_plan(agenda, &uart->hand_on,
+    // The driver collects bytes for a while and passes them on together.
+    if (!event_planned(&uart->pass_on))
+        agenda_plan(agenda, &uart->pass_on,
                     agenda->now_ns + latency_draw(&uart->chance, &uart->settings.read));
 }
 
@@ -93,12 +93,12 @@ static void to_host_arrived(struct world_uart *uart, uint8_t byte) {
     room_at_node(uart);
 }
 
-static void hand_on_due(void *owner) {
+static void pass_on_due(void *owner) {
     struct world_uart *uart = owner;
     if (uart->port && uart->port->bus)
         port_uart_bytes(uart->port);
     else
-        uart->received.count = 0; // nobody has opened the line
+        uart->received.count = 0; // the line is not open
 }
 
 size_t uart_to_node(struct world_uart *uart, const uint8_t *data, size_t size) {
@@ -123,7 +123,7 @@ void uart_noise(struct world_uart *uart) {
     }
 }
 
-// ---------------------------------------------------------------------------------------------- being made
+// ---------------------------------------------------------------------------------------------- creation
 
 static void way_start(struct world_uart *uart, struct uart_way *way, uint32_t room,
                       void (*arrived)(struct world_uart *uart, uint8_t byte)) {
@@ -143,7 +143,7 @@ struct world_uart *world_add_uart(struct world *world, const struct world_uart_s
     uart->settings = *settings;
     uart->chance = chance_of(world->seed, CHANCE_UART, world->uart_count++);
     uart->received.room = WORLD_UART_MAX;
-    uart->hand_on = (struct event){.fire = hand_on_due, .owner = uart};
+    uart->pass_on = (struct event){.fire = pass_on_due, .owner = uart};
     way_start(uart, &uart->to_node, WORLD_UART_MAX, at_node);
     way_start(uart, &uart->to_host, UART_FIFO, to_host_arrived);
     uart->next = world->uarts;
@@ -154,6 +154,6 @@ struct world_uart_settings *world_uart_settings(struct world_uart *uart) {
     return &uart->settings;
 }
 
-void world_uart_counters(const struct world_uart *uart, struct world_uart_counters *out) {
-    *out = uart->counters;
+const struct world_uart_counters *world_uart_counters(const struct world_uart *uart) {
+    return &uart->counters;
 }

@@ -113,8 +113,8 @@ struct can_wire_settings *world_can_settings(struct world_can *can) {
     return &can->wire.settings;
 }
 
-void world_can_counters(const struct world_can *can, struct can_wire_counters *out) {
-    *out = can->wire.counters;
+const struct can_wire_counters *world_can_counters(const struct world_can *can) {
+    return &can->wire.counters;
 }
 
 void world_can_status(const struct can_controller *controller, struct can_controller_status *out) {
@@ -127,9 +127,8 @@ void world_can_status(const struct can_controller *controller, struct can_contro
     };
 }
 
-void world_can_controller_counters(const struct can_controller *controller,
-                                   struct can_controller_counters *out) {
-    *out = controller->counters;
+const struct can_controller_counters *world_can_controller_counters(const struct can_controller *controller) {
+    return &controller->counters;
 }
 
 struct can_controller_settings *world_can_controller_settings(struct can_controller *controller) {
@@ -154,14 +153,6 @@ void world_can_babble(struct can_controller *controller, uint32_t id, const uint
     struct can_bits frame;
     if (make_frame(&frame, id, data, size) == 0)
         can_babble(controller, &frame, until_ns);
-}
-
-void world_can_cut(struct can_controller *controller, uint32_t segment) {
-    can_cut(controller, segment % CAN_SEGMENTS_MAX);
-}
-
-void world_can_restart(struct can_controller *controller) {
-    can_restart(controller);
 }
 
 // ------------------------------------------------------------------------------------------------ actions

@@ -1,4 +1,4 @@
-"""A simulated world, see world.h: makes its parts, moves its time, and reads the truth from it."""
+"""A simulated world (world.h): creates its parts, advances its time, and reads its true state."""
 
 from collections.abc import Callable
 from typing import Any, Final
@@ -21,7 +21,7 @@ from nodes.virtual.world.settings import (
 )
 
 START_NS: Final = 1_000_000_000_000
-"""Host time at which a world begins: not zero, as no real clock is."""
+"""Host time at which a world begins: not zero, like real clocks."""
 EDGE_DTYPE: Final = np.dtype(
     [
         ("true_ps", "<i8"),
@@ -39,7 +39,7 @@ _MOVE_COUNT_MAX: Final = 0xFFFF
 
 
 class World:
-    """A world of its own, decided by SEED (0..2^64-1). Not thread-safe; WorldError for what cannot be."""
+    """A world determined by SEED (0..2^64-1). Not thread-safe; WorldError for invalid arguments."""
 
     def __init__(self, seed: int, *, start_ns: int = START_NS, python: Latency | None = None) -> None:
         if not 0 <= seed < _SEED_LIMIT:
@@ -55,22 +55,22 @@ class World:
 
     @property
     def now_ns(self) -> int:
-        """True time, which is the host's CLOCK_MONOTONIC."""
+        """True time: the host's CLOCK_MONOTONIC."""
         return int(lib.world_now(self._raw))
 
     def run_until(self, until_ns: int) -> bool:
-        """Let time pass; returns True when it stopped earlier because ports have something (`noticed`)."""
+        """Advance time; return True when it stopped earlier because ports have something (`noticed`)."""
         return bool(lib.world_run(self._raw, until_ns))
 
     def run_for(self, duration_s: float) -> None:
-        """Let DURATION_S pass; notices are handled as they come."""
+        """Advance time by DURATION_S, and handle notices as they occur."""
         until_ns = self.now_ns + to_ns(duration_s, "a duration")
         while self.run_until(until_ns):
             for handler in self.noticed():
                 handler()
 
     def noticed(self) -> list[Callable[[], None]]:
-        """Return what is to be called for the notices so far."""
+        """Return the handlers to be called for the notices so far."""
         handlers = []
         while (port := lib.world_noticed(self._raw)) != ffi.NULL:
             handler = self._handlers.get(int(ffi.cast("uintptr_t", port)))
@@ -79,7 +79,7 @@ class World:
         return handlers
 
     def listen(self, port: Any, handler: Callable[[], None] | None) -> None:
-        """Call HANDLER for the notices of PORT (``struct world_port *``); None: nobody."""
+        """Call HANDLER for the notices of PORT (``struct world_port *``); None: no handler."""
         key = int(ffi.cast("uintptr_t", port))
         if handler is None:
             self._handlers.pop(key, None)
@@ -88,33 +88,33 @@ class World:
 
     @property
     def listening(self) -> bool:
-        """Whether any port could still have something to say."""
+        """Whether any port has a handler."""
         return bool(self._handlers)
 
     def python_wakes_ns(self, due_ns: int) -> int:
-        """Return when Python, waiting for DUE_NS, goes on: later by its latency, or by a stall."""
+        """Return when Python code that waits until DUE_NS continues: after its latency, or a stall."""
         return int(lib.world_python_wakes(self._raw, due_ns))
 
     @property
     def python_stalled_ns(self) -> int:
-        """Until when Python does not run."""
+        """Time until which Python does not run."""
         return int(lib.world_python_stalled(self._raw))
 
     def stall(self, duration_s: float, *, io: bool = True, python: bool = True) -> None:
-        """Neither the host's I/O threads nor its Python run for DURATION_S from now; the flags choose one."""
+        """Stall the host's I/O threads (IO) and its Python (PYTHON) for DURATION_S from now."""
         lib.world_stall(self._raw, self.now_ns + to_ns(duration_s, "a stall"), io, python)
 
     @property
     def trace(self) -> int:
-        """A hash of all that happened so far: equal in two runs that did the same."""
+        """Hash of all events so far: equal in two runs with the same events."""
         return int(lib.world_trace(self._raw))
 
     @property
     def events(self) -> int:
-        """How many events there were."""
+        """Number of events so far."""
         return int(lib.world_events(self._raw))
 
-    # ------------------------------------------------------------------------------------------ what is in it
+    # ------------------------------------------------------------------------------------------ parts
 
     def add_can(self, name: str = "can0", *, bitrate: int = 1_000_000, bit_errors: float = 0.0) -> CanWire:
         """Add a CAN bus (BITRATE 10000..1000000)."""
@@ -170,7 +170,10 @@ class World:
         dictionary: bytes | None = None,
         legacy: bool = False,
     ) -> "WorldNode":
-        """Add a node with UUID (12 hex digits) on WIRE; it is powered and boots. Options: as for SimNode."""
+        """Add a node with UUID (12 hex digits) on WIRE; it is powered and boots.
+
+        The other options are those of ``struct sim_options``.
+        """
         if len(uuid) != 12 or set(uuid) - set("0123456789abcdefABCDEF"):
             raise WorldError(f"the uuid {uuid!r} of a simulated node must be 12 hex digits")
         _check_clock(start_clock)
@@ -180,7 +183,7 @@ class World:
             )
         on_can = isinstance(wire, CanWire)
         c_dictionary = ffi.NULL if dictionary is None else ffi.new("uint8_t[]", dictionary)
-        self._keep.append(c_dictionary)  # the node reads it as long as it lives
+        self._keep.append(c_dictionary)  # the node uses it until the world ends
         raw_uuid = ffi.new("uint8_t[]", bytes.fromhex(uuid))
         options = ffi.new(
             "struct sim_options *",
@@ -201,7 +204,7 @@ class World:
 
 
 class WorldNode:
-    """A node of the world, and the truth about it."""
+    """A node of the world, and its true state."""
 
     def __init__(self, world: World, raw: Any, uuid: str) -> None:
         self.uuid = uuid
@@ -211,23 +214,23 @@ class WorldNode:
         self.controller = None if controller == ffi.NULL else CanController(world, controller, uuid)
         """None on a serial line."""
 
-    # ------------------------------------------------------------------------------------- life and faults
+    # ------------------------------------------------------------------------------------- power and faults
 
     def reset(self) -> None:
-        """Reset it now; it boots anew, its clock goes on."""
+        """Reset it now; it boots again, its clock continues."""
         lib.world_node_reset(self.raw)
 
     def power_off(self) -> None:
-        """Take its power: outputs fall, it says and hears nothing."""
+        """Switch its power off: outputs fall, it neither sends nor receives."""
         lib.world_node_power_off(self.raw)
 
     def power_on(self, start_clock: int = 0) -> None:
-        """Give it power again; its clock begins with START_CLOCK."""
+        """Switch its power on again; its clock begins with START_CLOCK."""
         _check_clock(start_clock)
         lib.world_node_power_on(self.raw, start_clock)
 
     def set_pace(self, *, task: Latency | None = None, irq_jitter_s: float | None = None) -> None:
-        """Make it slower or faster."""
+        """Change its latencies."""
         settings = lib.world_node_settings(self.raw)
         if task is not None:
             _assign(settings.task, task.as_dict())
@@ -242,11 +245,11 @@ class WorldNode:
             )
 
     def set_input(self, pin: int, level: int, at_ns: int = 0) -> None:
-        """Set the input PIN at AT_NS (or now); it outlives resets."""
+        """Set the input PIN at AT_NS (or now); it persists over resets."""
         self._plan(lib.world_node_set_input(self.raw, pin, level, at_ns), pin)
 
     def set_adc(self, pin: int, value: int, at_ns: int = 0) -> None:
-        """Set what a sample of PIN gives (0..4095), at AT_NS (or now)."""
+        """Set the sample value of PIN (0..4095), at AT_NS (or now)."""
         self._plan(-1 if value < 0 else lib.world_node_set_adc(self.raw, pin, value, at_ns), pin)
 
     def _plan(self, status: int, pin: int) -> None:
@@ -256,51 +259,14 @@ class WorldNode:
                 f"node {self.uuid}: no such pin or value ({pin}), or {limit} changes wait already"
             )
 
-    def add_axis(
-        self,
-        step_pin: int,
-        dir_pin: int,
-        *,
-        target: "WorldNode",
-        target_pin: int,
-        at: int,
-        position: int = 0,
-        direction: int = 1,
-        dir_inverted: bool = False,
-        step_inverted: bool = False,
-        both_edges: bool = False,
-        input_inverted: bool = False,
-        delay_s: float = 0.0,
-    ) -> int:
-        """Couple a stepper with an endstop (``struct world_axis``); returns the axis's number.
-
-        TARGET's input TARGET_PIN is 1 while the position is at or beyond AT in DIRECTION (1 or -1).
-        """
-        fields = {"step_pin": step_pin, "dir_pin": dir_pin, "target_pin": target_pin, "target": target.raw}
-        fields |= {"at": at, "position": position, "direction": direction}
-        fields |= {"dir_inverted": dir_inverted, "step_inverted": step_inverted}
-        fields |= {"both_edges": both_edges, "input_inverted": input_inverted}
-        fields["delay_ns"] = to_ns(delay_s, "an endstop's delay")
-        number = lib.world_node_add_axis(self.raw, ffi.new("struct world_axis *", fields))
-        if number < 0:
-            raise WorldError(f"node {self.uuid}: no such pin, or more than {lib.WORLD_AXES_MAX} axes")
-        return int(number)
-
     def start_plant(self, plant: NodePlant) -> SimPlant:
         """Connect the pins with PLANT from now on; raises CanductorError.
 
-        It goes before inputs and axes of the same pins. `connect_plants` lets several see each other.
+        Its pins no longer follow set_input and set_adc. `connect_plants` connects several.
         """
         return SimPlant(lib.world_node_board(self.raw), plant, lambda: self._world.now_ns)
 
-    def axis_position(self, number: int) -> int:
-        """Return where axis NUMBER is, in steps."""
-        axis = lib.world_node_axis(self.raw, number)
-        if axis == ffi.NULL:
-            raise WorldError(f"node {self.uuid} has no axis {number}")
-        return int(axis.position)
-
-    # ----------------------------------------------------------------------------------------------- truth
+    # ------------------------------------------------------------------------------------------ true state
 
     @property
     def clock(self) -> int:
@@ -313,7 +279,7 @@ class WorldNode:
         return float(lib.world_node_ppm(self.raw))
 
     def true_ps(self, clocks: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
-        """Return the true times, in ps, at which its clock became CLOCKS (of its present life)."""
+        """Return the true times, in ps, at which its clock became CLOCKS (since the last power on)."""
         clocks = np.ascontiguousarray(clocks, np.uint64)
         out = np.empty(len(clocks), np.int64)
         raw_in = ffi.cast("uint64_t *", clocks.ctypes.data)
@@ -334,16 +300,17 @@ class WorldNode:
         return int(lib.sim_level(lib.world_node_board(self.raw), pin))
 
     def counters(self) -> dict[str, int]:
-        """Return what the world and the firmware have counted (the firmware's begin anew at a reset)."""
-        board = lib.world_node_board(self.raw)
-        return counters(
-            "struct world_node_counters", lambda out: lib.world_node_counters(self.raw, out)
-        ) | counters("struct sim_counters", lambda out: lib.sim_counters(board, out))
+        """Return the counters of the world and of the firmware (the firmware's restart at a reset)."""
+        firmware = ffi.new("struct sim_counters *")
+        lib.sim_counters(lib.world_node_board(self.raw), firmware)
+        return counters(lib.world_node_counters(self.raw)) | counters(firmware)
 
 
 def _made(raw: Any) -> Any:
     if raw == ffi.NULL:
-        raise WorldError("a part of a simulated world cannot be made: its place is taken, or memory is out")
+        raise WorldError(
+            "cannot create a part of a simulated world: its place is taken, or memory is exhausted"
+        )
     return raw
 
 

@@ -148,7 +148,7 @@ def test_a_node_that_dies_ends_the_run_with_a_sentence(tmp_path: Path) -> None:
         os.kill(node, signal.SIGKILL)
         out, err = tool.process.communicate(timeout=WAIT_S)
         assert tool.process.returncode == 1
-        assert err == "canductor: node toolhead did not end in order: ended by signal 9\n"
+        assert err == "canductor: node toolhead did not end correctly: ended by signal 9\n"
         assert json.loads(out.splitlines()[-1])["ok"] is False
 
 
@@ -224,13 +224,13 @@ def test_faults_are_read(name: str, text: str, expected: BusFault) -> None:
         ("loss", "1%,jitter=1ms", "--loss has no jitter="),
         ("loss", "1%,at=1", "--loss has no at="),
         ("loss", "frame=0", "--loss's frame is '0', must be a whole number of at least 1"),
-        ("error", "1%,receiver=1", "only a loss or corruption can hit a single receiver"),
+        ("error", "1%,receiver=1", "only a loss or corruption can have a receiver"),
         ("delay", "5min", "--delay is '5min', must be a number with the unit us, ms or s"),
         ("delay", "nan", "--delay is 'nan', must be a number with the unit us"),
         ("delay", "share=1%", "--delay needs a time first, as in --delay 5ms,jitter=2ms"),
         ("bus-off", "2s", "--bus-off needs at=SECONDS, share= or frame= to know when"),
         ("bus-off", "2s,at=5,id=1", "--bus-off with at= takes only sender= besides"),
-        ("bus-off", "0,at=5", "--bus-off: fault bus_off: needs to last for some time"),
+        ("bus-off", "0,at=5", "--bus-off: fault bus_off: its time must be above 0 s"),
     ],
 )
 def test_bad_faults_are_refused_with_a_sentence(name: str, text: str, said: str) -> None:

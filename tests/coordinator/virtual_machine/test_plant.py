@@ -17,9 +17,9 @@ from coordinator.virtual_machine.plant_heat import HeatSettings, steinhart, tabl
 from coordinator.virtual_machine.virtual_machine import VirtualMachine
 from nodes.virtual.plant import Axis, Beta, NodePlant, Rtd, Steinhart
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
-from nodes.virtual.sim import SimNode
 from nodes.virtual.sim_plant import SimPlant, connect_plants
 from tests.stages.printer_text import printer_section, section, stepper_section
+from tests.stages.sim_node import SimNode
 
 CONFIGS = sorted(EXAMPLES.rglob("*.cfg"))
 SHARED = Path(__file__).parents[4] / "shared" / "data" / "config"

@@ -14,7 +14,7 @@ from tests.nodes.devices.machine import HZ, DeviceMachine
 
 
 def sensor(machine_pin: str = "PC2", **limits: float) -> tuple[AnalogIn, list[AnalogValue]]:
-    analog = AnalogIn("hot end", pin=machine_pin, **limits)  # type: ignore[arg-type]
+    analog = AnalogIn("hot end", pin=machine_pin, **limits)
     seen: list[AnalogValue] = []
     analog.on_value = seen.append
     return analog, seen
@@ -107,7 +107,7 @@ def test_it_can_be_stopped_and_begins_again_with_its_node() -> None:
 def test_older_firmware_reports_one_value_at_a_time() -> None:
     analog, seen = sensor()
     analog._full, analog._times = 8 * 1023, {"rest_ticks": 100}
-    analog._came(Message("analog_in_state", {"oid": 1, "next_clock": 50, "value": 4092}))
+    analog._received(Message("analog_in_state", {"oid": 1, "next_clock": 50, "value": 4092}))
     assert seen == [AnalogValue(0.5, (50 - 100) % (1 << 32))]
 
 
@@ -218,7 +218,7 @@ def test_reports_that_come_again_and_those_of_before_are_passed_over() -> None:
                 "ack_count": ack_count,
                 "state": bytes(states),
             }
-            switch._came(machine.node, oid, Message("buttons_state", parameters))
+            switch._received(machine.node, Message("buttons_state", parameters))
 
         told(0, 1, 0)
         told(0, 1, 0)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from nodes.devices.digital_out import DigitalOut
 from nodes.devices.pwm_out import PwmOut
-from nodes.devices.timed_output import WAY_S
+from nodes.devices.timed_output import TRANSIT_S
 from nodes.node.queue_slots import OUTPUT_SLOTS_MAX, OUTPUT_SLOTS_MIN, STEP_SLOTS_MIN, share_slots
 from tests.nodes.devices.machine import HZ, DeviceMachine
 
@@ -76,7 +76,7 @@ def test_of_values_too_close_together_the_last_one_comes_and_nothing_stops() -> 
     machine.run(main)
     clock, level = machine.edges("PA4")[-1]
     assert level == 1
-    assert clock <= last + round(2 * WAY_S * HZ)
+    assert clock <= last + round(2 * TRANSIT_S * HZ)
     assert machine.edges("PA3")[-1][1] == 0
 
 

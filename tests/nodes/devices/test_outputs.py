@@ -122,7 +122,7 @@ def test_what_cannot_be_is_told_when_it_is_configured() -> None:
     for out, text in (
         (PwmOut("fan", pin="PA3", cycle_s=1e-4), "set hardware_pwm"),
         (PwmOut("fan", pin="PA3", shutdown=0.5), "fully on or off"),
-        (PwmOut("fan", pin="PA3", max_duration_s=100), "13 s its clock can count"),
+        (PwmOut("fan", pin="PA3", max_duration_s=100), "13 s that its clock can count"),
         (PwmOut("fan", pin="XY3"), "fan on node n1: .*XY3"),
     ):
         machine = DeviceMachine(out)

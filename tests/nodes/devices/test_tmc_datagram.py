@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from nodes.devices import tmc_datagram
 
 BYTES = st.binary(min_size=1, max_size=12)
-REGISTERS = st.integers(0, tmc_datagram.REGISTER_MAX)
+REGISTERS = st.integers(0, 0x7F)
 VALUES = st.integers(0, 2**32 - 1)
 
 
@@ -41,7 +41,7 @@ def test_known_datagrams(data: str, crc: int) -> None:
 
 def test_a_question_bit_by_bit() -> None:
     sync, address, register, crc = "0101000001", "0100000001", "0011000001", "0"
-    sent = levels(tmc_datagram.ask(1, 6))
+    sent = levels(tmc_datagram.request(1, 6))
     assert sent[:30] == sync + address + register
     assert sent[30] == crc
     assert sent[31:39] == format(remainder(bytes((5, 1, 6))), "08b")[::-1]
@@ -51,7 +51,7 @@ def test_a_question_bit_by_bit() -> None:
 @given(st.integers(0, 3), REGISTERS, VALUES)
 def test_a_write_is_eight_bytes_and_ends_with_their_crc(address: int, register: int, value: int) -> None:
     bits = tmc_datagram.write(address, register, value)
-    data = tmc_datagram.unframed(bits)
+    data = tmc_datagram.from_bits(bits)
     assert data is not None
     assert (len(bits), len(data)) == (10, 8)
     assert data[:3] == bytes((5, address, register | 0x80))
@@ -61,22 +61,22 @@ def test_a_write_is_eight_bytes_and_ends_with_their_crc(address: int, register: 
 
 def reply(register: int, value: int) -> bytes:
     data = bytes((5, 0xFF, register)) + value.to_bytes(4, "big")
-    return tmc_datagram.framed(data + bytes((remainder(data),)))
+    return tmc_datagram.to_bits(data + bytes((remainder(data),)))
 
 
 @given(REGISTERS, VALUES)
 def test_an_answer_is_read(register: int, value: int) -> None:
-    assert tmc_datagram.answered(reply(register, value), register) == value
-    assert tmc_datagram.answered(reply(register, value), register ^ 1) is None
+    assert tmc_datagram.parse_answer(reply(register, value), register) == value
+    assert tmc_datagram.parse_answer(reply(register, value), register ^ 1) is None
 
 
 @given(REGISTERS, VALUES, st.integers(0, 79))
 def test_one_wrong_bit_is_noticed(register: int, value: int, bit: int) -> None:
     damaged = int.from_bytes(reply(register, value), "little") ^ 1 << bit
-    assert tmc_datagram.answered(damaged.to_bytes(10, "little"), register) is None
+    assert tmc_datagram.parse_answer(damaged.to_bytes(10, "little"), register) is None
 
 
 @given(st.binary(max_size=12), REGISTERS)
 def test_garbage_is_no_answer(bits: bytes, register: int) -> None:
-    value = tmc_datagram.answered(bits, register)
+    value = tmc_datagram.parse_answer(bits, register)
     assert value is None or reply(register, value) == bits

@@ -91,7 +91,7 @@ def test_what_was_not_understood_is_written_again() -> None:
 
 @pytest.mark.parametrize(
     ("fault", "sentence"),
-    [(PlantFault.OPEN, "does not answer"), (PlantFault.GARBLED, "gives answers that are damaged")],
+    [(PlantFault.OPEN, "does not answer"), (PlantFault.GARBLED, "sends damaged answers")],
 )
 def test_one_that_does_not_answer_is_told_of(fault: PlantFault, sentence: str) -> None:
     rig = Rig()

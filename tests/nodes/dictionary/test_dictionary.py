@@ -15,6 +15,7 @@ from nodes.dictionary.message_format import Message, MessageError, MessageFormat
 from nodes.dictionary.parts import OUTPUT, DictionaryError
 from tests import real_dictionaries
 from tests import wire_twin as twin
+from tests.nodes.dictionary.as_sent import decode_as_sent
 from tests.profiles import examples
 
 ROOT = Path(__file__).parents[3]
@@ -40,11 +41,11 @@ def test_what_a_dictionary_says() -> None:
 
 
 def test_ranges_count_up_from_the_number_at_the_names_end() -> None:
-    assert SMALL.enum_value("pin", "PA15") == 15
-    assert SMALL.enum_value("pin", "PB0") == 16
-    assert SMALL.enum_value("pin", "gpiochip1/gpio3") == 291
+    assert SMALL.enumerations["pin"].value_of("PA15") == 15
+    assert SMALL.enumerations["pin"].value_of("PB0") == 16
+    assert SMALL.enumerations["pin"].value_of("gpiochip1/gpio3") == 291
     with pytest.raises(MessageError, match="no pin 'PA16'"):
-        SMALL.enum_value("pin", "PA16")
+        SMALL.enumerations["pin"].value_of("PA16")
     assert SMALL.enum_name("static_string_id", 1) == "Timer too close"
     assert SMALL.enum_name("static_string_id", 77) == "?77"
 
@@ -141,7 +142,7 @@ def test_garbage_decodes_to_a_message_or_nothing(content: bytes) -> None:
     assert isinstance(SMALL.decode(content), Message | None)
     commands = SMALL.decode_commands(content)
     assert commands is None or all(isinstance(m, Message) for m in commands)
-    exact = SMALL.decode_commands(content, as_sent=True)
+    exact = decode_as_sent(SMALL, content)
     assert (exact is None) == (commands is None)
 
 

@@ -52,7 +52,7 @@ class Offer:
 
     kind: int
     due_ns: int = 0
-    pressing: bool = False
+    urgent: bool = False
 
 
 @dataclass
@@ -80,7 +80,7 @@ class LinkModel:
         self.urgent = False
         self.progress_ns = self.heard_ns = 0
         self.last_ack: int | None = None
-        self.naks_owed = self.owed_until_ns = self.owed_until = 0
+        self.naks_outstanding = self.outstanding_until_ns = self.outstanding_until = 0
         self.backoff = 0
         self.lead_in = "flush"
         self.clock: tuple[float, int, int] | None = None
@@ -236,9 +236,9 @@ class LinkModel:
     def _offer(self, kind: int, head: Command, now: int) -> Offer:
         due_ns = 0 if kind == BULK else self.motion_due(head.req_clock)
         if kind == MOTION:
-            return Offer(kind, due_ns or now, pressing=0 < due_ns <= now)
+            return Offer(kind, due_ns or now, urgent=0 < due_ns <= now)
         if kind == CONTROL and self.urgent:
-            return Offer(kind, 0, pressing=True)
+            return Offer(kind, 0, urgent=True)
         patience_ns = 1000 * MS if kind == BULK else 5 * MS
         soon_ns = head.queued_ns + patience_ns
         return Offer(kind, min(soon_ns, due_ns) if due_ns else soon_ns)
@@ -261,11 +261,11 @@ class LinkModel:
                 at_ns = min(at_ns, gate_ns)
                 continue
             offer = self._offer(kind, queue[0], now)
-            if may or offer.pressing:
+            if may or offer.urgent:
                 offers.append(offer)
             elif offer.due_ns > now:
                 at_ns = min(at_ns, offer.due_ns)
-        offers.sort(key=lambda offer: (not offer.pressing, offer.due_ns))
+        offers.sort(key=lambda offer: (not offer.urgent, offer.due_ns))
         size, chosen, next_ns = 0, [], NEVER
         for offer in offers:
             count, more, next_gate_ns = self._fitting(offer.kind, CONTENT_MAX - size, now)
@@ -317,8 +317,8 @@ class LinkModel:
         return [self.slots[sequence % 16] for sequence in range(self.first, self.next)]
 
     def _fits(self, size: int) -> bool:
-        flying = sum(self.slots[n % 16].on_wire for n in range(self.first, self.cursor))
-        return flying == 0 or flying + size <= self.window
+        in_flight = sum(self.slots[n % 16].on_wire for n in range(self.first, self.cursor))
+        return in_flight == 0 or in_flight + size <= self.window
 
     @property
     def _may_probe(self) -> bool:
@@ -336,8 +336,8 @@ class LinkModel:
         if self.cursor < self.next:
             sent = self.slots[self.cursor % 16]
             motion = self.queues[MOTION]
-            pressing = bool(sent.req_clocks) or bool(motion and motion[0].req_clock) or self.urgent
-            return Offer(sent.kind, 0, pressing) if self._fits(self._lead_in_bytes + len(sent.data)) else None
+            urgent = bool(sent.req_clocks) or bool(motion and motion[0].req_clock) or self.urgent
+            return Offer(sent.kind, 0, urgent) if self._fits(self._lead_in_bytes + len(sent.data)) else None
         if self.state != "running":
             return Offer(CONTROL) if self._may_probe else None
         plan = self._plan(now, allowed)
@@ -391,8 +391,8 @@ class LinkModel:
         return True
 
     def _rewind(self, now: int, lead_in: str) -> None:
-        self.naks_owed = min(self.naks_owed + self.cursor - self.first, 2 * IN_FLIGHT_MAX)
-        self.owed_until_ns, self.owed_until = now + self.rto_ns, self.next
+        self.naks_outstanding = min(self.naks_outstanding + self.cursor - self.first, 2 * IN_FLIGHT_MAX)
+        self.outstanding_until_ns, self.outstanding_until = now + self.rto_ns, self.next
         self.cursor = self.first
         if self.lead_in != "flush":
             self.lead_in = lead_in
@@ -493,18 +493,18 @@ class LinkModel:
         if self.state == "confirming" and behind == 1:
             self.state = "running"
             self._acknowledge(self.first + 1, now)
-            self.naks_owed, self.last_ack = 0, self.first
+            self.naks_outstanding, self.last_ack = 0, self.first
             return
         self.state = "confirming"
         self.first = self.cursor = self.next = self.first + behind
-        self.naks_owed = 0
+        self.naks_outstanding = 0
 
     def _nak(self, now: int) -> None:
         self.count["naks"] += 1
         if self.cursor == self.first:
             return
-        if self.naks_owed and now < self.owed_until_ns:
-            self.naks_owed -= 1
+        if self.naks_outstanding and now < self.outstanding_until_ns:
+            self.naks_outstanding -= 1
             return
         self._rewind(now, "sync")
 
@@ -518,8 +518,8 @@ class LinkModel:
         self.first = sequence
         self.cursor = max(self.cursor, sequence)
         self.progress_ns = now
-        if sequence > self.owed_until:
-            self.naks_owed = 0
+        if sequence > self.outstanding_until:
+            self.naks_outstanding = 0
 
     def _measure(self, sample_ns: int) -> None:
         srtt_ns, rttvar_ns = self.count["srtt_ns"], self.count["rttvar_ns"]

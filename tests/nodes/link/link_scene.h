@@ -163,7 +163,7 @@ static inline uint64_t deadline_of(const struct scene *scene) {
 
 // What would go now: its class, time and urgency; nothing: LINK_CLASSES.
 struct offered {
-    unsigned kind, pressing;
+    unsigned kind, urgent;
     uint64_t due_ns;
 };
 
@@ -172,15 +172,15 @@ static inline struct offered offer_of(const struct scene *scene, unsigned allowe
     memset(&offer, 0xEE, sizeof offer);
     if (!link_next_offer(&scene->link, scene->now, allowed, &offer))
         return (struct offered){.kind = LINK_CLASSES};
-    return (struct offered){offer.kind, offer.pressing, offer.due_ns};
+    return (struct offered){offer.kind, offer.urgent, offer.due_ns};
 }
 
-#define CHECK_OFFER(scene, kind_, due_ns_, pressing_)                                                        \
+#define CHECK_OFFER(scene, kind_, due_ns_, urgent_)                                                          \
     do {                                                                                                     \
         struct offered offered_ = offer_of(scene, LINK_ALL);                                                 \
         CHECK_EQUAL(offered_.kind, kind_);                                                                   \
         CHECK_EQUAL(offered_.due_ns, due_ns_);                                                               \
-        CHECK_EQUAL(offered_.pressing, pressing_);                                                           \
+        CHECK_EQUAL(offered_.urgent, urgent_);                                                               \
     } while (0)
 
 #endif

@@ -270,8 +270,8 @@ static void a_links_figures_are_those_of_its_link(void) {
     struct io_link *node = scene.bus->links[0];
     node->link.first = 20;
     node->link.next = 22;
-    node->link.flying_bytes = 77;
-    node->link.flying_commands = 5;
+    node->link.in_flight_bytes = 77;
+    node->link.in_flight_commands = 5;
     for (unsigned kind = 0; kind < LINK_CLASSES; kind++) {
         node->link.queues[kind].commands = 10 + kind;
         node->link.queues[kind].tail = node->link.queues[kind].head + 20 + kind;
@@ -286,7 +286,7 @@ static void a_links_figures_are_those_of_its_link(void) {
     io_publish(scene.bus);
     CHECK_EQUAL(io_get_link_stats(scene.bus, scene.link, &stats), IO_OK);
     io_get_stats(scene.bus, &bus_stats);
-    CHECK(stats.flying_blocks == 2 && stats.flying_bytes == 77 && stats.pending == 5 + 10 + 11 + 12);
+    CHECK(stats.in_flight_blocks == 2 && stats.in_flight_bytes == 77 && stats.pending == 5 + 10 + 11 + 12);
     CHECK_EQUAL(stats.link.rto_ns, 100 * MS);
     for (unsigned kind = 0; kind < LINK_CLASSES; kind++) {
         const struct io_depth *depth = &stats.queues[kind];

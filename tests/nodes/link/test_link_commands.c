@@ -158,7 +158,7 @@ static void a_long_life_repeats_nothing(void) {
     CHECK_EQUAL(after.blocks_repeated, 0);
     CHECK_EQUAL(after.bytes_repeated, 0);
     CHECK_EQUAL(link_pending(&scene.link), 0);
-    CHECK_EQUAL(scene.link.flying_bytes, 0);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 0);
 }
 
 int main(void) {

@@ -55,7 +55,7 @@ static void any_sequence_is_adopted_and_made_sure_of(void) {
         CHECK_EQUAL(go(&scene), 64);
         answer(&scene, expected, 0);
         CHECK_EQUAL(scene.link.state, LINK_CONFIRMING);
-        CHECK_EQUAL(scene.link.flying_bytes, 0);
+        CHECK_EQUAL(scene.link.in_flight_bytes, 0);
         answer(&scene, expected, 0); // once more, before the next question
         answer(&scene, expected + 1, 0);
         CHECK_EQUAL(scene.link.state, LINK_CONFIRMING);
@@ -88,22 +88,22 @@ static void a_lost_question_is_repeated(void) {
     CHECK_EQUAL(go(&scene), 64);
     scene.now += 100 * MS;
     link_handle_timer(&scene.link, scene.now);
-    CHECK_EQUAL(scene.link.naks_owed, 1);
+    CHECK_EQUAL(scene.link.naks_outstanding, 1);
     CHECK_OFFER(&scene, LINK_CONTROL, 0, 0);
     check_block(&scene, go(&scene), 59, "");
     CHECK_EQUAL(deadline_of(&scene), scene.now + 200 * MS);
     answer(&scene, 9, 0);
-    CHECK_EQUAL(scene.link.naks_owed, 0);
-    CHECK_EQUAL(scene.link.flying_bytes, 0);
+    CHECK_EQUAL(scene.link.naks_outstanding, 0);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 0);
     check_goes(&scene, "");
     scene.now += 200 * MS;
     link_handle_timer(&scene.link, scene.now);
-    CHECK_EQUAL(scene.link.naks_owed, 1);
+    CHECK_EQUAL(scene.link.naks_outstanding, 1);
     check_block(&scene, go(&scene), 59, "");
     answer(&scene, 10, 0);
     CHECK_EQUAL(scene.link.state, LINK_RUNNING);
-    CHECK_EQUAL(scene.link.naks_owed, 0);
-    CHECK_EQUAL(scene.link.flying_bytes, 0);
+    CHECK_EQUAL(scene.link.naks_outstanding, 0);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 0);
     struct link_stats stats = stats_of(&scene);
     CHECK_EQUAL(stats.timeouts, 2);
     CHECK_EQUAL(stats.blocks_repeated, 2);

@@ -277,7 +277,7 @@ def test_control_goes_before_motion_and_urgent_before_all() -> None:
     motion = [store(i, 50) for i in range(30)]
     line.link.send_batch(b"".join(map(record, motion)))
     line.pump()
-    flying = len(line.sent)
+    in_flight = len(line.sent)
     line.link.send(store(80))
     line.step()
     line.step()
@@ -286,7 +286,7 @@ def test_control_goes_before_motion_and_urgent_before_all() -> None:
     line.link.send_urgent(STOP)
     line.run()
     position = line.node.executed.index(store(80))
-    assert position == flying
+    assert position == in_flight
     assert line.node.executed[-1] == STOP
     assert store(81) not in line.node.executed
     done = len(line.node.executed) - 2

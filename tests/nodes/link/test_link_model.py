@@ -52,7 +52,7 @@ class CLink:
     def offer(self, now: int, allowed: int) -> tuple[int, int, bool] | None:
         if not lib.link_next_offer(self.c, now, allowed, self._offer):
             return None
-        return self._offer.kind, self._offer.due_ns, bool(self._offer.pressing)
+        return self._offer.kind, self._offer.due_ns, bool(self._offer.urgent)
 
     def stats(self) -> Any:
         lib.link_get_stats(self.c, self._stats)
@@ -219,7 +219,7 @@ class Pair:
         assert real.motion_content == model.motion_content
         for allowed in range(ALL + 1):
             offer = model.next_offer(now, allowed)
-            expected = None if offer is None else (offer.kind, offer.due_ns, offer.pressing)
+            expected = None if offer is None else (offer.kind, offer.due_ns, offer.urgent)
             assert self.real.offer(now, allowed) == expected
             assert lib.link_deadline(real, now, allowed) == model.deadline(now, allowed)
         stats = self.real.stats()

@@ -49,7 +49,7 @@ static void each_class_should_go_in_its_time(void) {
     scene.now = queued_ns + 10 * MS - 1;
     CHECK_OFFER(&scene, LINK_CONTROL, queued_ns + 8 * MS, 0);
     scene.now++;
-    CHECK_OFFER(&scene, LINK_MOTION, queued_ns + 10 * MS, 1); // pressing: before what is due earlier
+    CHECK_OFFER(&scene, LINK_MOTION, queued_ns + 10 * MS, 1); // urgent: before what is due earlier
     check_goes(&scene, "mcb");
 }
 
@@ -163,7 +163,7 @@ static void only_allowed_classes_go(void) {
 }
 
 // Motion whose time has come goes without being allowed, and is waited for until then.
-static void pressing_motion_needs_no_budget(void) {
+static void urgent_motion_needs_no_budget(void) {
     struct scene scene;
     open_running(&scene, WINDOW);
     motion(&scene, 'm', 1, 0, START);
@@ -177,7 +177,7 @@ static void pressing_motion_needs_no_budget(void) {
     CHECK_EQUAL(go_of(&scene, ONLY_CONTROL | ONLY_BULK), 0);
     CHECK_EQUAL(link_deadline(&scene.link, scene.now, 0), due_ns);
     scene.now = due_ns;
-    CHECK_EQUAL(offer_of(&scene, 0).pressing, 1);
+    CHECK_EQUAL(offer_of(&scene, 0).urgent, 1);
     check_block(&scene, go_of(&scene, 0), 0, "m");
 }
 
@@ -446,7 +446,7 @@ int main(void) {
     urgent_goes_first_and_once();
     only_what_may_go_is_offered();
     only_allowed_classes_go();
-    pressing_motion_needs_no_budget();
+    urgent_motion_needs_no_budget();
     a_gate_and_motion_without_budget_both_wake();
     blocks_are_filled_to_the_last_byte();
     motion_waits_for_its_fill();

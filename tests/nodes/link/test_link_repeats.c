@@ -50,7 +50,7 @@ static void each_timeout_doubles_the_next_up_to_a_quarter_of_what_loses_the_link
     CHECK_EQUAL(stats.blocks_repeated, 6);
     CHECK_EQUAL(stats.bytes_repeated, 6 * 64);
     CHECK_EQUAL(stats.commands_sent - before.commands_sent, 1);
-    CHECK_EQUAL(scene.link.flying_bytes, 64);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 64);
     CHECK_EQUAL(deadline_of(&scene), sent_ns + SECOND);
     time_passes(&scene, sent_ns + SECOND - 1);
     CHECK_EQUAL(scene.link.state, LINK_RUNNING);
@@ -74,7 +74,7 @@ static void only_a_sure_round_trip_undoes_the_doublings(void) {
     acknowledge_all(&scene);
     CHECK_EQUAL(stats_of(&scene).rto_ns, 20 * MS);
     CHECK_EQUAL(deadline_of(&scene), NEVER);
-    CHECK_EQUAL(scene.link.flying_bytes, 0);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 0);
 }
 
 static void round_trips_make_the_timeout(void) {
@@ -150,7 +150,7 @@ static void a_timeout_flushes_the_node(void) {
         }
         CHECK_EQUAL(go(&scene), 0);
         acknowledge_all(&scene);
-        CHECK_EQUAL(scene.link.flying_bytes, 0);
+        CHECK_EQUAL(scene.link.in_flight_bytes, 0);
         block_goes(&scene, 'b', 3);
         acknowledge_all(&scene); // a sure round trip
     }
@@ -164,23 +164,23 @@ static void repeats_stay_within_the_window(void) {
         block_goes(&scene, 'a', 59);
     control(&scene, 'b', 59);
     CHECK_EQUAL(go(&scene), 0);
-    CHECK_EQUAL(scene.link.flying_bytes, 192);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 192);
     time_passes(&scene, scene.now + 20 * MS);
-    CHECK_EQUAL(scene.link.flying_bytes, 0);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 0);
     CHECK_EQUAL(go(&scene), 65);
     CHECK_EQUAL(go(&scene), 64);
     CHECK_EQUAL(offer_of(&scene, LINK_ALL).kind, LINK_CLASSES);
     CHECK_EQUAL(go(&scene), 0);
     CHECK_EQUAL(deadline_of(&scene), scene.now + 40 * MS);
     answer(&scene, scene.link.first + 1, 0);
-    CHECK_EQUAL(scene.link.flying_bytes, 64);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 64);
     CHECK_OFFER(&scene, LINK_CONTROL, 0, 0);
     CHECK_EQUAL(go(&scene), 64);
-    CHECK_EQUAL(scene.link.flying_bytes, 128);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 128);
     CHECK_EQUAL(stats_of(&scene).bytes_repeated, 193);
     CHECK_EQUAL(go(&scene), 64);
     acknowledge_all(&scene);
-    CHECK_EQUAL(scene.link.flying_bytes, 0);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 0);
 }
 
 // A gate that opens does not wake while a repeat waits for room.
@@ -201,7 +201,7 @@ static void what_waits_behind_a_repeat_wakes_nobody(void) {
 static void a_repeat_presses_where_motion_or_an_emergency_is_behind_it(void) {
     enum { CONTROL, BULK, MOTION, MOTION_UNTIMED, BEFORE_MOTION, BEFORE_UNTIMED, BEFORE_URGENT, CASES };
     static const struct {
-        unsigned kind, pressing;
+        unsigned kind, urgent;
     } expected[CASES] = {
         [CONTROL] = {LINK_CONTROL, 0},       [BULK] = {LINK_BULK, 0},
         [MOTION] = {LINK_MOTION, 1},         [MOTION_UNTIMED] = {LINK_MOTION, 0},
@@ -224,7 +224,7 @@ static void a_repeat_presses_where_motion_or_an_emergency_is_behind_it(void) {
             CHECK_EQUAL(urgent(&scene, 'u', 1), LINK_OK);
         CHECK_EQUAL(offer_of(&scene, LINK_ALL).kind, LINK_CLASSES);
         time_passes(&scene, scene.now + 20 * MS);
-        CHECK_OFFER(&scene, expected[i].kind, 0, expected[i].pressing);
+        CHECK_OFFER(&scene, expected[i].kind, 0, expected[i].urgent);
         struct offered offered = offer_of(&scene, 0); // of a class that may not send, too
         CHECK_EQUAL(offered.kind, expected[i].kind);
         CHECK_EQUAL(go_of(&scene, 0), 65);
@@ -253,7 +253,7 @@ static void naks_that_repeats_may_cause_are_ignored(void) {
     three_blocks_go(&scene);
     nak(&scene);
     nak(&scene); // the repeat is on its way already
-    CHECK_EQUAL(scene.link.naks_owed, 3);
+    CHECK_EQUAL(scene.link.naks_outstanding, 3);
     three_blocks_go_again(&scene, 1);
     struct link_stats stats = stats_of(&scene);
     CHECK_EQUAL(stats.naks, 2);
@@ -265,18 +265,18 @@ static void naks_that_repeats_may_cause_are_ignored(void) {
     for (unsigned i = 0; i < 3; i++) {
         nak(&scene);
         CHECK_EQUAL(go(&scene), 0);
-        CHECK_EQUAL(scene.link.naks_owed, 2 - i);
+        CHECK_EQUAL(scene.link.naks_outstanding, 2 - i);
     }
     nak(&scene);
     CHECK_EQUAL(stats_of(&scene).naks, 6);
-    CHECK_EQUAL(scene.link.naks_owed, 3);
+    CHECK_EQUAL(scene.link.naks_outstanding, 3);
     three_blocks_go_again(&scene, 1);
     scene.now += 20 * MS - 1;
     nak(&scene);
     CHECK_EQUAL(go(&scene), 0);
     scene.now++;
     nak(&scene);
-    CHECK_EQUAL(scene.link.naks_owed, 5);
+    CHECK_EQUAL(scene.link.naks_outstanding, 5);
     three_blocks_go_again(&scene, 1);
     CHECK_EQUAL(stats_of(&scene).acks_duplicate, 0);
 }
@@ -289,9 +289,9 @@ static void an_acknowledgement_behind_the_repeats_ends_their_naks(void) {
     three_blocks_go_again(&scene, 1);
     block_goes(&scene, 'd', 1);
     answer(&scene, scene.link.next - 1, 0); // the repeats, and no more
-    CHECK_EQUAL(scene.link.naks_owed, 3);
+    CHECK_EQUAL(scene.link.naks_outstanding, 3);
     acknowledge_all(&scene);
-    CHECK_EQUAL(scene.link.naks_owed, 0);
+    CHECK_EQUAL(scene.link.naks_outstanding, 0);
 }
 
 // 30: as many as two times the blocks that can be in flight.
@@ -304,7 +304,7 @@ static void no_more_naks_are_ignored_than_can_come(void) {
     for (unsigned i = 0; i < 4; i++) {
         scene.now += 250 * MS - 1; // long enough for every nak to be heard
         nak(&scene);
-        CHECK_EQUAL(scene.link.naks_owed, owed[i]);
+        CHECK_EQUAL(scene.link.naks_outstanding, owed[i]);
         for (unsigned k = 0; k < 14; k++)
             CHECK(go(&scene) > 0);
     }
@@ -322,7 +322,7 @@ static void what_is_acknowledged_is_not_repeated(void) {
         for (unsigned i = 0; i < again; i++)
             CHECK(go(&scene) > 0);
         acknowledge_all(&scene);
-        CHECK_EQUAL(scene.link.flying_bytes, 0);
+        CHECK_EQUAL(scene.link.in_flight_bytes, 0);
         CHECK_EQUAL(link_pending(&scene.link), 0);
         CHECK_EQUAL(go(&scene), 0);
         CHECK_EQUAL(deadline_of(&scene), NEVER);
@@ -339,10 +339,10 @@ static void a_part_may_be_acknowledged_while_it_is_repeated(void) {
     CHECK_EQUAL(go(&scene), 15 + 1);
     CHECK_EQUAL(go(&scene), 25);
     answer(&scene, scene.link.next - 1, 0);
-    CHECK_EQUAL(scene.link.flying_bytes, 0);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 0);
     CHECK_EQUAL(link_pending(&scene.link), 1);
     check_block(&scene, go(&scene), 0, "cccccccccccccccccccccccccccccc");
-    CHECK_EQUAL(scene.link.flying_bytes, 35);
+    CHECK_EQUAL(scene.link.in_flight_bytes, 35);
 }
 
 static void what_was_never_sent_is_not_acknowledged(void) {

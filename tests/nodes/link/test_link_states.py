@@ -1,15 +1,13 @@
 """The states of a link: the table, its page, and that the link goes by it."""
 
-import runpy
-import warnings
 from pathlib import Path
 
 import pytest
 
 from nodes.link._link import lib
-from nodes.link.states import LinkEvent, LinkState, following, page
 from tests.nodes.link.twin import ask
 from tests.nodes.link.virtual import MS, CoreLink
+from tests.nodes.state_pages import LinkEvent, LinkState, following, link_page
 from tests.wire_twin import block
 
 ROOT = Path(__file__).parents[3]
@@ -18,14 +16,7 @@ LOST_AFTER_NS = 1000 * MS
 
 
 def test_the_diagram_of_the_states_is_not_stale() -> None:
-    assert (ROOT / "docs" / "link-states.md").read_text() == page()
-
-
-def test_the_page_is_written_by_the_module(capsys: pytest.CaptureFixture[str]) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # it is imported here, too
-        runpy.run_module("nodes.link.states", run_name="__main__")
-    assert capsys.readouterr().out == page()
+    assert (ROOT / "docs" / "link-states.md").read_text() == link_page()
 
 
 def test_the_words_cover_the_tables_states_and_events() -> None:

@@ -120,33 +120,33 @@ static void an_unknown_bit_rate_allows_everything(void) {
     schedule_sent(&schedule, LINK_BULK, 1000000);
     CHECK_EQUAL(schedule_allowed(&schedule), LINK_ALL);
     CHECK(schedule_room(&schedule, 1000) == UINT64_MAX);
-    CHECK(!schedule_breathe(&schedule, 1));
+    CHECK(!schedule_pause(&schedule, 1));
 }
 
 static void a_line_that_is_not_answered_pauses(void) {
     struct schedule schedule = fresh(S);
-    CHECK(!schedule_breathe(&schedule, UINT64_MAX));
-    CHECK(!schedule_breathe(&schedule, S));
+    CHECK(!schedule_pause(&schedule, UINT64_MAX));
+    CHECK(!schedule_pause(&schedule, S));
     schedule_advance(&schedule, S + 7 * MS);
     schedule_sent(&schedule, LINK_MOTION, 500); // 1 ms
-    CHECK(schedule_breathe(&schedule, S));
+    CHECK(schedule_pause(&schedule, S));
     uint64_t until_ns = S + 8 * MS + 120 * BIT_NS;
     CHECK_EQUAL(schedule_room_at(&schedule), until_ns);
     schedule_advance(&schedule, until_ns - 1);
-    CHECK(schedule_breathe(&schedule, S));
+    CHECK(schedule_pause(&schedule, S));
     schedule_advance(&schedule, until_ns);
-    CHECK(!schedule_breathe(&schedule, S)); // and not again at once, answered or not
+    CHECK(!schedule_pause(&schedule, S)); // and not again at once, answered or not
     schedule_advance(&schedule, until_ns + 7 * MS);
-    CHECK(schedule_breathe(&schedule, S));
+    CHECK(schedule_pause(&schedule, S));
 }
 
 static void order(void) {
     uint64_t now = 100 * MS;
-    struct link_offer pressing = {now - 1, LINK_MOTION, 1}, earlier = {now - 5, LINK_MOTION, 1};
+    struct link_offer urgent = {now - 1, LINK_MOTION, 1}, earlier = {now - 5, LINK_MOTION, 1};
     struct link_offer ahead = {now + MS, LINK_MOTION, 0}, asked = {now + 2 * MS, LINK_CONTROL, 0};
     struct link_offer overdue = {now - 50 * MS, LINK_CONTROL, 0}, longer = {now - 90 * MS, LINK_CONTROL, 0};
-    CHECK(schedule_before(&earlier, &pressing, now) && !schedule_before(&pressing, &earlier, now));
-    CHECK(schedule_before(&pressing, &overdue, now) && !schedule_before(&overdue, &pressing, now));
+    CHECK(schedule_before(&earlier, &urgent, now) && !schedule_before(&urgent, &earlier, now));
+    CHECK(schedule_before(&urgent, &overdue, now) && !schedule_before(&overdue, &urgent, now));
     CHECK(schedule_before(&ahead, &asked, now) && !schedule_before(&asked, &ahead, now));
     CHECK(schedule_before(&overdue, &ahead, now));
     // A flood that was queued first is not more overdue: neither goes before the other, the turn goes round.

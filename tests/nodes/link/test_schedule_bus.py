@@ -89,11 +89,13 @@ def test_at_95_percent_no_motion_is_late_and_bulk_gets_the_rest() -> None:
         bus.every(50 * MS, lambda: bus.send(bus.nodes[6], ask(7)))
         false_alarms: list[int] = []
         bus.every(50 * MS, lambda: false_alarms.append(bus.forecast().late_ns))
-        flying: list[int] = []
-        bus.every(5 * MS, lambda: flying.extend(bus.link_stats(n).flying_bytes for n in bus.nodes.values()))
+        in_flight: list[int] = []
+        bus.every(
+            5 * MS, lambda: in_flight.extend(bus.link_stats(n).in_flight_bytes for n in bus.nodes.values())
+        )
         bus.run(bus.now + 4 * S)
         assert plan.late() == []
-        assert 0 < max(flying) <= 192
+        assert 0 < max(in_flight) <= 192
         assert all(node.twin.overflows == node.twin.errors == 0 for node in bus.nodes.values())
         assert len(plan.due_ns) > 1500
         assert not any(false_alarms)
@@ -226,10 +228,10 @@ def test_the_kernel_queue_is_bounded(queue_frames: int) -> None:
         for node in bus.nodes.values():
             for i in range(30):
                 bus.send(node, store(i, 50))
-        flying: list[int] = []
-        bus.every(MS, lambda: flying.extend(bus.link_stats(n).flying_bytes for n in bus.nodes.values()))
+        in_flight: list[int] = []
+        bus.every(MS, lambda: in_flight.extend(bus.link_stats(n).in_flight_bytes for n in bus.nodes.values()))
         bus.run(bus.now + 1200 * MS)
-        assert 150 < max(flying) <= 192
+        assert 150 < max(in_flight) <= 192
         bound = queue_frames or 6  # 1.5 ms at 500 kbit/s
         assert bus.stats().queue_frames == bound
         assert bus.host_most <= bound

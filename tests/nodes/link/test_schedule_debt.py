@@ -24,7 +24,7 @@ class Bus:
         lib.schedule_init(self.schedule, BITRATE, 0.0, 0, 0, self.now)
 
     def run(self, seconds: float, *, foreign: float = 0.0, motion: float = 0.0) -> None:
-        """Let time pass with so much traffic of others, and of motion that is pressing: shares of the bus."""
+        """Let time pass with so much traffic of others, and of motion that is urgent: shares of the bus."""
         for _ in range(round(seconds * 1000)):
             self.now += MS
             lib.schedule_advance(self.schedule, self.now)

@@ -225,24 +225,24 @@ static void a_full_queue_is_looked_at_when_half_has_left(void) {
 static void the_pause_begins_and_ends_to_the_nanosecond(void) {
     struct schedule schedule = fresh();
     schedule_advance(&schedule, S + 7 * MS - 1);
-    CHECK(!schedule_breathe(&schedule, S));
+    CHECK(!schedule_pause(&schedule, S));
     schedule_advance(&schedule, S + 7 * MS);
-    CHECK(!schedule_breathe(&schedule, S + 1));
-    CHECK(schedule_breathe(&schedule, S));
+    CHECK(!schedule_pause(&schedule, S + 1));
+    CHECK(schedule_pause(&schedule, S));
     CHECK_EQUAL(schedule.pause_ns, S + 7 * MS + FRAME_NS);
     uint64_t end_ns = schedule.pause_ns;
     schedule_advance(&schedule, end_ns - 1);
-    CHECK(schedule_breathe(&schedule, UINT64_MAX)); // answered or not
+    CHECK(schedule_pause(&schedule, UINT64_MAX)); // answered or not
     schedule_advance(&schedule, end_ns);
-    CHECK(!schedule_breathe(&schedule, S));
+    CHECK(!schedule_pause(&schedule, S));
     CHECK_EQUAL(schedule.pause_ns, 0);
     schedule_advance(&schedule, end_ns + 7 * MS - 1);
-    CHECK(!schedule_breathe(&schedule, S));
+    CHECK(!schedule_pause(&schedule, S));
     schedule_advance(&schedule, end_ns + 7 * MS);
-    CHECK(schedule_breathe(&schedule, S));
+    CHECK(schedule_pause(&schedule, S));
     struct schedule serial = bus(250000, 0, 0, 1);
     schedule_advance(&serial, 2 * S);
-    CHECK(!schedule_breathe(&serial, S)); // who answers has a line of his own
+    CHECK(!schedule_pause(&serial, S)); // who answers has a line of his own
 }
 
 static void deadlines_order_what_is_not_overdue(void) {
@@ -254,10 +254,11 @@ static void deadlines_order_what_is_not_overdue(void) {
     CHECK(!schedule_before(&overdue, &at_now, now)); // overdue alike
     struct link_offer late_motion = {now - 5, LINK_MOTION, 0}, later_motion = {now - 4, LINK_MOTION, 0};
     CHECK(schedule_before(&late_motion, &later_motion, now)); // motion has true deadlines
-    struct link_offer pressing = {now + 50, LINK_CONTROL, 1}; // an urgent command
-    CHECK(schedule_before(&pressing, &late_motion, now) && !schedule_before(&late_motion, &pressing, now));
-    struct link_offer urgent = {now - 9, LINK_CONTROL, 1}, urgent_later = {now - 8, LINK_CONTROL, 1};
-    CHECK(schedule_before(&urgent, &urgent_later, now) && !schedule_before(&urgent_later, &urgent, now));
+    struct link_offer urgent = {now + 50, LINK_CONTROL, 1};   // an urgent command
+    CHECK(schedule_before(&urgent, &late_motion, now) && !schedule_before(&late_motion, &urgent, now));
+    struct link_offer early_urgent = {now - 9, LINK_CONTROL, 1}, late_urgent = {now - 8, LINK_CONTROL, 1};
+    CHECK(schedule_before(&early_urgent, &late_urgent, now) &&
+          !schedule_before(&late_urgent, &early_urgent, now));
 }
 
 // -------------------------------------------------------------------------------------------------- figures

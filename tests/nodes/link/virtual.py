@@ -84,11 +84,11 @@ class CoreLink:
         return at_ns
 
     def offer(self, now: int, allowed: int = lib.LINK_ALL) -> tuple[int, int, bool] | None:
-        """(class, when it should go, pressing), or None."""
+        """(class, when it should go, urgent), or None."""
         out: Any = ffi.new("struct link_offer *")
         if not lib.link_next_offer(self.c, now, allowed, out):
             return None
-        return out.kind, out.due_ns, bool(out.pressing)
+        return out.kind, out.due_ns, bool(out.urgent)
 
     def pending(self) -> int:
         count: int = lib.link_pending(self.c)

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from typing import Any, Protocol
 
 from nodes.mt.mt import MtStatus, Pair
-from nodes.mt.receiver import MtReceiver
 from nodes.virtual._sim import ffi, lib
+from tests.nodes.mt.receiver import MtReceiver
 
 
 class Receiver(Protocol):

@@ -22,8 +22,8 @@ from nodes.mt.mt import (
     to_frames,
     transmission,
 )
-from nodes.mt.receiver import MtReceiver
 from tests.nodes.mt import literal
+from tests.nodes.mt.receiver import MtReceiver
 from tests.nodes.mt.receivers import BOTH, FirmwareReceiver, feed
 
 ROOM = 12

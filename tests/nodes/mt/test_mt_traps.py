@@ -18,8 +18,8 @@ from nodes.mt.mt import (
     mask_of,
     transmission,
 )
-from nodes.mt.receiver import MtReceiver
 from tests.nodes.mt import literal
+from tests.nodes.mt.receiver import MtReceiver
 from tests.nodes.mt.receivers import BOTH, FirmwareReceiver, feed
 
 TABLE: tuple[Pair, ...] = ((-50_000, 12), (0, -7), (50_000, -7), (50_001, 0))

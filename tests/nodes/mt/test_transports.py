@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from nodes.mt.mt import MtError, Pair, from_bytes, to_bytes, transmission
 from nodes.mt.pace import NS_PER_S, PacedFrames, PacedWords
-from nodes.mt.receiver import ByteWords, MtReceiver, PolledRegister
 from nodes.virtual._sim import ffi, lib
 from tests.nodes.mt import literal
+from tests.nodes.mt.receiver import ByteWords, MtReceiver, PolledRegister
 from tests.nodes.mt.receivers import feed
 
 GAP = 50

@@ -7,8 +7,9 @@ import pytest
 from nodes.devices.stepper import Stepper
 from nodes.dictionary.dictionary import Dictionary
 from nodes.node.config import NodeConfig, NodeConfigError
-from nodes.node.states import TRANSITIONS, NodeEvent, NodeState, page
+from nodes.node.states import TRANSITIONS, NodeEvent, NodeState
 from tests.nodes.machine import make_config, stepper_x
+from tests.nodes.state_pages import node_page
 from tests.nodes.twin_bus import TwinNode, source_of, without_commands
 
 ROOT = Path(__file__).parents[3]
@@ -76,7 +77,7 @@ def test_both_edges_need_firmware_that_can() -> None:
 
 
 def test_the_diagram_of_the_states_is_not_stale() -> None:
-    assert (ROOT / "docs" / "node-states.md").read_text() == page()
+    assert (ROOT / "docs" / "node-states.md").read_text() == node_page()
 
 
 def test_every_state_can_be_reached_closed_and_only_closed_is_final() -> None:

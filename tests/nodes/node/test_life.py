@@ -5,6 +5,7 @@ import asyncio
 import pytest
 
 from nodes.bus.can_bus import CanBus
+from nodes.link import Frame
 from nodes.link.interfaces import OnFrame, OnLost
 from nodes.node.errors import NodeError, NodeRestarted
 from nodes.node.states import NodeState
@@ -12,7 +13,7 @@ from nodes.support.can_protocol import BUS_OFF
 from nodes.support.errors import CanductorError
 from tests.nodes import virtual_time
 from tests.nodes.machine import Machine, make_config, stepper_x, uuid
-from tests.nodes.twin_bus import Frame, TwinIO, TwinNode, source_of, with_canbus_id
+from tests.nodes.twin_bus import TwinIO, TwinNode, source_of, with_canbus_id
 
 
 def now_s() -> float:
@@ -198,7 +199,7 @@ def test_a_controller_that_goes_bus_off_loses_its_nodes_with_what_to_do() -> Non
 
     async def check() -> None:
         assert machine.io.on_frame is not None
-        machine.io.on_frame(Frame(BUS_OFF, bytes(8)))
+        machine.io.on_frame(Frame(BUS_OFF, bytes(8), 0))
         assert machine.node.state is NodeState.LOST
         assert "bus-off" in str(machine.node.failure)
         assert "'ip link set can0 type can restart-ms 100'" in str(machine.node.failure)

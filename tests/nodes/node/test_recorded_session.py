@@ -9,6 +9,7 @@ import pytest
 from nodes.dictionary.dictionary import BOOTSTRAP, Dictionary
 from nodes.dictionary.message_format import Message
 from tests import wire_twin as twin
+from tests.nodes.dictionary.as_sent import decode_as_sent, encode_as_sent
 
 ROOT = Path(__file__).parents[3]
 DATA = ROOT / "tests" / "data"
@@ -26,9 +27,9 @@ def test_golden_session() -> None:
         command = dictionary.command(entry["name"])
         values = [bytes.fromhex(v) if isinstance(v, str) else v for v in entry["values"]]
         assert command.encode(dict(zip(command.names, values, strict=True))) == block.content
-        decoded = dictionary.decode_commands(block.content, as_sent=True)
+        decoded = decode_as_sent(dictionary, block.content)
         assert decoded is not None
-        assert dictionary.encode_commands(decoded) == block.content
+        assert encode_as_sent(dictionary, decoded) == block.content
 
 
 def test_long_forms_mean_the_same_and_are_told_apart() -> None:
@@ -38,10 +39,10 @@ def test_long_forms_mean_the_same_and_are_told_apart() -> None:
         Message("set_digital_out", {"pin": 160032704, "value": 1}),
         Message("finalize_config", {"crc": 0xFFFFFFFF}),
     ]
-    exact = dictionary.decode_commands(content, as_sent=True)
+    exact = decode_as_sent(dictionary, content)
     assert exact is not None
     assert [m.params for m in exact] == [{"pin": (1 << 32) + 160032704, "value": 1}, {"crc": 0xFFFFFFFF}]
-    assert dictionary.encode_commands(exact) == content
+    assert encode_as_sent(dictionary, exact) == content
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +68,10 @@ def test_commands_of_the_recorded_session(recorded: tuple[bytes, bytes, Dictiona
     again = b""
     commands = 0
     for block in found:
-        messages = dictionary.decode_commands(block.content, as_sent=True)
+        messages = decode_as_sent(dictionary, block.content)
         assert messages is not None, block
         commands += len(messages)
-        again += twin.block(block.sequence, dictionary.encode_commands(messages))
+        again += twin.block(block.sequence, encode_as_sent(dictionary, messages))
         # A node reads 32 bits of every number; so does the everyday decoder.
         everyday = dictionary.decode_commands(block.content)
         assert everyday is not None

@@ -320,7 +320,7 @@ def test_uart_is_exclusive() -> None:
     master, slave = os.openpty()
     path = os.ttyname(slave)
     first = open_uart(path)
-    with pytest.raises(CanductorError, match="another program is using it"):
+    with pytest.raises(CanductorError, match="another program uses it"):
         open_uart(path)
     first.close()
     os.close(slave)

@@ -99,7 +99,7 @@ def test_a_log_still_being_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"CNDEDGE1", b"x" * 64, b"CNDEDGE1".ljust(64, b"\0")])
 def test_what_is_no_log_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "log").write_bytes(content)
-    with pytest.raises(CanductorError, match=r"edge log .*(no edge log|damaged)"):
+    with pytest.raises(CanductorError, match=r"edge log .*(not an edge log|damaged)"):
         EdgeLog(tmp_path / "log")
     with pytest.raises(CanductorError, match="cannot be read"):
         EdgeLog(tmp_path / "none")

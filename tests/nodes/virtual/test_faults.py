@@ -108,9 +108,9 @@ def test_bus_off_begins_without_any_traffic(tmp_path: Path) -> None:
         ({"kind": BusFaultKind.LOSE, "sender": 64}, "fault lose: sender 64 is not between 0 and 63"),
         ({"kind": BusFaultKind.LOSE, "from_s": 2, "until_s": 1}, "fault lose: end 1 is not between 2"),
         ({"kind": BusFaultKind.DELAY, "time_s": -1}, "fault delay: time -1 is not between 0"),
-        ({"kind": BusFaultKind.DELAY, "receiver": 1}, "only a loss or corruption can hit a single receiver"),
-        ({"kind": BusFaultKind.BUS_OFF}, "fault bus_off: needs to last for some time"),
-        ({"kind": BusFaultKind.LOSE, "timed": True}, "only bus-off can happen without a frame"),
+        ({"kind": BusFaultKind.DELAY, "receiver": 1}, "only a loss or corruption can have a receiver"),
+        ({"kind": BusFaultKind.BUS_OFF}, "fault bus_off: its time must be above 0 s"),
+        ({"kind": BusFaultKind.LOSE, "timed": True}, "only bus-off can be timed"),
     ],
 )
 def test_impossible_faults_are_refused(fields: dict[str, object], said: str) -> None:

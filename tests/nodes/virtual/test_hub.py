@@ -234,7 +234,7 @@ def test_a_path_in_use_is_refused_and_a_stale_one_replaced(tmp_path: Path) -> No
 
 def test_what_is_no_socket_is_never_removed(tmp_path: Path) -> None:
     (tmp_path / "precious").write_text("data")
-    with pytest.raises(CanductorError, match="no socket is in the way"):
+    with pytest.raises(CanductorError, match="a file other than a socket"):
         VirtualBus(tmp_path / "precious").start()
     assert (tmp_path / "precious").read_text() == "data"
 
@@ -273,7 +273,7 @@ def test_close_ends_connections_and_keeps_the_figures(tmp_path: Path) -> None:
 
 
 def test_the_process_says_when_it_is_ready_and_reports_at_the_end(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "nodes.virtual.hub", str(tmp_path / "bus"), "--bitrate", "250000"]
+    command = [sys.executable, "-m", "tests.stages.bus_process", str(tmp_path / "bus"), "--bitrate", "250000"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert f'"address": "virtual:{tmp_path / "bus"}"' in process.stdout.readline()

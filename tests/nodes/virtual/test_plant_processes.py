@@ -204,8 +204,8 @@ def test_no_file_no_page_no_log(tmp_path: Path) -> None:
     with pytest.raises(CanductorError, match=r"n\.plantlog: the plant's log cannot be read"):
         list(plant_log(tmp_path, "n"))
     (tmp_path / "n.page").write_bytes(bytes(2_000_000))
-    with pytest.raises(CanductorError, match="this is no page of a running plant"):
+    with pytest.raises(CanductorError, match="not the page of a running plant"):
         PlantPage.at(tmp_path, "n")
     (tmp_path / "n.plantlog").write_text("nonsense\n")
-    with pytest.raises(CanductorError, match=r"n\.plantlog:1: this is no line of a plant's log"):
+    with pytest.raises(CanductorError, match=r"n\.plantlog:1: not a line of a plant's log"):
         list(plant_log(tmp_path, "n"))

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from nodes.support.errors import CanductorError
-from nodes.virtual.processes import BusProcess, ChildProcess, NodeProcess
+from nodes.virtual.processes import ChildProcess, NodeProcess
+from tests.stages.bus_process import BusProcess
 
 WAIT_S = 20.0
 READY = "import json, signal, sys; print(json.dumps({'ready': True, 'argv': sys.argv[1:]}), flush=True)\n"
@@ -47,7 +48,7 @@ def test_bus_process_comes_up_and_reports(tmp_path: Path) -> None:
 def test_what_a_process_says_when_it_fails_is_passed_on(tmp_path: Path) -> None:
     (tmp_path / "bus").touch()
     bus = BusProcess(tmp_path / "bus")
-    with pytest.raises(CanductorError, match=r"did not become ready: ended with status 1: .* in the way"):
+    with pytest.raises(CanductorError, match=r"did not become ready: ended with status 1: .* than a socket"):
         bus.wait_ready()
 
 
@@ -71,7 +72,7 @@ def test_a_process_that_does_not_become_ready(code: str, said: str) -> None:
 def test_a_process_that_ignores_sigterm_is_killed() -> None:
     process = ChildProcess("thing", python(f"{IGNORING}{READY}signal.pause()"))
     process.wait_ready()
-    with pytest.raises(CanductorError, match=r"did not end in order: no answer in 0\.1 s; it was killed"):
+    with pytest.raises(CanductorError, match=r"did not end correctly: no answer in 0\.1 s; it was killed"):
         process.stop(0.1)
     assert not process.running
 
@@ -83,7 +84,7 @@ def test_a_process_that_died_is_told_at_stop_and_kill_may_be_repeated() -> None:
     with pytest.raises(CanductorError, match="ended by signal 9"):
         process.stop()
     process.kill()
-    with pytest.raises(CanductorError, match="killed before"):
+    with pytest.raises(CanductorError, match="was killed before"):
         process.stop()
 
 
@@ -107,7 +108,7 @@ def test_processes_outlive_the_thread_that_started_them() -> None:
 def test_processes_die_with_a_parent_that_is_killed(tmp_path: Path) -> None:
     parent_code = (
         "import signal, sys\n"
-        "from nodes.virtual.processes import BusProcess\n"
+        "from tests.stages.bus_process import BusProcess\n"
         "bus = BusProcess(sys.argv[1]); bus.wait_ready()\n"
         "print(bus.pid, flush=True); signal.pause()\n"
     )

@@ -18,11 +18,11 @@ from nodes.virtual.plant import (
     Term,
 )
 from nodes.virtual.plant_page import PlantFault, PlantItemKind
-from nodes.virtual.sim import SimNode
 from nodes.virtual.sim_plant import connect_plants
 from nodes.virtual.world import NodeSettings, World
 from tests.firmware.host import Host
 from tests.nodes.virtual.plants import HOT
+from tests.stages.sim_node import SimNode
 
 START_CLOCK = 2**32 - 1000
 TANK = NodePlant(
@@ -80,14 +80,14 @@ def test_only_one_plant_and_only_a_right_one() -> None:
     bad = NodePlant(node="n", heaters=(Heater(name="h", pin="PA0", body="b", power=1.0),))
     with pytest.raises(CanductorError, match="the plant of node n: line 2: body=b: expected a body"):
         SimNode().start_plant(bad)
-    with pytest.raises(CanductorError, match="cannot have name 'two words'; use 1 to 63 characters without"):
+    with pytest.raises(CanductorError, match="cannot have name 'two words'; give 1 to 63 characters without"):
         NodePlant(node="n", fans=(Fan(name="two words", pin="PA0"),)).text()
     needy = NodePlant(
         node="n",
         bodies=(Body(name="b", capacity=1.0, loss=1.0),),
         coolings=(Cooling(body="b", node="far", fan="f", conductance=1.0),),
     )
-    with pytest.raises(CanductorError, match="plant of node n speaks of node 'far', which has no plant"):
+    with pytest.raises(CanductorError, match="plant of node n refers to node 'far', which has no plant"):
         connect_plants({"n": SimNode().start_plant(needy)})
 
 

@@ -178,7 +178,8 @@ def test_a_token_that_others_can_read_is_not_used(tmp_path: Path, canductor: Com
             status, _, err = canductor(*words)
             assert (status, len(served.stops)) == (1, 0)
             assert err == (
-                f"canductor: the token's file {token} must be yours alone; chmod 600 it, and own it\n"
+                f"canductor: the token's file {token} must belong to this user and be accessible to no other;"
+                " chmod 600 it\n"
             )
         token.chmod(0o600)
         status, _, err = canductor(*words)

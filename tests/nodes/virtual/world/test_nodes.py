@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from nodes.node.states import NodeState
-from nodes.virtual.sim import SimNode
 from nodes.virtual.world import (
     CanState,
     Latency,
@@ -19,6 +18,7 @@ from nodes.virtual.world import (
     run,
 )
 from tests.nodes.virtual.world.machines import CanMachine, UartMachine, uuid
+from tests.stages.sim_node import SimNode
 
 HZ = 168_000_000
 S = 1_000_000_000
@@ -117,40 +117,6 @@ def test_power_off_is_silence_and_power_on_another_clock() -> None:
     machine.world.run_for(0.01)
     assert board.clock == 777 + HZ // 100
     assert machine.wire.counters()["frames"] == 2
-
-
-def test_an_endstop_follows_the_steps_of_another_node() -> None:
-    """Two nodes: the stepper is on one, the endstop's pin on the other."""
-    machine = CanMachine(1, 2, steppers=True)
-    motor, switch = machine.boards
-    pin = 40
-
-    async def main() -> None:
-        await machine.bus.start()
-        node = machine.nodes[0]
-        pins = node.dictionary.enumerations["pin"]
-        step_pin, dir_pin = pins.value_of("PA1"), pins.value_of("PB2")
-        axis = motor.add_axis(
-            step_pin, dir_pin, target=switch, target_pin=pin, at=30, delay_s=5e-6, position=0
-        )
-        assert switch.level(pin) == 0
-        at = motor.clock + HZ // 10
-        node.send("reset_step_clock", oid=0, clock=at & 0xFFFFFFFF)
-        node.send("set_next_step_dir", oid=0, dir=1)
-        node.send("queue_step", oid=0, interval=HZ // 1000, count=50, add=0)
-        rose_ns = 0
-        while machine.world.now_ns < 10_000 * S and not rose_ns and motor.axis_position(axis) < 50:
-            await asyncio.sleep(20e-6)
-            if switch.level(pin):
-                rose_ns = machine.world.now_ns
-        edges = motor.edges()
-        steps = edges[(edges["pin"] == step_pin) & (edges["level"] == 1)]
-        due_ns = int(steps["true_ps"][29]) // 1000 + 5000
-        assert due_ns <= rose_ns <= due_ns + 100_000
-        assert int(steps["clock"][29]) - at == 30 * (HZ // 1000)
-        await machine.bus.close()
-
-    run(machine.world, main(), limit_s=60)
 
 
 def test_a_slow_node_loses_what_does_not_fit_and_the_link_repeats_it() -> None:
