@@ -3,7 +3,7 @@
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Final, Protocol
@@ -23,6 +23,7 @@ from coordinator.dnc.tables import check_table
 from coordinator.dnc.verify import Compare, Twice
 from coordinator.ipc.client.blocking import BlockingClient
 from coordinator.ipc.client.upload import send_program, show_progress
+from coordinator.support.report import PlainReport, Report
 from nodes.support.errors import CanductorError
 
 NOT_YET_S: Final = 0.02
@@ -58,38 +59,6 @@ class Surroundings:
 
 
 HERE: Final = Surroundings()
-
-
-@dataclass(frozen=True, slots=True)
-class DncReport:
-    """What became of a command's transfers."""
-
-    outcomes: tuple[Outcome, ...]
-    text: str
-
-    @property
-    def ok(self) -> bool:
-        """Whether none failed."""
-        return all(outcome.ok for outcome in self.outcomes)
-
-    def to_json(self) -> Mapping[str, object]:
-        """Return the last transfer's figures."""
-        last = self.outcomes[-1]
-        figures: dict[str, object] = {"did": last.did, "transfers": len(self.outcomes)}
-        if last.listing is not None:
-            figures |= {"files": last.listing.sectors, "free_sectors": last.listing.free_sectors}
-        else:
-            figures |= {
-                "name": last.name,
-                "code": last.code,
-                "lines": last.lines,
-                "confirmed": last.confirmed,
-            }
-        return figures
-
-    def to_text(self) -> str:
-        """Return it for a reader."""
-        return self.text
 
 
 @contextlib.contextmanager
@@ -133,10 +102,20 @@ def _play(driver: Driver, endpoint: Endpoint, around: Surroundings) -> Outcome:
         raise
 
 
-def _report(outcome: Outcome, text: str) -> DncReport:
+def _report(outcome: Outcome, text: str) -> Report:
     if not outcome.ok:
         raise CanductorError(_sentence(outcome))
-    return DncReport((outcome,), text)
+    figures: dict[str, object] = {"did": outcome.did, "transfers": 1}
+    if outcome.listing is not None:
+        figures |= {"files": outcome.listing.sectors, "free_sectors": outcome.listing.free_sectors}
+    else:
+        figures |= {
+            "name": outcome.name,
+            "code": outcome.code,
+            "lines": outcome.lines,
+            "confirmed": outcome.confirmed,
+        }
+    return PlainReport(figures, text)
 
 
 def _sentence(outcome: Outcome) -> str:
@@ -148,7 +127,7 @@ def _sentence(outcome: Outcome) -> str:
     return outcome.sentence if named or not name else f"{outcome.name}: {outcome.sentence}"
 
 
-def receive(job: DncJob, check: Check = check_table, around: Surroundings = HERE) -> DncReport:
+def receive(job: DncJob, check: Check = check_table, around: Surroundings = HERE) -> Report:
     """Take one file into a folder, and print it if asked to; raises CanductorError. CHECK is for tables."""
     assert job.folder is not None
     with contextlib.ExitStack() as stack:
@@ -177,7 +156,7 @@ def receive(job: DncJob, check: Check = check_table, around: Surroundings = HERE
         _print(job, job.folder / outcome.name)
     except CanductorError as error:
         raise CanductorError(f"{text}, but not printed: {error}") from None
-    return DncReport(report.outcomes, f"{text}, and being printed")
+    return _report(outcome, f"{text}, and is being printed")
 
 
 def folder_take(folder: Folder) -> Take:
@@ -192,7 +171,7 @@ def _receive(job: DncJob, driver: Driver, endpoint: Endpoint, around: Surroundin
     return _play(driver, endpoint, around)
 
 
-def send(job: DncJob, around: Surroundings = HERE) -> DncReport:
+def send(job: DncJob, around: Surroundings = HERE) -> Report:
     """Give one file; raises CanductorError."""
     assert job.file is not None
     code = job.code or Entry(job.file.name, 0).code
@@ -235,7 +214,7 @@ def _open(file: Path) -> IO[bytes]:
         raise CanductorError(f"{file} cannot be read: {(error.strerror or str(error)).lower()}") from None
 
 
-def serve(job: DncJob, check: Check = check_table, around: Surroundings = HERE) -> DncReport:
+def serve(job: DncJob, check: Check = check_table, around: Surroundings = HERE) -> Report:
     """Be a file server until Ctrl-C; raises CanductorError when the port is gone. CHECK is for tables."""
     assert job.folder is not None
     outcome = Outcome(did="nothing")
@@ -257,7 +236,7 @@ def serve(job: DncJob, check: Check = check_table, around: Surroundings = HERE) 
                     return _report(outcome, "")
 
 
-def list_files(job: DncJob, around: Surroundings = HERE) -> DncReport:
+def list_files(job: DncJob, around: Surroundings = HERE) -> Report:
     """Ask for the directory; raises CanductorError."""
     with _line(job, around) as driver:
         driver.engine.ask_directory()
@@ -269,7 +248,7 @@ def list_files(job: DncJob, around: Surroundings = HERE) -> DncReport:
     return _report(outcome, "\n".join([*lines, *([] if free is None else [f"{free} sectors are free"])]))
 
 
-def drip(job: DncJob, around: Surroundings = HERE) -> DncReport:
+def drip(job: DncJob, around: Surroundings = HERE) -> Report:
     """Feed a control line by line, or print what the other side sends; raises CanductorError."""
     if job.file is None:
         return _drip_to_machine(job, around)
@@ -289,7 +268,7 @@ def _open_stream(file: Path, stack: contextlib.ExitStack, around: Surroundings) 
     return sys.stdin.buffer if around.typed is None else around.typed
 
 
-def _drip_to_machine(job: DncJob, around: Surroundings) -> DncReport:
+def _drip_to_machine(job: DncJob, around: Surroundings) -> Report:
     at = job.machine
     sinks: list[MachineSink] = []
     with BlockingClient(at.address, **at.settings("canductor dnc")) as client:

@@ -5,6 +5,7 @@ import contextlib
 import hashlib
 import time
 from dataclasses import dataclass, field
+from io import BytesIO
 from typing import Any, Final
 
 from coordinator.config.model import StepperDescription
@@ -40,21 +41,6 @@ def play(scenario: Scenario, seed: int) -> Result:
     run = _Run(stage)
     run.perform()
     return _judge(stage, run, began_s)
-
-
-class Text:
-    """The g-code as a file that is read."""
-
-    def __init__(self, text: str) -> None:
-        self._data = text.encode()
-
-    def read(self, size: int, /) -> bytes:
-        """Return at most SIZE bytes."""
-        part, self._data = self._data[:size], self._data[size:]
-        return part
-
-    def close(self) -> None:
-        """Nothing to release."""
 
 
 @dataclass(slots=True)
@@ -94,7 +80,8 @@ class _Run:
 
     async def _main(self) -> Outcome:
         self.stage.faults.begin("start", self._interrupt())
-        program = Program(Text(make_program(self.stage.scenario.program, self.stage.dice)), "job")
+        text = make_program(self.stage.scenario.program, self.stage.dice)
+        program = Program(BytesIO(text.encode()), "job")
         async with asyncio.timeout(LIMIT_S):
             return await run_job(
                 self.stage.description,
