@@ -33,6 +33,10 @@ RETIRED = {
     "Desk": "Endpoint",
     "Reactions": "Engine",
     "Scanner": "Lexer",
+    "Surroundings": "Environment",
+    "DncReport": "PlainReport",
+    "ServeReport": "PlainReport",
+    "ScenarioList": "PlainReport",
 }
 """By the name that is refused: what to write instead."""
 SEARCHED = ("coordinator", "nodes", "canbus_tools", "tests", "bench", "docs", "README.md", "CONTRIBUTING.md")

@@ -1,4 +1,4 @@
-"""One seed of one scenario: perform it on its stage, then let the checker judge."""
+"""One seed of one scenario: runs it on its stage, then checks the result."""
 
 import asyncio
 import contextlib
@@ -27,10 +27,10 @@ from nodes.support.errors import CanductorError
 LIMIT_S: Final = 90.0
 """Simulated time after which a run hangs."""
 AFTERWARDS_S: Final = 2.0
-"""The boards run for so long after the end, so that a board that still steps is detected."""
+"""How long the boards run after the end, so that a board that still steps is detected."""
 LINK_CONTROL_BYTES: Final = 1 << 15
 LINK_MOTION_BYTES: Final = 1 << 20
-"""What may wait in a link's queues."""
+"""Bounds of the queues of a link."""
 BY_THE_USER: Final = "stopped by the user"
 
 
@@ -45,7 +45,7 @@ def play(scenario: Scenario, seed: int) -> Result:
 
 @dataclass(slots=True)
 class _Run:
-    """The coordinator's part, and what was seen of it."""
+    """The run of the coordinator, and what was recorded of it."""
 
     stage: Stage
     record: PlanRecord = field(default_factory=lambda: PlanRecord((0.0, 0.0, 0.0, 0.0)))
@@ -61,13 +61,13 @@ class _Run:
     """Keeps the task that notes the stop alive."""
 
     def perform(self) -> None:
-        """Connect, run the job, and let the boards go on for a while afterwards."""
+        """Connect, run the job, and keep the boards running for a while afterwards."""
         with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
             runner.get_loop().set_exception_handler(self._exception)
             try:
                 self.outcome = runner.run(self._main())
             except ScenarioError:
-                raise  # a mistake in the file, not the machine's doing
+                raise  # an error in the file, not of the machine
             except CanductorError as error:
                 self.cause = str(error)
             except asyncio.CancelledError:
@@ -102,7 +102,7 @@ class _Run:
         self.job_ns = self.stage.now_ns()
         self.ready_s = self.stage.elapsed_s()
         for name, node in machine.nodes.items():
-            with contextlib.suppress(CanductorError):  # one that may be absent is
+            with contextlib.suppress(CanductorError):  # an optional node may be absent
                 self.links[name] = link_of(node)
         self.both_edges = {name: s.steps_on_both_edges for name, s in machine.devices.steppers.items()}
         self.stage.faults.begin("job", self._interrupt())
