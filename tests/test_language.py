@@ -44,6 +44,10 @@ RETIRED = {
     "ResponseLike": "Response",
     "WAY_S": "TRANSIT_S",
     "world_axis": "a plant",
+    "Surroundings": "Environment",
+    "DncReport": "PlainReport",
+    "ServeReport": "PlainReport",
+    "ScenarioList": "PlainReport",
 }
 """By the name that is refused: what to write instead."""
 SEARCHED = ("coordinator", "nodes", "canbus_tools", "tests", "bench", "docs", "README.md", "CONTRIBUTING.md")

@@ -13,25 +13,10 @@ from coordinator.verification.true_position import PlaceProof
 
 
 @dataclass(frozen=True, slots=True)
-class NodeReport:
-    """One node's part in it. ``dispatch_late_s``: how late the host's kernel ran its timers at worst."""
-
-    name: str
-    bytes_sent: int
-    retransmitted_bytes: int
-    min_lead_s: float | None
-    round_trip_s: float
-    clock_error_bound_s: float
-    dispatch_late_s: float
-
-
-@dataclass(frozen=True, slots=True)
 class DemoReport:
     """The demo's outcome; ``ok`` only when every step was proved."""
 
-    moves: int
-    print_time_s: float
-    queue_steps: int
+    outcome: Outcome
     steppers: tuple[StepperProof, ...]
     places: tuple[PlaceProof, ...]
     """Of what was homed."""
@@ -40,7 +25,8 @@ class DemoReport:
     clocks: tuple[ClockProof, ...]
     stray_edges: int
     """Level changes of pins that the configuration does not use."""
-    nodes: tuple[NodeReport, ...]
+    dispatch_late_s: Mapping[str, float]
+    """By node: the largest delay with which the host's kernel ran its timers."""
     frames: int
     frames_lost: int
     notices: tuple[str, ...]
@@ -53,15 +39,17 @@ class DemoReport:
 
     def to_json(self) -> Mapping[str, object]:
         """Return the figures by name."""
-        leads = [node.min_lead_s for node in self.nodes if node.min_lead_s is not None]
+        outcome = self.outcome
+        links = {node.name: node.link for node in outcome.nodes}
+        leads = [link.min_lead_s for link in links.values() if link.min_lead_s is not None]
         return {
-            "nodes": [node.name for node in self.nodes],
-            "moves": self.moves,
-            "print_time_s": round(self.print_time_s, 3),
+            "nodes": list(links),
+            "moves": outcome.moves,
+            "print_time_s": round(outcome.print_time_s, 3),
             "steps": sum(s.steps_executed for s in self.steppers),
             "steps_planned": sum(s.steps_expected for s in self.steppers),
-            "queue_steps": self.queue_steps,
-            "bytes_to_nodes": sum(node.bytes_sent for node in self.nodes),
+            "queue_steps": outcome.queue_steps,
+            "bytes_to_nodes": sum(link.bytes_sent for link in links.values()),
             "position_error_steps": sum(s.position_error_steps for s in self.steppers),
             "worst_step_error_us": _us(max((s.worst_error_s for s in self.steppers), default=0.0)),
             "worst_band_error_us": _us(max((s.worst_band_error_s for s in self.steppers), default=0.0)),
@@ -69,7 +57,7 @@ class DemoReport:
             "heat": [heat.to_json() for heat in self.heat],
             "clock_rms_us": {clock.node: _us(clock.rms_s) for clock in self.clocks},
             "clock_worst_us": {clock.node: _us(clock.worst_s) for clock in self.clocks},
-            "retransmitted_bytes": sum(node.retransmitted_bytes for node in self.nodes),
+            "retransmitted_bytes": sum(link.bytes_repeated for link in links.values()),
             "min_lead_ms": round(min(leads) * 1e3, 1) if leads else None,
             "frames": self.frames,
             "frames_lost": self.frames_lost,
@@ -88,12 +76,13 @@ class DemoReport:
                 }
                 for s in self.steppers
             },
-            "dispatch_late_us": {node.name: _us(node.dispatch_late_s) for node in self.nodes},
-            "round_trip_us": {node.name: _us(node.round_trip_s) for node in self.nodes},
+            "dispatch_late_us": {name: _us(late_s) for name, late_s in self.dispatch_late_s.items()},
+            "round_trip_us": {name: _us(link.srtt_s) for name, link in links.items()},
         }
 
     def to_text(self) -> str:
         """Return the proof for a reader."""
+        outcome = self.outcome
         lines = [*self.notices, ""]
         lines += [
             f"{s.stepper} on {s.node}: {s.steps_executed:,} of {s.steps_expected:,} steps, at position "
@@ -111,10 +100,10 @@ class DemoReport:
             f"clock of {c.node}: {_us(c.rms_s)} µs rms from print time, {_us(c.worst_s)} µs at worst"
             for c in self.clocks
         ]
-        lines += [_node_line(node) for node in self.nodes]
+        lines += [node.to_text() for node in outcome.nodes]
         lines.append(
-            f"{self.moves:,} moves in {self.print_time_s:.1f} s, {self.queue_steps:,} queue_step commands; "
-            f"{self.frames:,} CAN frames, {self.frames_lost:,} of them lost on purpose"
+            f"{outcome.moves:,} moves in {outcome.print_time_s:.1f} s, {outcome.queue_steps:,} queue_step "
+            f"commands; {self.frames:,} CAN frames, {self.frames_lost:,} of them lost on purpose"
         )
         lines.append(
             "PROVED: every stepper stands where the plan says; no step early, late or lost"
@@ -145,40 +134,19 @@ def report_of(
     *,
     heat: Sequence[HeatProof] = (),
 ) -> DemoReport:
-    """Return the report, with every stepper proved; the nodes have ended, with these FIGURES."""
+    """Return the report, with every stepper proved; FIGURES: statistics of the nodes, which have ended."""
     frames, frames_lost = hardware.frames()
     return DemoReport(
-        moves=outcome.moves,
-        print_time_s=outcome.print_time_s,
-        queue_steps=outcome.queue_steps,
+        outcome=outcome,
         steppers=tuple(prover.steppers()),
         places=tuple(prover.places(hardware)),
         heat=tuple(heat),
         clocks=tuple(prover.clocks()),
         stray_edges=prover.stray_edges(),
-        nodes=tuple(
-            NodeReport(
-                name=node.name,
-                bytes_sent=node.link.bytes_sent,
-                retransmitted_bytes=node.link.bytes_repeated,
-                min_lead_s=node.link.min_lead_s,
-                round_trip_s=node.link.srtt_s,
-                clock_error_bound_s=node.clock_error_s,
-                dispatch_late_s=float(figures[node.name]["late_us_max"]) * 1e-6,
-            )
-            for node in outcome.nodes
-        ),
+        dispatch_late_s={name: float(of_node["late_us_max"]) * 1e-6 for name, of_node in figures.items()},
         frames=frames,
         frames_lost=frames_lost,
         notices=tuple(notices),
-    )
-
-
-def _node_line(node: NodeReport) -> str:
-    lead = "no motion" if node.min_lead_s is None else f"lead at least {node.min_lead_s * 1e3:.0f} ms"
-    return (
-        f"node {node.name}: {node.bytes_sent:,} bytes sent, {node.retransmitted_bytes:,} of them again, "
-        f"{lead}, round trip {_us(node.round_trip_s)} µs"
     )
 
 

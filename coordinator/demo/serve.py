@@ -8,12 +8,13 @@ from pathlib import Path
 from coordinator.assembly.load import load_machine
 from coordinator.config.model import MachineDescription
 from coordinator.demo.run import DemoOptions
-from coordinator.front_ends.serve import ServeOptions, ServeReport, serve
+from coordinator.front_ends.serve import ServeOptions, serve
 from coordinator.support.examples import DEMO_GCODE
+from coordinator.support.report import Report
 from coordinator.virtual_machine.virtual_machine import VirtualMachine
 
 
-def serve_demo(options: DemoOptions, serving: ServeOptions) -> ServeReport:
+def serve_demo(options: DemoOptions, serving: ServeOptions) -> Report:
     """Serve until Ctrl-C or SIGTERM; raises CanductorError."""
     description = load_machine(str(options.machine))
     with (

@@ -1,4 +1,4 @@
-"""What goes over the line: characters, block check, headers and blocks of text."""
+"""Elements of the protocol: characters, block check, headers and blocks of text."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -21,11 +21,11 @@ SPACE: Final = 0x20
 
 CRLF: Final = b"\r\n"
 DIRECTORY_REQUEST: Final = bytes((DC3, ESC, DC1)) + b"0 D" + CRLF
-"""What a control sends to see the directory: the FE 401's command for it."""
+"""Request for the directory, as of the FE 401."""
 NAME_MAX: Final = 64
 """Characters of a file's name in a header."""
 INPUT: Final = "E"
-"""Mode of a header: the control wants the file."""
+"""Mode of a header: the control requests the file."""
 OUTPUT: Final = "A"
 """Mode of a header: the control sends the file."""
 CODES: Final = {
@@ -37,11 +37,11 @@ CODES: Final = {
     "P": "PLC program",
     "T": "tool table",
 }
-"""File codes known by name; any other letter is carried as well."""
+"""File codes known by name; any other letter is transferred as well."""
 
 
-class BadText(CanductorError):  # noqa: N818 (the sentence is about a text)
-    """A text that no block can carry."""
+class BadText(CanductorError):  # noqa: N818 (the message is about a text)
+    """A text that cannot be sent in a block."""
 
 
 def block_check(data: bytes | bytearray) -> int:
@@ -59,7 +59,7 @@ def block_check(data: bytes | bytearray) -> int:
 def write_block(start: int, content: bytes, *, avoid_control: bool = False, dc1: bool = False) -> bytes:
     """Return START content ETB BCC [DC1].
 
-    AVOID_CONTROL: no check character below 20 hex, by a space before ETB.
+    AVOID_CONTROL: insert a space before ETB if the check character would be below 20 hex.
     """
     body = bytes((start,)) + content + bytes((ETB,))
     check = block_check(body)
@@ -72,8 +72,8 @@ def write_block(start: int, content: bytes, *, avoid_control: bool = False, dc1:
 def strip_text(content: bytes, check: int, *, avoid_control: bool) -> bytes:
     """Return the line in a block's content: without one stuffed space, then without CR LF.
 
-    After CR LF a space can only be stuffed. Without CR LF it is one where the option is on and the check
-    character, which CHECK is, would have been a control character without it.
+    A space after CR LF is always stuffed. Without CR LF it is if the option is on and CHECK, the check
+    character, would have been a control character without it.
     """
     if content.endswith(CRLF + b" ") or (
         avoid_control and content.endswith(b" ") and check ^ SPACE < SPACE and not content.endswith(CRLF)
@@ -83,14 +83,14 @@ def strip_text(content: bytes, check: int, *, avoid_control: bool) -> bytes:
 
 
 def is_text(content: bytes, data_bits: int = 8) -> bool:
-    """Tell whether a block may carry CONTENT: no control character but CR LF as a pair."""
+    """Return whether CONTENT may be sent: it has no control characters except CR LF pairs."""
     bare = content.replace(CRLF, b"")
     return not any(c < SPACE or c == 0x7F or (data_bits == 7 and c > 0x7F) for c in bare)
 
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Which file, and in which direction. NAME may be empty: the next file, then."""
+    """File and direction of a transfer. An empty NAME requests the next file."""
 
     code: str
     """One letter: what kind of file."""
@@ -104,7 +104,7 @@ class Header:
             raise BadText(f"the file code is {self.code!r}, must be one letter such as H, D or S")
         if len(self.name) > NAME_MAX or not (self.name.isascii() and self.name.isprintable()):
             raise BadText(
-                f"{self.name[:NAME_MAX]!a} is no name for the other side: it takes at most"
+                f"{self.name[:NAME_MAX]!a} is not a valid name for the other side: at most"
                 f" {NAME_MAX} ASCII characters"
             )
         if self.name != self.name.strip():
@@ -113,7 +113,7 @@ class Header:
             raise BadText(f"a header's mode is {self.mode!r}, must be {INPUT} or {OUTPUT}")
 
     def to_content(self) -> bytes:
-        """Return what stands between SOH and ETB."""
+        """Return the characters between SOH and ETB."""
         return f"{self.code}{self.name}{self.mode}".encode("ascii")
 
 

@@ -1,4 +1,4 @@
-"""Puts an engine on a port: bytes and time in, bytes out, events to the caller."""
+"""Connects an engine with a port: bytes and time in, bytes out, events to the caller."""
 
 import time
 from collections.abc import Callable
@@ -8,23 +8,23 @@ from coordinator.dnc.engine import Engine, State
 from coordinator.dnc.events import Event
 
 UNREADABLE_MIN: Final = 8
-"""Characters that no header is in, of which somebody should hear."""
+"""Received characters without a header after which ON_UNREADABLE is called."""
 INSTANT_S: Final = 1e-6
 POLL_S: Final = 1.0
-"""Between two looks at what else may end the wait."""
+"""Maximum duration of one read."""
 
 
 class Line(Protocol):
-    """What a driver needs of a port."""
+    """The interface of a port."""
 
     def read(self, timeout_s: float) -> bytes: ...  # noqa: D102
     def write(self, data: bytes, timeout_s: float) -> None: ...  # noqa: D102
 
 
 class Driver:
-    """One engine on one port, in the thread of who calls.
+    """One engine on one port; runs in the caller's thread.
 
-    ON_UNREADABLE: called once when what comes to a peripheral that waits is nothing but noise.
+    ON_UNREADABLE: called once when a waiting peripheral receives only noise.
     """
 
     def __init__(
@@ -42,7 +42,7 @@ class Driver:
         self._on_unreadable = on_unreadable
 
     def wait(self, until_s: float | None = None) -> list[Event]:
-        """Return what happened as soon as something did, or nothing at UNTIL_S; raises PortError."""
+        """Wait for events and return them; none at UNTIL_S. Raises PortError."""
         while True:
             self.flush()
             if events := self.engine.take_events():
@@ -54,21 +54,21 @@ class Driver:
             data = self._port.read(due_s - now_s)
             now_s = self._clock()
             if data:
-                self.engine.receive(data, self._came_s(now_s))
+                self.engine.receive(data, self._received_s(now_s))
             else:
                 self.engine.handle_timer(now_s)
-            self._look_at_noise(len(data))
+            self._count_noise(len(data))
 
-    def _came_s(self, now_s: float) -> float:
-        """Return when what was read at NOW_S came.
+    def _received_s(self, now_s: float) -> float:
+        """Return when the bytes that were read at NOW_S arrived.
 
-        A busy computer lets this side look late. What is there before a deadline was acted on counts as in
-        time, else the wait would look like silence on the line: the end of a block, or no other answer.
+        On a busy computer they may be read late. Bytes that are there before a deadline is handled are in
+        time; else the delay would look like silence on the line: the end of a block, or a missing answer.
         """
         deadline_s = self.engine.next_deadline()
         return now_s if deadline_s is None else min(now_s, deadline_s - INSTANT_S)
 
-    def _look_at_noise(self, count: int) -> None:
+    def _count_noise(self, count: int) -> None:
         if self.engine.state is not State.IDLE or not self.engine.is_peripheral:
             self._unread = 0
             return
@@ -79,13 +79,13 @@ class Driver:
             self._on_unreadable = None
 
     def flush(self) -> None:
-        """Send what the engine has to say."""
+        """Send the output of the engine."""
         if output := self.engine.take_output():
             options = self.engine.options
             self._port.write(output, options.answer_s + 2 * len(output) * options.character_time_s)
 
-    def give_up(self, sentence: str) -> None:
-        """End what is on, so that the other side knows; raises PortError."""
+    def abort(self, sentence: str) -> None:
+        """Abort a running transfer by EOT, for the reason SENTENCE; raises PortError."""
         if self.engine.state is not State.IDLE:
             self.engine.fail(sentence)
             self.flush()

@@ -1,4 +1,4 @@
-"""What a side does with files: takes them into a folder or a machine, gives them out, tells the directory."""
+"""Files of a transfer: received into a folder or a machine, sent from a folder, listed in the directory."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from nodes.support.errors import CanductorError
 
 
 class Pause(Enum):
-    """A source has no line yet."""
+    """Result of a source that has no line yet."""
 
     NOT_YET = auto()
 
@@ -23,36 +23,36 @@ NOT_YET: Final = Pause.NOT_YET
 
 
 class Source(Protocol):
-    """Where lines come from."""
+    """Provides the lines to send."""
 
     def next_line(self) -> bytes | Pause | None:
         """Return a line, NOT_YET, or None at the end; raises CanductorError."""
 
     def close(self) -> None:
-        """Let it go."""
+        """Release it."""
 
 
 class Sink(Protocol):
-    """Where lines go."""
+    """Takes the lines that are received."""
 
     name: str
     size_bytes: int
     is_live: bool
-    """Whether ``ready`` shall be asked now and then, also while nothing comes."""
+    """Whether ``ready`` must be polled, also while no line arrives."""
 
     @property
     def ready(self) -> bool:
-        """Whether another line may come; raises CanductorError when none may any more."""
+        """Whether there is room for another line; raises CanductorError when no more lines are accepted."""
         ...
 
     def write(self, line: bytes) -> None:
         """Take a line; raises CanductorError."""
 
     def keep(self) -> None:
-        """Make all of it count; raises CanductorError."""
+        """Complete the file; raises CanductorError."""
 
     def drop(self, why: str = "") -> None:
-        """Forget it, for the reason WHY; without effect after ``keep``."""
+        """Discard it, for the reason WHY; without effect after ``keep``."""
 
 
 class FileSource:
@@ -67,7 +67,7 @@ class FileSource:
         try:
             return next(self._lines, None)
         except OSError as error:
-            raise CanductorError(f"the file cannot be read on: {error}") from None
+            raise CanductorError(f"reading the file failed: {error}") from None
 
     def close(self) -> None:
         """See Source."""
@@ -76,7 +76,7 @@ class FileSource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
-    """What became of one transfer."""
+    """The result of one transfer."""
 
     did: str
     """received, sent, listed, failed."""
@@ -87,7 +87,7 @@ class Outcome:
     sentence: str = ""
     """Why it failed."""
     confirmed: bool = False
-    """Sent: the other side said that it has all."""
+    """Sent: the other side confirmed the whole file."""
     listing: Listing | None = None
 
     @property
@@ -97,13 +97,13 @@ class Outcome:
 
 
 Take = Callable[[Header], Sink]
-"""Returns where the file of a header goes; raises FileRefused."""
+"""Returns the sink for the file of a header; raises FileRefused."""
 Give = Callable[[Header], tuple[str, Source]]
-"""Returns the name and lines of the file that a header asks for; raises CanductorError."""
+"""Returns name and lines of the file that a header requests; raises CanductorError."""
 
 
 class Endpoint:
-    """Acts on an engine's events; of TAKE and GIVE, what is not given is refused to the other side."""
+    """Handles an engine's events. Without TAKE or GIVE, requests of the other side for it are refused."""
 
     def __init__(
         self,
@@ -120,14 +120,14 @@ class Endpoint:
         self._sink: Sink | None = None
         self._source: Source | None = None
         self._name = ""
-        """Of the file of the transfer that is on: as asked for, and once it is open, as it is called here."""
+        """Of the current transfer's file: the requested name, and the local name once the file is open."""
         self._why = ""
         self._waits_for_line = False
         """The source has no line yet."""
 
     @property
-    def looks(self) -> bool:
-        """Whether ``go_on`` shall be called now and then."""
+    def needs_polling(self) -> bool:
+        """Whether ``go_on`` must be called periodically."""
         return self._waits_for_line or (self._sink is not None and self._sink.is_live)
 
     def begin(self, header: Header) -> None:
@@ -140,10 +140,10 @@ class Endpoint:
             self._engine.send(header.code, header.name)
 
     def handle(self, event: events.Event) -> Outcome | None:
-        """Act on EVENT; return what became of a transfer that it ended."""
+        """Handle EVENT; return the result of a transfer that it ended."""
         outcome = self._act(event)
         if outcome is not None:
-            self._name = ""  # what comes next is not about that file
+            self._name = ""  # the next event does not belong to that file
         return outcome
 
     def _act(self, event: events.Event) -> Outcome | None:
@@ -151,7 +151,7 @@ class Endpoint:
             case events.Asked(header=header):
                 self._asked(header)
             case events.DirectoryAsked():
-                self._tell_directory()
+                self._send_directory()
             case events.LineWanted():
                 self.go_on()
             case events.Line(text=text):
@@ -167,9 +167,9 @@ class Endpoint:
         return None
 
     def go_on(self) -> None:
-        """Give the next line, if there is one yet; let the next one come, if there is room."""
+        """Send the next line if there is one; accept the next line if there is room."""
         if self._sink is not None:
-            self._look_for_room(self._sink)
+            self._check_room(self._sink)
             return
         if self._engine.state is not State.LINE_WANTED or self._source is None:
             self._waits_for_line = False
@@ -187,7 +187,7 @@ class Endpoint:
         except CanductorError as error:
             self._end_with(error)
 
-    def _look_for_room(self, sink: Sink) -> None:
+    def _check_room(self, sink: Sink) -> None:
         try:
             if sink.ready and self._engine.state is State.LINE_GIVEN:
                 self._engine.line_taken()
@@ -196,7 +196,7 @@ class Endpoint:
                 self._end_with(error)
 
     def close(self, why: str = "") -> None:
-        """Drop what is not complete, for the reason WHY."""
+        """Discard what is not complete, for the reason WHY."""
         if self._sink is not None:
             self._sink.drop(why)
         if self._source is not None:
@@ -222,13 +222,15 @@ class Endpoint:
 
     def _open_sink(self, header: Header) -> None:
         if self._take is None:
-            raise FileRefused("the other side wanted to send a file, but none is taken here", "NO INPUT")
+            raise FileRefused(
+                "the other side wanted to send a file, but no files are accepted here", "NO INPUT"
+            )
         self._sink = self._take(header)
         self._name = self._sink.name
 
     def _open_source(self, header: Header) -> None:
         if self._give is None:
-            raise FileRefused("the other side asked for a file, but none is given here", "NO OUTPUT")
+            raise FileRefused("the other side asked for a file, but no files are provided here", "NO OUTPUT")
         self._name, self._source = self._give(header)
 
     def _line(self, text: bytes) -> None:
@@ -243,7 +245,7 @@ class Endpoint:
                 self._engine.line_taken()
 
     def _end_with(self, error: CanductorError) -> None:
-        """End the transfer because of this side."""
+        """End the transfer because of an error of this side."""
         self._why = str(error)
         if self._engine.is_peripheral:
             self._engine.refuse(error.text if isinstance(error, FileRefused) else "ERROR IN FILE")
@@ -284,12 +286,14 @@ class Endpoint:
         self.close(why)
         return Outcome(did="failed", name=self._name, code=self._code, lines=self._engine.lines, sentence=why)
 
-    def _tell_directory(self) -> None:
+    def _send_directory(self) -> None:
         self.close()
         self._name = self._why = ""
         if self._folder is None or self._give is None:
             self._end_with(
-                FileRefused("the other side asked for the directory, but there is none", "NO DIRECTORY")
+                FileRefused(
+                    "the other side asked for the directory, but there is no directory here", "NO DIRECTORY"
+                )
             )
         else:
             self._engine.give_directory(write_listing(self._folder.files(), self._folder.free_bytes))
@@ -300,7 +304,7 @@ class Endpoint:
 
 
 class Library:
-    """Gives the files of a folder; a header without a name asks for the next one of its code."""
+    """Provides the files of a folder; a header without a name requests the next one of its code."""
 
     def __init__(self, folder: Folder, engine: Engine) -> None:
         self._folder = folder
@@ -333,7 +337,7 @@ class Library:
 
 
 class _Nothing:
-    """No line at all: what comes after the last file."""
+    """A source without lines, which follows the last file."""
 
     def next_line(self) -> None:
         """See Source."""

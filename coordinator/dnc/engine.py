@@ -1,15 +1,15 @@
-"""The conversation about files over one line, as the control or as the peripheral. Sans-IO.
+"""The transfer protocol of one line, as the control or as the peripheral. Sans-IO.
 
-A block is repeated on NAK and on nothing else: blocks have no number, so that a repeat for want of an answer
-would double a line whenever the answer got lost. Whoever misses an answer sends EOT and has failed.
+A block is repeated only on NAK: blocks have no number, so a repeat after a missing answer would double a line
+whenever the answer was lost. A side that misses an answer sends EOT and fails.
 
     control  fetch:      SOH K name E →   ← ACK, blocks, each ACK →   ← ETX   EOT →
     control  send:       SOH K name A →   ← ACK   blocks →, each ← ACK   ETX EOT →
     control  directory:  DC3 ESC DC1 0 SP D CR LF →   ← lines of text, ETX   EOT →
     error of a peripheral: ← SOH text ETB BCC   ACK EOT →
 
-The owner passes on bytes and time, sends what ``take_output`` returns, and answers ``take_events``.
-Times are seconds of any clock that does not jump.
+The owner passes in bytes and time, sends the bytes of ``take_output``, and handles the events of
+``take_events``. Times are seconds of a monotonic clock.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ DIRECTORY_MAX: Final = 262_144
 """Bytes of a directory."""
 
 ERROR_TEXT_MAX: Final = 32
-"""Characters of an error's text: more, old controls do not show."""
+"""Characters of an error's text; old controls display no more."""
 
 
 class State(Enum):
@@ -65,13 +65,13 @@ class State(Enum):
 _TRANSFER: Final = frozenset(State) - {State.IDLE, State.ASKED, State.ERROR_SENT, State.LISTING}
 _QUIET: Final = (Kind.NOISE, Kind.HOLD, Kind.GO_ON)
 _IGNORED: Final = frozenset((kind, state) for kind in _QUIET for state in State) | {
-    # Answers that noise made do no harm where blocks are expected.
+    # Answers that result from noise are harmless where blocks are expected.
     *(
         (kind, state)
         for kind in (Kind.ACK, Kind.NAK, Kind.CONFLICT, Kind.DIRECTORY)
         for state in (State.RECEIVING, State.LINE_GIVEN, State.END_GIVEN)
     ),
-    # What is like a block, where answers are expected, is noise.
+    # Block-like data is noise where answers are expected.
     *(
         (kind, state)
         for kind in (Kind.DAMAGED, Kind.ETX, Kind.DIRECTORY)
@@ -99,11 +99,11 @@ class Engine:
         self.options = options
         self.state = State.IDLE
         self.header: Header | None = None
-        """Of the transfer that is on, or was last."""
+        """Of the current transfer, or the last one."""
         self.lines = 0
         """Of that transfer, acknowledged."""
         self.repeats = 0
-        """Blocks sent or asked for again since the engine was made."""
+        """Blocks sent or requested again since the engine was created."""
         self.is_peripheral = peripheral
         self._lexer = Lexer(options)
         self._now_s = now_s
@@ -116,17 +116,17 @@ class Engine:
         self._busy_until_s = now_s
         self._deadline_s: float | None = None
         self._held = False
-        self._wants_line = False
-        """The owner was told that a line is wanted, and has not given it."""
-        self._heard = 0
+        self._line_requested = False
+        """``LineWanted`` was issued, and the owner has not given the line."""
+        self._received_count = 0
         """Characters since the transfer began."""
         self._maybe_acked = False
-        """There was an ACK in the noise since the block was sent."""
+        """Noise since the block was sent contained an ACK."""
         self._listing = bytearray()
         self._last_content = b""
-        """Of the block that was taken last."""
+        """Of the block that was accepted last."""
         self._last_ack = False
-        """The last answer given was ACK: after NAK no end can come."""
+        """The last answer of this side was ACK: no end can follow NAK."""
 
     @property
     def held(self) -> bool:
@@ -135,42 +135,42 @@ class Engine:
 
     @property
     def _what(self) -> str:
-        """What the transfer that is on is about, for sentences."""
+        """What is transferred, for messages."""
         return "the directory" if self.header is None else "the file"
 
     @property
     def noise_bytes(self) -> int:
-        """Bytes so far that meant nothing."""
+        """Received bytes that were discarded as noise."""
         return self._lexer.noise_bytes
 
     # ---------------------------------------------------------------------------------- for the driver
 
     def receive(self, data: bytes, now_s: float) -> None:
-        """Take bytes of the line, of which the last came at NOW_S."""
+        """Process received bytes, of which the last arrived at NOW_S."""
         self.handle_timer(now_s - len(data) * self.options.character_time_s)
         self._now_s = max(self._now_s, now_s)
-        self._heard += len(data)
+        self._received_count += len(data)
         if self.state is State.LISTING:
             self._take_listing(data)
-        self._judge(self._lexer.receive(data, now_s))
+        self._process_tokens(self._lexer.receive(data, now_s))
 
     def handle_timer(self, now_s: float) -> None:
-        """Do what is due."""
+        """Handle expired deadlines."""
         self._now_s = max(self._now_s, now_s)
         if self.state is State.LISTING:
             self._end_listing(now_s)
-        self._judge(self._lexer.handle_timer(now_s))
+        self._process_tokens(self._lexer.handle_timer(now_s))
         if self._deadline_s is None or now_s < self._deadline_s:
             return
         if self._lexer.next_deadline() is None or now_s >= self._deadline_s + self.options.answer_s:
             self._time_out()
 
     def next_deadline(self) -> float | None:
-        """Return when ``handle_timer`` shall be called; None: no need."""
+        """Return when ``handle_timer`` has to be called; None: not at all."""
         scanning_s = self._lexer.next_deadline()
         if scanning_s is None or self._deadline_s is None:
             return self._deadline_s if scanning_s is None else scanning_s
-        # What is on the line is judged before patience ends, unless it never ends.
+        # Received data is processed before the answer times out, unless the data never ends.
         return min(scanning_s, self._deadline_s + self.options.answer_s)
 
     def take_output(self) -> bytes:
@@ -180,22 +180,22 @@ class Engine:
         return output
 
     def take_events(self) -> list[events.Event]:
-        """Return what happened since."""
+        """Return the events since the last call."""
         happened, self._events = self._events, []
         return happened
 
     # ----------------------------------------------------------------------------------- for the owner
 
     def fetch(self, code: str, name: str) -> None:
-        """Control: ask for a file; an empty name asks for the next one. Raises BadText."""
+        """Control: request a file; an empty name requests the next one. Raises BadText."""
         self._send_header(Header(code, name, INPUT))
 
     def send(self, code: str, name: str) -> None:
-        """Control: announce a file; ``LineWanted`` comes when the peripheral takes it. Raises BadText."""
+        """Control: announce a file; ``LineWanted`` follows when the peripheral accepts it. Raises BadText."""
         self._send_header(Header(code, name, OUTPUT))
 
     def ask_directory(self) -> None:
-        """Control: ask for the directory."""
+        """Control: request the directory."""
         self._begin(None)
         self._listing.clear()
         self._lexer.reset()
@@ -208,7 +208,7 @@ class Engine:
         # The tolerance is as for a block: for two clocks that differ.
         self._left_s = self._busy_until_s - (0.5 + 0.08 * len(text)) * self.options.character_time_s
         self._wait(State.ETX_SENT, self.options.answer_s)
-        self._tries = self.options.transmissions  # it is no block: not repeated
+        self._tries = self.options.transmissions  # not a block, so not repeated
 
     def give_line(self, text: bytes) -> None:
         """Send a line, given without CR LF; raises BadText, with nothing sent, if no block can carry it."""
@@ -216,22 +216,24 @@ class Engine:
         if len(text) + 2 > self.options.block_max:
             raise BadText(
                 f"line {self.lines + 1} has {len(text)} characters;"
-                f" a block takes {self.options.block_max - 2}"
+                f" a block has at most {self.options.block_max - 2}"
             )
         if b"\r" in text or b"\n" in text or not is_text(text, self.options.frame.data_bits):
-            raise BadText(f"line {self.lines + 1} has {_odd(text, self.options.frame.data_bits)}")
+            raise BadText(
+                f"line {self.lines + 1} has {_invalid_character(text, self.options.frame.data_bits)}"
+            )
         self._tries = 0
-        self._wants_line = False
+        self._line_requested = False
         self._transmit(STX, text + CRLF)
         self._wait(State.BLOCK_SENT, self.options.answer_s)
 
     def give_end(self) -> None:
-        """Say that the line before was the last."""
+        """Announce that the previous line was the last."""
         assert self.state is State.LINE_WANTED
         self._tries = 1
-        self._wants_line = False
+        self._line_requested = False
         if self.is_peripheral:
-            self._say_etx()
+            self._send_etx()
         else:
             self._say(bytes((ETX, EOT)))
             self._end(events.Sent(confirmed=False))
@@ -243,14 +245,14 @@ class Engine:
         self._answer(ACK)
 
     def file_kept(self) -> None:
-        """Answer ``Ended``: the file is safe."""
+        """Answer ``Ended``: the file is stored."""
         assert self.state is State.END_GIVEN
         if not self.is_peripheral:
             self._say(bytes((EOT,)))
         self._idle()
 
     def accept(self) -> None:
-        """Peripheral: take the file or send it, as the header asked."""
+        """Peripheral: accept the request of the header."""
         assert self.state is State.ASKED
         assert self.header is not None
         self._say(bytes((ACK,)))
@@ -261,14 +263,14 @@ class Engine:
             self._want_line()
 
     def refuse(self, text: str) -> None:
-        """Peripheral: tell the control of an error instead; also amidst a file. The transfer is over."""
+        """Peripheral: report an error to the control, also during a file. This ends the transfer."""
         line = "".join(c if c.isascii() and c.isprintable() else "?" for c in text)[:ERROR_TEXT_MAX]
         self._tries = 0
         self._transmit(SOH, line.encode("ascii"))
         self._wait(State.ERROR_SENT, self.options.answer_s)
 
     def fail(self, sentence: str) -> None:
-        """Give the transfer up, for the reason SENTENCE; the other side gets EOT."""
+        """Abort the transfer for the reason SENTENCE; the other side receives EOT."""
         self._say(bytes((EOT,)))
         self._end(events.Failed(sentence))
 
@@ -302,9 +304,9 @@ class Engine:
     def _begin(self, header: Header | None) -> None:
         assert self.state in (State.IDLE, State.ASKED)
         self.header = header
-        self.lines = self._heard = 0
+        self.lines = self._received_count = 0
         self._tries = 0
-        self._held = self._wants_line = False
+        self._held = self._line_requested = False
         self._last_ack = True
 
     def _transmit(self, start: int, content: bytes) -> None:
@@ -319,7 +321,7 @@ class Engine:
         # The tolerance is for two clocks that differ; an answer before DC1 is one.
         block_s = (len(self._sent) - self.options.dc1) * self.options.character_time_s
         self._left_s = self._busy_until_s - self.options.dc1 * self.options.character_time_s - 0.08 * block_s
-        # Where it is not known when it leaves, an answer may come that late, after another that is none.
+        # If it is unknown when the block leaves, the real answer may follow a false one that much later.
         self._lexer.nak_extra_s = 0.0 if self.options.paced else 1.1 * block_s
 
     def _say(self, data: bytes) -> None:
@@ -337,8 +339,8 @@ class Engine:
             self._wait(State.LINE_WANTED, self.options.decide_s)
         else:
             self._wait(State.LINE_WANTED, None)
-            if not self._wants_line:
-                self._wants_line = True
+            if not self._line_requested:
+                self._line_requested = True
                 self._events.append(events.LineWanted())
 
     def _wait(self, state: State, patience_s: float | None) -> None:
@@ -352,40 +354,42 @@ class Engine:
         self._wait(State.IDLE, None)
 
     def _end(self, event: events.Event) -> None:
-        """End the transfer; what the owner has not yet heard of it and could no longer answer, is void."""
+        """End the transfer; discard its events that the owner could no longer answer."""
         self._idle()
-        self._wants_line = False
+        self._line_requested = False
         self._events = [e for e in self._events if isinstance(e, events.Failed | events.Sent)]
         self._events.append(event)
 
     def _time_out(self) -> None:
         if self.state is State.LINE_WANTED:
             self.fail(
-                f"the other side asked for a pause and did not go on within {self.options.decide_s:g} s"
+                f"the other side asked for a pause and did not continue within {self.options.decide_s:g} s"
             )
         elif self.state is State.ERROR_SENT:
-            self._end(events.Failed("the other side did not answer the error it was told"))
-        elif self._heard and self.state in (State.HEADER_SENT, State.LISTING):
-            self.fail("what the other side answers cannot be read; check baud rate, parity and the cable")
+            self._end(events.Failed("the other side did not answer the error report"))
+        elif self._received_count and self.state in (State.HEADER_SENT, State.LISTING):
+            self.fail("the answer of the other side cannot be read; check baud rate, parity and the cable")
         else:
             what = {
                 State.HEADER_SENT: "the header",
-                State.RECEIVING: f"line {self.lines}, the last one that came"
+                State.RECEIVING: f"line {self.lines}, the last one received"
                 if self.lines
                 else "the header's answer",
                 State.ETX_SENT: f"the end of {self._what}",
                 State.LISTING: "the request for the directory",
             }.get(self.state, f"line {self.lines + 1}")
-            self.fail(f"nothing came after {what} in time; check the cable, the other side and its settings")
+            self.fail(
+                f"nothing was received after {what} in time; check the cable, the other side and its settings"
+            )
 
-    def _say_etx(self) -> None:
+    def _send_etx(self) -> None:
         self._say(bytes((ETX,)))
         self._left_s = self._busy_until_s - 0.5 * self.options.character_time_s
         self._wait(State.ETX_SENT, self.options.answer_s)
 
     # ------------------------------------------------------------------------------ what the line says
 
-    def _judge(self, tokens: list[Token]) -> None:
+    def _process_tokens(self, tokens: list[Token]) -> None:
         for token in tokens:
             if token.kind not in _QUIET and not self.options.paced:
                 self._busy_until_s = min(self._busy_until_s, self._now_s)  # a fast line: it has left
@@ -399,10 +403,10 @@ class Engine:
     def _out_of_step(self, token: Token) -> None:
         self.fail(
             f"the other side sent {_SHOWN[token.kind]} while this side waited for {self.state.value}:"
-            " the two are out of step; nothing is kept"
+            " the two sides are out of step; the file was discarded"
         )
 
-    def _acked(self, token: Token) -> None:
+    def _ack_received(self, token: Token) -> None:
         if self._too_early(token):
             return
         if self.state is State.BLOCK_SENT:
@@ -413,7 +417,7 @@ class Engine:
         else:
             self._want_line()
 
-    def _naked(self, token: Token) -> None:
+    def _nak_received(self, token: Token) -> None:
         if self._too_early(token):
             return
         what = {State.HEADER_SENT: "the header", State.ERROR_SENT: "the error"}.get(
@@ -433,48 +437,51 @@ class Engine:
         )
 
     def _too_early(self, token: Token) -> bool:
-        """End a transfer in which an answer came before its block can have: it was the one before's."""
+        """End a transfer if an answer arrived before its block was sent: it belongs to the block before."""
         early = self.options.paced and token.at_s < self._left_s
         if early and self.header is None:
             self.fail("the control ended the directory before all of it was sent")
         elif early:
-            self.fail("an answer came before its block was sent: one before was noise; nothing is kept")
+            self.fail(
+                "an answer was received before its block was sent, so an earlier one was noise;"
+                " nothing is kept"
+            )
         return early
 
-    def _naked_end(self, _: Token) -> None:
+    def _etx_nak_received(self, _: Token) -> None:
         if self._tries >= self.options.transmissions:
             self.fail(f"the end of {self._what} was refused; check baud rate, parity and the cable")
             return
         self._tries += 1
         self.repeats += 1
-        self._say_etx()
+        self._send_etx()
 
     def _confirmed(self, token: Token) -> None:
         if self._too_early(token):
             return
         if token.at_s - self._left_s > self.options.answer_s / 2:
-            # The control that gives up says the same as the one that has all.
+            # A control that aborts sends the same as one that received everything.
             self._end(
                 events.Failed(
-                    f"the control ended the transfer late: whether it has {self._what} is not known"
+                    f"the control ended the transfer late; it is unknown whether it has {self._what}"
                 )
             )
         else:
             self._end(events.Sent(confirmed=True))
 
-    def _given_up(self, _: Token) -> None:
+    def _eot_received(self, _: Token) -> None:
         place = f"after line {self.lines}" if self.lines else "before the first line"
         self._end(events.Failed(f"the other side ended the transfer {place}"))
 
-    def _block_came(self, token: Token) -> None:
+    def _block_received(self, token: Token) -> None:
         if self.state is State.HEADER_SENT and self.header is not None and self.header.mode == OUTPUT:
             self._out_of_step(token)
             return
         if not self._last_ack and self.lines and token.content == self._last_content:
-            # NAK may have gone to noise, and the ACK before it got lost: then this is the line before again.
+            # The NAK may have answered noise, and the ACK before be lost: then this is the same line again.
             self.fail(
-                f"line {self.lines} came once more after noise on the line: whether the program has it twice"
-                " cannot be told; send the file again"
+                f"line {self.lines} was received again after noise on the line; it is unknown whether the"
+                " program has it twice; send the file again"
             )
             return
         self._last_content = token.content
@@ -490,7 +497,7 @@ class Engine:
         if self._tries >= self.options.transmissions:
             what = f"line {self.lines + 1}" if self.state is State.RECEIVING else "the header"
             self.fail(
-                f"{what} came damaged {self._tries} times; the last {token.reason};"
+                f"{what} was received damaged {self._tries} times; the last {token.reason};"
                 " check baud rate and parity"
             )
         else:
@@ -507,21 +514,21 @@ class Engine:
         assert self.header is not None
         pair = self.header.mode == OUTPUT
         if not self._last_ack or pair != (token.kind is Kind.END):
-            return  # noise: an end follows an ACK, and is ETX EOT in output alone
+            return  # noise: an end follows an ACK, and is ETX EOT only in output
         if self.state is State.HEADER_SENT and self.header.name:
-            return  # likewise: only who asks for the next file may be told at once that there is none
+            return  # likewise: an immediate end answers only a request for the next file
         self._wait(State.END_GIVEN, None)
         self._events.append(events.Ended())
 
-    def _header_came(self, token: Token) -> None:
+    def _header_received(self, token: Token) -> None:
         if not self.is_peripheral:
             if self.state is not State.IDLE:
-                self._error_came(token)
+                self._error_received(token)
             return
         header = read_header(token.content)
         again = self.state is State.RECEIVING and self.lines == 0 and header == self.header
         if self.state is not State.IDLE and not again:
-            self._end(events.Failed(f"the control began anew after line {self.lines}"))
+            self._end(events.Failed(f"the control began a new transfer after line {self.lines}"))
         self._idle()
         if header is None:
             self.refuse("NO SUCH FILE")
@@ -533,10 +540,10 @@ class Engine:
             self._wait(State.ASKED, None)
             self._events.append(events.Asked(header))
 
-    def _error_came(self, token: Token) -> None:
+    def _error_received(self, token: Token) -> None:
         text = "".join(c if c.isprintable() else "?" for c in token.content.decode("latin-1").rstrip())
         self._say(bytes((ACK, EOT)))
-        self._end(events.Failed(f"the peripheral says: {text or 'an error'}"))
+        self._end(events.Failed(f"the peripheral reports: {text or 'an error'}"))
 
     def _directory_asked(self, _: Token) -> None:
         if not self.is_peripheral:
@@ -546,7 +553,7 @@ class Engine:
         self._events.append(events.DirectoryAsked())
 
     def _error_acked(self, _: Token) -> None:
-        self._end(events.Failed("the control was told of an error"))
+        self._end(events.Failed("an error was reported to the control"))
 
     def _hold(self, _: Token) -> None:
         self._held = True
@@ -560,49 +567,49 @@ class Engine:
 
     _Act = Callable[["Engine", Token], None]
     _ACTS: ClassVar[dict[tuple[State, Kind], _Act]] = {
-        (State.IDLE, Kind.HEADER): _header_came,
+        (State.IDLE, Kind.HEADER): _header_received,
         (State.IDLE, Kind.DAMAGED): _damaged_idle,
         (State.IDLE, Kind.DIRECTORY): _directory_asked,
-        (State.HEADER_SENT, Kind.ACK): _acked,
-        (State.HEADER_SENT, Kind.NAK): _naked,
-        (State.HEADER_SENT, Kind.EOT): _given_up,
-        (State.HEADER_SENT, Kind.HEADER): _header_came,
-        (State.HEADER_SENT, Kind.BLOCK): _block_came,
+        (State.HEADER_SENT, Kind.ACK): _ack_received,
+        (State.HEADER_SENT, Kind.NAK): _nak_received,
+        (State.HEADER_SENT, Kind.EOT): _eot_received,
+        (State.HEADER_SENT, Kind.HEADER): _header_received,
+        (State.HEADER_SENT, Kind.BLOCK): _block_received,
         (State.HEADER_SENT, Kind.ETX): _ended,
-        (State.LINE_WANTED, Kind.EOT): _given_up,
-        (State.LINE_WANTED, Kind.HEADER): _header_came,
+        (State.LINE_WANTED, Kind.EOT): _eot_received,
+        (State.LINE_WANTED, Kind.HEADER): _header_received,
         (State.LINE_WANTED, Kind.HOLD): _hold,
         (State.LINE_WANTED, Kind.GO_ON): _go_on,
-        (State.BLOCK_SENT, Kind.ACK): _acked,
-        (State.BLOCK_SENT, Kind.NAK): _naked,
-        (State.BLOCK_SENT, Kind.EOT): _given_up,
-        (State.BLOCK_SENT, Kind.HEADER): _header_came,
+        (State.BLOCK_SENT, Kind.ACK): _ack_received,
+        (State.BLOCK_SENT, Kind.NAK): _nak_received,
+        (State.BLOCK_SENT, Kind.EOT): _eot_received,
+        (State.BLOCK_SENT, Kind.HEADER): _header_received,
         (State.BLOCK_SENT, Kind.HOLD): _hold,
         (State.BLOCK_SENT, Kind.GO_ON): _go_on,
         (State.ETX_SENT, Kind.EOT): _confirmed,
-        (State.ETX_SENT, Kind.NAK): _naked_end,
-        (State.ETX_SENT, Kind.HEADER): _header_came,
-        (State.RECEIVING, Kind.BLOCK): _block_came,
-        (State.RECEIVING, Kind.HEADER): _header_came,
+        (State.ETX_SENT, Kind.NAK): _etx_nak_received,
+        (State.ETX_SENT, Kind.HEADER): _header_received,
+        (State.RECEIVING, Kind.BLOCK): _block_received,
+        (State.RECEIVING, Kind.HEADER): _header_received,
         (State.RECEIVING, Kind.DAMAGED): _damaged,
         (State.RECEIVING, Kind.ETX): _ended,
         (State.RECEIVING, Kind.END): _ended,
-        (State.RECEIVING, Kind.EOT): _given_up,
-        (State.LINE_GIVEN, Kind.EOT): _given_up,
-        (State.LINE_GIVEN, Kind.HEADER): _header_came,
-        (State.END_GIVEN, Kind.EOT): _given_up,
-        (State.ASKED, Kind.EOT): _given_up,
-        (State.LISTING, Kind.HEADER): _header_came,
+        (State.RECEIVING, Kind.EOT): _eot_received,
+        (State.LINE_GIVEN, Kind.EOT): _eot_received,
+        (State.LINE_GIVEN, Kind.HEADER): _header_received,
+        (State.END_GIVEN, Kind.EOT): _eot_received,
+        (State.ASKED, Kind.EOT): _eot_received,
+        (State.LISTING, Kind.HEADER): _header_received,
         (State.ERROR_SENT, Kind.ACK): _error_acked,
         (State.ERROR_SENT, Kind.EOT): _error_acked,
-        (State.ERROR_SENT, Kind.NAK): _naked,
-        (State.ERROR_SENT, Kind.HEADER): _header_came,
+        (State.ERROR_SENT, Kind.NAK): _nak_received,
+        (State.ERROR_SENT, Kind.HEADER): _header_received,
     }
 
 
-def _odd(text: bytes, data_bits: int) -> str:
+def _invalid_character(text: bytes, data_bits: int) -> str:
     """Name the first character of TEXT that no block can carry."""
     odd = next(c for c in text if c < 0x20 or c == 0x7F or (data_bits == 7 and c > 0x7F))
     if odd > 0x7F:
         return f"the character {odd:02X} hex, which does not fit into 7 bits; use the frame 8N1"
-    return f"the control character {odd:02X} hex, which no block can carry; take it out"
+    return f"the control character {odd:02X} hex, which no block can carry; remove it"

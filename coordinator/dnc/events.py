@@ -1,4 +1,4 @@
-"""What an engine tells its owner."""
+"""Events of an engine for its owner."""
 
 from dataclasses import dataclass
 
@@ -7,50 +7,50 @@ from coordinator.dnc.blocks import Header
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Peripheral: the control's header came; answer with ``accept`` or ``refuse``."""
+    """Peripheral: the control's header was received; answer with ``accept`` or ``refuse``."""
 
     header: Header
 
 
 @dataclass(frozen=True, slots=True)
 class DirectoryAsked:
-    """Peripheral: the control wants the directory; answer with ``give_directory``."""
+    """Peripheral: the control requests the directory; answer with ``give_directory``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line came, without CR LF; ``line_taken`` acknowledges it and lets the next one come."""
+    """A line was received, without CR LF; ``line_taken`` acknowledges it, so that the next one can follow."""
 
     text: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class LineWanted:
-    """The line before was taken: ``give_line`` or ``give_end``, at any time."""
+    """The previous line was accepted: call ``give_line`` or ``give_end``, at any time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """All lines came. Keep the file, then call ``file_kept`` or ``fail``."""
+    """All lines were received. Store the file, then call ``file_kept`` or ``fail``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """All lines were taken. CONFIRMED: the other side said so at the end, as it does for input only."""
+    """All lines were accepted. CONFIRMED: by the other side at the end, which happens only for input."""
 
     confirmed: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Directory:
-    """Control: the peripheral's directory came, as text."""
+    """Control: the peripheral's directory was received, as text."""
 
     text: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """The transfer is over without a file; a sentence says why."""
+    """The transfer failed; SENTENCE gives the reason."""
 
     sentence: str
 

@@ -1,4 +1,4 @@
-"""Programs that have no end yet: lines from a pipe that come when they come."""
+"""Lines of a program that is still being written, such as those of a pipe."""
 
 import contextlib
 import queue
@@ -10,11 +10,11 @@ from coordinator.dnc.files import read_lines
 from nodes.support.errors import CanductorError
 
 QUEUED_LINES_MAX: Final = 64
-"""Lines read ahead: what feeds them waits, then, as the control does with its answers."""
+"""Lines read ahead; with more, the writer of the pipe waits."""
 
 
 class SlowSource:
-    """The lines of a pipe, read by a thread, so that the line is looked after while none comes."""
+    """The lines of a pipe, read by a thread, so that the serial line is served while no line arrives."""
 
     def __init__(self, content: IO[bytes], line_max: int) -> None:
         self._content = content
@@ -34,7 +34,7 @@ class SlowSource:
         return line
 
     def close(self) -> None:
-        """See Source: the thread ends with the next line that comes."""
+        """See Source: the thread ends with the next line that arrives."""
         self._closing.set()
 
     def _read(self) -> None:
@@ -45,7 +45,7 @@ class SlowSource:
         except CanductorError as error:
             self._put(error)
         except (OSError, ValueError) as error:  # ValueError: closed
-            self._put(CanductorError(f"the program cannot be read on: {error}"))
+            self._put(CanductorError(f"reading the program failed: {error}"))
         else:
             self._put(None)
 

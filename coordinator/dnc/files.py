@@ -1,4 +1,4 @@
-"""The folder that files go to and come from: names are checked, files appear whole or not at all."""
+"""The folder of the transferred files: names are checked, and files appear only when complete."""
 
 import contextlib
 import errno
@@ -15,7 +15,7 @@ from coordinator.dnc.blocks import BadText, is_text
 from nodes.support.errors import CanductorError
 
 Check = Callable[[bytes, str], None]
-"""Gets a file's content and name; raises CanductorError if it may not be kept."""
+"""Takes a file's content and name; raises CanductorError if the file is not valid."""
 
 SUFFIXES: Final[Mapping[str, str]] = {
     "H": ".h",
@@ -26,10 +26,10 @@ SUFFIXES: Final[Mapping[str, str]] = {
     "P": ".plc",
     "T": ".t",
 }
-"""What a file's name ends in by its code, where the other side's names have no suffix."""
+"""Suffixes of file names by code, for names of the other side without a suffix."""
 SIZE_MAX: Final = 2**30
 CHECKED_MAX: Final = 2**24
-"""Bytes of a file that is checked as a whole before it is kept."""
+"""Maximum size in bytes of a file that is validated before it is stored."""
 FILES_MAX: Final = 10_000
 NAME_MAX: Final = 100
 _RESERVED: Final = re.compile(r"(con|prn|aux|nul|clock\$|com\d|lpt\d)(\..*)?", re.IGNORECASE)
@@ -39,7 +39,7 @@ _CREATE: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLO
 
 
 class FileRefused(CanductorError):  # noqa: N818
-    """A file cannot be taken or given; TEXT says so to an old control, in 32 capitals at most."""
+    """A file cannot be received or sent; TEXT is the report for the control, at most 32 capital letters."""
 
     def __init__(self, sentence: str, text: str) -> None:
         super().__init__(sentence)
@@ -61,7 +61,7 @@ class Entry:
 
 
 def check_name(name: str) -> str:
-    """Return NAME if a file of the folder may be called so; raises FileRefused."""
+    """Return NAME if it is a valid file name; raises FileRefused."""
     if (
         not _PLAIN.fullmatch(name)
         or len(name) > NAME_MAX
@@ -70,7 +70,7 @@ def check_name(name: str) -> str:
         or _RESERVED.fullmatch(name)
     ):
         raise FileRefused(
-            f"{name[:NAME_MAX]!a} is no name for a file: 1 to {NAME_MAX} ASCII characters without"
+            f"{name[:NAME_MAX]!a} is not a valid file name: 1 to {NAME_MAX} ASCII characters without"
             ' / \\ : * ? " < > |, not beginning with . or -, and no name that systems reserve',
             "BAD FILE NAME",
         )
@@ -78,13 +78,13 @@ def check_name(name: str) -> str:
 
 
 def stored_name(code: str, name: str) -> str:
-    """Return what a file that came as NAME with CODE is called here; raises FileRefused."""
+    """Return the local name of a file that is received as NAME with CODE; raises FileRefused."""
     suffix = SUFFIXES.get(code, "")
     return check_name(check_name(name) if "." in name else check_name(name) + suffix)
 
 
 class Folder:
-    """Files below PATH, none in folders of it; links are not followed. Opened once: it stays the same."""
+    """The files of PATH, without subfolders; links are not followed. PATH is opened once."""
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class Folder:
             self._fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except OSError as error:
             raise CanductorError(
-                f"the folder {path} cannot be opened: {_why(error)}; make it, or name another"
+                f"the folder {path} cannot be opened: {_why(error)}; create it, or use another folder"
             ) from None
         self.path = path
         self.overwrite = overwrite
@@ -110,7 +110,7 @@ class Folder:
         self._checked_codes = checked_codes
 
     def close(self) -> None:
-        """Let the folder go."""
+        """Close the folder."""
         os.close(self._fd)
 
     def files(self) -> list[Entry]:
@@ -128,12 +128,12 @@ class Folder:
 
     @property
     def free_bytes(self) -> int:
-        """Return what the disk still takes."""
+        """Return the free space of the disk in bytes."""
         status = os.fstatvfs(self._fd)
         return status.f_bavail * status.f_frsize
 
     def open(self, code: str, name: str) -> tuple[str, IO[bytes]]:
-        """Return the name and content of the file that a header means; raises FileRefused."""
+        """Return name and content of the file that a header requests; raises FileRefused."""
         known = {entry.name for entry in self.files()}
         wanted = (name, name + SUFFIXES.get(code, ""))
         found = next((w for w in wanted if w in known), None)
@@ -153,14 +153,14 @@ class Folder:
         return found, os.fdopen(fd, "rb")
 
     def take(self, code: str, name: str) -> "Incoming":
-        """Begin a file that comes; raises FileRefused when it must not."""
+        """Create a file that is received; raises FileRefused."""
         stored = stored_name(code, name)
         status = self._status(stored)
         if status is not None and not stat.S_ISREG(status.st_mode):
-            raise FileRefused(f"{stored} in {self.path} is there and is not a file", "NAME IN USE")
+            raise FileRefused(f"{stored} in {self.path} exists and is not a file", "NAME IN USE")
         if status is not None and not self.overwrite:
             raise FileRefused(
-                f"{stored} is in {self.path} already; choose another name, or allow --overwrite",
+                f"{stored} exists in {self.path} already; use another name, or give --overwrite",
                 "FILE EXISTS",
             )
         check = self._check if code in self._checked_codes else None
@@ -174,7 +174,7 @@ class Folder:
 
 
 class Incoming:
-    """A file that comes: nobody sees it before ``keep``, which shows it whole, after the disk has it."""
+    """A file that is received: ``keep`` brings it to the disk and gives it its name."""
 
     is_live = False
     ready = True
@@ -190,7 +190,7 @@ class Incoming:
             self._file = os.fdopen(os.open(self._partial, _CREATE, 0o644, dir_fd=fd), "wb")
         except OSError as error:
             raise FileRefused(
-                f"nothing can be written in {folder.path}: {_why(error)}; name another folder", "DISK ERROR"
+                f"no file can be created in {folder.path}: {_why(error)}; use another folder", "DISK ERROR"
             ) from None
 
     def write(self, line: bytes) -> None:
@@ -199,14 +199,14 @@ class Incoming:
         self.size_bytes += len(data)
         limit = CHECKED_MAX if self._check is not None else self._folder.size_max
         if self.size_bytes > limit:
-            raise FileRefused(f"{self.name} gets longer than {limit:,} bytes", "FILE TOO LONG")
+            raise FileRefused(f"{self.name} is longer than {limit:,} bytes", "FILE TOO LONG")
         try:
             self._file.write(data)
         except OSError as error:
             raise self._disk_error(error) from None
 
     def content(self) -> IO[bytes]:
-        """Return what came so far, to be read; raises FileRefused."""
+        """Return what was received so far; raises FileRefused."""
         try:
             self._file.flush()
             return os.fdopen(os.open(self._partial, _READ, dir_fd=self._folder_fd), "rb")
@@ -214,7 +214,7 @@ class Incoming:
             raise FileRefused(f"{self.name} cannot be read again: {_why(error)}", "DISK ERROR") from None
 
     def keep(self) -> None:
-        """Check the file and show it under its name; raises CanductorError, and then there is none."""
+        """Check the file and give it its name; raises CanductorError, and then the file is removed."""
         try:
             self._file.flush()
             os.fsync(self._file.fileno())
@@ -227,7 +227,7 @@ class Incoming:
         except FileExistsError:
             self.drop()
             raise FileRefused(
-                f"{self.name} has come into {self._folder.path} meanwhile; nothing was overwritten",
+                f"{self.name} was created in {self._folder.path} in the meantime; it was not overwritten",
                 "FILE EXISTS",
             ) from None
         except OSError as error:
@@ -237,8 +237,8 @@ class Incoming:
             self.drop()
             raise
 
-    def drop(self, why: str = "") -> None:  # noqa: ARG002 (others tell it)
-        """Forget the file; after ``keep`` without effect."""
+    def drop(self, why: str = "") -> None:  # noqa: ARG002 (other sinks report it)
+        """Discard the file; without effect after ``keep``."""
         with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):
@@ -246,7 +246,7 @@ class Incoming:
 
     def _disk_error(self, error: OSError) -> FileRefused:
         return FileRefused(
-            f"{self.name} cannot be written: {_why(error)}; make room there, or name another folder",
+            f"{self.name} cannot be written: {_why(error)}; free some space, or use another folder",
             "DISK ERROR",
         )
 
@@ -260,7 +260,7 @@ class Incoming:
         except OSError as error:
             if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.EMLINK):
                 raise
-            # No hard links on this disk: an empty file takes the name, or fails to if there is one.
+            # No hard links on this disk: an empty file reserves the name, which fails if it exists.
             os.close(os.open(self.name, _CREATE, 0o644, dir_fd=self._folder_fd))
             os.rename(self._partial, self.name, **names)  # noqa: PTH104 (likewise)
             return
@@ -274,7 +274,7 @@ def read_lines(content: IO[bytes], line_max: int) -> Iterator[bytes]:
         number += 1
         bare = line.removesuffix(b"\n").removesuffix(b"\r") if line.endswith(b"\n") else line
         if len(bare) > line_max:
-            raise BadText(f"line {number} is longer than {line_max} characters, more than a block takes")
+            raise BadText(f"line {number} is longer than {line_max} characters, the limit of a block")
         yield bare
 
 

@@ -1,4 +1,4 @@
-"""What ``canductor dnc`` is asked to do."""
+"""The options of one ``canductor dnc`` command."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,12 +9,12 @@ from coordinator.ipc.client.target import Target
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DncJob:
-    """One command: the line, what is transferred, and what happens to it."""
+    """One command: the serial line, the files, and what is done with them."""
 
     port: str
     options: DncOptions
     paced: bool | None = None
-    """Whether the port keeps to the baud rate; None: as the port says."""
+    """Whether the port keeps to the baud rate; None: detected."""
     rtscts: bool = False
     peripheral: bool = False
     """This side is the peripheral."""
@@ -30,7 +30,7 @@ class DncJob:
     start: bool = False
     """Print what was received, or as it is received."""
     numbered: bool = False
-    """N words rise by the same step each time."""
+    """N words increase by the same step."""
     verify: bool = False
     """Transfer the file a second time and compare."""
     machine: Target = field(default_factory=Target)

@@ -1,8 +1,8 @@
-"""Makes tokens of the bytes that come over a line: blocks, answers, endings, and what is damaged.
+"""Converts received bytes to tokens: blocks, answers, ends, and damaged data.
 
-Everything on this half-duplex line is followed by silence: whoever sent it waits. That is the second check
-beside the block check, and the stronger one: a 7 that a flipped bit made an ETB ends a block early, but the
-block's rest then follows without a pause. So each token counts only when the line is silent behind it:
+On this half-duplex line silence follows each message, because the sender waits. This is a second check after
+the block check, and the stronger one: if a flipped bit turns a 7 into ETB, the block ends early, but its rest
+follows without a pause. So a token is accepted only if silence follows it:
 
     token                   silence
     block, header, ACK     1.5 characters: the next one would be there; behind a block's DC1 none at all
@@ -10,7 +10,7 @@ block's rest then follows without a pause. So each token counts only when the li
     ETX                    ``character_s``: a damaged STX is an ETX, too, and the block's rest follows
     anything damaged       ``character_s``
 
-Sans-IO. Times are seconds of any clock that does not jump. A lexer never raises and holds one block.
+Sans-IO. Times are seconds of a monotonic clock. A lexer never raises, and stores at most one block.
 """
 
 import re
@@ -39,7 +39,7 @@ from coordinator.dnc.tokens import Kind, Token
 
 STARTS: Final = (SOH, STX)
 BLOCK_LIKE: Final = 16
-"""Characters in one go that cannot be noise alone."""
+"""Characters without a pause that cannot be only noise."""
 
 
 _TEXT: Final = re.compile(rb"[\r\n -\xff]+")
@@ -72,37 +72,37 @@ class Lexer:
         self._reason = ""
         self._junk_bytes = 0
         self._holds_ack = False
-        self._is_told = False
-        """What is junk now is the rest of what was told as OVERRUN."""
+        self._is_reported = False
+        """The current junk is the rest of an OVERRUN that was reported."""
         self._awaits_check = False
-        """The next character of what is damaged follows an ETB."""
+        """The next character of the damaged data follows an ETB."""
         self._pause_s = 0.0
         """Silence before the character that is fed."""
         self._block_like = False
         self._unit_ended = False
-        """An ETB and a check character have gone by."""
+        """An ETB and a check character were received."""
         self._first_part = b""
         """Of a block within which the line fell silent; its rest may still come."""
         self._rest = bytearray()
         self._etx_stands = False
-        """What is junk now followed an ETX."""
+        """The current junk followed an ETX."""
         self._ends_with_eot = False
-        self._signs: list[Token] = []
+        self._tokens: list[Token] = []
         self.expects_blocks = True
-        """Else it is answers that are expected, and what is like a block matters less."""
+        """Otherwise answers are expected, and block-like data is noise."""
         self.answer_leads = False
-        """An ACK may be followed by a block at once, as that of a header is."""
+        """An ACK may be followed by a block without a pause, as after a header."""
         self.nak_extra_s = 0.0
-        """For the answer to the block itself to come after a NAK that belongs to something before it."""
+        """Additional wait after a NAK, during which the real answer to the block may follow."""
         self.noise_bytes = 0
 
     def reset(self) -> None:
-        """Forget what is begun."""
+        """Discard what was begun."""
         self._state = _State.IDLE
-        self._signs.clear()
+        self._tokens.clear()
 
     def receive(self, data: bytes, now_s: float) -> list[Token]:
-        """Take DATA, whose last character came at NOW_S; return what is complete."""
+        """Process DATA, whose last character arrived at NOW_S; return the complete tokens."""
         first_s = now_s - len(data) * self._options.character_time_s
         self._expire(first_s)
         self._pause_s = first_s - self._last_s
@@ -121,21 +121,21 @@ class Lexer:
         return self._take()
 
     def handle_timer(self, now_s: float) -> list[Token]:
-        """Return what the silence until NOW_S made complete."""
+        """Return the tokens that the silence until NOW_S completed."""
         self._expire(now_s)
         return self._take()
 
     def next_deadline(self) -> float | None:
-        """Return when silence will tell something; None: nothing is begun."""
+        """Return when silence completes a token; None: nothing is begun."""
         wait_s = self._silence_s()
         return None if wait_s is None else self._last_s + wait_s
 
     def _take(self) -> list[Token]:
-        tokens, self._signs = self._signs, []
+        tokens, self._tokens = self._tokens, []
         return tokens
 
     def _text_from(self, data: bytes, at: int) -> int:
-        """Return where the text ends that goes into the block as it is: most of what comes."""
+        """Return where the text ends that is added to the block unchanged."""
         if self._state is not _State.BLOCK:
             return at
         room = self._options.block_max + 2 - len(self._data)  # its first character, and a stuffed space
@@ -190,7 +190,7 @@ class Lexer:
             self._emit(Kind.EOT)
         elif first_part and _is_whole(first_part + self._rest):
             self._emit(Kind.NOISE)  # the line was slow; a second NAK would ask for two repeats
-        elif self._block_like and not self._is_told:
+        elif self._block_like and not self._is_reported:
             self._emit(Kind.DAMAGED, reason=reason)
         elif self._etx_stands:
             self.noise_bytes += self._junk_bytes
@@ -213,9 +213,9 @@ class Lexer:
                 self._unit_ended = True
                 self._state = _State.DONE
             case _State.DONE:
-                self._behind_block(character, gap)
+                self._after_block(character, gap)
             case _State.SIMPLE:
-                self._behind_simple(character, gap)
+                self._after_simple(character, gap)
             case _State.COMMAND:
                 self._in_command(character, gap)
             case _State.JUNK:
@@ -223,7 +223,7 @@ class Lexer:
 
     def _begin(self, character: int) -> None:
         self._reason = ""
-        self._unit_ended = self._ends_with_eot = self._etx_stands = self._is_told = False
+        self._unit_ended = self._ends_with_eot = self._etx_stands = self._is_reported = False
         self._block_like = False
         if character in STARTS:
             self._start = character
@@ -262,7 +262,7 @@ class Lexer:
         else:
             self._data.append(character)
 
-    def _behind_block(self, character: int, gap: bool) -> None:
+    def _after_block(self, character: int, gap: bool) -> None:
         if character == DC1 and self._good:
             self._end_block()  # no text holds DC1: this is the end, there is nothing to wait for
         elif character == DC1 and not self._dc1_seen:
@@ -270,9 +270,9 @@ class Lexer:
         elif character in STARTS:
             self._restart(character, gap)
         else:
-            self._to_junk("goes on behind its end", character)
+            self._to_junk("continues after its end", character)
 
-    def _behind_simple(self, character: int, gap: bool) -> None:
+    def _after_simple(self, character: int, gap: bool) -> None:
         first = self._data[0]
         if len(self._data) == 1 and first == ETX and character == EOT:
             # A lone ETX may be noise, and an EOT much later gives up: only together they are the end.
@@ -285,7 +285,7 @@ class Lexer:
             self._emit(Kind.ACK)
             self._begin(character)
         elif first == NAK and gap:
-            self._behind_nak(character)
+            self._after_nak(character)
         elif gap and character in STARTS:  # a lone ETX that was none
             self._noise(len(self._data))
             self._begin(character)
@@ -297,7 +297,7 @@ class Lexer:
             self._noise(len(self._data))
             self._begin(character)
 
-    def _behind_nak(self, character: int) -> None:
+    def _after_nak(self, character: int) -> None:
         if character in STARTS:
             self._noise(1)
             self._begin(character)
@@ -345,14 +345,14 @@ class Lexer:
         self._block_like = self._block_like or self._unit_ended or self._junk_bytes > BLOCK_LIKE
 
     def _restart(self, character: int, gap: bool) -> None:
-        """Take the beginning of a block while another is not done with."""
+        """Handle the start of a block while another is not complete."""
         if not self.expects_blocks and (gap or self._state is _State.DONE):
             self._emit(Kind.NOISE)
             self._begin(character)
         elif self.expects_blocks and (self._unit_ended or (gap and self._block_like)):
             self._emit(Kind.OVERRUN)
             self._to_junk("came before the last was answered", character)
-            self._is_told = True
+            self._is_reported = True
         elif gap:
             self._emit(Kind.NOISE)
             self._begin(character)
@@ -383,11 +383,11 @@ class Lexer:
         if kind is Kind.NOISE:
             content = bytes((ACK,)) if self._holds_ack else b""
             self._noise(self._junk_bytes)
-        self._signs.append(Token(kind, self._last_s, content, check, reason))
+        self._tokens.append(Token(kind, self._last_s, content, check, reason))
 
 
 def _is_whole(data: bytes) -> bool:
-    """Tell whether DATA is a whole block, with DC1 or without."""
+    """Return whether DATA is a complete block, with DC1 or without."""
     return any(
         len(block) > 2 and block[-2] == ETB and block_check(block[:-1]) == block[-1]
         for block in (data, data.removesuffix(bytes((DC1,))))

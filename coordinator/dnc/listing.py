@@ -1,7 +1,7 @@
-"""The directory as a peripheral tells it: lines of text, without a block check.
+"""The directory of a peripheral: lines of text, without a block check.
 
-Four lines that mean nothing; then on each line six characters that mean nothing, a name, blanks, the sectors
-it takes and whatever follows; at last ``FREE:`` and a number of sectors.
+Four lines are ignored. Each further line has six characters that are ignored, a name, blanks, the number of
+sectors, and text that is ignored. The last line is ``FREE:`` and a number of sectors.
 """
 
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ _IGNORED_CHARACTERS: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """What a directory tells."""
+    """The content of a directory."""
 
     sectors: dict[str, int]
     """By name."""
@@ -26,7 +26,7 @@ class Listing:
 
 
 def write_listing(entries: Iterable[Entry], free_bytes: int) -> bytes:
-    """Return the directory of ENTRIES; names with blanks are left out, nobody could read them back."""
+    """Return the directory of ENTRIES; names with blanks are left out, since they could not be parsed."""
     lines = ["", "      CANDUCTOR", "", ""]
     for entry in entries:
         if " " not in entry.name:
@@ -37,9 +37,11 @@ def write_listing(entries: Iterable[Entry], free_bytes: int) -> bytes:
 
 
 def read_listing(text: bytes) -> Listing:
-    """Read a directory; raises CanductorError for what cannot be one."""
+    """Parse a directory; raises CanductorError."""
     if any(c > 0x7E or (c < 0x20 and c not in b"\r\n\t") for c in text):
-        raise CanductorError("the directory came damaged; check baud rate and parity, and ask again")
+        raise CanductorError(
+            "the directory was received damaged; check baud rate and parity, and request it again"
+        )
     sectors: dict[str, int] = {}
     free = None
     for line in text.decode("ascii").split("\n")[_IGNORED_LINES:]:

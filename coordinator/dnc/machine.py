@@ -1,7 +1,7 @@
-"""A program that a machine prints while it comes, as a job of its own: lines in, what became of it out.
+"""A program that a machine prints while it is received, as a job of its own.
 
 The machine answers each piece when it has room for the next. Until then some lines wait here, and the next
-one over the serial line is not acknowledged. All in one thread: calls are begun, and looked after later.
+one over the serial line is not acknowledged. All in one thread: calls are begun, and checked later.
 """
 
 import contextlib
@@ -14,9 +14,9 @@ from coordinator.ipc.protocol.methods import ApiError
 from nodes.support.errors import CanductorError
 
 LINES_MAX: Final = 64
-"""That wait for the machine here."""
+"""Lines that wait here for the machine."""
 ANSWER_S: Final = 10.0
-"""For an answer that the machine gives at once."""
+"""Timeout of an answer that needs no work of the machine."""
 _FAILURE_MAX: Final = 500
 
 Begin = Callable[[str, Mapping[str, Any]], Future[Any]]
@@ -24,7 +24,7 @@ Begin = Callable[[str, Mapping[str, Any]], Future[Any]]
 
 
 class Client(Protocol):
-    """What is needed of a machine's client."""
+    """The interface of a client of the machine."""
 
     def begin(self, method: str, params: Mapping[str, Any]) -> Future[Any]: ...  # noqa: D102
 
@@ -46,7 +46,7 @@ class MachineSink:
         try:
             self._answer.result(ANSWER_S)
         except ApiError as error:
-            wait((self._job,), ANSWER_S)  # it says why there is no job
+            wait((self._job,), ANSWER_S)  # its error is the reason
             self._check_job()
             raise _refused(str(error)) from None
         except TimeoutError:
@@ -71,14 +71,14 @@ class MachineSink:
         self._go_on()
 
     def keep(self) -> None:
-        """Say that all lines came; raises CanductorError."""
+        """Report the end of the program; raises CanductorError."""
         self._end({"end": True})
 
     def drop(self, why: str = "") -> None:
-        """Say that no more lines come, for the reason WHY: what came is carried out all the same."""
+        """Report that no more lines follow, for the reason WHY; the lines so far are carried out."""
         if not self._ended:
             with contextlib.suppress(CanductorError):  # the job is over already
-                self._end({"failure": (why or "no more lines came")[:_FAILURE_MAX]})
+                self._end({"failure": (why or "no more lines were received")[:_FAILURE_MAX]})
 
     def wait_until_over(self) -> Mapping[str, Any]:
         """Return how the job ended, once it has; raises CanductorError unless it was done."""
@@ -91,7 +91,7 @@ class MachineSink:
     # ------------------------------------------------------------------------------------------- calls
 
     def _go_on(self) -> None:
-        """Look after what was begun, and feed what waits."""
+        """Check the last call, and send the lines that wait."""
         if self._answer.done():
             self._check_job()
             try:
@@ -135,8 +135,8 @@ def _refused(sentence: str) -> FileRefused:
 
 
 def _result(answer: Future[Any]) -> Any:
-    """Return what ANSWER brings; raises CanductorError."""
+    """Return the result of ANSWER; raises CanductorError."""
     try:
         return answer.result()
     except CancelledError:
-        raise CanductorError("the machine is gone") from None
+        raise CanductorError("the connection to the machine was lost") from None

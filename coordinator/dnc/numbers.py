@@ -1,8 +1,8 @@
-"""Numbers of lines, where a program has some: by them a block that came twice, or never, shows.
+"""Line numbers of a program, which reveal a block that was received twice or lost.
 
-Blocks themselves have no numbers. Dialog programs, which begin with ``0 BEGIN PGM``, are numbered by ones and
-end with END PGM: controls see to that. N words of ISO programs are as their authors like, unless they are
-said to be even; but no program has the same numbered line twice in a row.
+Blocks have no numbers. The lines of dialog programs, which begin with ``0 BEGIN PGM``, are numbered in
+steps of 1 and end with END PGM. N words of ISO programs are arbitrary unless they are declared even; but no
+program has the same numbered line twice in a row.
 """
 
 import re
@@ -17,8 +17,8 @@ _DIALOG_NUMBER: Final = re.compile(rb"\s*(\d{1,9})(?=\s|$)")
 _N_WORD: Final = re.compile(rb"\s*/?\s*[Nn](\d{1,9})(?!\d)")
 
 
-class Numbers:
-    """The numbers of the lines of a program called NAME; EVEN: its N words rise by the same each time."""
+class LineNumbers:
+    """The numbers of the lines of a program called NAME; EVEN: its N words increase by the same step."""
 
     def __init__(self, name: str, *, even: bool = False) -> None:
         self._name = name
@@ -30,7 +30,7 @@ class Numbers:
         self._step: int | None = None
 
     def check(self, line: bytes) -> None:
-        """Take note of LINE; raises FileRefused if it cannot follow those before."""
+        """Record LINE; raises FileRefused if it cannot follow the lines before."""
         self._lines += 1
         if self._lines == 1:
             self._dialog = _DIALOG.match(line) is not None
@@ -38,7 +38,7 @@ class Numbers:
         if found is not None:
             number = int(found[1])
             if not self._dialog and line == self._before:
-                raise self._refused(f"came twice (N{number}), or never as it was")
+                raise self._refused(f"was received twice (N{number}), or a line is missing")
             self._check_step(number)
             self._number = number
         self._before = line
@@ -46,7 +46,9 @@ class Numbers:
     def end(self) -> None:
         """Raise FileRefused if the program cannot end here."""
         if self._dialog and not _DIALOG_END.match(self._before):
-            raise FileRefused(f"{self._name} has no END PGM: its end is missing; send it again", "NO END PGM")
+            raise FileRefused(
+                f"{self._name} has no END PGM: its end is missing; send the file again", "NO END PGM"
+            )
 
     def _check_step(self, number: int) -> None:
         if self._number is None:
@@ -60,17 +62,18 @@ class Numbers:
 
     def _refused(self, what: str) -> FileRefused:
         return FileRefused(
-            f"line {self._lines} of {self._name} {what}: a line came twice or got lost; send it again",
+            f"line {self._lines} of {self._name} {what}: a line was received twice or lost;"
+            " send the file again",
             "WRONG LINE NUMBER",
         )
 
 
 class NumberedSink:
-    """SINK for lines whose numbers are looked at. A ``Sink``."""
+    """SINK with a check of the line numbers. A ``Sink``."""
 
     def __init__(self, sink: Sink, *, even: bool = False) -> None:
         self._sink = sink
-        self._numbers = Numbers(sink.name, even=even)
+        self._numbers = LineNumbers(sink.name, even=even)
         self.name = sink.name
         self.size_bytes = 0
         self.is_live = sink.is_live
@@ -97,5 +100,5 @@ class NumberedSink:
 
 
 def numbered(take: Take, *, even: bool) -> Take:
-    """Return TAKE with lines whose numbers are looked at."""
+    """Return TAKE with a check of the line numbers."""
     return lambda header: NumberedSink(take(header), even=even)

@@ -1,4 +1,4 @@
-"""What both sides of a line have to agree on, and how patient this side is."""
+"""Options of the serial line and of the protocol."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -39,7 +39,7 @@ def read_frame(text: str) -> SerialFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DncOptions:
-    """All of the protocol that can be chosen; times in seconds."""
+    """Options of the protocol; times in seconds."""
 
     frame: SerialFrame = SerialFrame()
     baud: int = 9600
@@ -47,22 +47,22 @@ class DncOptions:
     """Send DC1 after each check character; received, it may be there or not."""
     avoid_control: bool = False
     """Send no check character below 20 hex;
-    a received space for that, after CR LF, is taken off in any case."""
+    a received space for that, after CR LF, is always removed."""
     transmissions: int = TRANSMISSIONS_MAX
     """Of one block, the first included; old controls send 3 times."""
     block_max: int = BLOCK_MAX
     """Characters of one block's text, CR LF included."""
     answer_s: float = 8.0
-    """For the other side to answer a block, and for its next block; then EOT, and the transfer has failed."""
+    """Timeout of an answer to a block, and of the next block; then EOT is sent and the transfer fails."""
     decide_s: float = 30.0
-    """For the other side to answer a header: a floppy may have to start."""
+    """Timeout of the answer to a header: a floppy drive may have to start."""
     character_s: float = 0.25
-    """Silence that ends whatever is on the line."""
+    """Silence that ends any message."""
     nak_quiet_s: float = 0.3
     """After NAK: repeat only if no other answer comes within this time."""
     paced: bool = False
-    """The line is known to take characters no faster than BAUD: an answer that comes before the block can
-    have left is none, then. Not for sockets and pseudo-terminals."""
+    """The line transmits at BAUD at most: an answer that arrives before the block can have been sent is
+    rejected. Not for sockets and pseudo-terminals."""
 
     def __post_init__(self) -> None:
         """Check; raises CanductorError."""
@@ -79,8 +79,8 @@ class DncOptions:
                 raise CanductorError(f"{name} is {value}, must be from {low} to {high}")
         if self.answer_s <= self.character_s or self.answer_s <= self.nak_quiet_s:
             raise CanductorError(
-                f"an answer may take {self.answer_s:g} s, must be longer than the silence that ends a block"
-                f" ({self.character_s:g} s) and the wait after NAK ({self.nak_quiet_s:g} s)"
+                f"the timeout of an answer is {self.answer_s:g} s, must be longer than the silence that ends"
+                f" a block ({self.character_s:g} s) and the wait after NAK ({self.nak_quiet_s:g} s)"
             )
 
     @property
@@ -90,10 +90,10 @@ class DncOptions:
 
     @property
     def settle_s(self) -> float:
-        """Silence after which a block or answer is complete: the next character would be there."""
+        """Silence after which a block or answer is complete: the next character would have arrived."""
         return 1.5 * self.character_time_s
 
     @property
     def pair_s(self) -> float:
-        """Between ETX and EOT at most: they are sent in one go, but adapters hand on in pieces."""
+        """Maximum time between ETX and EOT: they are sent together, but adapters may split them."""
         return min(self.character_s, 0.02 + 4 * self.character_time_s)

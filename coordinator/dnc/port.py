@@ -18,13 +18,13 @@ from nodes.support.errors import CanductorError
 
 READ_SIZE: Final = 4096
 _QUEUED_MAX: Final = 256
-"""Pieces of READ_SIZE that wait, from a port without a file descriptor."""
+"""Queue length of a port without a file descriptor, in pieces of READ_SIZE."""
 _PSEUDO_MAJORS: Final = range(136, 144)
 _IN_TEXT: Final = re.compile(r"(?:\[Errno |\()(-?\d+)(?:\]|,) '?([^')]*)")
 
 
 class PortError(CanductorError):
-    """The port cannot be opened, or is gone."""
+    """The port cannot be opened, or was lost."""
 
 
 class Port:
@@ -39,7 +39,7 @@ class Port:
                 bytesize=options.frame.data_bits,
                 parity=options.frame.parity,
                 stopbits=options.frame.stop_bits,
-                xonxoff=False,  # it would eat DC1, and a check character of 11 or 13 hex
+                xonxoff=False,  # it would remove DC1, and check characters of 11 or 13 hex
                 rtscts=rtscts,
                 timeout=0.05,
                 write_timeout=None,
@@ -63,7 +63,7 @@ class Port:
 
     @property
     def is_paced(self) -> bool:
-        """Whether characters leave at the baud rate: not those of sockets, pseudo-terminals, USB modems."""
+        """Whether characters are sent at the baud rate; not on sockets, pseudo-terminals and USB modems."""
         if self._fd is None or not self._is_tty:
             return False
         device = os.fstat(self._fd)
@@ -73,7 +73,7 @@ class Port:
         )
 
     def close(self) -> None:
-        """Let the line go."""
+        """Close the port."""
         self._closing.set()
         if self._fd is None:
             self._thread.join(timeout=1.0)
@@ -81,7 +81,7 @@ class Port:
             self._port.close()
 
     def read(self, timeout_s: float) -> bytes:
-        """Return what came, after TIMEOUT_S at most; raises PortError."""
+        """Return received bytes, after TIMEOUT_S at most; raises PortError."""
         if self._fd is None:
             return self._read_queue(timeout_s)
         try:
@@ -92,15 +92,15 @@ class Port:
         except BlockingIOError:
             return b""
         except (OSError, ValueError) as error:
-            raise PortError(f"{self.name} is gone: {error}; check its plug and start again") from None
+            raise PortError(f"{self.name} was lost: {error}; check its plug and start again") from None
         if not data:
             if self._is_tty:
                 return b""
-            raise PortError(f"{self.name} was closed by the other side; start again when it is back")
+            raise PortError(f"{self.name} was closed by the other side; start again when it is available")
         return data
 
     def write(self, data: bytes, timeout_s: float) -> None:
-        """Send DATA; raises PortError when the line has not taken it within TIMEOUT_S."""
+        """Send DATA; raises PortError when the port has not accepted it within TIMEOUT_S."""
         try:
             if self._fd is None:
                 self._port.write(data)
@@ -108,11 +108,13 @@ class Port:
             while data:
                 _, ready, _ = select.select([], [self._fd], [], timeout_s)
                 if not ready:
-                    raise PortError(f"{self.name} takes no bytes for {timeout_s:g} s; check its handshake")
+                    raise PortError(
+                        f"{self.name} has not accepted data for {timeout_s:g} s; check its flow control"
+                    )
                 with contextlib.suppress(BlockingIOError):
                     data = data[os.write(self._fd, data) :]
         except (OSError, ValueError) as error:
-            raise PortError(f"{self.name} is gone: {error}; check its plug and start again") from None
+            raise PortError(f"{self.name} was lost: {error}; check its plug and start again") from None
 
     def _read_queue(self, timeout_s: float) -> bytes:
         try:
@@ -120,11 +122,11 @@ class Port:
         except queue.Empty:
             return b""
         if isinstance(data, OSError):
-            raise PortError(f"{self.name} is gone: {data}; start again when it is back")
+            raise PortError(f"{self.name} was lost: {data}; start again when it is available")
         return data
 
     def _read_on(self) -> None:
-        """Read a port that select does not know."""
+        """Read a port that has no file descriptor for select."""
         while not self._closing.is_set():
             try:
                 data = self._port.read(1)
@@ -143,7 +145,7 @@ class Port:
 
 
 def _descriptor(port: Any) -> int | None:
-    """Return the file descriptor to wait at, if the port has one."""
+    """Return the file descriptor of the port, if it has one."""
     try:
         return int(port.fileno())
     except (AttributeError, OSError, ValueError):
@@ -151,11 +153,11 @@ def _descriptor(port: Any) -> int | None:
 
 
 def _mark_parity_errors(fd: int, *, on: bool) -> None:
-    """Have a character of wrong parity come as NUL, which no block holds; pyserial lets it pass as right."""
+    """Read characters with a parity error as NUL, which no block contains; pyserial does not report them."""
     settings = termios.tcgetattr(fd)
     mask = termios.INPCK if on else 0
     settings[0] = (settings[0] & ~(termios.INPCK | termios.PARMRK | termios.IGNPAR)) | mask
-    # A read with nothing there fails, then; else it would look like the end.
+    # Without data a read then fails; otherwise it would look like the end.
     settings[6][termios.VMIN] = 1
     settings[6][termios.VTIME] = 0
     termios.tcsetattr(fd, termios.TCSANOW, settings)
@@ -167,19 +169,19 @@ def _cannot_open(name: str, options: DncOptions, error: Exception) -> str:
         return f"{name} cannot be reached: {why}; check host, port, and that the serial server runs"
     match code:
         case errno.EACCES | errno.EPERM:
-            return f"{name} may not be opened; add yourself to the group 'dialout' and log in again"
+            return f"{name} cannot be opened: permission denied; add yourself to the group 'dialout'"
         case errno.ENOENT | errno.ENODEV | errno.ENXIO:
             return f"there is no serial port '{name}'; check its plug ('ls /dev/serial/by-id')"
         case errno.EAGAIN | errno.EBUSY:
-            return f"{name} is in use by another program; close that first"
+            return f"{name} is in use by another program; close that program first"
         case errno.ENOTTY | errno.EISDIR:
-            return f"{name} is no serial port; name a device such as /dev/ttyUSB0, or socket://HOST:PORT"
+            return f"{name} is not a serial port; use a device such as /dev/ttyUSB0, or socket://HOST:PORT"
     settings = f"{options.baud} baud {options.frame}"
     return f"{name} cannot be opened at {settings}: {why}; check name and settings"
 
 
 def _reason(error: Exception) -> tuple[int | None, str]:
-    """Return number and text of ERROR; pyserial leaves them in a text of its own, now and then."""
+    """Return number and text of ERROR; pyserial sometimes has them only in its own text."""
     text = getattr(error, "strerror", None) or str(error)
     code = getattr(error, "errno", None)
     if (found := _IN_TEXT.search(text)) is not None:

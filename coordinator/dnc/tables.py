@@ -1,4 +1,4 @@
-"""Tables that come by file code S: validated as imported ones are, before they are kept."""
+"""Validates received tables (file code S) as imported tables are."""
 
 import tempfile
 from pathlib import Path
@@ -7,11 +7,11 @@ from coordinator.tables.files import read_table
 from nodes.support.errors import CanductorError
 
 _ANY_AXIS = "x"
-"""Which axis a table is for is said when it is sent to one."""
+"""The axis of a table is chosen when it is sent to a machine."""
 
 
 def check_table(content: bytes, name: str) -> None:
-    """Raise CanductorError, about NAME, unless CONTENT is a sound table: CSV by its name, else COMP_FILE."""
+    """Raise CanductorError, about NAME, unless CONTENT is a valid table: CSV by its name, else COMP_FILE."""
     with tempfile.TemporaryDirectory(prefix="canductor-") as folder:
         path = Path(folder) / "table"
         path.write_bytes(content)

@@ -1,11 +1,11 @@
-"""What may be on a line, once its bytes are read."""
+"""Tokens of the received data."""
 
 from dataclasses import dataclass
 from enum import Enum, auto
 
 
 class Kind(Enum):
-    """What a token is."""
+    """Kinds of tokens."""
 
     BLOCK = auto()
     HEADER = auto()
@@ -21,24 +21,24 @@ class Kind(Enum):
     GO_ON = auto()
     """DC1 by itself."""
     DAMAGED = auto()
-    """A block it was, but not as it was sent."""
+    """A damaged block."""
     OVERRUN = auto()
-    """The other side went on without an answer to a damaged block: it took noise for one."""
+    """The other side continued without an answer to a damaged block: it took noise for the answer."""
     CONFLICT = auto()
     """NAK and another answer to one block: one of them is noise."""
     NOISE = auto()
-    """What means nothing; CONTENT is an ACK if one was in it."""
+    """Noise; CONTENT is an ACK if the noise contained one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """What was on the line, and when its last character was."""
+    """A token and the time of its last character."""
 
     kind: Kind
     at_s: float
     content: bytes = b""
     """Of a block or header: what is between its first character and ETB."""
     check: int = 0
-    """The block check that came."""
+    """The received block check."""
     reason: str = ""
-    """Of what is damaged: why, to complete 'the block ...'."""
+    """Of a damaged block: the reason, which completes 'the block ...'."""

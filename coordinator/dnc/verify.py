@@ -1,7 +1,7 @@
-"""Files that come twice: kept only if both times are the same, whatever the block check let pass.
+"""Files that are transferred twice and stored only if both copies are identical.
 
-The block check of this protocol is one character, and its blocks have no numbers: some damage nobody can
-see, however careful. To see the file twice closes that: the same damage would have to come at the same place.
+The block check of this protocol is one character, and its blocks have no numbers, so some damage cannot be
+detected in one transfer. In two transfers the same damage would have to occur at the same place.
 """
 
 from typing import IO
@@ -14,7 +14,7 @@ _TEXT = "NOT THE SAME"
 
 
 class FirstPass:
-    """Where FILE goes the first time: complete it is not shown yet. A ``Sink``."""
+    """Writes FILE the first time; it gets its name only after the second time. A ``Sink``."""
 
     is_live = False
     ready = True
@@ -24,7 +24,7 @@ class FirstPass:
         self.name = file.name
         self.size_bytes = 0
         self.came = False
-        """Whether all of it came."""
+        """Whether all of it was received."""
 
     def write(self, line: bytes) -> None:
         """See Sink."""
@@ -42,9 +42,9 @@ class FirstPass:
 
 
 class Compare:
-    """Lines that come, which must be those of CONTENT, a file called NAME, from whose end on nothing is left.
+    """Compares received lines with those of CONTENT, a file called NAME.
 
-    A ``Sink``; KEEPS is what shows the file when all is the same, DIFFERS says what to do when it is not.
+    A ``Sink``. KEEPS is stored if all lines are identical; DIFFERS is the advice if they are not.
     """
 
     is_live = False
@@ -84,11 +84,13 @@ class Compare:
             self._keeps.drop(why)
 
     def _refuse(self, line: int) -> None:
-        raise FileRefused(f"line {line} of {self.name} is not the same twice: {self._differs}", _TEXT)
+        raise FileRefused(
+            f"line {line} of {self.name} differs between the two transfers: {self._differs}", _TEXT
+        )
 
 
-class Twice:
-    """Takes each file of FOLDER twice; one at a time: another name makes the one before forgotten."""
+class TwoPassFolder:
+    """Receives each file of FOLDER twice, one file at a time: another name discards the file before."""
 
     def __init__(self, folder: Folder, line_max: int) -> None:
         self._folder = folder
@@ -96,14 +98,14 @@ class Twice:
         self._first: FirstPass | None = None
 
     def take(self, header: Header) -> Sink:
-        """Return where the file of HEADER goes; raises FileRefused."""
+        """Return the sink for the file of HEADER; raises FileRefused."""
         first, self._first = self._first, None
         if first is not None and first.came and first.name == stored_name(header.code, header.name):
             return Compare(
                 first.name,
                 first.file.content(),
                 self._line_max,
-                "one of them came damaged; nothing is kept, send it twice again",
+                "one was damaged; both were discarded; send the file twice again",
                 keeps=first.file,
             )
         if first is not None:
@@ -113,12 +115,12 @@ class Twice:
 
     @property
     def waits_for(self) -> str | None:
-        """Return the name of the file that came once."""
+        """Return the name of the file that was received once."""
         first = self._first
         return first.name if first is not None and first.came else None
 
     def close(self) -> None:
-        """Forget what came once."""
+        """Discard a file that was received once."""
         if self._first is not None:
             self._first.file.drop()
             self._first = None

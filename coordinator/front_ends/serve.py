@@ -3,7 +3,7 @@
 import contextlib
 import platform
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from ipaddress import ip_address
 from pathlib import Path
@@ -27,6 +27,7 @@ from coordinator.service.core.machine_service import MachineService, ServiceSett
 from coordinator.service.core.typed import Typed
 from coordinator.service.state.log_ring import Entry
 from coordinator.support.interrupts import run_to_end
+from coordinator.support.report import PlainReport, Report
 from coordinator.support.values import Value
 from coordinator.support.version import version
 from coordinator.tables.store import table_folder
@@ -75,28 +76,7 @@ class ServeOptions:
     """Whether others than this computer may read them."""
 
 
-@dataclass(frozen=True, slots=True)
-class ServeReport:
-    """How a service ended that was asked to stop."""
-
-    address: str
-    state: str
-
-    @property
-    def ok(self) -> bool:
-        """Always: failures raise."""
-        return True
-
-    def to_json(self) -> Mapping[str, object]:
-        """Return the figures by name."""
-        return {"address": self.address, "state": self.state}
-
-    def to_text(self) -> str:
-        """Return the same for a reader."""
-        return f"served at {self.address} until asked to end; the machine was in {self.state}"
-
-
-def serve_machine(options: ServeOptions) -> ServeReport:
+def serve_machine(options: ServeOptions) -> Report:
     """Serve the machine of OPTIONS.config. Raises CanductorError, KeyboardInterrupt if motion was cut off."""
     path = str(options.config)
     if options.klippy_api is None:
@@ -106,7 +86,7 @@ def serve_machine(options: ServeOptions) -> ServeReport:
 
 def serve(
     load: Callable[[], MachineDescription], options: ServeOptions, *, cache: DictionaryCache | None = None
-) -> ServeReport:
+) -> Report:
     """Serve the machine that LOAD describes; raises as ``serve_machine``."""
     raise_files_limit()
     process = _ServiceProcess(load, options, cache)
@@ -115,7 +95,9 @@ def serve(
     except KeyboardInterrupt:
         if process.cut_off:
             raise
-    return ServeReport(str(process.path), str(process.state))
+    address, state = str(process.path), process.state
+    text = f"served at {address} until it was stopped; the machine was in state {state}"
+    return PlainReport({"address": address, "state": state}, text)
 
 
 class _ServiceProcess:

@@ -1,4 +1,4 @@
-"""Who makes the faults of a scenario happen, in the world's true time."""
+"""Carries out the faults of a scenario, in the true time of the world."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -15,7 +15,7 @@ from nodes.virtual.sim_plant import SimPlant
 from nodes.virtual.world import CanController, CanPort, CanWire, Uart, UartPort
 
 FRAME_BITS: Final = 110
-"""Of a usual frame: turns a share of frames into a share of bits."""
+"""Bits of a typical frame: converts a ratio of frames to a ratio of bits."""
 BABBLE: Final = b"\xff" * 8
 
 
@@ -25,7 +25,7 @@ def bit_errors(share: float) -> float:
 
 
 class SimActor:
-    """Acts on the parts of WORLD; NAME is the scenario's, for messages. The mappings may still grow."""
+    """Changes the parts of WORLD; NAME is the scenario's, for messages. The mappings may still grow."""
 
     def __init__(
         self,
@@ -60,17 +60,17 @@ class SimActor:
         return self._world.now_ns
 
     def call(self, at_ns: int, what: Callable[[], object]) -> None:
-        """Call WHAT at AT_NS, and let the host go on."""
+        """Call WHAT at AT_NS, and continue the host after it."""
         self._world.at(at_ns, what, wakes=True)
 
     def act(self, fault: ScenarioFault) -> None:
-        """Plan FAULT: its begin, and its end."""
+        """Schedule the start and the end of FAULT."""
         act = self._acts[fault.kind]
         if fault.node and not (fault.node == HOST and fault.kind == "stall"):
-            self._board(fault)  # is told now, not in the middle
+            self._board(fault)  # an unknown node is reported now, not during the run
         if fault.bus and fault.bus not in self._wires:
             raise ScenarioError(
-                f"{self._name}: a fault names the bus '{fault.bus}', which the machine has not"
+                f"{self._name}: a fault names the bus '{fault.bus}', which the machine does not have"
             )
         self._world.at(fault.begin_ns, partial(act, fault, True))
         self._world.at(fault.end_ns, partial(act, fault, False))

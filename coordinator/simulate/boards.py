@@ -1,4 +1,4 @@
-"""The boards of a scenario: simulated nodes as its settings and the seed make them, and what they did."""
+"""The boards of a scenario: simulated nodes by its settings and the seed, and what their pins did."""
 
 import json
 import zlib
@@ -34,11 +34,11 @@ EXTENSIONS: Final = frozenset(
         *("config_table_register", "table_register_poll", "table_register_write"),
     )
 )
-"""What the dictionary of firmware without this project's extensions does not have."""
+"""Missing in the dictionary of firmware without this project's extensions."""
 
 
 class Board:
-    """One simulated board: NAME as SETTING and DICE make it, at WIRE of WORLD."""
+    """The simulated board NAME at WIRE of WORLD, with the values of SETTING drawn by DICE."""
 
     def __init__(
         self,
@@ -87,13 +87,13 @@ class Board:
         return Latency(busy_s + 5e-6, self._latency_s / 3, busy_s + max(self._latency_s, 5e-6))
 
     def stall(self, duration_s: float) -> None:
-        """Let it not come to its tasks for DURATION_S; its timers and interrupts go on."""
+        """Delay its tasks by DURATION_S; its timers and interrupts continue."""
         self.node.set_pace(task=self._task(duration_s))
         end_ns = self._world.now_ns + round(duration_s * 1e9)
         self._world.at(end_ns, lambda: self.node.set_pace(task=self._task(0.0)))
 
     def truth(self) -> BoardTruth:
-        """Return what its pins did."""
+        """Return the changes of its pins."""
         edges = self.node.edges()
         return BoardTruth(
             at_ns=edges["true_ps"] // PS_PER_NS,

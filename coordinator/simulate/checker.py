@@ -1,4 +1,4 @@
-"""The checker: what the nodes' pins did in truth, against the plan; independent of the code under test.
+"""The checker compares the changes of the nodes' pins with the plan, independently of the code under test.
 
 Expected steps come from numpy over the planner's trapezoids (`coordinator.verification.expected`),
 executed ones from the pins of the simulated boards with the simulation's true time. Neither the step
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from coordinator.verification.expected import ExpectedSteps, Floats, Ints
 
 STEP_BAND_S: Final = 12.5e-6
-"""How far step generation may put a step from its planned time."""
+"""Maximum deviation of a step from its planned time by step generation."""
 ROUNDING_TICKS: Final = 2
-"""What whole ticks take of a step's time: one for the interval, one for the pin's own clock."""
+"""Rounding of a step's time: one tick for the interval, one for the clock of the pin."""
 
 PrintTime = Callable[[Ints], Floats]
 """From true time in ns to print time in s."""
@@ -27,12 +27,12 @@ PrintTime = Callable[[Ints], Floats]
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """Something that must not be."""
+    """A rule that was violated."""
 
     rule: str
     """In one word, for statistics."""
     text: str
-    """What, where and by how much."""
+    """What was violated, where, and by how much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,16 +45,16 @@ class ExecutedSteps:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepperTruth:
-    """One stepper, as planned and as it was."""
+    """The planned and the executed steps of one stepper."""
 
     stepper: str
     node: str
     planned: ExpectedSteps
     executed: ExecutedSteps
     allowed_s: float
-    """How far a step may be from its planned time."""
+    """Maximum deviation of a step from its planned time."""
     counted: int | None = None
-    """Steps by the node's own counter, where it could be asked."""
+    """Steps by the node's own counter, if it could be queried."""
     reachable: bool = True
     """Whether a stop could reach its node when it was declared."""
 
@@ -75,30 +75,30 @@ class Ending:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputTruth:
-    """One output that is no stepper's, and what its pin did."""
+    """An output of no stepper, and the changes of its pin."""
 
     name: str
     node: str
     at_ns: Ints
     """True times of its changes."""
     level: NDArray[np.uint8]
-    """To what it changed."""
+    """The new levels."""
     stopped: int
     """The level that it has to have after a stop."""
     reachable: bool
     """Whether a stop could reach its node when it was declared."""
     cold_ns: Sequence[tuple[int, int]] = ()
-    """From when to when it must not be on."""
+    """Intervals within which it must be off."""
 
     def level_at(self, at_ns: int) -> int:
-        """Return the level behind all that happened up to AT_NS."""
+        """Return the level at AT_NS."""
         before = int(np.searchsorted(self.at_ns, at_ns, side="right"))
         return int(self.level[before - 1]) if before else 0
 
 
 @dataclass(frozen=True, slots=True)
 class QueueDepth:
-    """The deepest a queue ever was."""
+    """The maximum depth of a queue."""
 
     name: str
     deepest: int
@@ -115,7 +115,7 @@ def concatenate(chunks: Sequence[ExpectedSteps]) -> ExpectedSteps:
 
 
 def check_stepper(truth: StepperTruth, print_time: PrintTime, ending: Ending) -> list[Violation]:
-    """Return what is wrong with one stepper's steps; nothing when all is right."""
+    """Return the violations of one stepper."""
     found: list[Violation] = []
     where = f"{truth.stepper} on node {truth.node}"
 
@@ -190,7 +190,7 @@ def _check_counter(truth: StepperTruth, ending: Ending, wrong: Wrong) -> None:
 
 
 def check_output(truth: OutputTruth, ending: Ending) -> list[Violation]:
-    """Return what is wrong with one output; nothing when all is right."""
+    """Return the violations of one output."""
     found = []
     where = f"{truth.name} on node {truth.node}"
     for begin_ns, end_ns in truth.cold_ns:
@@ -215,7 +215,7 @@ def check_output(truth: OutputTruth, ending: Ending) -> list[Violation]:
 
 
 def check_queues(depths: Sequence[QueueDepth]) -> list[Violation]:
-    """Return which queues were deeper than they may be."""
+    """Return the queues that exceeded their bounds."""
     return [
         Violation("queue", f"{q.name} held {q.deepest}, its bound is {q.bound}")
         for q in depths
@@ -227,7 +227,7 @@ MAX_CAUSE_CHARS: Final = 500
 
 
 def check_ending(expect: str, causes: Sequence[str], ending: Ending) -> list[Violation]:
-    """Return what is wrong with how the run ended: every stop has a cause, and one that is to be expected."""
+    """Return the violations of the end of the run: every stop must have an expected cause."""
     cause = ending.cause
     if cause is None:
         return [Violation("ending", "the job completed, but it had to stop")] if expect == "stops" else []
@@ -243,7 +243,7 @@ def check_ending(expect: str, causes: Sequence[str], ending: Ending) -> list[Vio
 
 
 def worst_error_s(truth: StepperTruth, print_time: PrintTime) -> float:
-    """Return how far the worst step was from its planned time."""
+    """Return the maximum deviation of a step from its planned time."""
     at_s = print_time(truth.executed.at_ns)
     count = min(len(at_s), len(truth.planned.print_time))
     return float(np.abs(at_s[:count] - truth.planned.print_time[:count]).max()) if count else 0.0

@@ -1,4 +1,4 @@
-"""When what goes wrong: the faults of a scenario, drawn from the seed, in true time."""
+"""The faults of a scenario, drawn from the seed, in true time."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -9,14 +9,14 @@ from coordinator.support.toml_values import Dice
 
 NS: Final = 1_000_000_000
 SILENCE_S: Final = 1.5
-"""A stop whose only cause can be a bad wire comes so long after the last that was sound, at most."""
+"""Maximum time from the last good frame to a stop that only a bad wire can have caused."""
 ISOLATING: Final = ("cut", "power", "stall", "babble", "errors", "loss")
-"""What may keep a stop from reaching a node."""
+"""Faults that may keep a stop from reaching a node."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScenarioFault:
-    """One thing that goes wrong once, from BEGIN_NS to END_NS of true time."""
+    """One fault, from BEGIN_NS to END_NS of true time."""
 
     kind: str
     node: str
@@ -28,20 +28,20 @@ class ScenarioFault:
 
 
 class Actor(Protocol):
-    """Who makes them happen."""
+    """Carries out faults."""
 
     def act(self, fault: ScenarioFault) -> None:
-        """Plan FAULT, which lies ahead."""
+        """Schedule FAULT, which lies in the future."""
 
     def call(self, at_ns: int, what: Callable[[], object]) -> None:
-        """Call WHAT on the loop at a true time that lies ahead."""
+        """Call WHAT on the loop at a true time in the future."""
 
     def now_ns(self) -> int:
         """Return true time."""
 
 
 class Faults:
-    """The faults of SCENARIO as DICE decide; ACTOR makes them happen. BUS_OF: each node's wire."""
+    """The faults of SCENARIO, drawn with DICE and carried out by ACTOR. BUS_OF: each node's wire."""
 
     def __init__(self, scenario: Scenario, dice: Dice, actor: Actor, bus_of: Mapping[str, str]) -> None:
         self._scenario = scenario
@@ -52,11 +52,11 @@ class Faults:
 
     @property
     def begun(self) -> tuple[ScenarioFault, ...]:
-        """All that are planned so far."""
+        """All faults that are scheduled so far."""
         return tuple(self._begun)
 
     def begin(self, since: str, interrupt: Callable[[], object]) -> None:
-        """Plan all that count from SINCE, which is now; INTERRUPT is called for Ctrl-C."""
+        """Schedule the faults relative to SINCE, which is now; INTERRUPT is called for Ctrl-C."""
         now_ns = self._actor.now_ns()
         for number, setting in enumerate(self._scenario.faults):
             if setting.since == since:
@@ -84,11 +84,11 @@ class Faults:
     # ------------------------------------------------------------------------------------------ afterwards
 
     def happened(self) -> int:
-        """Return how many have begun."""
+        """Return how many faults have begun."""
         return sum(fault.begin_ns <= self._actor.now_ns() for fault in self._begun)
 
     def sound_until_ns(self, job_ns: int, stopped_ns: int) -> int:
-        """Return until when every step that was due must have been made, though the machine STOPPED later."""
+        """Return the time up to which every due step must have been made; STOPPED_NS: when it stopped."""
         bad_wire = any(
             bus.loss.high or bus.corruption.high or bus.errors.high for bus in self._scenario.buses.values()
         )

@@ -1,10 +1,11 @@
-"""One seed of one scenario: perform it on its stage, then let the checker judge."""
+"""One seed of one scenario: runs it on its stage, then checks the result."""
 
 import asyncio
 import contextlib
 import hashlib
 import time
 from dataclasses import dataclass, field
+from io import BytesIO
 from typing import Any, Final
 
 from coordinator.config.model import StepperDescription
@@ -26,10 +27,10 @@ from nodes.support.errors import CanductorError
 LIMIT_S: Final = 90.0
 """Simulated time after which a run hangs."""
 AFTERWARDS_S: Final = 2.0
-"""The boards run for so long after the end, so that a board that still steps is detected."""
+"""How long the boards run after the end, so that a board that still steps is detected."""
 LINK_CONTROL_BYTES: Final = 1 << 15
 LINK_MOTION_BYTES: Final = 1 << 20
-"""What may wait in a link's queues."""
+"""Bounds of the queues of a link."""
 BY_THE_USER: Final = "stopped by the user"
 
 
@@ -42,24 +43,9 @@ def play(scenario: Scenario, seed: int) -> Result:
     return _judge(stage, run, began_s)
 
 
-class Text:
-    """The g-code as a file that is read."""
-
-    def __init__(self, text: str) -> None:
-        self._data = text.encode()
-
-    def read(self, size: int, /) -> bytes:
-        """Return at most SIZE bytes."""
-        part, self._data = self._data[:size], self._data[size:]
-        return part
-
-    def close(self) -> None:
-        """Nothing to release."""
-
-
 @dataclass(slots=True)
 class _Run:
-    """The coordinator's part, and what was seen of it."""
+    """The run of the coordinator, and what was recorded of it."""
 
     stage: Stage
     record: PlanRecord = field(default_factory=lambda: PlanRecord((0.0, 0.0, 0.0, 0.0)))
@@ -75,13 +61,13 @@ class _Run:
     """Keeps the task that notes the stop alive."""
 
     def perform(self) -> None:
-        """Connect, run the job, and let the boards go on for a while afterwards."""
+        """Connect, run the job, and keep the boards running for a while afterwards."""
         with asyncio.Runner(loop_factory=self.stage.make_loop) as runner:
             runner.get_loop().set_exception_handler(self._exception)
             try:
                 self.outcome = runner.run(self._main())
             except ScenarioError:
-                raise  # a mistake in the file, not the machine's doing
+                raise  # an error in the file, not of the machine
             except CanductorError as error:
                 self.cause = str(error)
             except asyncio.CancelledError:
@@ -94,7 +80,8 @@ class _Run:
 
     async def _main(self) -> Outcome:
         self.stage.faults.begin("start", self._interrupt())
-        program = Program(Text(make_program(self.stage.scenario.program, self.stage.dice)), "job")
+        text = make_program(self.stage.scenario.program, self.stage.dice)
+        program = Program(BytesIO(text.encode()), "job")
         async with asyncio.timeout(LIMIT_S):
             return await run_job(
                 self.stage.description,
@@ -115,7 +102,7 @@ class _Run:
         self.job_ns = self.stage.now_ns()
         self.ready_s = self.stage.elapsed_s()
         for name, node in machine.nodes.items():
-            with contextlib.suppress(CanductorError):  # one that may be absent is
+            with contextlib.suppress(CanductorError):  # an optional node may be absent
                 self.links[name] = link_of(node)
         self.both_edges = {name: s.steps_on_both_edges for name, s in machine.devices.steppers.items()}
         self.stage.faults.begin("job", self._interrupt())

@@ -1,7 +1,7 @@
-"""G-code for simulations, made from a seed: little way, many changes.
+"""G-code for simulations, made from a seed: short moves with many changes.
 
-Put together from strokes as a slicer's output has them, each at a speed of its own: lines, curves of short
-segments, zigzags that turn at once, dashes at full speed, hops with retraction, pauses.
+It consists of strokes like those of a slicer, each at its own speed: lines, curves of short segments, zigzags
+with sharp turns, dashes at full speed, hops with retraction, pauses.
 """
 
 import math
@@ -14,14 +14,14 @@ from coordinator.support.toml_values import Dice
 
 ORIGIN_MM: Final = 10.0
 EXTRUSION: Final = 0.04
-"""mm of filament per mm of way."""
+"""mm of filament per mm of travel."""
 DASH_MM: Final = 14.0
 RETRACT_MM: Final = 0.6
 HOP_MM: Final = 0.3
 
 
 def make_program(program: Program, dice: Dice) -> str:
-    """Return the g-code of PROGRAM as DICE decide."""
+    """Return the g-code of PROGRAM, drawn with DICE."""
     if program.lines:
         return program.lines
     pen = _Pen(dice.stream("program"), program.size_mm, dice.draw(program.speed_mm_s, "speed"))
@@ -35,7 +35,7 @@ def make_program(program: Program, dice: Dice) -> str:
 
 
 def _with_fan(lines: Iterable[str], share: float, rng: random.Random) -> Iterator[str]:
-    """Yield LINES, behind a SHARE of them another speed of the fan."""
+    """Yield LINES; after a ratio SHARE of them the fan speed changes."""
     for line in lines:
         yield line
         if rng.random() < share:
@@ -43,7 +43,7 @@ def _with_fan(lines: Iterable[str], share: float, rng: random.Random) -> Iterato
 
 
 class _Pen:
-    """Where the tool is, and the strokes it can make."""
+    """The position of the tool, and the strokes it can make."""
 
     def __init__(self, rng: random.Random, size_mm: float, speed_mm_s: float) -> None:
         self._rng = rng

@@ -193,20 +193,3 @@ class SimulationReport:
             f"{stopped:,} stopped with a cause, {len(failed):,} failed"
         )
         return "\n".join(lines)
-
-
-@dataclass(frozen=True, slots=True)
-class ScenarioList:
-    """What --list shows."""
-
-    entries: Sequence[tuple[str, str, str]]
-    """Name, expectation, what it is about."""
-    ok: bool = True
-
-    def to_json(self) -> Mapping[str, object]:
-        """Return them by name."""
-        return {"scenarios": {n: {"expect": e, "about": a} for n, e, a in self.entries}}
-
-    def to_text(self) -> str:
-        """Return one line each."""
-        return "\n".join(f"{name:22}  {expect:9}  {about}" for name, expect, about in self.entries)

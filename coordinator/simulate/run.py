@@ -16,10 +16,10 @@ from typing import Any, Final
 from coordinator.simulate import scenario as scenarios
 from coordinator.simulate.checker import Violation
 from coordinator.simulate.play import play
-from coordinator.simulate.result import Result, ScenarioList, SimulationReport
+from coordinator.simulate.result import Result, SimulationReport
 from coordinator.simulate.scenario import Scenario
 from coordinator.support.progress import Progress, ProgressDisplay
-from coordinator.support.report import Report
+from coordinator.support.report import PlainReport, Report
 from coordinator.support.toml_values import ScenarioError
 from nodes.support.errors import CanductorError
 
@@ -54,7 +54,9 @@ def run_simulation(options: SimulateOptions) -> Report:
     """Do what OPTIONS ask for; raises CanductorError for a scenario that cannot be read."""
     chosen = [scenarios.find(name) for name in options.scenarios or scenarios.names()]
     if options.list:
-        return ScenarioList([(s.name, s.expect, s.about) for s in chosen])
+        listed = {s.name: {"expect": s.expect, "about": s.about} for s in chosen}
+        text = "\n".join(f"{s.name:22}  {s.expect:9}  {s.about}" for s in chosen)
+        return PlainReport({"scenarios": listed}, text)
     tasks = list(plan(chosen, options))
     began_s = time.monotonic()
     results: list[Result] = []

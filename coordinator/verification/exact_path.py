@@ -2,7 +2,7 @@
 
 ``StepperPath`` is a stepper's place u (steps) as a function of print time, from trapezoids, shapers,
 pressure advance and the inverse formulas of the kinematics. ``solve`` finds when u crosses the boundary of a
-step; ``turning_points`` cuts u into monotone pieces, so that ``crossings`` counts all steps there must be.
+step; ``turning_points`` cuts u into monotone pieces, so that ``places`` counts all steps there must be.
 """
 
 import math
@@ -323,13 +323,6 @@ class Leg:
         return self.spec.formula is None and not self.setting.acts_on(self.spec.weights)
 
 
-def legs_of(
-    spec: StepperSpec, epochs: Iterable[tuple[Position, NDArray[np.void]]], setting: Setting
-) -> list[Leg]:
-    """Return the legs of a program that changes nothing but where the axes are declared to stand."""
-    return [Leg(spec, start, moves, setting) for start, moves in epochs if len(moves)]
-
-
 def follow(legs: Iterable[Leg]) -> Iterator[tuple[StepperPath, Floats, Floats, Floats]]:
     """Yield the path of each leg with its ``places``."""
     at = 0.0
@@ -338,9 +331,3 @@ def follow(legs: Iterable[Leg]) -> Iterator[tuple[StepperPath, Floats, Floats, F
         t, u, place = places(path)
         yield path, t, u, place
         at = float(u[-1])
-
-
-def crossings(path: StepperPath) -> tuple[int, int]:
-    """Return how many steps the whole motion asks for, and where it ends."""
-    _, u, place = places(path)
-    return int(np.abs(np.diff(place)).sum()), resting(float(u[-1]))

@@ -10,21 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-TRAPEZOID = np.dtype(
-    [
-        ("print_time", "f8"),
-        ("accel_s", "f8"),
-        ("cruise_s", "f8"),
-        ("decel_s", "f8"),
-        ("start_v", "f8"),
-        ("cruise_v", "f8"),
-        ("accel", "f8"),
-        ("start", "f8", 4),
-        ("ratio", "f8", 4),
-    ],
-)
-"""`struct trapezoid` of coordinator/motion/trapezoid.h."""
-
 _CHUNK = 4096
 """Trapezoids looked at together: bounds the memory of long programs."""
 
@@ -109,7 +94,7 @@ def expected_steps(
     step_distance: float,
     origin: float,
 ) -> Iterator[ExpectedSteps]:
-    """Yield the steps that MOVES (dtype TRAPEZOID, in order) ask of one stepper.
+    """Yield the steps that MOVES (struct trapezoid, in order) ask of one stepper.
 
     A stepper stands at step round((position - ORIGIN) / STEP_DISTANCE), position being the weighted sum of
     the axes in mm; it steps when its position crosses the middle between two steps.

@@ -5,9 +5,8 @@ expected ones from numpy (`coordinator.verification.expected`). Steps are paired
 or reversed step shows as a difference in number, direction or time.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +18,8 @@ EDGE_TOLERANCE_S = 25e-6
 """No step may be further than this from its planned time, clock error apart."""
 
 Clocks = NDArray[np.uint64]
-
-
-class NodeTruth(Protocol):
-    """A node's true clock at any moment, from its log."""
-
-    def ticks_to_monotonic_ns(self, clock: Clocks, /) -> NDArray[np.int64]:
-        """Return the host's CLOCK_MONOTONIC at these node clocks."""
-        ...
+TrueTime = Callable[[Clocks], NDArray[np.int64]]
+"""From clocks of a node, by its log, to times of the host's CLOCK_MONOTONIC in ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +113,7 @@ def prove_stepper(
     *,
     counted: int,
     clock_map: ClockMap,
-    truth: NodeTruth,
+    truth: TrueTime,
     primary: PrimaryClock,
 ) -> StepperProof:
     """Pair EXPECTED with EXECUTED steps (clock, direction) and measure every difference.
@@ -142,7 +135,7 @@ def prove_stepper(
         wrong += int(np.count_nonzero(direction != chunk.direction[: len(clock)]))
         band = (clock.astype(np.float64) - clock_map.ticks(planned)) / clock_map.clock_freq
         worst_band = max(worst_band, float(np.abs(band).max()))
-        true = primary.print_time(truth.ticks_to_monotonic_ns(clock)) - planned
+        true = primary.print_time(truth(clock)) - planned
         worst_true = max(worst_true, float(np.abs(true).max()))
     more, total = log.rest()
     return StepperProof(
@@ -171,7 +164,7 @@ class ClockProof:
 def prove_clock(
     node: str,
     clock_map: ClockMap,
-    truth: NodeTruth,
+    truth: TrueTime,
     primary: PrimaryClock,
     span: Sequence[float],
 ) -> ClockProof:
@@ -180,6 +173,6 @@ def prove_clock(
     if not len(moments):
         return ClockProof(node, 0.0, 0.0)
     ticks = clock_map.ticks(moments)
-    true = primary.print_time(truth.ticks_to_monotonic_ns(ticks.astype(np.uint64)))
+    true = primary.print_time(truth(ticks.astype(np.uint64)))
     error = true - moments
     return ClockProof(node, float(np.sqrt(np.mean(error**2))), float(np.abs(error).max()))

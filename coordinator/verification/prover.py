@@ -61,18 +61,16 @@ class Prover:
         """Measure the clocks of the secondary nodes that step."""
         primary = self._description.nodes[0].name
         return [
-            prove_clock(name, clock_map, self._logs[name], self._primary, self._outcome.span)
+            prove_clock(
+                name, clock_map, self._logs[name].ticks_to_monotonic_ns, self._primary, self._outcome.span
+            )
             for name, clock_map in self._outcome.maps.items()
             if name != primary
         ]
 
     def stray_edges(self) -> int:
         """Count level changes of pins that nothing of the configuration is on."""
-        return sum(self._stray(node.name, log) for node, log in self._with_logs())
-
-    def _with_logs(self) -> Iterator[tuple[Any, NodeLog]]:
-        for node in self._description.nodes:
-            yield node, self._logs[node.name]
+        return sum(self._stray(node, log) for node, log in self._logs.items())
 
     def _stray(self, node: str, log: NodeLog) -> int:
         owned = [self._pins[name] for name in self._claimed[node]]
@@ -88,7 +86,7 @@ class Prover:
             self._executed(stepper, log),
             counted=self._outcome.positions[stepper.name],
             clock_map=self._outcome.maps[stepper.node],
-            truth=log,
+            truth=log.ticks_to_monotonic_ns,
             primary=self._primary,
         )
 

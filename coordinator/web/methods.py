@@ -11,12 +11,10 @@ from coordinator.web.server import WebServer
 def add_page_methods(registry: Registry, page: "WebServer") -> None:
     """Add the methods of PAGE to REGISTRY."""
 
-    def link(caller: Caller, params: dict[str, Any]) -> Value:
-        del caller
+    def link(_caller: Caller, params: dict[str, Any]) -> Value:
         return {"url": page.new_link(Scope[params["scope"].upper()]), "expires_s": LINK_S}
 
-    async def sign_out(caller: Caller, params: dict[str, Any]) -> Value:
-        del caller, params
+    async def sign_out(_caller: Caller, _params: dict[str, Any]) -> Value:
         return {"sessions": await page.sign_all_out()}
 
     scopes = (Scope.WATCH.word, Scope.OPERATE.word)

@@ -216,7 +216,7 @@ async def _bench(process: subprocess.Popen[str], folder: Path) -> AsyncIterator[
     assert process.stdout is not None
     port = int(await asyncio.to_thread(process.stdout.readline) or "0")
     assert port, (folder / "errors").read_text()
-    async with Client.connect(f"tcp://127.0.0.1:{port}", token=ADMIN_TOKEN) as client:
+    async with Client(f"tcp://127.0.0.1:{port}", token=ADMIN_TOKEN) as client:
         yield Bench(process, folder, port, client)
 
 

@@ -350,7 +350,7 @@ async def pester(site: Site, seed: int, ended: asyncio.Event, *, at_once: int = 
 async def main() -> None:
     """Visit until standard input ends, and print what became of it."""
     path, port, token, seed = sys.argv[1:]
-    async with Client.connect(path) as client:
+    async with Client(path) as client:
         methods = (await client.call("api.methods"))["methods"]
     ended = asyncio.Event()
     asyncio.get_running_loop().add_reader(sys.stdin, ended.set)

@@ -2,6 +2,7 @@
 
 import asyncio
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,6 @@ from coordinator.runtime.machine import Machine, link_of
 from coordinator.service.core.job_runner import run_job
 from coordinator.service.jobs.outcome import Outcome
 from coordinator.simulate import scenario as scenarios
-from coordinator.simulate.play import Text
 from coordinator.simulate.stage import Stage
 from nodes.link import IOStats, LinkError
 from nodes.support.errors import CanductorError
@@ -55,7 +55,7 @@ class Loaded:
             return runner.run(self._main())
 
     async def _main(self) -> Outcome:
-        program = Program(Text(zigzag(self.speed_mm_s, self.segment_mm, self.count)), "load")
+        program = Program(BytesIO(zigzag(self.speed_mm_s, self.segment_mm, self.count).encode()), "load")
         return await run_job(
             self.stage.description,
             program,

@@ -58,11 +58,11 @@ def test_the_proof_holds_with_wrong_clocks_a_rollover_and_lost_frames(loss: floa
     worst_s = max(stepper.worst_error_s for stepper in report.steppers)
     assert worst_s <= EDGE_TOLERANCE_S + max(clock.worst_s for clock in report.clocks) + 1e-6
     assert {clock.node for clock in report.clocks} == {"toolhead", "zboard"}
-    assert all(node.min_lead_s is not None and node.min_lead_s > 0 for node in report.nodes)
+    assert all((node.link.min_lead_s or 0) > 0 for node in report.outcome.nodes)
     assert {place.axis for place in report.places} == set("xyz")
     assert max(abs(place.error_mm) for place in report.places) < 0.0125
     assert (report.frames_lost > 0) == (loss > 0)
-    assert (sum(node.retransmitted_bytes for node in report.nodes) > 100) == (loss > 0)
+    assert (sum(node.link.bytes_repeated for node in report.outcome.nodes) > 100) == (loss > 0)
     assert "PROVED" in report.to_text()
 
 

@@ -116,14 +116,14 @@ def test_whatever_came_is_carried_out_when_no_more_comes(tmp_path: Path, paused:
         if leaves:
             job.over.cancel()
         else:
-            await job.feed(failure="nothing came after line 93 in time")
+            await job.feed(failure="nothing was received after line 93 in time")
         if paused:
             await asyncio.sleep(10)
             assert stage.job_state == "paused"
             assert any("no more" in line or "line 93" in line for line in stage.lines)
             await stage.call("job.resume")
         await stage.until_job("failed")
-        why = "the client 'a test' left" if leaves else "nothing came after line 93 in time"
+        why = "the client 'a test' left" if leaves else "nothing was received after line 93 in time"
         told = await stage.call("job.status")
         assert told["message"] == f"JOB: {why}; all that came, to line 93, is carried out"
         ends_at(stage, lines[-1])

@@ -72,7 +72,7 @@ async def come_and_go(address: str, seed: int, stop: asyncio.Event) -> int:
     chance, visits = random.Random(seed), 0
     while not stop.is_set():
         with suppress(TimeoutError):
-            async with Client.connect(address) as client:
+            async with Client(address) as client:
                 await client.call("machine.state")
                 if chance.random() < 0.5:
                     async with asyncio.timeout(chance.uniform(0.0, 1.0)):
@@ -116,7 +116,7 @@ async def soak(pid: int, folder: Path, minutes: float) -> tuple[list[Footprint],
     async with asyncio.timeout(START_S):
         while not (folder / "soak.sock").exists():  # noqa: ASYNC110 - another process makes it
             await asyncio.sleep(LOOK_S)
-    async with Client.connect(address) as client:
+    async with Client(address) as client:
         async with asyncio.timeout(START_S):
             async for update in client.watch(["machine.state"], rate_hz=10):
                 if update.values.get("machine.state") == "ready":

@@ -5,8 +5,7 @@ from typing import Any, Final
 
 import shtab
 
-from coordinator.cli.commands.remote import Answer
-from coordinator.support.report import Report
+from coordinator.support.report import PlainReport, Report
 from nodes.support.option_values import add_command
 
 SHELLS: Final = ("bash", "zsh", "fish")
@@ -23,4 +22,4 @@ def _declare(command: argparse.ArgumentParser) -> None:
 
 def _run(given: argparse.Namespace) -> Report:
     script = shtab.complete(given.parser, given.shell)
-    return Answer(script, script.rstrip())
+    return PlainReport({"result": script}, script.rstrip())

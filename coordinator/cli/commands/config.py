@@ -11,7 +11,7 @@ from coordinator.assembly.consequences import meaning
 from coordinator.assembly.load import load_machine
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import Unsupported
-from coordinator.support.report import Report
+from coordinator.support.report import PlainReport, Report
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import add_command, add_group, existing_file
 
@@ -105,27 +105,7 @@ def check(path: str) -> CheckReport:
     return CheckReport(path, problems, described.notes, described.unsupported)
 
 
-@dataclass(frozen=True, slots=True)
-class Reference:
-    """Tables of sections and their options."""
-
-    sections: Sequence[str]
-
-    @property
-    def ok(self) -> bool:
-        """It always is."""
-        return True
-
-    def to_json(self) -> Mapping[str, Any]:
-        """Return it for --json."""
-        return {"sections": {title: tables.section_json(title) for title in self.sections}}
-
-    def to_text(self) -> str:
-        """Return Markdown."""
-        return "\n".join(map(tables.section_table, self.sections)).rstrip()
-
-
-def reference(beginnings: Sequence[str]) -> Reference:
+def reference(beginnings: Sequence[str]) -> Report:
     """Return the tables of all sections, or of those whose name begins with one of BEGINNINGS."""
     wanted = [word.strip("[]") for word in beginnings]
     titles = [
@@ -137,4 +117,5 @@ def reference(beginnings: Sequence[str]) -> Reference:
         raise CanductorError(
             f"no section begins with {' or '.join(wanted)}; 'canductor config reference' prints all"
         )
-    return Reference(titles)
+    text = "\n".join(map(tables.section_table, titles)).rstrip()
+    return PlainReport({"sections": {title: tables.section_json(title) for title in titles}}, text)

@@ -229,7 +229,7 @@ def _machine(given: argparse.Namespace, *, prints: bool, hint: str) -> Target:
 def _receive(given: argparse.Namespace) -> Report:
     machine = _machine(given, prints=given.start, hint="give --start as well")
     job = _job(given, peripheral=given.name is None, name=given.name or "", machine=machine)
-    return work.receive(job, around=getattr(given, "surroundings", work.HERE))
+    return work.receive(job, around=getattr(given, "environment", work.THIS_COMPUTER))
 
 
 def _send(given: argparse.Namespace) -> Report:
@@ -238,15 +238,15 @@ def _send(given: argparse.Namespace) -> Report:
         raise UsageError("--verify requests the file again, which a peripheral cannot; leave it out")
     name = given.name or given.file.stem
     job = _job(given, peripheral=peripheral, name=name, code=given.code or "")
-    return work.send(job, around=getattr(given, "surroundings", work.HERE))
+    return work.send(job, around=getattr(given, "environment", work.THIS_COMPUTER))
 
 
 def _serve(given: argparse.Namespace) -> Report:
-    return work.serve(_job(given, peripheral=True), around=getattr(given, "surroundings", work.HERE))
+    return work.serve(_job(given, peripheral=True), around=getattr(given, "environment", work.THIS_COMPUTER))
 
 
 def _list(given: argparse.Namespace) -> Report:
-    return work.list_files(_job(given), around=getattr(given, "surroundings", work.HERE))
+    return work.list_files(_job(given), around=getattr(given, "environment", work.THIS_COMPUTER))
 
 
 def _drip(given: argparse.Namespace) -> Report:
@@ -269,4 +269,4 @@ def _drip(given: argparse.Namespace) -> Report:
         start=prints,
         machine=machine,
     )
-    return work.drip(job, around=getattr(given, "surroundings", work.HERE))
+    return work.drip(job, around=getattr(given, "environment", work.THIS_COMPUTER))

@@ -3,8 +3,6 @@
 import argparse
 import json
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from coordinator.cli.arguments.target import declare_target, target_of
@@ -13,6 +11,7 @@ from coordinator.ipc.client.target import Target
 from coordinator.ipc.client.upload import send_program, show_progress
 from coordinator.ipc.protocol.methods import ApiError
 from coordinator.support.interrupts import Terminated
+from coordinator.support.report import PlainReport
 from nodes.support.errors import CanductorError
 from nodes.support.option_values import UsageError, add_command, decimal, existing_file, integer
 
@@ -30,27 +29,10 @@ def add_to(commands: Any) -> None:
         add_command(commands, name, summary, declare, run)
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """The result of a method of the machine."""
-
-    result: Any
-    text: str
-    ok: bool = True
-
-    def to_json(self) -> Mapping[str, object]:
-        """Return the result."""
-        return {"result": self.result}
-
-    def to_text(self) -> str:
-        """Return it for a reader."""
-        return self.text
-
-
 # ---------------------------------------------------------------------------------------- status, send, estop
 
 
-def _status(given: argparse.Namespace) -> Answer:
+def _status(given: argparse.Namespace) -> PlainReport:
     async def body(client: Client) -> dict[str, Any]:
         info = await client.call("machine.info")
         state = await client.call("state.get", {"fields": ["job.*", "nodes.*"]})
@@ -62,7 +44,7 @@ def _status(given: argparse.Namespace) -> Answer:
     if info.get("cause"):
         lines.append(f"  because: {info['cause']}")
     lines += [f"  {path} = {_word(value)}" for path, value in sorted(result["state"].items())]
-    return Answer(result, "\n".join(lines))
+    return PlainReport({"result": result}, "\n".join(lines))
 
 
 def _declare_send(command: argparse.ArgumentParser) -> None:
@@ -74,7 +56,7 @@ def _declare_send(command: argparse.ArgumentParser) -> None:
     declare_target(command)
 
 
-def _send(given: argparse.Namespace) -> Answer:
+def _send(given: argparse.Namespace) -> PlainReport:
     name = given.name or given.file.name
     result = send_program(
         target_of(given),
@@ -84,12 +66,14 @@ def _send(given: argparse.Namespace) -> Answer:
         start=given.start,
         on_progress=None if given.json else show_progress,
     )
-    return Answer(result, f"{name} is {'being printed' if given.start else 'in the job folder'}")
+    return PlainReport(
+        {"result": result}, f"{name} is {'being printed' if given.start else 'in the job folder'}"
+    )
 
 
-def _estop(given: argparse.Namespace) -> Answer:
+def _estop(given: argparse.Namespace) -> PlainReport:
     result = target_of(given).call("machine.emergency_stop")
-    return Answer(result, "stopped: every node was ordered to shut down")
+    return PlainReport({"result": result}, "stopped: every node was ordered to shut down")
 
 
 # --------------------------------------------------------------------------------------------------- call
@@ -102,9 +86,9 @@ def _declare_call(command: argparse.ArgumentParser) -> None:
     declare_target(command)
 
 
-def _call(given: argparse.Namespace) -> Answer:
+def _call(given: argparse.Namespace) -> PlainReport:
     result = target_of(given).call(given.method, _read_params(given.params))
-    return Answer(result, json.dumps(result, indent=2, ensure_ascii=False))
+    return PlainReport({"result": result}, json.dumps(result, indent=2, ensure_ascii=False))
 
 
 def _read_params(pairs: list[str]) -> dict[str, Any]:
@@ -135,7 +119,7 @@ def _declare_watch(command: argparse.ArgumentParser) -> None:
     declare_target(command)
 
 
-def _watch(given: argparse.Namespace) -> Answer:
+def _watch(given: argparse.Namespace) -> PlainReport:
     """Show fields as they change, until the count is reached or Ctrl-C, which is no failure."""
     fields = given.fields or ["*"]
     shown = 0
@@ -160,7 +144,7 @@ def _watch(given: argparse.Namespace) -> Answer:
         raise
     except KeyboardInterrupt:
         pass
-    return Answer({"updates": shown}, "")
+    return PlainReport({"result": {"updates": shown}}, "")
 
 
 def _report_no_match(fields: list[str], *, waiting: bool) -> None:
@@ -198,17 +182,18 @@ def _declare_page(command: argparse.ArgumentParser) -> None:
     declare_target(command)
 
 
-def _page(given: argparse.Namespace) -> Answer:
+def _page(given: argparse.Namespace) -> PlainReport:
     if given.sign_out and given.watch:
         raise UsageError("--sign-out prints no link; leave out --watch")
     target = target_of(given)
     if given.sign_out:
         result = _call_page(target, "page.sign_out", {})
-        return Answer(result, f"sessions of browsers that were ended: {result['sessions']}")
+        return PlainReport({"result": result}, f"sessions of browsers that were ended: {result['sessions']}")
     result = _call_page(target, "page.link", {"scope": "watch" if given.watch else "operate"})
     minutes = result["expires_s"] / 60
-    return Answer(
-        result, f"{result['url']}\nOpen it in a browser within {minutes:.0f} minutes; it works once."
+    return PlainReport(
+        {"result": result},
+        f"{result['url']}\nOpen it in a browser within {minutes:.0f} minutes; it works once.",
     )
 
 

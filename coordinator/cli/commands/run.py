@@ -102,7 +102,7 @@ class RunReport:
             f"  {name}: moved by {steps:+,} steps, as its node counts them"
             for name, steps in outcome.positions.items()
         ]
-        lines += [_node_line(node) for node in outcome.nodes]
+        lines += [f"  {node.to_text()}" for node in outcome.nodes]
         if astray := self._astray():
             lines.append(
                 f"FAILED: {', '.join(astray)} moved by another number of steps than was sent; "
@@ -121,15 +121,6 @@ def _node_json(node: NodeOutcome) -> Mapping[str, object]:
         "motion_queue_max": link.motion_commands_max,
         "clock_error_us": round(node.clock_error_s * 1e6, 2),
     }
-
-
-def _node_line(node: NodeOutcome) -> str:
-    link = node.link
-    lead = "no motion" if link.min_lead_s is None else f"lead at least {link.min_lead_s * 1e3:.0f} ms"
-    return (
-        f"  node {node.name}: {link.bytes_sent:,} bytes sent, {link.bytes_repeated:,} of them again, {lead}, "
-        f"round trip {link.srtt_s * 1e3:.2f} ms, clock known to {node.clock_error_s * 1e6:.1f} µs"
-    )
 
 
 def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
@@ -151,7 +142,7 @@ def run_machine(options: RunOptions, host: Computer | None = None) -> RunReport:
                 description,
                 program,
                 show,
-                on_output=lambda told: _say(told.text),
+                on_output=lambda output: _say(output.text),
                 cache=DictionaryCache.of_user(),
                 tables=table_folder(machine_name(options.config)),
                 host=host,
@@ -168,7 +159,7 @@ def _announce(description: MachineDescription) -> None:
 
 @contextmanager
 def _progress(options: RunOptions, program: Program) -> Iterator[Callable[[Progress], None]]:
-    """Show how a file goes on; who types sees the replies, undisturbed."""
+    """Show the progress of a file; for typed lines, only their replies are shown."""
     if options.gcode is None:
         yield lambda _: None
         return

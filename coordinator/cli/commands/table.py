@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,11 +10,10 @@ from canbus_tools.bus.computer import ThisComputer
 from canbus_tools.tables.table_device import carry_out
 from coordinator.assembly.load import load_machine
 from coordinator.cli.arguments.target import declare_target, target_of
-from coordinator.cli.commands.remote import Answer
 from coordinator.cli.commands.table_device import declare_device, device_job
 from coordinator.ipc.client.target import Target
 from coordinator.streaming.compensation import corrected_axes, why_not_corrected
-from coordinator.support.report import Report
+from coordinator.support.report import PlainReport, Report
 from coordinator.tables.axis_table import AxisTable, TableError, figures, notes
 from coordinator.tables.files import read_table
 from coordinator.tables.plot import draw
@@ -25,37 +24,21 @@ DOWNLOAD_TIMEOUT_S: Final = 120.0
 """A long table on a busy serial line takes that long."""
 
 
-@dataclass(frozen=True, slots=True)
-class Checked:
-    """A table that is sound."""
-
-    figures: Mapping[str, float | int | str]
-    notes: tuple[str, ...]
-    output: Path | None = None
-
-    @property
-    def ok(self) -> bool:
-        """It is, or it would not be here."""
-        return True
-
-    def to_json(self) -> Mapping[str, object]:
-        """Return the figures by name."""
-        written = {} if self.output is None else {"output": str(self.output)}
-        return {**self.figures, "notes": list(self.notes), **written}
-
-    def to_text(self) -> str:
-        """Return them for a reader."""
-        f, unit = self.figures, self.figures["unit"]
-        lines = [
-            f"axis {f['axis']}: {f['points']} points from {f['first']:g} to {f['last']:g} {unit}",
-            f"  corrections from {f['least_correction']:g} to {f['greatest_correction']:g} {unit}",
-            f"  greatest slope {f['greatest_slope']:.3g}, backlash up to {f['greatest_backlash']:g} {unit}",
-            f"  between its points it may miss up to {f['between_points']:.2g} {unit}",
-            *(f"  note: {note}" for note in self.notes),
-        ]
-        if self.output is not None:
-            lines.append(f"  drawn in {self.output}")
-        return "\n".join(lines)
+def _table_report(table: AxisTable, remarks: Sequence[str], output: Path | None = None) -> PlainReport:
+    """Return a report of TABLE with REMARKS; OUTPUT: the drawing that was written."""
+    f = figures(table)
+    unit = f["unit"]
+    lines = [
+        f"axis {f['axis']}: {f['points']} points from {f['first']:g} to {f['last']:g} {unit}",
+        f"  corrections from {f['least_correction']:g} to {f['greatest_correction']:g} {unit}",
+        f"  greatest slope {f['greatest_slope']:.3g}, backlash up to {f['greatest_backlash']:g} {unit}",
+        f"  error between points up to {f['between_points']:.2g} {unit}",
+        *(f"  note: {remark}" for remark in remarks),
+    ]
+    if output is None:
+        return PlainReport({**f, "notes": list(remarks)}, "\n".join(lines))
+    written = {**f, "notes": list(remarks), "output": str(output)}
+    return PlainReport(written, "\n".join([*lines, f"  drawn in {output}"]))
 
 
 def add_to(commands: Any) -> None:
@@ -127,18 +110,18 @@ def _declare_remove(command: argparse.ArgumentParser) -> None:
     declare_device(command, sends=True, has_file=False)
 
 
-def _check(given: argparse.Namespace) -> Checked:
+def _check(given: argparse.Namespace) -> Report:
     table = _read(given)
-    return Checked(figures(table), tuple(_notes(table, given.machine)))
+    return _table_report(table, _notes(table, given.machine))
 
 
-def _plot(given: argparse.Namespace) -> Checked:
+def _plot(given: argparse.Namespace) -> Report:
     table = _read(given)
     try:
         given.output.write_text(draw(table), encoding="utf-8")
     except OSError as error:
         raise TableError(f"{given.output} cannot be written: {error.strerror or error}") from None
-    return Checked(figures(table), (), given.output)
+    return _table_report(table, (), given.output)
 
 
 def _send(given: argparse.Namespace) -> Report:
@@ -226,7 +209,7 @@ def _notes(table: AxisTable, config: Path | None) -> list[str]:
     return lines
 
 
-def _answer(result: Any, lines: list[str], downloads: Sequence[Mapping[str, Any]] = ()) -> Answer:
+def _answer(result: Any, lines: list[str], downloads: Sequence[Mapping[str, Any]] = ()) -> Report:
     """Return it as text too, and what DOWNLOADS cost; not ok when a node has a problem."""
     problems = 0
     for axis in result["axes"]:
@@ -242,7 +225,7 @@ def _answer(result: Any, lines: list[str], downloads: Sequence[Mapping[str, Any]
         lines.append(f"  to {'axle' if len(one['axles']) == 1 else 'axles'} {axles}: {one['told']}")
     if not result["axes"]:
         lines.append("no axis of this machine can have a table; add [axis_tables] to its configuration")
-    return Answer(result, "\n".join(lines), ok=not problems)
+    return PlainReport({"result": result}, "\n".join(lines), ok=not problems)
 
 
 def _side(side: dict[str, Any]) -> str:

@@ -17,7 +17,7 @@ T = TypeVar("T")
 class BlockingClient:
     """``with BlockingClient(address) as client``; its connection lives on a loop in a thread of its own.
 
-    OPTIONS are those of ``Client.connect``; any thread may call.
+    OPTIONS are those of ``Client``; any thread may call.
     """
 
     def __init__(self, address: str | None = None, **options: Any) -> None:
@@ -60,7 +60,7 @@ class BlockingClient:
             self._wait(_close(updates))
 
     async def _enter(self) -> Client:
-        return await Client.connect(self._address, **self._options).__aenter__()
+        return await Client(self._address, **self._options).__aenter__()
 
     def _wait(self, work: Coroutine[Any, Any, T]) -> T:
         future = asyncio.run_coroutine_threadsafe(work, self._loop)

@@ -9,7 +9,7 @@ from typing import Any, Final, Self
 
 from coordinator.ipc.client.connect_errors import connect_error_sentence, refusal_sentence, tls_hint
 from coordinator.ipc.client.feeds import Event, EventQueue, Update, Watch
-from coordinator.ipc.protocol.address import Address, read_address
+from coordinator.ipc.protocol.address import read_address
 from coordinator.ipc.protocol.limits import EndReason, Limits
 from coordinator.ipc.protocol.messages import LENGTH_MAX, Encoder, Encoding, WireReader
 from coordinator.ipc.protocol.methods import ApiError, Scope
@@ -44,7 +44,11 @@ class Hello:
 
 
 class Client:
-    """One machine at ADDRESS. ``async with Client.connect(…) as client``; lives on the loop that enters it.
+    """The machine at ADDRESS (see ``read_address``): ``async with Client(…) as client``.
+
+    It lives on the loop that enters it. TLS: None trusts the certificates that this computer trusts.
+    TIMEOUT_S: for connecting, and for calls while there is no connection. Raises CanductorError for an
+    invalid address; entering raises it when no machine answers there.
 
     When the connection is lost, calls under way raise ConnectionLost; watches and notifications go on as soon
     as the machine is back, watches with a snapshot; new calls wait for that, up to TIMEOUT_S.
@@ -52,16 +56,16 @@ class Client:
 
     def __init__(
         self,
-        address: Address,
+        address: str | None = None,
         *,
-        token: str | None,
-        name: str,
-        scope: Scope | None,
-        tls: ssl.SSLContext | None,
-        encoding: Encoding,
-        timeout_s: float,
+        token: str | None = None,
+        name: str = "",
+        scope: Scope | None = None,
+        tls: ssl.SSLContext | None = None,
+        encoding: Encoding = Encoding.MSGPACK,
+        timeout_s: float = 5.0,
     ) -> None:
-        self.address = address
+        self.address = read_address(address)
         self.hello: Hello | None = None
         """Of the connection that is open; None while there is none."""
         self._hello_params: dict[str, Value] = {"version": API_VERSION, "client": name}
@@ -85,33 +89,6 @@ class Client:
         self._refusal: Refused | None = None
         self._keeper: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-
-    @classmethod
-    def connect(
-        cls,
-        address: str | None = None,
-        *,
-        token: str | None = None,
-        name: str = "",
-        scope: Scope | None = None,
-        tls: ssl.SSLContext | None = None,
-        encoding: Encoding = Encoding.MSGPACK,
-        timeout_s: float = 5.0,
-    ) -> Self:
-        """Return a client of the machine at ADDRESS (see ``read_address``) to be entered.
-
-        TLS: None trusts what this computer trusts. TIMEOUT_S: for connecting, and for calls while it is not
-        connected. Raises CanductorError for what is no address; entering raises it when nobody answers there.
-        """
-        return cls(
-            read_address(address),
-            token=token,
-            name=name,
-            scope=scope,
-            tls=tls,
-            encoding=encoding,
-            timeout_s=timeout_s,
-        )
 
     async def __aenter__(self) -> Self:
         try:

@@ -26,7 +26,7 @@ class Target:
     timeout_s: float = 5.0
 
     def settings(self, name: str) -> dict[str, Any]:
-        """Return what ``Client.connect`` needs to connect as NAME; raises CanductorError."""
+        """Return the options of a ``Client`` called NAME; raises CanductorError."""
         return {"token": self.token, "tls": self._tls(), "timeout_s": self.timeout_s, "name": name}
 
     def _tls(self) -> ssl.SSLContext | None:
@@ -45,7 +45,7 @@ class Target:
         """Run BODY with a connected client, on its own loop; Ctrl-C cancels it. Raises CanductorError."""
 
         async def main() -> T:
-            async with Client.connect(self.address, **self.settings("canductor")) as client:
+            async with Client(self.address, **self.settings("canductor")) as client:
                 return await body(client)
 
         return run_to_end(main)

@@ -1,7 +1,7 @@
-"""What a machine announces of itself on the network: one DNS-SD service of type ``_canductor._tcp``.
+"""The announcement of a machine on the network: one DNS-SD service of type ``_canductor._tcp``.
 
-docs/ipc.md describes its TXT record. Everybody on the network can send anything, so reading is total: an
-announcement, or None.
+docs/ipc.md describes its TXT record. Any computer on the network can send any record, so reading never
+raises: it returns an announcement, or None.
 """
 
 import re
@@ -27,61 +27,46 @@ _WORDS: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Announcement:
-    """One machine and where it is reached."""
+    """One machine and its addresses."""
 
     name: str
     host: str
-    """The name that the computer it runs on has for itself."""
+    """Host name of the computer it runs on."""
     version: str
     state: str
     api: int
     """Version of the interface (docs/ipc.md)."""
     tls: bool
     id: str
-    """Identifies one run of a coordinator: two addresses with the same id lead to the same one."""
+    """Identifies one run of a coordinator: addresses with the same id lead to the same one."""
     port: int
     addresses: tuple[str, ...]
     """IP addresses, IPv4 first."""
     change: int = 0
-    """Rises with each change: some keep an old record for seconds, and miss a state that comes back to it."""
+    """Incremented with each change: some resolvers keep an old record for seconds."""
 
     def txt(self) -> dict[str, str]:
         """Return the TXT record."""
-        return {
-            "name": self.name,
-            "host": self.host,
-            "version": self.version,
-            "state": self.state,
-            "api": str(self.api),
-            "tls": "1" if self.tls else "0",
-            "id": self.id,
-            "change": str(self.change),
-        }
+        words = {name: getattr(self, name) for name in _WORDS}
+        return {name: str(int(word) if isinstance(word, bool) else word) for name, word in words.items()}
 
     @classmethod
     def read(
         cls, txt: Mapping[bytes, bytes | None], port: int | None, addresses: Iterable[str]
     ) -> Self | None:
         """Return what a service record and its TXT say; None when it is not a machine that can be reached."""
-        words: dict[str, str] = {}
-        for key, rule in _WORDS.items():
-            word = (txt.get(key.encode()) or b"").decode("ascii", "replace")
-            if rule.fullmatch(word) is None:
-                return None
-            words[key] = word
+        words = {key: (txt.get(key.encode()) or b"").decode("ascii", "replace") for key in _WORDS}
+        if any(rule.fullmatch(words[key]) is None for key, rule in _WORDS.items()):
+            return None
         usable = usable_addresses(addresses)
-        if words["tls"] == "0":  # no machine has such a port beyond its loopback: a token would be read there
+        if words["tls"] == "0":  # no machine serves plain TCP beyond loopback: tokens could be read
             usable = tuple(address for address in usable if ip_address(address).is_loopback)
         if port is None or not 0 < port < 65536 or not usable:
             return None
         return cls(
-            name=words["name"],
-            host=words["host"],
-            version=words["version"],
-            state=words["state"],
+            **{key: words[key] for key in ("name", "host", "version", "state", "id")},
             api=int(words["api"]),
             tls=words["tls"] == "1",
-            id=words["id"],
             change=int(words["change"]),
             port=port,
             addresses=usable,
@@ -89,13 +74,13 @@ class Announcement:
 
     @property
     def at(self) -> tuple[str, ...]:
-        """What to give to ``--at``, the best first."""
+        """Values for ``--at``, the best first."""
         scheme = "tls" if self.tls else "tcp"
         return tuple(f"{scheme}://{bracketed(address)}:{self.port}" for address in self.addresses)
 
 
 def usable_addresses(addresses: Iterable[str]) -> tuple[str, ...]:
-    """Return those that one can connect to, IPv4 first; not those that mean something on one link only."""
+    """Return the addresses that can be connected to, IPv4 first; without link-local ones."""
     usable = set()
     for text in addresses:
         try:
@@ -112,10 +97,10 @@ def usable_addresses(addresses: Iterable[str]) -> tuple[str, ...]:
 
 
 def bracketed(address: str) -> str:
-    """Return ADDRESS as it stands before a port."""
+    """Return ADDRESS in the form that is used before a port."""
     return f"[{address}]" if ":" in address else address
 
 
 def host_word(host: str) -> str:
-    """Return the name of a computer as an announcement can carry it."""
+    """Return the host name with the characters that an announcement can carry."""
     return re.sub(r"[^!-~]", "_", host)[:64] or "unknown"

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,13 +17,13 @@ from nodes.support.errors import CanductorError
 from nodes.support.host_sockets import host_sockets
 
 SOCKETS_MAX: Final = 64
-"""Sockets that are asked; whoever has more names one."""
+"""Sockets that are queried; with more of them, name one."""
 WORD_MAX: Final = 48
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """One machine; AT is what to give to ``--at``, the best first."""
+    """One machine; AT: values for ``--at``, the best first."""
 
     name: str
     state: str
@@ -36,33 +36,27 @@ class Found:
     id: str
 
     def to_json(self) -> Mapping[str, object]:
-        """Return it by name."""
-        return {
-            "name": self.name,
-            "state": self.state,
-            "host": self.host,
-            "version": self.version,
-            "api": self.api,
-            "at": list(self.at),
-            "here": self.here,
-        }
+        """Return the fields by name, without the id."""
+        values = asdict(self)
+        del values["id"]
+        return values | {"at": list(self.at)}
 
 
 @dataclass(frozen=True, slots=True)
 class Discovered:
-    """What was found, and what was left out."""
+    """The machines that were found, and what was left out."""
 
     machines: Sequence[Found]
     silent: Sequence[Path]
-    """Sockets at which nobody answered as a machine does."""
+    """Sockets at which no machine answered."""
     skipped: int
-    """Announcements that told no machine one could reach."""
+    """Announcements without a reachable machine."""
     problem: str | None
-    """Why the network could not be asked."""
+    """Why the network could not be searched."""
 
     @property
     def ok(self) -> bool:
-        """To find nothing is no failure."""
+        """Always True: finding no machine is not a failure."""
         return True
 
     def to_json(self) -> Mapping[str, object]:
@@ -78,11 +72,11 @@ class Discovered:
         """Return a table, and a line for each thing left out."""
         lines = _table(self.machines) if self.machines else ["no machine was found"]
         if self.silent:
-            lines.append(f"nobody answers at {', '.join(map(str, self.silent))}")
+            lines.append(f"no machine answers at {', '.join(map(str, self.silent))}")
         if self.skipped:
-            lines.append(f"announcements that make no sense: {self.skipped}")
+            lines.append(f"invalid announcements: {self.skipped}")
         if self.problem is not None:
-            lines.append(f"only this computer was asked: {self.problem}")
+            lines.append(f"only this computer was searched: {self.problem}")
         return "\n".join(lines)
 
 
@@ -114,7 +108,7 @@ async def find_machines(timeout_s: float, listen: OpenServices | None = None) ->
 
 
 def _add(found: list[Found], announced: Announcement, own: set[str]) -> None:
-    """Add a machine, or its addresses to the one that it is.
+    """Add a machine, or its addresses to the one that was found already.
 
     Only addresses of this computer are added to a machine of this computer: an announcement proves nothing.
     """
@@ -123,18 +117,8 @@ def _add(found: list[Found], announced: Announcement, own: set[str]) -> None:
             if machine.here and machine.id == announced.id:
                 found[place] = replace(machine, at=machine.at + announced.at)
                 return
-    found.append(
-        Found(
-            announced.name,
-            announced.state,
-            announced.host,
-            announced.version,
-            announced.api,
-            announced.at,
-            here=False,
-            id=announced.id,
-        )
-    )
+    a = announced
+    found.append(Found(a.name, a.state, a.host, a.version, a.api, a.at, here=False, id=a.id))
 
 
 async def _browse(
@@ -149,12 +133,12 @@ async def _browse(
 
 
 async def _ask(path: Path, timeout_s: float) -> Found | None:
-    """Return the machine that serves at PATH; None when there is no sense to be had from it."""
+    """Return the machine that serves at PATH; None without a valid answer."""
     with contextlib.suppress(
         CanductorError, TimeoutError, LookupError, TypeError, AttributeError, ValueError
     ):
         async with asyncio.timeout(timeout_s):
-            async with Client.connect(str(path), scope=Scope.WATCH, timeout_s=timeout_s) as client:
+            async with Client(str(path), scope=Scope.WATCH, timeout_s=timeout_s) as client:
                 info: dict[str, Any] = await client.call("machine.info")
                 api = 0 if client.hello is None else int(client.hello.version)
                 return Found(

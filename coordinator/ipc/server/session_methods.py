@@ -36,8 +36,7 @@ def add_session_methods(registry: Registry) -> None:
 # ------------------------------------------------------------------------------------------------ handlers
 
 
-def _hello(session: "Session", params: dict[str, Any], now_s: float) -> Value:
-    del now_s
+def _hello(session: "Session", params: dict[str, Any], _now_s: float) -> Value:
     if session.caller is not None:
         raise ApiError("bad_params", "api.hello was called already")
     if params["version"] != API_VERSION:
@@ -78,23 +77,19 @@ def _scope_of(session: "Session", token: str | None) -> Scope | None:
     return grant.scope
 
 
-def _methods(session: "Session", params: dict[str, Any], now_s: float) -> Value:
-    del params, now_s
+def _methods(session: "Session", _params: dict[str, Any], _now_s: float) -> Value:
     return {"version": API_VERSION, "methods": session.context.registry.schema()}
 
 
-def _ping(session: "Session", params: dict[str, Any], now_s: float) -> Value:
-    del session, params, now_s
+def _ping(_session: "Session", _params: dict[str, Any], _now_s: float) -> Value:
     return {}
 
 
-def _cancel(session: "Session", params: dict[str, Any], now_s: float) -> Value:
-    del now_s
+def _cancel(session: "Session", params: dict[str, Any], _now_s: float) -> Value:
     return {"found": session.cancel(params["id"])}
 
 
-def _get(session: "Session", params: dict[str, Any], now_s: float) -> Value:
-    del now_s
+def _get(session: "Session", params: dict[str, Any], _now_s: float) -> Value:
     publisher = session.context.publisher
     taken = publisher.state.snapshot(publisher.filter(_globs(session, params, "fields")))
     return {"sequence": taken.sequence, "values": taken.values}
@@ -113,15 +108,13 @@ def _watch(session: "Session", params: dict[str, Any], now_s: float) -> Value:
     return {"subscription": number, "sequence": taken.sequence, "values": taken.values}
 
 
-def _unwatch(session: "Session", params: dict[str, Any], now_s: float) -> Value:
-    del now_s
+def _unwatch(session: "Session", params: dict[str, Any], _now_s: float) -> Value:
     if session.subscriptions.pop(params["subscription"], None) is None:
         raise ApiError("bad_params", f"there is no subscription {params['subscription']}")
     return {}
 
 
-def _listen(session: "Session", params: dict[str, Any], now_s: float) -> Value:
-    del now_s
+def _listen(session: "Session", params: dict[str, Any], _now_s: float) -> Value:
     globs = _globs(session, params, "events")
     session.listens = session.context.publisher.filter(globs)
     return {}
@@ -142,9 +135,8 @@ def _globs(session: "Session", params: dict[str, Any], name: str) -> list[str]:
     return globs
 
 
-def _of_session(caller: Caller, params: dict[str, Any]) -> Value:
+def _of_session(_caller: Caller, _params: dict[str, Any]) -> Value:
     """Fail: sessions perform these methods themselves."""
-    del caller, params
     raise ApiError("internal", "a method of the session was called without one")
 
 

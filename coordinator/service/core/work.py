@@ -4,10 +4,11 @@ A work is stepped in the motion worker's thread, where the planner may be touche
 it and is notified of its end.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Final, Protocol
+from typing import Final
 
 from coordinator.gcode.commands import PrintControl, Vocabulary
 from coordinator.gcode.events import End, Event, Full, Idle, Progress
@@ -62,49 +63,54 @@ class Rest(Enum):
     """As soon as it is read: the next work's moves may join without a stop."""
 
 
-class Work(Protocol):
+NO_PROGRESS: Final = Progress(0, 0, None)
+
+
+@dataclass(slots=True)
+class Work(ABC):
     """One thing to do; ``step`` answers as a job's does and End when all is read."""
 
+    _job: Job | None = field(default=None, init=False)
+    """Reads the work's program, once it is begun; None also for a work without a program."""
+
     @property
+    @abstractmethod
     def name(self) -> str:
         """For messages."""
-        ...
 
     @property
+    @abstractmethod
     def rest(self) -> Rest:
         """How it ends."""
-        ...
 
+    @abstractmethod
     def begin(self, setting: Setting) -> None:
         """Get ready; before the first step."""
 
+    @abstractmethod
     def step(self) -> Event:
         """Go on; raises CanductorError when it cannot."""
-        ...
 
     def pending(self) -> Event | None:
         """Return the next event of what was done so far; raises CanductorError."""
-        ...
+        return None if self._job is None else self._job.pending()
 
     @property
     def settled(self) -> bool:
         """Whether no event and no result is pending."""
-        ...
+        return self._job is None or self._job.settled
 
     @property
     def at_line(self) -> bool:
         """Whether it stands between two lines."""
-        ...
+        return self._job is None or self._job.at_line
 
     def progress(self) -> Progress:
         """Return how far it is read."""
-        ...
+        return NO_PROGRESS
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 (most works hold nothing)
         """Release what it holds."""
-
-
-NO_PROGRESS: Final = Progress(0, 0, None)
 
 
 class _Text:
@@ -122,7 +128,7 @@ class _Text:
 
 
 @dataclass(slots=True)
-class LinesWork:
+class LinesWork(Work):
     """G-code LINES of a client, in the modes that the lines before them left."""
 
     lines: Sequence[str]
@@ -130,7 +136,6 @@ class LinesWork:
     rest: Rest = Rest.STANDSTILL
     while_printing: bool = False
     """Whether they come between two lines of a job that prints: then none of them may move."""
-    _job: Job | None = None
 
     def begin(self, setting: Setting) -> None:
         """Read the lines as a program of its own."""
@@ -139,41 +144,19 @@ class LinesWork:
         setting.planner.lines = 0
         self._job = setting.job(program, while_printing=self.while_printing)
 
-    def pending(self) -> Event | None:
-        """Return the next event of what was done so far."""
-        return None if self._job is None else self._job.pending()
-
-    @property
-    def settled(self) -> bool:
-        """Whether no event and no result is pending."""
-        return self._job is None or self._job.settled
-
-    @property
-    def at_line(self) -> bool:
-        """Whether it stands between two lines."""
-        return self._job is None or self._job.at_line
-
     def step(self) -> Event:
         """Go on."""
         assert self._job is not None
         event = self._job.step()
         return End(self._job.planner.lines, 0.0) if isinstance(event, Idle) else event
 
-    def progress(self) -> Progress:
-        """Return no progress: it is read at once."""
-        return NO_PROGRESS
-
-    def close(self) -> None:
-        """Nothing to release."""
-
 
 @dataclass(slots=True)
-class FileWork:
+class FileWork(Work):
     """A job's PROGRAM, which begins in the modes that a program begins in, and leaves them so."""
 
     program: Program
     rest: Rest = Rest.STANDSTILL
-    _job: Job | None = None
 
     @property
     def name(self) -> str:
@@ -185,20 +168,6 @@ class FileWork:
         setting.planner.reset_modes()
         setting.planner.lines = 0
         self._job = setting.job(self.program)
-
-    def pending(self) -> Event | None:
-        """Return the next event of what was done so far."""
-        return None if self._job is None else self._job.pending()
-
-    @property
-    def settled(self) -> bool:
-        """Whether no event and no result is pending."""
-        return self._job is None or self._job.settled
-
-    @property
-    def at_line(self) -> bool:
-        """Whether it stands between two lines."""
-        return self._job is None or self._job.at_line
 
     def step(self) -> Event:
         """Go on."""
@@ -218,7 +187,7 @@ class FileWork:
 
 
 @dataclass(slots=True)
-class MoveWork:
+class MoveWork(Work):
     """One straight move in the machine's frame: AXES (letter to mm), from where it is when RELATIVE."""
 
     axes: Mapping[str, float]
@@ -238,20 +207,6 @@ class MoveWork:
             axis = AXIS_LETTERS.index(letter)
             self.target[axis] = value + (self.target[axis] if self.relative else 0.0)
 
-    def pending(self) -> Event | None:
-        """Return nothing: it is one move."""
-        return None
-
-    @property
-    def settled(self) -> bool:
-        """Return True: it is one move."""
-        return True
-
-    @property
-    def at_line(self) -> bool:
-        """Return True: it is one move."""
-        return True
-
     def step(self) -> Event:
         """Plan it."""
         assert self._planner is not None
@@ -261,13 +216,6 @@ class MoveWork:
         if status is FeedStatus.LIMIT:
             raise WorkError(str(self._planner.fault))
         return End(0, 0.0)
-
-    def progress(self) -> Progress:
-        """Return nothing: it is one move."""
-        return NO_PROGRESS
-
-    def close(self) -> None:
-        """Nothing to release."""
 
 
 def commands_in(lines: Sequence[str]) -> list[str]:

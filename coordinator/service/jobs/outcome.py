@@ -22,6 +22,15 @@ class NodeOutcome:
     clock_error_s: float
     """Upper bound, as the clock estimator states it."""
 
+    def to_text(self) -> str:
+        """Return the figures as one line."""
+        link = self.link
+        lead = "no motion" if link.min_lead_s is None else f"lead at least {link.min_lead_s * 1e3:.0f} ms"
+        return (
+            f"node {self.name}: {link.bytes_sent:,} bytes sent, {link.bytes_repeated:,} of them again, "
+            f"{lead}, round trip {link.srtt_s * 1e3:.2f} ms, clock known to {self.clock_error_s * 1e6:.1f} µs"
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:

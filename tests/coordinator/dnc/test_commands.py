@@ -16,7 +16,7 @@ from serial import rfc2217
 
 from coordinator.cli.main import main
 from coordinator.cli.parser import parse_command_line
-from coordinator.dnc.commands import Surroundings
+from coordinator.dnc.commands import Environment
 from coordinator.dnc.options import DncOptions
 from coordinator.dnc.port import Port, PortError
 from tests.coordinator.dnc.virtual_cable import PROGRAM, VirtualCable
@@ -67,13 +67,13 @@ def test_a_file_server(folders: tuple[Path, Path]) -> None:
         for words, sentence in (
             (
                 ("receive", "PART", *into(theirs)),
-                f"PART.nc is in {theirs} already; choose another name, or allow --overwrite",
+                f"PART.nc exists in {theirs} already; use another name, or give --overwrite",
             ),
-            (("receive", "NONE", *into(theirs)), "NONE.nc: the peripheral says: NO SUCH FILE"),
-            (("receive", "tab.nc", *into(theirs)), "tab.nc: the peripheral says: ERROR IN FILE"),
+            (("receive", "NONE", *into(theirs)), "NONE.nc: the peripheral reports: NO SUCH FILE"),
+            (("receive", "tab.nc", *into(theirs)), "tab.nc: the peripheral reports: ERROR IN FILE"),
             (
                 ("send", str(theirs / "PART.nc"), "--name", "part.nc"),
-                "part.nc: the peripheral says: FILE EXISTS",
+                "part.nc: the peripheral reports: FILE EXISTS",
             ),
         ):
             ended = cable.run(*words, *at)
@@ -125,9 +125,9 @@ def test_a_cut_cable_leaves_nothing(folders: tuple[Path, Path]) -> None:
     with cable.started("receive", "-p", "1", *FAST, *into(theirs)) as receiver:
         sent = cable.run("send", str(ours / "part.nc"), "-p", "0", *FAST)
         assert sent.status == 1
-        assert "nothing came after line 31 in time; check the cable" in sent.sentences[-1]
+        assert "nothing was received after line 31 in time; check the cable" in sent.sentences[-1]
         sentence = receiver.end().sentences[-1]
-        assert "nothing came after line 30, the last one that came in time" in sentence
+        assert "nothing was received after line 30, the last one received in time" in sentence
     assert list(theirs.iterdir()) == []
 
 
@@ -180,7 +180,7 @@ def test_over_tcp(folders: tuple[Path, Path], scheme: str, capsys: pytest.Captur
 
 def _serve(url: str, folder: Path, say: Callable[[str], None]) -> None:
     words = ["dnc", "serve", str(folder), "-p", url, *FAST]
-    serve = parse_command_line(words, surroundings=Surroundings(say=say))
+    serve = parse_command_line(words, environment=Environment(say=say))
     with contextlib.suppress(PortError):  # the other side has gone
         serve()
 
@@ -247,12 +247,12 @@ class _SerialLine:
             "socket://127.0.0.1:1 cannot be reached: connection refused",
         ),
         (("list", "-p", "rfc2217://127.0.0.1:1"), 1, "connection refused; check host, port, and that the"),
-        (("list", "-p", "/dev/null"), 1, "/dev/null is no serial port; name a device such as /dev/ttyUSB0"),
-        (("list", "-p", "."), 1, ". is no serial port; name a device"),
+        (("list", "-p", "/dev/null"), 1, "/dev/null is not a serial port; use a device such as /dev/ttyUSB0"),
+        (("list", "-p", "."), 1, ". is not a serial port; use a device"),
         (("list", "-p", ""), 1, "there is no serial port ''; check its plug"),
         (("list", "-p", "X", "--frame", "9Z1"), 2, "--frame is '9Z1', must be like 7E1"),
         (("list", "-p", "X", "--baud", "fast"), 2, "--baud is 'fast', must be a whole number"),
-        (("list", "-p", "X", "--silence", "9"), 2, "an answer may take 8 s, must be longer"),
+        (("list", "-p", "X", "--silence", "9"), 2, "the timeout of an answer is 8 s, must be longer"),
         (("send", "none.nc", "-p", "X"), 1, "there is no file 'none.nc'"),
         (
             ("send", "tab.nc", "-p", "X"),
@@ -305,7 +305,7 @@ def test_nobody_answers(tmp_path: Path) -> None:
     ):
         ended = cable.run(*words, "-p", "0")
         assert ended.status == 1
-        assert f"nothing came after {what} in time; check the cable" in ended.sentences[-1]
+        assert f"nothing was received after {what} in time; check the cable" in ended.sentences[-1]
 
 
 def test_a_port_that_is_in_use(capsys: pytest.CaptureFixture[str]) -> None:
@@ -316,7 +316,7 @@ def test_a_port_that_is_in_use(capsys: pytest.CaptureFixture[str]) -> None:
         with contextlib.closing(Port(name, DncOptions())) as port:
             assert not port.is_paced
             assert main(["dnc", "list", "-p", name]) == 1
-        assert "is in use by another program; close that first" in capsys.readouterr().err
+        assert "is in use by another program; close that program first" in capsys.readouterr().err
     finally:
         os.close(ours)
         os.close(theirs)
@@ -333,10 +333,12 @@ def test_the_wrong_baud_rate(tmp_path: Path) -> None:
         long = "A" * 30  # a NAK comes back
         asked = cable.run("receive", long, "-p", "1", *into(tmp_path))
         assert asked.sentences == [
-            f"{long}.nc: what the other side answers cannot be read; check baud rate, parity and the cable"
+            f"{long}.nc: the answer of the other side cannot be read; check baud rate, parity and the cable"
         ]
         told = server.stop().sentences
-    assert told[1] == "what comes cannot be read; are baud rate and frame those of the control?"
+    assert (
+        told[1] == "the received data cannot be read; check that baud rate and frame are those of the control"
+    )
 
 
 def test_a_line_to_oneself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -344,4 +346,4 @@ def test_a_line_to_oneself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     (tmp_path / "ok.nc").write_bytes(b"ok\n")
     words = ["dnc", "send", str(tmp_path / "ok.nc"), "-p", "loop://", "--baud", "115200"]
     assert main(words) == 1
-    assert capsys.readouterr().err == "canductor: ok: the peripheral says: DokA\n"
+    assert capsys.readouterr().err == "canductor: ok: the peripheral reports: DokA\n"

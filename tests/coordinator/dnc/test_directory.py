@@ -52,7 +52,7 @@ def test_a_directory_after_silence(idle_s: float, paced: bool) -> None:
     peripheral = asked_for_directory(idle_s, paced=paced, answer_s=2.0)
     peripheral.wait(2.2)
     peripheral.come(bytes([EOT]))
-    assert peripheral.failure().endswith("late: whether it has the directory is not known")
+    assert peripheral.failure().endswith("late; it is unknown whether it has the directory")
 
 
 def test_a_directory_that_is_ended_or_not() -> None:
@@ -62,7 +62,7 @@ def test_a_directory_that_is_ended_or_not() -> None:
     assert peripheral.failure() == "the control ended the directory before all of it was sent"
     peripheral = asked_for_directory(10.0)
     peripheral.wait(20.0)
-    assert peripheral.failure().startswith("nothing came after the end of the directory in time")
+    assert peripheral.failure().startswith("nothing was received after the end of the directory in time")
     peripheral = asked_for_directory(10.0)
     peripheral.wait(1.1)
     peripheral.come(bytes([NAK]), 0.5)
@@ -79,4 +79,4 @@ def test_a_peripheral_without_directory() -> None:
     control.engine.ask_directory()
     control.said()
     assert control.come(write_block(SOH, b"NO DIRECTORY", dc1=True)) == bytes([ACK, EOT])
-    assert control.failure() == "the peripheral says: NO DIRECTORY"
+    assert control.failure() == "the peripheral reports: NO DIRECTORY"

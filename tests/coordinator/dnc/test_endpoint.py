@@ -106,7 +106,7 @@ def test_one_file_after_the_other(tmp_path: Path, control: Control) -> None:
     assert control.list() == {"15.h": 1, "a.nc": 1, "b.nc": 1, "c.txt": 1}
     assert control.fetch("H", "15").kept == [b"15.h"]
     missing = control.fetch("H", "16")
-    assert missing.outcome == events.Failed("the peripheral says: NO SUCH FILE")
+    assert missing.outcome == events.Failed("the peripheral reports: NO SUCH FILE")
 
 
 def test_programs_and_tables_come(tmp_path: Path, control: Control) -> None:
@@ -122,10 +122,10 @@ def test_programs_and_tables_come(tmp_path: Path, control: Control) -> None:
     assert outcomes[-1].sentence.startswith("Y.comp")
     assert sorted(control.list()) == ["PART.nc", "X.comp"]
     again = control.send("D", "PART", [b"M30"])
-    assert again.outcome == events.Failed("the peripheral says: FILE EXISTS")
+    assert again.outcome == events.Failed("the peripheral reports: FILE EXISTS")
     for name in ("../PART", "/etc/passwd", ".bashrc", "CON"):
         bad = control.send("D", name, [b"M30"])
-        assert bad.outcome == events.Failed("the peripheral says: BAD FILE NAME")
+        assert bad.outcome == events.Failed("the peripheral reports: BAD FILE NAME")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["PART.nc", "X.comp"]
 
 
@@ -163,9 +163,9 @@ def test_a_failure_tells_which_file_was_asked_for(tmp_path: Path, control: Contr
     sentences = [_sentence(failure).replace(f"{tmp_path}", "F") for failure in failures]
     assert [sentence.partition(": 1 to")[0] for sentence in sentences] == [
         "there is no file 'nosuch' in F",
-        "'../evil' is no name for a file",
-        "good.nc is in F already; choose another name, or allow --overwrite",
-        "long: line 1 is longer than 1022 characters, more than a block takes",
+        "'../evil' is not a valid file name",
+        "good.nc exists in F already; use another name, or give --overwrite",
+        "long: line 1 is longer than 1022 characters, the limit of a block",
     ]
 
 
@@ -189,8 +189,8 @@ def test_what_cannot_be_told_of_a_file_is_told_without_one(tmp_path: Path) -> No
         server.handle_timer(now_s + 8.0)
         server.look(now_s + 8.0)
     assert [_sentence(outcome) for outcome in server.outcomes[1:]] == [
-        "the control ended the transfer late: whether it has the directory is not known",
-        "the control was told of an error",
+        "the control ended the transfer late; it is unknown whether it has the directory",
+        "an error was reported to the control",
     ]
 
 

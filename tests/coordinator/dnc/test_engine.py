@@ -30,7 +30,7 @@ def test_a_repeat_is_on_nak_alone(start_s: float) -> None:
     assert bench.wait(20.0) == bytes([EOT]), (
         "a time-out repeats nothing: a repeat after a lost ACK doubles a line"
     )
-    assert "nothing came after line 1" in bench.failure()
+    assert "nothing was received after line 1" in bench.failure()
 
 
 @pytest.mark.parametrize("transmissions", [1, 3, 15])
@@ -49,7 +49,7 @@ def test_a_receiver_refuses_so_often(transmissions: int) -> None:
     for _ in range(transmissions - 1):
         assert bench.come(damaged, 1.0) == bytes([NAK])
     assert bench.come(damaged, 1.0) == bytes([EOT])
-    assert f"line 1 came damaged {transmissions} times" in bench.failure()
+    assert f"line 1 was received damaged {transmissions} times" in bench.failure()
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_the_same_line_again_after_nak_cannot_be_told_from_a_repeat() -> None:
     assert bench.come(b"noise\x17noise", 0.5) == bytes([NAK])
     bench.wait(0.1)
     assert bench.come(block(b"X1"), 0.1) == bytes([EOT])
-    assert "came once more" in bench.failure()
+    assert "was received again" in bench.failure()
 
 
 def test_equal_lines_are_two_lines() -> None:
@@ -202,7 +202,7 @@ def test_two_blocks_at_once_end_the_transfer() -> None:
     """Also for an owner that hears of it late: what it can no longer answer it is not told."""
     bench = receiving()
     assert bench.come(block(b"X1") + block(b"X2"), 0.0) == bytes([EOT])
-    assert "the two are out of step" in bench.failure()
+    assert "the two sides are out of step" in bench.failure()
 
 
 def test_an_idle_control_answers_nothing() -> None:
@@ -249,10 +249,10 @@ def test_a_peripheral_tells_an_error() -> None:
     assert error.startswith(b"\x01NO SUCH FILE\x17")
     control.wait(0.1)
     assert control.come(error) == bytes([ACK, EOT])
-    assert control.failure() == "the peripheral says: NO SUCH FILE"
+    assert control.failure() == "the peripheral reports: NO SUCH FILE"
     peripheral.wait(0.05)
     assert peripheral.come(bytes([ACK, EOT])) == b""
-    assert "told of an error" in peripheral.failure()
+    assert "an error was reported" in peripheral.failure()
     assert peripheral.engine.state is State.IDLE
 
 
@@ -314,7 +314,9 @@ def test_options_are_checked(wrong: dict[str, Any]) -> None:
 
 
 def test_patience_is_longer_than_silence() -> None:
-    with pytest.raises(CanductorError, match=r"an answer may take 0\.2 s, must be longer than the silence"):
+    with pytest.raises(
+        CanductorError, match=r"the timeout of an answer is 0\.2 s, must be longer than the silence"
+    ):
         DncOptions(answer_s=0.2)
 
 

@@ -31,7 +31,7 @@ def names(path: Path) -> list[str]:
     ],
 )  # fmt: skip
 def test_bad_names(name: str, tmp_path: Path) -> None:
-    with pytest.raises(FileRefused, match="is no name for a file"):
+    with pytest.raises(FileRefused, match="is not a valid file name"):
         check_name(name)
     folder = Folder(tmp_path)
     with pytest.raises(FileRefused):
@@ -70,7 +70,7 @@ def test_a_dropped_file_leaves_nothing(tmp_path: Path) -> None:
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
     (tmp_path / "A.nc").write_text("old")
-    with pytest.raises(FileRefused, match="already; choose another name, or allow --overwrite") as refused:
+    with pytest.raises(FileRefused, match="already; use another name, or give --overwrite") as refused:
         Folder(tmp_path).take("D", "A")
     assert refused.value.text == "FILE EXISTS"
     overwriting = Folder(tmp_path, overwrite=True).take("D", "A")
@@ -82,7 +82,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
 def test_a_file_that_came_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
     incoming = Folder(tmp_path).take("D", "A")
     (tmp_path / "A.nc").write_text("theirs")
-    with pytest.raises(FileRefused, match="meanwhile"):
+    with pytest.raises(FileRefused, match="in the meantime"):
         incoming.keep()
     assert (tmp_path / "A.nc").read_text() == "theirs"
     assert names(tmp_path) == ["A.nc"]
@@ -114,7 +114,7 @@ def test_links_are_not_followed(tmp_path: Path) -> None:
     for name in "ABD":
         with pytest.raises(FileRefused):
             folder.open("D", name)
-        with pytest.raises(FileRefused, match="is there and is not a file"):
+        with pytest.raises(FileRefused, match="exists and is not a file"):
             folder.take("D", name)
     assert folder.files() == []
     assert outside.read_text() == "secret"
@@ -157,7 +157,7 @@ def test_tables_are_checked_before_they_are_kept(tmp_path: Path) -> None:
     assert seen == [(b"bad\n", "BAD.comp"), (b"0 0 0\n", "GOOD.comp")]
     assert names(tmp_path) == ["BAD.nc", "GOOD.comp"]
     huge = folder.take("S", "HUGE")
-    with pytest.raises(FileRefused, match="gets longer than"):
+    with pytest.raises(FileRefused, match="is longer than"):
         huge.write(b"0" * CHECKED_MAX)
     huge.drop()
 
@@ -190,7 +190,7 @@ def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(CanductorError, match="cannot be opened: no such file or directory; make it"):
+    with pytest.raises(CanductorError, match="cannot be opened: no such file or directory; create it"):
         Folder(tmp_path / "none")
 
 

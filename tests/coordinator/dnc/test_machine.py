@@ -160,7 +160,10 @@ def test_drip_to_the_machine(tmp_path: Path, bad: bool) -> None:
         assert (ended.status, ended.sentences) == (1, ["JOB:4: G99 is not known"])
         assert job.lines[:4] == lines[:4]
     else:
-        assert (ended.status, ended.sentences) == (0, ["JOB: all 104 lines came; waiting for the machine"])
+        assert (ended.status, ended.sentences) == (
+            0,
+            ["JOB: all 104 lines were received; waiting for the machine"],
+        )
         assert job.lines == lines
 
 
@@ -234,7 +237,7 @@ def test_a_job_that_is_cancelled_ends_the_transfer_while_nothing_comes() -> None
 
     assert come(write_block(SOH, b"DJOBA")) == b"\x06"
     assert come(write_block(STX, b"G28\r\n")) == b"\x06"
-    assert endpoint.looks
+    assert endpoint.needs_polling
     machine.calls[0][2].set_result({"state": "cancelled", "message": ""})
     machine.answer()
     endpoint.go_on()

@@ -6,7 +6,7 @@ import pytest
 
 from coordinator.dnc.blocks import Header
 from coordinator.dnc.files import FileRefused, Folder
-from coordinator.dnc.numbers import Numbers, numbered
+from coordinator.dnc.numbers import LineNumbers, numbered
 
 DIALOG = (
     "0 BEGIN PGM 15 MM",
@@ -23,7 +23,7 @@ ISO = ("%15 G71 *", "N10 G28", "N20 G1 X1", "N30 G1 X1", "G1 X1", "G1 X1", "", "
 
 
 def look(lines: tuple[str, ...] | list[str], *, even: bool = False) -> None:
-    numbers = Numbers("PART", even=even)
+    numbers = LineNumbers("PART", even=even)
     for line in lines:
         numbers.check(line.encode())
     numbers.end()
@@ -42,10 +42,10 @@ def test_a_dialog_program_shows_every_line_that_is_doubled_or_lost() -> None:
     for at, line in enumerate(DIALOG):
         if line.startswith(" "):
             continue
-        with pytest.raises(FileRefused, match="came twice or got lost"):
+        with pytest.raises(FileRefused, match="received twice or lost"):
             look([*DIALOG[: at + 1], *DIALOG[at:]])
         if at:
-            with pytest.raises(FileRefused, match=r"came twice or got lost|no END PGM"):
+            with pytest.raises(FileRefused, match=r"received twice or lost|no END PGM"):
                 look([*DIALOG[:at], *DIALOG[at + 1 :]])
     for end in range(1, len(DIALOG)):
         with pytest.raises(FileRefused, match="PART has no END PGM: its end is missing"):
@@ -53,7 +53,7 @@ def test_a_dialog_program_shows_every_line_that_is_doubled_or_lost() -> None:
 
 
 def test_an_iso_program_shows_a_numbered_line_that_is_doubled() -> None:
-    with pytest.raises(FileRefused, match=r"line 4 of PART came twice \(N20\)"):
+    with pytest.raises(FileRefused, match=r"line 4 of PART was received twice \(N20\)"):
         look([*ISO[:3], *ISO[2:]])
     look([*ISO[:2], *ISO[3:]])  # anybody may have taken a line out
     with pytest.raises(FileRefused, match="line 4 of PART has number 50, after 30"):

@@ -6,7 +6,7 @@ import pytest
 
 from coordinator.dnc.blocks import Header
 from coordinator.dnc.files import FileRefused, Folder
-from coordinator.dnc.verify import Compare, Twice
+from coordinator.dnc.verify import Compare, TwoPassFolder
 from tests.coordinator.dnc.ordeal import judge_twice, make_case
 from tests.coordinator.dnc.virtual_cable import PROGRAM, VirtualCable
 
@@ -14,7 +14,7 @@ HEADER = Header("D", "PART", "A")
 LINES = [b"G28", b"", b"G1 X1"]
 
 
-def come(twice: Twice, lines: list[bytes], header: Header = HEADER) -> None:
+def come(twice: TwoPassFolder, lines: list[bytes], header: Header = HEADER) -> None:
     sink = twice.take(header)
     try:
         for line in lines:
@@ -30,7 +30,7 @@ def names(folder: Path) -> list[str]:
 
 
 def test_the_same_twice_is_kept(tmp_path: Path) -> None:
-    twice = Twice(Folder(tmp_path, newline=b"\r\n"), 100)
+    twice = TwoPassFolder(Folder(tmp_path, newline=b"\r\n"), 100)
     come(twice, LINES)
     assert twice.waits_for == "PART.nc"
     assert [name[:5] for name in names(tmp_path)] == [".dnc-"]
@@ -51,9 +51,11 @@ def test_the_same_twice_is_kept(tmp_path: Path) -> None:
     ],
 )
 def test_what_differs_is_not_kept(tmp_path: Path, second: list[bytes], line: int) -> None:
-    twice = Twice(Folder(tmp_path), 100)
+    twice = TwoPassFolder(Folder(tmp_path), 100)
     come(twice, LINES)
-    with pytest.raises(FileRefused, match=f"line {line} of PART.nc is not the same twice: one of them came"):
+    with pytest.raises(
+        FileRefused, match=f"line {line} of PART.nc differs between the two transfers: one was damaged"
+    ):
         come(twice, second)
     assert names(tmp_path) == []
     come(twice, LINES)
@@ -62,7 +64,7 @@ def test_what_differs_is_not_kept(tmp_path: Path, second: list[bytes], line: int
 
 
 def test_another_file_makes_the_one_before_forgotten(tmp_path: Path) -> None:
-    twice = Twice(Folder(tmp_path), 100)
+    twice = TwoPassFolder(Folder(tmp_path), 100)
     come(twice, LINES)
     come(twice, LINES, Header("D", "OTHER", "A"))
     assert twice.waits_for == "OTHER.nc"
@@ -74,7 +76,7 @@ def test_another_file_makes_the_one_before_forgotten(tmp_path: Path) -> None:
 
 
 def test_a_second_time_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
-    twice = Twice(Folder(tmp_path), 100)
+    twice = TwoPassFolder(Folder(tmp_path), 100)
     come(twice, LINES)
     sink = twice.take(HEADER)
     assert isinstance(sink, Compare)
@@ -105,9 +107,9 @@ def test_asked_for_twice(tmp_path: Path) -> None:
         words = ("receive", "PART", "-p", "1", "--verify", "--folder", str(theirs))
         bad = cable.run(*words)
         assert bad.status == 1
-        assert "line 12 of PART.nc is not the same twice: one of them came damaged" in bad.sentences[-1]
+        assert "line 12 of PART.nc differs between the two transfers: one was damaged" in bad.sentences[-1]
         assert names(theirs) == []
-        assert cable.run(*words).text == f"PART.nc: 60 lines are in {theirs}, the same twice"
+        assert cable.run(*words).text == f"PART.nc: 60 lines are in {theirs}, identical twice"
     assert (theirs / "PART.nc").read_bytes() == PROGRAM
     assert names(ours) == ["part.nc"]
 
@@ -124,8 +126,8 @@ def test_what_a_control_sends_twice(tmp_path: Path) -> None:
             assert list(there.glob("*.nc")) == []
             assert cable.run("send", str(tmp_path / name), "-p", "1").status == 0
         took = taking.end()
-    assert (took.status, took.text) == (0, f"part.nc: 60 lines are in {there}, the same twice")
-    once = "came once, {} lines; send it once more, to compare"
+    assert (took.status, took.text) == (0, f"part.nc: 60 lines are in {there}, identical twice")
+    once = "was received once, {} lines; send it again, to compare"
     assert took.sentences[1:] == [
         f"part.nc {once.format(60)}",
         f"other.nc {once.format(1)}",
@@ -151,7 +153,7 @@ def test_sent_and_fetched_back(tmp_path: Path) -> None:
         bad = cable.run(*words, "--name", "BAD")
     assert good.figures["confirmed"] is True
     assert bad.sentences[-1] == (
-        "BAD was sent, but is not confirmed: line 12 of BAD is not the same twice:"
+        "BAD was sent, but not confirmed: line 12 of BAD differs between the two transfers:"
         " delete it at the other side"
     )
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import IO, Any, Final
 
 from coordinator.cli.parser import parse_command_line
-from coordinator.dnc.commands import Surroundings
+from coordinator.dnc.commands import Environment
 from coordinator.dnc.options import DncOptions
 from coordinator.support.interrupts import Terminated
 from nodes.support.errors import CanductorError
@@ -123,8 +123,8 @@ class _Command:
         self.said: list[str] = []
         self.stopping = False
         self.stopped = False
-        around = Surroundings(self._open, lambda: cable.time.now_s, self.said.append, typed)
-        self._job = parse_command_line(["dnc", *words], surroundings=around)
+        around = Environment(self._open, lambda: cable.time.now_s, self.said.append, typed)
+        self._job = parse_command_line(["dnc", *words], environment=around)
         self._thread: Thread[Ended]
 
     def _open(self, name: str, options: DncOptions, rtscts: bool) -> _Port:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coordinator.verification.exact_path import INVERSE, Setting, StepperPath, crossings, legs_of, solve
+from coordinator.verification.exact_path import INVERSE, Leg, Setting, StepperPath, places, resting, solve
 from coordinator.verification.exact_signal import Floats, Phases, Shaped, Smoothed
 from tests.coordinator.motion.exact_cases import AWAY, LINEAR, PARAMS, SETTING, chain, spec_of, trapezoids
 from tests.coordinator.motion.exact_check import Epoch, StepperProof, check
@@ -136,14 +136,14 @@ def test_slopes_of_the_kinematics_are_their_derivatives(kind: str) -> None:
 
 def proof_of(moves: list[Move]) -> StepperProof:
     epochs: list[Epoch] = [(ORIGIN, trapezoids(moves))]
-    return StepperProof(legs_of(stepper(0, X), epochs, Setting()))
+    return StepperProof([Leg(stepper(0, X), start, moved, Setting()) for start, moved in epochs])
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_good_steps_pass(seed: int) -> None:
     _, moves, streams = executed(seed)
     for spec in MACHINES["cartesian"]:
-        proof = StepperProof(legs_of(spec, [(ORIGIN, trapezoids(moves))], Setting()))
+        proof = StepperProof([Leg(spec, ORIGIN, trapezoids(moves), Setting())])
         stream = streams[spec.name]
         verdict = check(proof, stream, NODES[spec.node].clock_freq, 12.5e-6)
         assert verdict.checked == verdict.emitted == stream.steps
@@ -158,7 +158,7 @@ def test_the_end_of_a_stretch_is_where_the_next_begins() -> None:
     later["print_time"] += 100.0
     later["start"][:, 0] += 7.0
     epochs: list[Epoch] = [(ORIGIN, trapezoids(moves)), ((7.0, 0.0, 0.0, 0.0), later)]
-    proof = StepperProof(legs_of(stepper(0, X), epochs, Setting()))
+    proof = StepperProof([Leg(stepper(0, X), start, moved, Setting()) for start, moved in epochs])
     first, second = proof_of(moves), proof_of(again)
     assert proof.wanted == pytest.approx(first.wanted + second.wanted, abs=1)
     assert proof.wanted_position == pytest.approx(first.wanted_position + second.wanted_position, abs=1)
@@ -201,7 +201,8 @@ def test_every_crossing_is_counted_and_solved(kind: str, setting: Setting) -> No
     assert path.u(np.array([0.5]))[0] == pytest.approx(0, abs=1e-9)
     t: Floats = np.linspace(0.9, end, 200_001)
     place = np.floor(path.u(t) + 0.5).astype(np.int64)
-    count, last = crossings(path)
+    _, turns, done = places(path)
+    count, last = int(np.abs(np.diff(done)).sum()), resting(float(turns[-1]))
     assert count == pytest.approx(int(np.abs(np.diff(place)).sum()), abs=4), "pairs between two samples"
     assert last == place[-1]
     at = np.flatnonzero(np.abs(np.diff(place)) == 1)

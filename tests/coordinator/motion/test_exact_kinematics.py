@@ -7,7 +7,7 @@ import pytest
 
 from coordinator.motion.specs import StepperSpec
 from coordinator.motion.steps.steps import MAX_ERROR_S, StepGenerator
-from coordinator.verification.exact_path import Setting, legs_of
+from coordinator.verification.exact_path import Leg, Setting
 from tests.coordinator.motion.exact_cases import AWAY, LINEAR, PARAMS, SETTING, chain, spec_of, trapezoids
 from tests.coordinator.motion.exact_check import StepperProof, check
 from tests.coordinator.motion.replay import Stream, replay
@@ -47,7 +47,7 @@ def test_every_step_is_where_the_exact_motion_has_it(kind: str, setting: str, se
     moves["start"] += AWAY
     spec, chosen = spec_of(kind), SETTINGS[setting]
     stream = generated(spec, moves, chosen)
-    proof = StepperProof(legs_of(spec, [(AWAY, moves)], chosen))
+    proof = StepperProof([Leg(spec, AWAY, moves, chosen)])
     verdict = check(proof, stream, node_spec().clock_freq, MAX_ERROR_S)
     assert verdict.checked == verdict.emitted
     assert verdict.outside == 0, f"at {verdict.outside_s} s"

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coordinator.verification.expected import TRAPEZOID, expected_steps
+from coordinator.verification.exact_signal import TRAPEZOID
+from coordinator.verification.expected import expected_steps
 
 
 def trapezoid(
@@ -22,7 +23,7 @@ def trapezoid(
     cruise_v = min(cruise_v, (length * accel) ** 0.5)
     accel_s = cruise_v / accel
     cruise_s = (length - cruise_v * accel_s) / cruise_v
-    row = (print_time, accel_s, cruise_s, accel_s, 0.0, cruise_v, accel, start, tuple(way / length))
+    row = (print_time, accel_s, cruise_s, accel_s, 0.0, cruise_v, accel, start, tuple(way / length), 0.0, 1)
     return np.array([row], dtype=TRAPEZOID)[0]
 
 

@@ -29,7 +29,7 @@ def test_check_tells_what_a_table_holds(comp: Path, capsys: pytest.CaptureFixtur
     status, out, _ = ended(capsys, "check", comp)
     assert (status, out.splitlines()[0]) == (0, "axis x: 2 points from 0 to 100 mm")
     assert "backlash up to 0.02 mm" in out
-    assert "between its points it may miss up to 0 mm" in out
+    assert "error between points up to 0 mm" in out
     comp.write_text("0 0 0\n100000 5 -1\n")
     status, out, _ = ended(capsys, "check", comp, "--axis", "y", "--type", "1", "--unit", "um", "--json")
     assert (status, json.loads(out)["greatest_correction"]) == (0, pytest.approx(0.005))

@@ -22,7 +22,7 @@ from tests.stages.loop_thread import in_thread
 @pytest.mark.parametrize("encoding", Encoding)
 def test_calls(tmp_path: Path, encoding: Encoding) -> None:
     async def body(served: Served) -> None:
-        async with Client.connect(served.at, name="test", scope=Scope.OPERATE, encoding=encoding) as client:
+        async with Client(served.at, name="test", scope=Scope.OPERATE, encoding=encoding) as client:
             assert client.hello is not None
             assert client.hello.scope is Scope.OPERATE
             assert (await client.call("machine.info"))["scope"] == "operate"
@@ -37,7 +37,7 @@ def test_calls(tmp_path: Path, encoding: Encoding) -> None:
 
 def test_cancelling_a_call_cancels_it_in_the_machine(tmp_path: Path) -> None:
     async def body(served: Served) -> None:
-        async with Client.connect(served.at) as client:
+        async with Client(served.at) as client:
             call = asyncio.create_task(client.call("wait"))
             await client.call("machine.info")
             call.cancel()
@@ -51,7 +51,7 @@ def test_watching(tmp_path: Path) -> None:
     async def body(served: Served) -> None:
         served.state.update("nodes.a", {"load": 1, "state": "ready"})
         served.state.set("job.progress", 0.5)
-        async with Client.connect(served.at) as client:
+        async with Client(served.at) as client:
             updates = client.watch(["nodes.*"], rate_hz=50)
             first = await anext(updates)
             assert first.snapshot
@@ -73,7 +73,7 @@ def test_watching(tmp_path: Path) -> None:
 def test_a_gap_is_noticed_and_filled_with_a_snapshot(tmp_path: Path) -> None:
     async def body(served: Served) -> None:
         served.state.set("a", 1)
-        async with Client.connect(served.at) as client:
+        async with Client(served.at) as client:
             updates = client.watch(rate_hz=50)
             await anext(updates)
             (connection,) = served.server._connections
@@ -89,7 +89,7 @@ def test_a_gap_is_noticed_and_filled_with_a_snapshot(tmp_path: Path) -> None:
 
 def test_notifications(tmp_path: Path) -> None:
     async def body(served: Served) -> None:
-        async with Client.connect(served.at) as client:
+        async with Client(served.at) as client:
             events = client.events(["log", "gcode.*"])
             taken = asyncio.ensure_future(anext(events))
             (connection,) = served.server._connections
@@ -106,7 +106,7 @@ def test_notifications(tmp_path: Path) -> None:
 def test_it_comes_back_and_goes_on_watching(tmp_path: Path) -> None:
     async def body(served: Served) -> None:
         served.state.set("a", 1)
-        async with Client.connect(served.at) as client:
+        async with Client(served.at) as client:
             updates = client.watch(rate_hz=50)
             await anext(updates)
             lost = asyncio.create_task(client.call("wait"))
@@ -131,11 +131,11 @@ def test_it_comes_back_and_goes_on_watching(tmp_path: Path) -> None:
 def test_who_is_not_there_or_refuses(tmp_path: Path) -> None:
     async def body(served: Served) -> None:
         with pytest.raises(ConnectionLost, match="does not answer"):
-            await Client.connect(str(tmp_path / "none")).__aenter__()
+            await Client(str(tmp_path / "none")).__aenter__()
         address = f"tcp://127.0.0.1:{served.server.tcp_port}"
         with pytest.raises(Refused, match="token is not known"):
-            await Client.connect(address, token="x" * 40).__aenter__()
-        async with Client.connect(address, token=TOKENS[Scope.WATCH]) as client:
+            await Client(address, token="x" * 40).__aenter__()
+        async with Client(address, token=TOKENS[Scope.WATCH]) as client:
             assert client.hello is not None
             assert client.hello.scope is Scope.WATCH
 
@@ -175,10 +175,10 @@ def test_tls(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
     async def body(served: Served) -> None:
         address = f"tls://127.0.0.1:{served.server.tcp_port}"
         trusting = ssl.create_default_context(cafile=str(pem))
-        async with Client.connect(address, token=TOKENS[Scope.OPERATE], tls=trusting) as client:
+        async with Client(address, token=TOKENS[Scope.OPERATE], tls=trusting) as client:
             assert (await client.call("machine.info"))["scope"] == "operate"
         with pytest.raises(ConnectionLost, match="cannot be trusted"):  # a server that nothing vouches for
-            await Client.connect(address, token=TOKENS[Scope.OPERATE]).__aenter__()
+            await Client(address, token=TOKENS[Scope.OPERATE]).__aenter__()
         reader, writer = await served.dial(tcp=True)  # without TLS
         writer.write(b'{"id":1,"method":"api.hello","params":{"version":1}}\n')
         assert b"result" not in await reader.read()
@@ -189,7 +189,7 @@ def test_tls(tmp_path: Path, certificate: tuple[Path, Path]) -> None:
 async def refusal(at: str, token: str | None = None, trusted: Path | None = None) -> str:
     tls = None if trusted is None else ssl.create_default_context(cafile=trusted)
     with pytest.raises(CanductorError) as failure:
-        await Client.connect(at, token=token, tls=tls).__aenter__()
+        await Client(at, token=token, tls=tls).__aenter__()
     return str(failure.value)
 
 

@@ -357,7 +357,7 @@ def test_sockets_and_announcements_in_one_table(tmp_path: Path, monkeypatch: pyt
             ["here", "ready", "box", "0.1.0", "1", str(served.path)],
             [here.at[0]],
             ["else", "startup", "here", "0.1.0", "1", other.at[0]],
-            ["nobody", "answers", "at", str(folder / "left-behind.sock")],
+            ["no", "machine", "answers", "at", str(folder / "left-behind.sock")],
         ]
 
     jump_loop.run(main())
@@ -370,7 +370,9 @@ _DISCOVER = "from coordinator.cli.main import main; main(['discover', '--timeout
 
 def test_a_computer_without_networks() -> None:
     said = on_own_networks(_DISCOVER)
-    assert "no machine was found\nonly this computer was asked: this computer has no network address" in said
+    assert (
+        "no machine was found\nonly this computer was searched: this computer has no network address" in said
+    )
 
 
 _TAKEN = """

@@ -49,7 +49,7 @@ def test_silence_before_tls_takes_no_more_places_than_there_are(
         await served.server_has(1)
         trusting = ssl.create_default_context(cafile=str(certificate[0]))
         address = f"tls://127.0.0.1:{served.server.tcp_port}"
-        async with Client.connect(address, token=TOKENS[Scope.OPERATE], tls=trusting) as client:
+        async with Client(address, token=TOKENS[Scope.OPERATE], tls=trusting) as client:
             assert (await client.call("machine.info"))["scope"] == "operate"
         ends[1].cancel()
 
