@@ -8,7 +8,8 @@ A section ``[heater_fan hotend]`` of the configuration becomes one object of a s
 3. ``connect``: its nodes are configured and their clocks known; it may talk to them, and may fail.
 4. ``ready``: everything is connected. It must not fail.
 5. ``stopped``: a node or the host stopped the machine for safety; nodes have put their outputs to defaults.
-6. ``close``: it is over, whether it was ever connected or not.
+6. ``close``: the machine is closed, whether it was ever connected or not.
+   A module that stops acting in both cases overrides ``end``, which both of them call.
 
 A restart makes new modules: all state is in the object. Everything happens on the control loop, except that
 ``GCodeCommand.read`` runs where the program is read (coordinator/gcode/commands.py).
@@ -24,11 +25,15 @@ from coordinator.config.options import BadValue, ListOption, Option, SectionRead
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
 from coordinator.gcode.commands import GCodeCommand
 from coordinator.motion.planner.planner import Planner
+from coordinator.runtime.machine import Modules
 from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest, shown
 from coordinator.support.values import Value
 from nodes.node.config import NodeConfig
 from nodes.node.node import Node
+from nodes.support.errors import CanductorError
+
+__all__ = ["Build", "Device", "Module", "Modules"]
 
 
 class Device(Protocol):
@@ -41,42 +46,11 @@ class Device(Protocol):
         """Its node is ready: at the start, and each time that it came back after it was lost."""
 
 
-class Modules(Protocol):
-    """The other modules of the machine."""
-
-    def find(self, name: str, kind: "type[M]") -> "M | None":
-        """Return the module of section NAME, or None when there is none of KIND."""
-
-    def names(self, kind: "type[Module]") -> list[str]:
-        """Return the section names of all modules of KIND, in the order of the file."""
-
-    def is_left_out(self, name: str) -> bool:
-        """Return whether NAME, a section or a heater of that name, is one that is not supported yet."""
-
-    def knows(self, command: str) -> bool:
-        """Return whether programs know COMMAND, by a module or anyway."""
-
-    @property
-    def command_help(self) -> "Mapping[str, str]":
-        """What each command of programs does, by its name: a sentence without a full stop."""
-
-    def status(self) -> "Mapping[str, Mapping[str, Value]]":
-        """Report how each module is, by its name; on the control loop."""
-
-    @property
-    def config(self) -> "Mapping[str, Mapping[str, str]]":
-        """The configuration as text: options by section."""
-
-    @property
-    def settings(self) -> "Mapping[str, Mapping[str, object]]":
-        """What was read of it: values and defaults."""
-
-
 class Module:
     """One section of the configuration."""
 
-    SPEC: ClassVar[SectionSpec]
-    """All its options; the reference page is made from it."""
+    SPEC: ClassVar[SectionSpec] = SectionSpec(help="", options=())
+    """All its options; the reference page is made from it. Modules without a section have none."""
     NAMED: ClassVar[bool] = False
     """Whether there may be several, ``[kind NAME]``; else there is one, ``[kind]``."""
     NAMELESS: ClassVar[bool] = False
@@ -88,31 +62,46 @@ class Module:
         """Read all options; no I/O. Raises ConfigError."""
         self.name = build.name
         """The section's name: ``heater_fan hotend``."""
+        self._live: ModuleContext | None = None
+        """The running machine; None before ``connect``."""
 
     def link(self, modules: Modules) -> None:
         """Find other modules; raises ConfigError."""
 
-    async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act; raises CanductorError when the hardware does not allow it."""
+    async def connect(self, live: ModuleContext) -> None:
+        """Start acting; raises CanductorError when the hardware does not allow it."""
+        self._live = live
+
+    @property
+    def live(self) -> ModuleContext:
+        """The running machine; raises CanductorError before ``connect``."""
+        if self._live is None:
+            raise CanductorError(f"[{self.name}] needs a machine that is connected")
+        return self._live
 
     def ready(self) -> None:
-        """Take note that the machine is ready."""
+        """Update its state: the machine is ready."""
 
     def job_begins(self) -> None:
-        """Take note that a service is about to print a file: what was known of the last one is void."""
+        """Forget what was known of the last job: a service is about to print a file."""
 
     def stopped(self, cause: str) -> None:
-        """Take note that the machine is stopped, and why."""
+        """Update its state: the machine was stopped because of CAUSE."""
+        self.end(cause)
 
     def close(self) -> None:
         """Release what it holds."""
+        self.end("the machine was closed")
+
+    def end(self, cause: str) -> None:
+        """Stop acting because of CAUSE; may be called more than once."""
 
     def status(self) -> Mapping[str, Value]:
-        """Report how it is: for macros and front ends; cheap, and not changed afterwards."""
+        """Return its status, for macros and front ends: quickly, and never changed afterwards."""
         return {}
 
     def stands_for(self) -> Mapping[str, set[str]]:
-        """Report which of its commands stand for lines of g-code, each with what may be commands in them."""
+        """Return the words of the g-code that its commands stand for, by command."""
         return {}
 
 

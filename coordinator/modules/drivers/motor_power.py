@@ -7,13 +7,11 @@ import asyncio
 from collections.abc import Collection, Iterable, Mapping
 from typing import Final
 
-from coordinator.config.options import SectionSpec
 from coordinator.config.pins import PinDescription
 from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.digital_out import DigitalOut
 from nodes.node.node import Node
@@ -40,8 +38,6 @@ class EnableLine(DigitalOut):
 class MotorPower(Module):
     """The enable pins of a machine's steppers."""
 
-    SPEC = SectionSpec(help="Enable pins", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "stepper_enable"
@@ -53,7 +49,6 @@ class MotorPower(Module):
                 line.steppers.append(stepper.name)
         self._lines = tuple(lines.values())
         self._motors = build.machine.motors
-        self._live: ModuleContext | None = None
         for line in self._lines:
             build.add_device(line.node, line)
         for name in ("M84", "M18"):
@@ -66,10 +61,6 @@ class MotorPower(Module):
                 "SET_STEPPER_ENABLE", "Switch the motor STEPPER on or off (ENABLE=1, 0)", self._read_one
             )
         )
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
 
     def stopped(self, cause: str) -> None:
         """Take note that the nodes have switched all off."""

@@ -4,12 +4,10 @@ import math
 from typing import Final
 
 from coordinator.config.model import StepperDescription
-from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.single import Ramp, SingleMove
 
 TIMES: Final = 10
@@ -23,19 +21,12 @@ THERE_S: Final = 0.25
 class StepperBuzz(Module):
     """The command."""
 
-    SPEC = SectionSpec(help="Motors to and fro", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._steppers = {stepper.name: stepper for stepper in build.machine.steppers}
-        self._live: ModuleContext | None = None
         build.add_command(
             GCodeCommand("STEPPER_BUZZ", "Move the motor STEPPER to and fro ten times, by 1 mm", self._read)
         )
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
 
     def _read(self, call: Call) -> Reading:
         name = call.parameters("STEPPER").get("STEPPER", "")
@@ -53,9 +44,8 @@ class StepperBuzz(Module):
         return AtStandstill(buzz, done)
 
     async def _buzz(self, stepper: "StepperDescription") -> None:
-        assert self._live is not None
         way = WAY_RAD if stepper.function.turns else WAY_MM
         speed = 2 * way / THERE_S
         ramp = Ramp(way, speed, 4 * speed / THERE_S)
         for direction in (1.0, -1.0) * TIMES:
-            await SingleMove(self._live.machine, ramp, ways={stepper.name: direction}).run()
+            await SingleMove(self.live.machine, ramp, ways={stepper.name: direction}).run()

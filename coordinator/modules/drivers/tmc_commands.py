@@ -1,9 +1,8 @@
 """What the drivers of a machine have in common: their wires, and the commands that name a stepper."""
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 from coordinator.config.errors import ConfigError
-from coordinator.config.options import SectionSpec
 from coordinator.config.pins import PinDescription
 from coordinator.drivers.tmc_chips import Field
 from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
 
 class TmcCommands(Module):
     """The commands, and the wires."""
-
-    SPEC: ClassVar = SectionSpec(help="What stepper drivers have in common", options=())
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)

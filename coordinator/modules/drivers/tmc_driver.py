@@ -68,7 +68,6 @@ class TmcDriver(StallEndstop):
         """What has to be in its registers."""
         self.run_a, self.hold_a = self.settings.run_a, self.settings.hold_a
         self._drv_status: Mapping[str, int] = {}
-        self._live: ModuleContext | None = None
         self._watch: asyncio.Task[None] | None = None
         self._is_new: asyncio.Event | None = None
         self._warned = False
@@ -89,7 +88,7 @@ class TmcDriver(StallEndstop):
 
     async def connect(self, live: "ModuleContext") -> None:
         """Set the driver; raises CanductorError when it cannot be."""
-        self._live = live
+        await super().connect(live)
         self._is_new = asyncio.Event()
         both_edges = live.machine.devices.steppers[self.stepper.name].steps_on_both_edges
         self.values = self.settings.registers(both_edges=both_edges)
@@ -99,13 +98,9 @@ class TmcDriver(StallEndstop):
             self._is_new.set()
         self._watch = asyncio.get_running_loop().create_task(self._keep_watch())
 
-    def stopped(self, cause: str) -> None:
-        """Watch no more."""
+    def end(self, cause: str) -> None:
+        """Stop watching."""
         del cause
-        self.close()
-
-    def close(self) -> None:
-        """Watch no more."""
         if self._watch is not None:
             self._watch.cancel()
 
@@ -122,9 +117,7 @@ class TmcDriver(StallEndstop):
 
     @property
     def _node(self) -> "Node":
-        if self._live is None:
-            raise CanductorError(f"[{self.name}] needs a machine that is connected")
-        return self._live.node(self.node_name)
+        return self.live.node(self.node_name)
 
     # --------------------------------------------------------------------------------------- registers
 
@@ -214,7 +207,6 @@ class TmcDriver(StallEndstop):
     # ------------------------------------------------------------------------------------------- watch
 
     async def _keep_watch(self) -> None:
-        assert self._live is not None
         assert self._is_new is not None
         silent = 0
         while True:
@@ -232,11 +224,13 @@ class TmcDriver(StallEndstop):
                     self._check(await self.read("GSTAT"), await self.read("DRV_STATUS"))
                 silent = 0
             except DriverFaultError as error:
-                self._live.stop(str(error))
+                self.live.stop(str(error))
             except CanductorError as error:
                 silent += 1
-                if silent >= SILENT_MAX and self._node.talks:  # else its node's own trouble is told elsewhere
-                    self._live.stop(str(error))
+                if (
+                    silent >= SILENT_MAX and self._node.talks
+                ):  # else its node's own trouble is reported elsewhere
+                    self.live.stop(str(error))
                 if self._is_new.is_set():
                     await asyncio.sleep(WATCH_S)
 

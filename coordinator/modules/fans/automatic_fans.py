@@ -148,7 +148,6 @@ class ControllerFan(FanModule):
         self._idle_speed = self._speed if idle is None else idle
         self._idle_s = build.get(IDLE_TIMEOUT)
         self._heaters: list[Heater] = []
-        self._live: ModuleContext | None = None
         self._worked_s: float | None = None
 
     @staticmethod
@@ -171,20 +170,16 @@ class ControllerFan(FanModule):
     async def connect(self, live: "ModuleContext") -> None:
         """Begin to look."""
         await super().connect(live)
-        self._live = live
         live.every(LOOK_S, self._look)
 
     def _look(self) -> None:
-        assert self._live is not None
-        now_s = self._live.now_s()
-        if self._moves(self._live) or any(unit.target_c > 0 for unit in self._heaters):
+        now_s = self.live.now_s()
+        on = self._power.are_on()
+        moves = any(on.get(name, self.live.machine.busy) for name in self._steppers)
+        if moves or any(unit.target_c > 0 for unit in self._heaters):
             self._worked_s = now_s
             self.unit.set_speed(self._speed)
         elif self._worked_s is not None and now_s - self._worked_s < self._idle_s:
             self.unit.set_speed(self._idle_speed)
         else:
             self.unit.set_speed(0.0)
-
-    def _moves(self, live: "ModuleContext") -> bool:
-        on = self._power.are_on()
-        return any(on.get(name, live.machine.busy) for name in self._steppers)

@@ -197,16 +197,13 @@ class FanModule(Module):
     unit: FanUnit
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
+        """Start acting."""
+        await super().connect(live)
         self.unit.connect(live)
 
-    def stopped(self, cause: str) -> None:
-        """Act no more."""
+    def end(self, cause: str) -> None:
+        """Stop acting."""
         del cause
-        self.unit.end()
-
-    def close(self) -> None:
-        """Act no more."""
         self.unit.end()
 
     def status(self) -> Mapping[str, Value]:

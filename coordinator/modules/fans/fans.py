@@ -55,8 +55,6 @@ class Fan(FanModule):
 class GenericFans(Module):
     """The fans that programs set by their names."""
 
-    SPEC: ClassVar = SectionSpec(help="What fans with a name have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.units: dict[str, FanUnit] = {}

@@ -60,8 +60,6 @@ MIRROR_C: Final = 5000.0
 class TemperatureFans(Module):
     """The fans with a target."""
 
-    SPEC: ClassVar = SectionSpec(help="What fans with a target have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.by_name: dict[str, TemperatureFan] = {}
@@ -143,15 +141,10 @@ class TemperatureFan(FanModule):
         await self.input.connect(live)
         live.every(LOOK_S, lambda: self._look(live))
 
-    def stopped(self, cause: str) -> None:
-        """Act no more."""
-        super().stopped(cause)
+    def end(self, cause: str) -> None:
+        """Stop acting."""
+        super().end(cause)
         self.input.end(cause)
-
-    def close(self) -> None:
-        """Act no more."""
-        super().close()
-        self.input.end("the machine was closed")
 
     def _measured(self, at_s: float, celsius: float) -> None:
         self._silent = False

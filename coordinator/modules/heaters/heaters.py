@@ -1,9 +1,8 @@
 """What all heaters and sensors have in common: their names, and the commands for any of them."""
 
 from collections.abc import Awaitable, Callable, Mapping
-from typing import ClassVar, Final
+from typing import Final
 
-from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading, Synchronized
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
@@ -20,8 +19,6 @@ FAN_STEPS_MAX: Final = 12
 
 class HeaterRegistry(Module):
     """The heaters and temperature sensors of the machine, and the commands for any of them."""
-
-    SPEC: ClassVar = SectionSpec(help="What all heaters have in common", options=())
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)

@@ -13,7 +13,6 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import Heater
 from coordinator.modules.heaters.heaters import HeaterRegistry
 from coordinator.modules.words import one, parameters, value
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest, shown
 from coordinator.support.values import Value
 
@@ -39,15 +38,12 @@ GAINS: Final = ("KP", "KI", "KD")
 class PidProfiles(Module):
     """The profiles of all heaters, and PID_PROFILE."""
 
-    SPEC: ClassVar = SectionSpec(help="What profiles have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "pid_profile"
         self._heaters = build.shared(HeaterRegistry)
         self._of: dict[str, dict[str, PidGains]] = {}
         self._loaded: dict[str, str] = {}
-        self._live: ModuleContext | None = None
         build.add_command(
             GCodeCommand(
                 "PID_PROFILE",
@@ -64,10 +60,6 @@ class PidProfiles(Module):
         """Return the heater that programs or sections call NAME."""
         units = self._heaters.units.values()
         return next((unit for unit in units if name in (unit.key, unit.name)), None)
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
-        self._live = live
 
     def status(self) -> Mapping[str, Value]:
         """Report which profile each heater has; those that have none are left out."""

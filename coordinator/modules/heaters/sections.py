@@ -41,13 +41,9 @@ class HeaterSection(Module):
         """Begin to act."""
         await self.unit.connect(live)
 
-    def stopped(self, cause: str) -> None:
-        """Act no more."""
+    def end(self, cause: str) -> None:
+        """Stop acting."""
         self.unit.end(cause)
-
-    def close(self) -> None:
-        """Act no more."""
-        self.unit.end("the machine was closed")
 
     def status(self) -> Mapping[str, Value]:
         """Report how the heater is."""
@@ -89,8 +85,6 @@ class HeaterGeneric(HeaterSection):
 
 class ExtruderHeaterCommands(Module):
     """The heaters of all extruders, and the commands for them."""
-
-    SPEC: ClassVar = SectionSpec(help="What the heaters of extruders have in common", options=())
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)
@@ -140,7 +134,6 @@ class ExtruderHeaterSection(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.unit: Heater | None = None
-        self._connected = False
         self.min_extrude_c = build.get(MIN_EXTRUDE_TEMP)
         if build.find(HEATER_PIN) is None:
             return
@@ -155,24 +148,20 @@ class ExtruderHeaterSection(Module):
             self.unit.link(modules)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
+        """Start acting."""
         if self.unit is not None:
             await self.unit.connect(live)
-            self._connected = True
+            await super().connect(live)
 
-    def stopped(self, cause: str) -> None:
-        """Act no more."""
+    def end(self, cause: str) -> None:
+        """Stop acting."""
         if self.unit is not None:
             self.unit.end(cause)
-
-    def close(self) -> None:
-        """Act no more."""
-        self.stopped("the machine was closed")
 
     @property
     def too_cold(self) -> bool:
         """Whether it is connected and too cold; one that is only planned with is not."""
-        return self._connected and not self.can_extrude
+        return self._live is not None and not self.can_extrude
 
     @property
     def can_extrude(self) -> bool:

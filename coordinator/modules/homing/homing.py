@@ -13,7 +13,6 @@ from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import RailDescription
-from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.reply_kinds import ReplyKind
@@ -22,7 +21,6 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.homing.homing_plan import AXES, Approach, approaches, landed, second_landed
 from coordinator.modules.homing.virtual_endstop import StallEndstop, section_of
 from coordinator.runtime.machine import Machine
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.homing import HomingMove, HomingResult
 from coordinator.runtime.moves.single import Ramp, SingleMove
 from coordinator.runtime.moves.straight import move_by
@@ -39,15 +37,12 @@ ReadHome = Callable[[Call, str], Reading]
 class Homing(Module):
     """Homes the machine that it is built for."""
 
-    SPEC = SectionSpec(help="Homing", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "query_endstops"
         self._described = build.machine
         self._last_query: dict[str, bool] = {}
         self._approaches = approaches(build.machine)
-        self._live: ModuleContext | None = None
         self._feelers: dict[str, StallEndstop] = {}
         """By virtual endstop."""
         self.instead: Callable[[Call, str], Reading] | None = None
@@ -87,10 +82,6 @@ class Homing(Module):
             found = modules.find(section_of(virtual), StallEndstop) if virtual else None
             if found is not None:
                 self._feelers[virtual] = found
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
 
     def read(self, call: Call, axes: str) -> Reading:
         """Read G28 of AXES (letters)."""
@@ -257,6 +248,4 @@ class Homing(Module):
 
     @property
     def _machine(self) -> "Machine":
-        if self._live is None:
-            raise CanductorError("homing needs a machine that is connected")
-        return self._live.machine
+        return self.live.machine

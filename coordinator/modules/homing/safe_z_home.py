@@ -11,7 +11,6 @@ from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import Homing
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.straight import move_by
 from nodes.support.errors import CanductorError
 
@@ -76,7 +75,6 @@ class SafeZHome(Module):
         self._speed, self._hop_speed = build.get(SPEED), build.get(Z_HOP_SPEED)
         self._hop_mm, self._back = build.get(Z_HOP), build.get(BACK)
         self._limits = build.machine.limits
-        self._live: ModuleContext | None = None
         kinematics = build.machine.kinematics
         if not kinematics.straight:
             raise ConfigError(
@@ -97,10 +95,6 @@ class SafeZHome(Module):
                 x, y = self._place
                 return f"{x:g}, {y:g}, but {'XY'[axis]} goes from {low:g} to {high:g} mm"
         return ""
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
 
     def _read(self, call: Call, axes: str) -> Reading:
         missing = "".join(axis for axis in "XY" if axis not in call.homed + axes)
@@ -144,8 +138,7 @@ class SafeZHome(Module):
 
     async def _move(self, call: Call, way: tuple[float, float, float], speed: float, accel: float) -> Call:
         """Move by WAY; return CALL with the place that this led to, by the steps that were made."""
-        assert self._live is not None
-        x, y, z = await move_by(self._live.machine, way, speed, accel)
+        x, y, z = await move_by(self.live.machine, way, speed, accel)
         at = call.position
         return replace(call, position=(at[0] + x, at[1] + y, at[2] + z, at[3]))
 

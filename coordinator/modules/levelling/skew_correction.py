@@ -101,8 +101,6 @@ class SkewCorrection(Module):
 class Skews(Module):
     """The commands, and what holds."""
 
-    SPEC = SectionSpec("Commands about skew", ())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.name = "skew_correction"
@@ -112,7 +110,6 @@ class Skews(Module):
         """What holds for the lines to come."""
         self._profile = ""
         self._profiles: dict[str, Skew] = {}
-        self._live: ModuleContext | None = None
         build.shared(Homing).corrected = self.home
         for name, help_, read in (
             ("SET_SKEW", "Correct what was measured: XY=AC,BD,AD XZ= YZ=, or CLEAR=1", self._set),
@@ -125,15 +122,7 @@ class Skews(Module):
 
     def link(self, modules: Modules) -> None:
         """Find the profiles."""
-        for name in modules.names(SkewCorrection):
-            found = modules.find(name, SkewCorrection)
-            assert found is not None
-            if found.profile:
-                self._profiles[found.profile] = found.skew
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
+        self._profiles = {found.profile: found.skew for found in modules.of(SkewCorrection) if found.profile}
 
     def status(self) -> Mapping[str, Value]:
         """Report the profile that was loaded last, and what holds."""

@@ -12,7 +12,6 @@ from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.runtime.moves.single import Ramp, SingleMove
 
 ENABLE: Final = BoolOption(
@@ -34,7 +33,6 @@ class ForceMove(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._machine = build.machine
-        self._live: ModuleContext | None = None
         if not build.get(ENABLE):
             return
         build.add_command(
@@ -51,10 +49,6 @@ class ForceMove(Module):
                 self._read_position,
             )
         )
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
 
     # ----------------------------------------------------------------------------------------------- moving
 
@@ -78,11 +72,10 @@ class ForceMove(Module):
         return AtStandstill(move, done)
 
     async def _move(self, name: str, distance_mm: float, speed: float, accel: float) -> None:
-        assert self._live is not None
         if distance_mm:
             ramp = Ramp(abs(distance_mm), speed, accel)
             ways = {name: math.copysign(1.0, distance_mm)}
-            await SingleMove(self._live.machine, ramp, ways=ways).run()
+            await SingleMove(self.live.machine, ramp, ways=ways).run()
 
     # -------------------------------------------------------------------------------------------- positions
 

@@ -52,8 +52,6 @@ PINS: Final = ListOption(
 class OutputPins(Module):
     """The outputs that programs set."""
 
-    SPEC: ClassVar = SectionSpec(help="What outputs have in common", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self.by_name: dict[str, OutputPin] = {}
@@ -116,7 +114,6 @@ class OutputPin(Module):
             )
         add_pinned(build, self._output, pin)
         build.add_device(pin.node, self)
-        self._live: ModuleContext | None = None
         build.shared(OutputPins).by_name[build.instance] = self
 
     def _share(self, build: Build, option: FloatOption) -> float:
@@ -146,8 +143,8 @@ class OutputPin(Module):
             self.set(self._begin * self._scale)
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to act."""
-        self._live = live
+        """Start acting."""
+        await super().connect(live)
         if self._begins_late:
             self.set(self._begin * self._scale)
 
@@ -169,13 +166,9 @@ class OutputPin(Module):
             return
         self._now = share
 
-    def stopped(self, cause: str) -> None:
-        """Act no more: its node has it at its shutdown_value."""
+    def end(self, cause: str) -> None:
+        """Stop acting: the node has set the output to its shutdown_value."""
         del cause
-        self._live = None
-
-    def close(self) -> None:
-        """Act no more."""
         self._live = None
 
     def status(self) -> Mapping[str, Value]:

@@ -9,7 +9,6 @@ from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, needed, parameters
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.quoting import nearest
 from coordinator.support.values import Value
 
@@ -41,24 +40,15 @@ class DelayedGCode(Module):
         self.id = build.instance
         self.template = GCodeTemplate(build, GCODE)
         self._initial_s = build.get(INITIAL)
-        self._live: ModuleContext | None = None
         self._call_off: Callable[[], None] | None = None
         build.shared(DelayedGCodes)
-
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take the clock."""
-        self._live = live
 
     def ready(self) -> None:
         """Begin to wait."""
         self.wait(self._initial_s)
 
-    def stopped(self, cause: str) -> None:  # noqa: ARG002
-        """Run no more."""
-        self.close()
-
-    def close(self) -> None:
-        """Run no more."""
+    def end(self, cause: str) -> None:  # noqa: ARG002
+        """Stop running."""
         self.wait(0)
         self._live = None
 
@@ -93,8 +83,6 @@ class DelayedGCode(Module):
 class DelayedGCodes(Module):
     """The commands of all."""
 
-    SPEC = SectionSpec("Commands about delayed g-code", ())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._all: dict[str, DelayedGCode] = {}
@@ -110,10 +98,7 @@ class DelayedGCodes(Module):
 
     def link(self, modules: Modules) -> None:
         """Find them."""
-        for name in modules.names(DelayedGCode):
-            found = modules.find(name, DelayedGCode)
-            assert found is not None
-            self._all[found.id] = found
+        self._all = {found.id: found for found in modules.of(DelayedGCode)}
 
     def _named(self, command: Command, values: Mapping[str, str]) -> DelayedGCode:
         name = needed(command, values, "ID")

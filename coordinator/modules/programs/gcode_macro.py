@@ -144,8 +144,6 @@ class GCodeMacro(Module):
 class Variables(Module):
     """What all macros have in common."""
 
-    SPEC = SectionSpec("Commands about macros", ())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._macros: dict[str, GCodeMacro] = {}
@@ -157,10 +155,7 @@ class Variables(Module):
 
     def link(self, modules: Modules) -> None:
         """Find the macros."""
-        for name in modules.names(GCodeMacro):
-            macro = modules.find(name, GCodeMacro)
-            assert macro is not None
-            self._macros[macro.command] = macro
+        self._macros = {macro.command: macro for macro in modules.of(GCodeMacro)}
 
     def _set(self, call: Call) -> Reading:
         words = call.command.parameters()

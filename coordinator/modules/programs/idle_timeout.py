@@ -41,7 +41,6 @@ class IdleTimeout(Module):
         self._configured_s = self._timeout_s = build.get(TIMEOUT)
         self._template = GCodeTemplate(build, GCODE) if build.find(GCODE) is not None else None
         self._default: tuple[str, ...] = ()
-        self._live: ModuleContext | None = None
         self._state = "Idle"
         self._since_s = 0.0
         self._busy_since_s: float | None = None
@@ -57,18 +56,14 @@ class IdleTimeout(Module):
         self._default = tuple(name for name in OFF if modules.knows(name))
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Begin to watch."""
-        self._live = live
+        """Start watching."""
+        await super().connect(live)
         self._since_s = live.now_s()
         self._state = "Ready"
         live.every(LOOK_S, self.look)
 
-    def close(self) -> None:
-        """Watch no more."""
-        self._live = None
-
-    def stopped(self, cause: str) -> None:  # noqa: ARG002
-        """Watch no more: all is off."""
+    def end(self, cause: str) -> None:  # noqa: ARG002
+        """Stop watching: all is off."""
         self._live, self._state = None, "Idle"
 
     def status(self) -> Mapping[str, Value]:

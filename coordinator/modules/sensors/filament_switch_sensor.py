@@ -72,7 +72,6 @@ class FilamentSwitchSensor(Module):
         self._stats = build.shared(PrintStats)
         self._can_pause = False
         self._quiet_until_s = 0.0
-        self._live: ModuleContext | None = None
         pin = build.pin(PIN)
         self.switch = Button(self.name, pin=pin.name, pull=pin.pull, invert=pin.invert)
         self.switch.on_change = self._changed
@@ -84,12 +83,12 @@ class FilamentSwitchSensor(Module):
         self._can_pause = modules.knows("PAUSE")
 
     async def connect(self, live: "ModuleContext") -> None:
-        """Act from now on."""
-        self._live = live
+        """Start acting."""
+        await super().connect(live)
         self._quiet_until_s = live.now_s() + self._delay_s
 
-    def stopped(self, cause: str) -> None:  # noqa: ARG002
-        """Act no more."""
+    def end(self, cause: str) -> None:  # noqa: ARG002
+        """Stop acting."""
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
@@ -115,8 +114,6 @@ class FilamentSwitchSensor(Module):
 class FilamentSensors(Module):
     """The commands of all."""
 
-    SPEC = SectionSpec("Commands about filament sensors", ())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._all: dict[str, FilamentSwitchSensor] = {}
@@ -130,10 +127,7 @@ class FilamentSensors(Module):
 
     def link(self, modules: Modules) -> None:
         """Find them."""
-        for name in modules.names(FilamentSwitchSensor):
-            found = modules.find(name, FilamentSwitchSensor)
-            assert found is not None
-            self._all[found.id] = found
+        self._all = {found.id: found for found in modules.of(FilamentSwitchSensor)}
 
     def _sensor(self, call: Call, *others: str) -> tuple[FilamentSwitchSensor, Mapping[str, str]]:
         given = parameters(call.command, ("SENSOR", *others))

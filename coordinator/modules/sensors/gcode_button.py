@@ -10,7 +10,6 @@ from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import flag, one, parameters
-from coordinator.runtime.module_context import ModuleContext
 from coordinator.support.values import Value
 from nodes.devices.button import Button
 
@@ -35,16 +34,11 @@ class GCodeButton(Module):
         pin = build.pin(PIN)
         self._button = Button(self.name, pin=pin.name, pull=pin.pull, invert=pin.invert)
         self._button.on_change = self._changed
-        self._live: ModuleContext | None = None
         add_pinned(build, self._button, pin)
         build.shared(GCodeButtons)
 
-    async def connect(self, live: "ModuleContext") -> None:
-        """Act from now on."""
-        self._live = live
-
-    def stopped(self, cause: str) -> None:  # noqa: ARG002
-        """Act no more."""
+    def end(self, cause: str) -> None:  # noqa: ARG002
+        """Stop acting."""
         self._live = None
 
     def status(self) -> Mapping[str, Value]:
@@ -65,8 +59,6 @@ class GCodeButton(Module):
 class GCodeButtons(Module):
     """The commands of all."""
 
-    SPEC = SectionSpec("Commands about buttons", ())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._all: dict[str, GCodeButton] = {}
@@ -77,10 +69,7 @@ class GCodeButtons(Module):
 
     def link(self, modules: Modules) -> None:
         """Find them."""
-        for name in modules.names(GCodeButton):
-            found = modules.find(name, GCodeButton)
-            assert found is not None
-            self._all[found.id] = found
+        self._all = {found.id: found for found in modules.of(GCodeButton)}
 
     def _query(self, call: Call) -> Reading:
         name = one(call.command, parameters(call.command, ("BUTTON",)), "BUTTON", self._all)

@@ -49,13 +49,9 @@ class TemperatureSensor(SensorModule):
         """Begin to measure."""
         await self.input.connect(live)
 
-    def stopped(self, cause: str) -> None:
-        """Measure no more."""
+    def end(self, cause: str) -> None:
+        """Stop measuring."""
         self.input.end(cause)
-
-    def close(self) -> None:
-        """Measure no more."""
-        self.input.end("the machine was closed")
 
     def _measured(self, _at_s: float, celsius: float) -> None:
         low, high = self._extremes or (celsius, celsius)

@@ -3,7 +3,6 @@
 from importlib.metadata import version
 from typing import Final
 
-from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module, Modules
@@ -14,8 +13,6 @@ NAME: Final = "canductor"
 
 class Console(Module):
     """The answers."""
-
-    SPEC = SectionSpec("What a console asks", ())
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)

@@ -1,21 +1,16 @@
 """GET_POSITION: where the machine is in all frames, from what the nodes count to the program's numbers."""
 
-from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.status import frames
 from coordinator.modules.base import Build, Module
-from coordinator.runtime.module_context import ModuleContext
 
 
 class Positions(Module):
     """The command."""
 
-    SPEC = SectionSpec(help="Positions", options=())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
-        self._live: ModuleContext | None = None
         build.add_command(
             GCodeCommand(
                 "GET_POSITION",
@@ -25,10 +20,6 @@ class Positions(Module):
             )
         )
 
-    async def connect(self, live: "ModuleContext") -> None:
-        """Take over the machine."""
-        self._live = live
-
     def _read(self, call: Call) -> Reading:
         told = frames(call.figures())
         if call.while_printing:
@@ -37,8 +28,7 @@ class Positions(Module):
 
     async def _tell(self, told: tuple[str, ...]) -> Done:
         """Answer with what the nodes count, what follows from that, and what the program was TOLD."""
-        assert self._live is not None
-        machine = self._live.machine
+        machine = self.live.machine
         counts = await machine.query_stepper_counts()
         places = machine.stepper_positions.positions(counts)
         head = machine.stepper_positions.head(places)

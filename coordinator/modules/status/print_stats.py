@@ -6,7 +6,6 @@ A service tells it; where there is none, nothing is ever printed.
 from collections.abc import Mapping
 from typing import Final
 
-from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import bounded, parameters
@@ -25,8 +24,6 @@ NOTHING: Final[Mapping[str, Value]] = {
 
 class PrintStats(Module):
     """What is known of the job; shared by all that look at it."""
-
-    SPEC = SectionSpec("How the job is", ())
 
     def __init__(self, build: Build) -> None:
         super().__init__(build)

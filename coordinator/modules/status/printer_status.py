@@ -12,7 +12,6 @@ from typing import Any, Final
 
 from jinja2 import ChainableUndefined
 
-from coordinator.config.options import SectionSpec
 from coordinator.gcode.commands import Call
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.absent_status import absent_statuses
@@ -28,8 +27,6 @@ Shown = Mapping[str, Mapping[str, object]]
 class PrinterStatus(Module):
     """Gathers it; shared by all who render."""
 
-    SPEC = SectionSpec("What macros see of the machine", ())
-
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         build.shared(PrintStats)
@@ -37,7 +34,6 @@ class PrinterStatus(Module):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._loop_thread = 0
         self._last: Shown = {}
-        self._live: ModuleContext | None = None
 
     def link(self, modules: Modules) -> None:
         """Remember who there is."""
@@ -45,7 +41,7 @@ class PrinterStatus(Module):
 
     async def connect(self, live: "ModuleContext") -> None:
         """Ask the loop from now on."""
-        self._live = live
+        await super().connect(live)
         self._loop, self._loop_thread = asyncio.get_running_loop(), threading.get_ident()
 
     def close(self) -> None:

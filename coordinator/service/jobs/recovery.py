@@ -18,7 +18,7 @@ from coordinator.ipc.protocol.methods import ApiError
 from coordinator.modules.programs.exclude_object import ExcludeObject
 from coordinator.modules.programs.gcode_macro import GCodeMacro
 from coordinator.motion.planner.planner import Planner
-from coordinator.runtime.machine import MachineModules
+from coordinator.runtime.machine import Modules
 from coordinator.service.core.feeder import COME_BACK_MM_S
 from coordinator.service.core.interface import ServiceInterface
 from coordinator.service.core.motion import Motion
@@ -286,7 +286,7 @@ class Recovery:
         return RecoverWork(program, line=line, reached=reached, held=found.held, objects=objects)
 
 
-def _hot(modules: "MachineModules") -> Mapping[str, Any]:
+def _hot(modules: "Modules") -> Mapping[str, Any]:
     """Return heater targets, fan speeds and excluded objects, as the modules report them."""
     status = modules.status()
     heaters: dict[str, float] = {}
