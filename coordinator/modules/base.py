@@ -23,7 +23,7 @@ from coordinator.config.file import RawSection
 from coordinator.config.model import MachineDescription
 from coordinator.config.options import BadValue, ListOption, Option, SectionReader, SectionSpec
 from coordinator.config.pins import PinDescription, PinOption, PinRegistry
-from coordinator.gcode.commands import GCodeCommand
+from coordinator.gcode.commands import Call, GCodeCommand, Reading
 from coordinator.motion.planner.planner import Planner
 from coordinator.runtime.machine import Modules
 from coordinator.runtime.module_context import ModuleContext
@@ -49,14 +49,18 @@ class Device(Protocol):
 class Module:
     """One section of the configuration."""
 
+    KIND: ClassVar[str] = ""
+    """The first word of its sections; empty: it has none, or its package declares it as an entry point."""
     SPEC: ClassVar[SectionSpec] = SectionSpec(help="", options=())
     """All its options; the reference page is made from it. Modules without a section have none."""
     NAMED: ClassVar[bool] = False
     """Whether there may be several, ``[kind NAME]``; else there is one, ``[kind]``."""
     NAMELESS: ClassVar[bool] = False
     """Whether, where there may be several, one may be without a name."""
+    READS: ClassVar[str] = ""
+    """A pattern of section names: it reads further options of sections that the machine itself reads."""
     TITLE: ClassVar[str] = ""
-    """Which sections it reads a part of: ``[extruder], [extruder1] …``; else it has its own."""
+    """How these sections are shown: ``[extruder], [extruder1] …``."""
 
     def __init__(self, build: "Build") -> None:
         """Read all options; no I/O. Raises ConfigError."""
@@ -191,9 +195,11 @@ class Build:
         """Have DEVICE on a node."""
         self.devices.append((node, device))
 
-    def add_command(self, command: GCodeCommand) -> None:
-        """Have programs know COMMAND."""
-        self.commands.append(command)
+    def add_command(
+        self, name: str, text: str, read: Callable[[Call], Reading], *, while_printing: bool = False
+    ) -> None:
+        """Add the command NAME to those of programs; arguments as in GCodeCommand, TEXT is its help."""
+        self.commands.append(GCodeCommand(name, text, read, while_printing=while_printing))
 
     def replace_command(self, command: GCodeCommand, rename: str = "") -> None:
         """Have programs know COMMAND; one that had its name before is called RENAME then."""

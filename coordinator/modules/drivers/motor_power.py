@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Mapping
 from typing import Final
 
 from coordinator.config.pins import PinDescription
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
@@ -52,14 +52,10 @@ class MotorPower(Module):
         for line in self._lines:
             build.add_device(line.node, line)
         for name in ("M84", "M18"):
-            build.add_command(
-                GCodeCommand(name, "Switch all motors off; nothing is homed any more", self._read_off)
-            )
-        build.add_command(GCodeCommand("M17", "Switch all motors on", self._read_on))
+            build.add_command(name, "Switch all motors off; nothing is homed any more", self._read_off)
+        build.add_command("M17", "Switch all motors on", self._read_on)
         build.add_command(
-            GCodeCommand(
-                "SET_STEPPER_ENABLE", "Switch the motor STEPPER on or off (ENABLE=1, 0)", self._read_one
-            )
+            "SET_STEPPER_ENABLE", "Switch the motor STEPPER on or off (ENABLE=1, 0)", self._read_one
         )
 
     def stopped(self, cause: str) -> None:

@@ -4,7 +4,7 @@ import math
 from typing import Final
 
 from coordinator.config.model import StepperDescription
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
@@ -24,9 +24,7 @@ class StepperBuzz(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         self._steppers = {stepper.name: stepper for stepper in build.machine.steppers}
-        build.add_command(
-            GCodeCommand("STEPPER_BUZZ", "Move the motor STEPPER to and fro ten times, by 1 mm", self._read)
-        )
+        build.add_command("STEPPER_BUZZ", "Move the motor STEPPER to and fro ten times, by 1 mm", self._read)
 
     def _read(self, call: Call) -> Reading:
         name = call.parameters("STEPPER").get("STEPPER", "")

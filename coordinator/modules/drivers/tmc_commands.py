@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from coordinator.config.errors import ConfigError
 from coordinator.config.pins import PinDescription
 from coordinator.drivers.tmc_chips import Field
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
@@ -38,7 +38,7 @@ class TmcCommands(Module):
                 self._set_field,
             ),
         ):
-            build.add_command(GCodeCommand(name, text, read))
+            build.add_command(name, text, read)
 
     def wire(self, build: Build, rx: "PinDescription", tx: "PinDescription | None") -> tuple[TmcUart, str]:
         """Return the wire on these pins and its node, for the section of BUILD; raises ConfigError."""

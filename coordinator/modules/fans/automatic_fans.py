@@ -85,6 +85,7 @@ class _HeaterNames:
 class HeaterFan(FanModule):
     """A fan that runs while a heater is hot."""
 
+    KIND = "heater_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that runs while a heater is hot or is to be, as that of a hot end",
@@ -122,6 +123,7 @@ class HeaterFan(FanModule):
 class ControllerFan(FanModule):
     """A fan that cools a board while it is at work."""
 
+    KIND = "controller_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that runs while steppers are on or a heater has a target, and some time after; steppers"

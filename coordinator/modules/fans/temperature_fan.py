@@ -13,7 +13,7 @@ from coordinator.config.sections.sensor_options import (
     SENSOR_OPTIONS,
     UNSUPPORTED_SENSOR_OPTIONS,
 )
-from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
+from coordinator.gcode.commands import Call, Reading, Synchronized
 from coordinator.gcode.parser import WordError
 from coordinator.heat.controller import Controller
 from coordinator.heat.pid import Pid, PidGains
@@ -64,12 +64,10 @@ class TemperatureFans(Module):
         super().__init__(build)
         self.by_name: dict[str, TemperatureFan] = {}
         build.add_command(
-            GCodeCommand(
-                "SET_TEMPERATURE_FAN_TARGET",
-                "Set what a temperature_fan holds: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
-                self._set,
-                while_printing=True,
-            )
+            "SET_TEMPERATURE_FAN_TARGET",
+            "Set what a temperature_fan holds: TEMPERATURE_FAN= TARGET= MIN_SPEED= MAX_SPEED=",
+            self._set,
+            while_printing=True,
         )
 
     def _set(self, call: Call) -> Reading:
@@ -96,6 +94,7 @@ class TemperatureFans(Module):
 class TemperatureFan(FanModule):
     """A fan that holds a temperature down."""
 
+    KIND = "temperature_fan"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A fan that holds a temperature down, as that of a board or a chamber",

@@ -3,7 +3,7 @@
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Final
 
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading, Synchronized
+from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading, Synchronized
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError
 from coordinator.gcode.reply_kinds import ReplyKind
@@ -33,7 +33,7 @@ class HeaterRegistry(Module):
             ("TURN_OFF_HEATERS", "Let all heaters cool down", self._turn_off),
             ("SET_HEATER_TEMPERATURE", "Set a heater's target: HEATER= TARGET=", self._set),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
         for name, help_, read in (
             (
                 "TEMPERATURE_WAIT",
@@ -48,7 +48,7 @@ class HeaterRegistry(Module):
                 self._mpc,
             ),
         ):
-            build.add_command(GCodeCommand(name, help_, read))
+            build.add_command(name, help_, read)
 
     def add(self, unit: Heater, tag: str = "") -> None:
         """Take a heater on; TAG is what M105 calls it."""

@@ -6,7 +6,7 @@ from typing import ClassVar, Final
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import ChoiceOption, FloatOption, SectionSpec
 from coordinator.config.sections.heater_options import PID_KD, PID_KI, PID_KP
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading, Synchronized
+from coordinator.gcode.commands import Call, Immediate, Reading, Synchronized
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.heat.pid import Pid, PidGains
 from coordinator.modules.base import Build, Module, Modules
@@ -45,11 +45,7 @@ class PidProfiles(Module):
         self._of: dict[str, dict[str, PidGains]] = {}
         self._loaded: dict[str, str] = {}
         build.add_command(
-            GCodeCommand(
-                "PID_PROFILE",
-                "LOAD=, SAVE= or SET_VALUES= a profile of HEATER=, or GET_VALUES=1",
-                self._read,
-            )
+            "PID_PROFILE", "LOAD=, SAVE= or SET_VALUES= a profile of HEATER=, or GET_VALUES=1", self._read
         )
 
     def add(self, heater: str, name: str, gains: PidGains) -> None:
@@ -162,6 +158,7 @@ def _texts(gains: PidGains) -> dict[str, str]:
 class PidProfile(Module):
     """One profile of one heater."""
 
+    KIND = "pid_profile"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="PID constants of a heater for other circumstances: [pid_profile HEATER NAME], and PID_PROFILE"

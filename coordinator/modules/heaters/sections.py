@@ -11,7 +11,7 @@ from coordinator.config.sections.heater_options import (
     MIN_EXTRUDE_TEMP,
     UNSUPPORTED_HEATER_OPTIONS,
 )
-from coordinator.gcode.commands import Call, GCodeCommand, Reading
+from coordinator.gcode.commands import Call, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.heaters.heater import Heater
@@ -53,14 +53,15 @@ class HeaterSection(Module):
 class HeaterBed(HeaterSection):
     """The heater of the bed."""
 
+    KIND = "heater_bed"
     SPEC: ClassVar = SectionSpec(
         help="The heated bed", options=HEATER_OPTIONS, unsupported=UNSUPPORTED_HEATER_OPTIONS
     )
 
     def __init__(self, build: Build) -> None:
         super().__init__(build, "heater_bed", "B")
-        build.add_command(GCodeCommand("M140", "Set the bed's target: S", self._set, while_printing=True))
-        build.add_command(GCodeCommand("M190", "Set the bed's target and wait for it: S or R", self._wait))
+        build.add_command("M140", "Set the bed's target: S", self._set, while_printing=True)
+        build.add_command("M190", "Set the bed's target and wait for it: S or R", self._wait)
 
     def _set(self, call: Call) -> Reading:
         return self.heaters.set_in_time(self.unit, _target(call, "S"))
@@ -72,6 +73,7 @@ class HeaterBed(HeaterSection):
 class HeaterGeneric(HeaterSection):
     """A heater of any kind."""
 
+    KIND = "heater_generic"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A heater for anything else; programs call it by NAME",
@@ -92,12 +94,8 @@ class ExtruderHeaterCommands(Module):
         self.by_extruder: dict[str, ExtruderHeaterSection] = {}
         self._extruders = [extruder.name for extruder in build.machine.extruders]
         self.heaters = build.shared(HeaterRegistry)
-        build.add_command(
-            GCodeCommand("M104", "Set an extruder's target: S, T", self._set, while_printing=True)
-        )
-        build.add_command(
-            GCodeCommand("M109", "Set an extruder's target and wait for it: S or R, T", self._wait)
-        )
+        build.add_command("M104", "Set an extruder's target: S, T", self._set, while_printing=True)
+        build.add_command("M109", "Set an extruder's target and wait for it: S or R, T", self._wait)
 
     def _set(self, call: Call) -> Reading:
         return self.heaters.set_in_time(self._unit(call), _target(call, "ST"))
@@ -124,6 +122,7 @@ class ExtruderHeaterCommands(Module):
 class ExtruderHeaterSection(Module):
     """The heater of an extruder; an extruder without heater_pin has none."""
 
+    READS = r"extruder[0-9]*"
     TITLE: ClassVar = "[extruder], [extruder1] …"
     SPEC: ClassVar = SectionSpec(
         help="The heater of an extruder",

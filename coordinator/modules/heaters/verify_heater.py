@@ -46,6 +46,7 @@ HEATING_GAIN: Final = FloatOption(
 class VerifyHeater(Module):
     """How the heater of the section's instance is watched."""
 
+    KIND = "verify_heater"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="The watch over a heater (extruder, heater_bed or the name of a heater_generic); every heater"

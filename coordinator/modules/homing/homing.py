@@ -13,7 +13,7 @@ from typing import Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.model import RailDescription
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.kinematics.base import Point
@@ -49,10 +49,8 @@ class Homing(Module):
         """Reads G28 in its place; a G28 among the lines that it stands for is homing again."""
         self.corrected: Callable[[ReadHome], ReadHome] | None = None
         """What homing finds, for programs whose X Y Z are not those of the axes."""
-        build.add_command(GCodeCommand("M119", "Report which endstops are pressed", self._read_query))
-        build.add_command(
-            GCodeCommand("QUERY_ENDSTOPS", "Report which endstops are pressed", self._read_query)
-        )
+        build.add_command("M119", "Report which endstops are pressed", self._read_query)
+        build.add_command("QUERY_ENDSTOPS", "Report which endstops are pressed", self._read_query)
 
     def status(self) -> Mapping[str, Value]:
         """Report which endstops were pressed when somebody asked last."""

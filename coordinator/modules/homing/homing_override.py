@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec, TextOption
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Lines, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Lines, Reading
 from coordinator.gcode.events import Done
 from coordinator.modules.base import Build, Module
 from coordinator.modules.homing.homing import Homing
@@ -35,6 +35,7 @@ _LINES: Final = "_HOMING_OVERRIDE_LINES"
 class HomingOverride(Module):
     """What G28 does in its place."""
 
+    KIND = "homing_override"
     SPEC = SectionSpec("G28 is done by these lines of g-code", (GCODE, AXES, *SET))
 
     def __init__(self, build: Build) -> None:
@@ -44,10 +45,8 @@ class HomingOverride(Module):
         self._set = [build.find(option) for option in SET]
         self._sets = any(value is not None for value in self._set)
         if self._sets:
-            build.add_command(
-                GCodeCommand(_SET_POSITION, "Begin what stands in for G28", self._read_set_position)
-            )
-            build.add_command(GCodeCommand(_LINES, "Go on with it", self._read_lines))
+            build.add_command(_SET_POSITION, "Begin what stands in for G28", self._read_set_position)
+            build.add_command(_LINES, "Go on with it", self._read_lines)
         self._homing = build.shared(Homing)
         self._homing.replace_by(self._read, build)
 

@@ -63,6 +63,7 @@ BACK: Final = BoolOption(
 class SafeZHome(Module):
     """What G28 does in its place."""
 
+    KIND = "safe_z_home"
     SPEC = SectionSpec(
         "G28 homes Z at one place of the bed, behind X and Y",
         (PLACE, SPEED, Z_HOP, Z_HOP_SPEED, BACK),

@@ -15,7 +15,6 @@ from coordinator.gcode.builtins.machine import come_to_standstill
 from coordinator.gcode.commands import (
     AtStandstill,
     Call,
-    GCodeCommand,
     Immediate,
     Position,
     ProgramContext,
@@ -78,6 +77,7 @@ class Skew:
 class SkewCorrection(Module):
     """A profile; the plain section has none."""
 
+    KIND = "skew_correction"
     SPEC = SectionSpec(
         "Axes that are not at right angles; [skew_correction NAME] is a profile", tuple(OPTIONS.values())
     )
@@ -118,7 +118,7 @@ class Skews(Module):
             ("SKEW_PROFILE", "LOAD or SAVE a profile by its name", self._manage),
             (RESTORE, "Let hold what held before a crash", self._restore),
         ):
-            build.add_command(GCodeCommand(name, help_, read))
+            build.add_command(name, help_, read)
 
     def link(self, modules: Modules) -> None:
         """Find the profiles."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Lines, Reading
+from coordinator.gcode.commands import Call, Immediate, Lines, Reading
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import bounded, parameters
@@ -51,6 +51,7 @@ class _Settings:
 class FirmwareRetraction(Module):
     """Its commands; how far the filament is drawn back is what G10 did, also when settings change."""
 
+    KIND = "firmware_retraction"
     SPEC = SectionSpec(
         "Retraction by G10 and G11",
         (LENGTH, SPEED, EXTRA, BACK_SPEED, HOP),
@@ -65,14 +66,14 @@ class FirmwareRetraction(Module):
         )
         self._retracted: _Settings | None = None
         """What G10 went by."""
-        build.add_command(GCodeCommand("G10", "Draw the filament back", self._retract))
-        build.add_command(GCodeCommand("G11", "Push the filament forward again", self._unretract))
+        build.add_command("G10", "Draw the filament back", self._retract)
+        build.add_command("G11", "Push the filament forward again", self._unretract)
         for name, help_, read in (
             ("SET_RETRACTION", "Change how G10 and G11 act", self._set),
             ("GET_RETRACTION", "Report the settings of G10 and G11", self._get),
             ("CLEAR_RETRACTION", "Forget that the filament is drawn back, and all changes", self._clear),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
 
     def status(self) -> Mapping[str, Value]:
         """Report the settings, and whether the filament is drawn back."""

@@ -8,7 +8,7 @@ import math
 from typing import Final
 
 from coordinator.config.options import BoolOption, SectionSpec
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
@@ -28,6 +28,7 @@ _AXES: Final = "XYZ"
 class ForceMove(Module):
     """The commands."""
 
+    KIND = "force_move"
     SPEC = SectionSpec("Commands that move past all limits", (ENABLE,))
 
     def __init__(self, build: Build) -> None:
@@ -36,18 +37,14 @@ class ForceMove(Module):
         if not build.get(ENABLE):
             return
         build.add_command(
-            GCodeCommand(
-                "FORCE_MOVE",
-                "Move the motor STEPPER by DISTANCE mm at VELOCITY mm/s, with ACCEL mm/s² if given",
-                self._read_move,
-            )
+            "FORCE_MOVE",
+            "Move the motor STEPPER by DISTANCE mm at VELOCITY mm/s, with ACCEL mm/s² if given",
+            self._read_move,
         )
         build.add_command(
-            GCodeCommand(
-                "SET_KINEMATIC_POSITION",
-                "Say where the head is: X Y Z in mm; SET_HOMED and CLEAR_HOMED name axes",
-                self._read_position,
-            )
+            "SET_KINEMATIC_POSITION",
+            "Say where the head is: X Y Z in mm; SET_HOMED and CLEAR_HOMED name axes",
+            self._read_position,
         )
 
     # ----------------------------------------------------------------------------------------------- moving

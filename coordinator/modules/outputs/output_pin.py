@@ -5,7 +5,7 @@ from typing import ClassVar, Final
 
 from coordinator.config.options import BoolOption, FloatOption, ListOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
+from coordinator.gcode.commands import Call, Reading, Synchronized
 from coordinator.gcode.parser import WordError
 from coordinator.modules.base import Build, Module
 from coordinator.modules.pinned import AHEAD_S, add_pinned, pwm_cycle
@@ -56,12 +56,10 @@ class OutputPins(Module):
         super().__init__(build)
         self.by_name: dict[str, OutputPin] = {}
         build.add_command(
-            GCodeCommand(
-                "SET_PIN",
-                "Set an output_pin at its place among the moves: PIN= VALUE=",
-                self._set,
-                while_printing=True,
-            )
+            "SET_PIN",
+            "Set an output_pin at its place among the moves: PIN= VALUE=",
+            self._set,
+            while_printing=True,
         )
 
     def _set(self, call: Call) -> Reading:
@@ -76,6 +74,7 @@ class OutputPins(Module):
 class OutputPin(Module):
     """An output that programs set."""
 
+    KIND = "output_pin"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="An output that programs set: SET_PIN PIN=NAME VALUE=",
@@ -179,6 +178,7 @@ class OutputPin(Module):
 class StaticDigitalOutput(Module):
     """Outputs that have one value for ever."""
 
+    KIND = "static_digital_output"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(help="Outputs that are switched at the start, and stay so", options=(PINS,))
 

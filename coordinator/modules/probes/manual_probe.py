@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from coordinator.gcode.builtins.state import go
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, ProgramContext, Reading, ToProgram
+from coordinator.gcode.commands import AtStandstill, Call, ProgramContext, Reading, ToProgram
 from coordinator.gcode.events import Done, Reply
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
@@ -49,7 +49,7 @@ class ManualProbe(Module):
                 self._read_apply,
             ),
         ):
-            build.add_command(GCodeCommand(name, text, read))
+            build.add_command(name, text, read)
 
     def status(self) -> dict[str, Value]:
         """Return whether a height is looked for."""

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parser import Command, WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
@@ -30,6 +30,7 @@ _COMMAND: Final = "_RUN_DELAYED_GCODE"
 class DelayedGCode(Module):
     """One of them; a service runs its lines as those of a client."""
 
+    KIND = "delayed_gcode"
     SPEC = SectionSpec(
         "G-code that runs by itself after a while", (GCODE, INITIAL), unsupported=("description",)
     )
@@ -87,14 +88,9 @@ class DelayedGCodes(Module):
         super().__init__(build)
         self._all: dict[str, DelayedGCode] = {}
         build.add_command(
-            GCodeCommand(
                 "UPDATE_DELAYED_GCODE", "Have the delayed g-code ID run after DURATION; 0: not at all",
-                self._update, while_printing=True,
-            )
-        )  # fmt: skip
-        build.add_command(
-            GCodeCommand(_COMMAND, "What a delayed g-code does", self._run, while_printing=True)
-        )
+                self._update, while_printing=True)  # fmt: skip
+        build.add_command(_COMMAND, "What a delayed g-code does", self._run, while_printing=True)
 
     def link(self, modules: Modules) -> None:
         """Find them."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, ProgramContext, Reading, ToProgram
+from coordinator.gcode.commands import Call, Immediate, ProgramContext, Reading, ToProgram
 from coordinator.gcode.parser import Command, WordError, number, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import flag, needed, parameters
@@ -34,6 +34,7 @@ class _Object:
 class ExcludeObject(Module):
     """The objects of the program that is being read."""
 
+    KIND = "exclude_object"
     SPEC = SectionSpec("Leaving out single objects of a print", (), unsupported=("enable_exclude_object",))
 
     def __init__(self, build: Build) -> None:
@@ -51,7 +52,7 @@ class ExcludeObject(Module):
             ("EXCLUDE_OBJECT_END", "An object ends", self._end, False),
             ("EXCLUDE_OBJECT", "Leave out an object from here on", self._exclude, True),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=while_printing))
+            build.add_command(name, help_, read, while_printing=while_printing)
 
     def status(self) -> Mapping[str, Value]:
         """Report the objects, which of them are left out, and which one is being read."""

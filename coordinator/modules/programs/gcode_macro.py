@@ -100,6 +100,7 @@ class GCodeTemplate:
 class GCodeMacro(Module):
     """One macro."""
 
+    KIND = "gcode_macro"
     SPEC = SectionSpec(
         "A command of its own: NAME, in capitals, stands for lines of g-code",
         (GCODE, RENAME, DESCRIPTION),
@@ -148,9 +149,7 @@ class Variables(Module):
         super().__init__(build)
         self._macros: dict[str, GCodeMacro] = {}
         build.add_command(
-            GCodeCommand(
-                "SET_GCODE_VARIABLE", "Give a macro's variable another value", self._set, while_printing=True
-            )
+            "SET_GCODE_VARIABLE", "Give a macro's variable another value", self._set, while_printing=True
         )
 
     def link(self, modules: Modules) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from coordinator.config.options import FloatOption, GCodeOption, SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Lines, Reading
+from coordinator.gcode.commands import Call, Immediate, Lines, Reading
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
 from coordinator.modules.words import bounded, parameters
@@ -34,6 +34,7 @@ LOOK_S: Final = 1.0
 class IdleTimeout(Module):
     """Watches, and acts."""
 
+    KIND = "idle_timeout"
     SPEC = SectionSpec("What is done when the machine is left alone", (TIMEOUT, GCODE))
 
     def __init__(self, build: Build) -> None:
@@ -47,9 +48,9 @@ class IdleTimeout(Module):
         self._works = 0
         self._acting = False
         build.add_command(
-            GCodeCommand("SET_IDLE_TIMEOUT", "Let nothing happen for TIMEOUT", self._set, while_printing=True)
+            "SET_IDLE_TIMEOUT", "Let nothing happen for TIMEOUT", self._set, while_printing=True
         )
-        build.add_command(GCodeCommand("_IDLE_TIMEOUT", "What is done when nothing happens", self._lines))
+        build.add_command("_IDLE_TIMEOUT", "What is done when nothing happens", self._lines)
 
     def link(self, modules: Modules) -> None:
         """Find what there is to switch off."""

@@ -9,7 +9,7 @@ from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.gcode.builtins.state import save_state
-from coordinator.gcode.commands import Call, GCodeCommand, ProgramContext, Reading, ToProgram
+from coordinator.gcode.commands import Call, ProgramContext, Reading, ToProgram
 from coordinator.gcode.events import Reply
 from coordinator.modules.base import Build, Module
 from coordinator.modules.status.print_stats import PrintStats
@@ -31,6 +31,7 @@ STATE: Final = "PAUSE_STATE"
 class PauseResume(Module):
     """The commands."""
 
+    KIND = "pause_resume"
     SPEC = SectionSpec("Pausing a job, by g-code", (VELOCITY,))
 
     def __init__(self, build: Build) -> None:
@@ -45,7 +46,7 @@ class PauseResume(Module):
             ("CANCEL_PRINT", "End the job", self._cancel),
             ("CLEAR_PAUSE", "Forget that there was a pause", self._clear),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
 
     def status(self) -> Mapping[str, Value]:
         """Return whether there is a pause."""

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Reading
 from coordinator.gcode.events import Done
 from coordinator.modules.base import Build, Module
 from coordinator.support.values import Value
@@ -32,7 +32,7 @@ class SaveConfig(Module):
                 lambda call: self._read_restart(call, firmware=True),
             ),
         ):
-            build.add_command(GCodeCommand(name, text, read))
+            build.add_command(name, text, read)
 
     def status(self) -> dict[str, Value]:
         """Report what SAVE_CONFIG would write."""

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from coordinator.config.errors import ConfigError
 from coordinator.config.options import SectionSpec, TextOption
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.programs.gcode_macro import literal, plain
@@ -32,6 +32,7 @@ _HEADER: Final = "[Variables]"
 class SaveVariables(Module):
     """The values, and the file that has them."""
 
+    KIND = "save_variables"
     SPEC = SectionSpec("Values that are kept in a file (SAVE_VARIABLE)", (FILENAME,))
 
     def __init__(self, build: Build) -> None:
@@ -42,9 +43,7 @@ class SaveVariables(Module):
         self._variables: dict[str, Any] = {}
         self._writer: _Writer | None = None
         build.add_command(
-            GCodeCommand(
-                "SAVE_VARIABLE", "Keep VALUE as VARIABLE in the file", self._save, while_printing=True
-            )
+            "SAVE_VARIABLE", "Keep VALUE as VARIABLE in the file", self._save, while_printing=True
         )
 
     def link(self, modules: Modules) -> None:  # noqa: ARG002

@@ -7,7 +7,6 @@ from typing import Final
 from coordinator.config.options import GCodeOption, SectionSpec, TextOption
 from coordinator.gcode.commands import (
     Call,
-    GCodeCommand,
     Immediate,
     ProgramContext,
     Reading,
@@ -37,6 +36,7 @@ _BUSY: Final = "a job is on its way; wait for its end, or cancel it"
 class VirtualSdcard(Module):
     """Its commands; the service has the files."""
 
+    KIND = "virtual_sdcard"
     SPEC = SectionSpec("Files that are printed", (PATH, ON_ERROR), unsupported=("with_subdirs",))
 
     def __init__(self, build: Build) -> None:
@@ -65,7 +65,7 @@ class VirtualSdcard(Module):
             ("RESUME_INTERRUPTED", "Go on with a job that a crash has ended", self._recover, False),
             ("_ON_ERROR_GCODE", "What is done when a job failed", self._failed, False),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=while_printing))
+            build.add_command(name, help_, read, while_printing=while_printing)
 
     def status(self) -> Mapping[str, Value]:
         """Report which file is printed, and how far it is read."""

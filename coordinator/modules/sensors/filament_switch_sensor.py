@@ -5,7 +5,7 @@ from typing import Final
 
 from coordinator.config.options import BoolOption, FloatOption, GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
@@ -54,6 +54,7 @@ _INSERT: Final = "_FILAMENT_INSERT"
 class FilamentSwitchSensor(Module):
     """One sensor."""
 
+    KIND = "filament_switch_sensor"
     SPEC = SectionSpec(
         "A switch that tells whether there is filament",
         (PIN, PAUSE, RUNOUT, INSERT, EVENT_DELAY),
@@ -123,7 +124,7 @@ class FilamentSensors(Module):
             (_RUNOUT, "What is done when filament runs out", self._runout),
             (_INSERT, "What is done when filament comes", self._insert),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
 
     def link(self, modules: Modules) -> None:
         """Find them."""

@@ -5,7 +5,7 @@ from typing import Final
 
 from coordinator.config.options import GCodeOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.pinned import add_pinned
 from coordinator.modules.programs.gcode_macro import GCodeTemplate
@@ -23,6 +23,7 @@ _COMMAND: Final = "_BUTTON"
 class GCodeButton(Module):
     """One button; a service runs its lines as those of a client."""
 
+    KIND = "gcode_button"
     SPEC = SectionSpec("A button that runs g-code", (PIN, PRESS, RELEASE), unsupported=LATER)
     NAMED = True
 
@@ -63,9 +64,9 @@ class GCodeButtons(Module):
         super().__init__(build)
         self._all: dict[str, GCodeButton] = {}
         build.add_command(
-            GCodeCommand("QUERY_BUTTON", "Report whether BUTTON is pressed", self._query, while_printing=True)
+            "QUERY_BUTTON", "Report whether BUTTON is pressed", self._query, while_printing=True
         )
-        build.add_command(GCodeCommand(_COMMAND, "What a button does", self._run, while_printing=True))
+        build.add_command(_COMMAND, "What a button does", self._run, while_printing=True)
 
     def link(self, modules: Modules) -> None:
         """Find them."""

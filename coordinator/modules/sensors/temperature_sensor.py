@@ -27,6 +27,7 @@ GCODE_ID: Final = TextOption(
 class TemperatureSensor(SensorModule):
     """A sensor of no heater."""
 
+    KIND = "temperature_sensor"
     NAMED: ClassVar = True
     SPEC: ClassVar = SectionSpec(
         help="A temperature that is watched; with min_temp or max_temp its node stops all outside them",

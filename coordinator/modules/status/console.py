@@ -3,7 +3,7 @@
 from importlib.metadata import version
 from typing import Final
 
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.reply_kinds import ReplyKind
 from coordinator.modules.base import Build, Module, Modules
 from coordinator.modules.status.print_stats import PrintStats
@@ -22,7 +22,7 @@ class Console(Module):
             ("STATUS", "Report the machine's state", self._status),
             ("M115", "Report the firmware name and version", self._identify),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
 
     def link(self, modules: Modules) -> None:
         """Remember who there is."""

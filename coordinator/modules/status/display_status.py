@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from coordinator.config.options import SectionSpec
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parser import WordError, number
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import parameters
@@ -17,6 +17,7 @@ TEXT_MAX: Final = 500
 class DisplayStatus(Module):
     """A message, and how far the program believes to be."""
 
+    KIND = "display_status"
     SPEC = SectionSpec("What programs show: a message (M117) and their progress (M73)", ())
 
     def __init__(self, build: Build) -> None:
@@ -28,7 +29,7 @@ class DisplayStatus(Module):
             ("SET_DISPLAY_TEXT", "Show MSG; without it, nothing", self._set),
             ("M73", "Set the progress of the program: P, percent", self._tell),
         ):
-            build.add_command(GCodeCommand(name, help_, read, while_printing=True))
+            build.add_command(name, help_, read, while_printing=True)
 
     def status(self) -> Mapping[str, Value]:
         """Report the message, and the progress of 0 to 1; None: not told."""

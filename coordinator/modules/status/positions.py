@@ -1,6 +1,6 @@
 """GET_POSITION: where the machine is in all frames, from what the nodes count to the program's numbers."""
 
-from coordinator.gcode.commands import AtStandstill, Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import AtStandstill, Call, Immediate, Reading
 from coordinator.gcode.events import Done
 from coordinator.gcode.status import frames
 from coordinator.modules.base import Build, Module
@@ -12,12 +12,10 @@ class Positions(Module):
     def __init__(self, build: Build) -> None:
         super().__init__(build)
         build.add_command(
-            GCodeCommand(
-                "GET_POSITION",
-                "Report the position in all frames; while a job prints, in those of the job",
-                self._read,
-                while_printing=True,
-            )
+            "GET_POSITION",
+            "Report the position in all frames; while a job prints, in those of the job",
+            self._read,
+            while_printing=True,
         )
 
     def _read(self, call: Call) -> Reading:

@@ -6,7 +6,7 @@ A service tells it; where there is none, nothing is ever printed.
 from collections.abc import Mapping
 from typing import Final
 
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.modules.base import Build, Module
 from coordinator.modules.words import bounded, parameters
 from coordinator.support.values import Value
@@ -33,12 +33,10 @@ class PrintStats(Module):
         self._total: int | None = None
         self._current: int | None = None
         build.add_command(
-            GCodeCommand(
-                "SET_PRINT_STATS_INFO",
-                "Set TOTAL_LAYER and CURRENT_LAYER of the job",
-                self._set,
-                while_printing=True,
-            )
+            "SET_PRINT_STATS_INFO",
+            "Set TOTAL_LAYER and CURRENT_LAYER of the job",
+            self._set,
+            while_printing=True,
         )
 
     @property

@@ -1,7 +1,7 @@
 """[respond]: RESPOND shows a line to the user, with a prefix that tells its kind; so does M118."""
 
 from coordinator.config.options import ChoiceOption, SectionSpec, TextOption
-from coordinator.gcode.commands import Call, GCodeCommand, Immediate, Reading
+from coordinator.gcode.commands import Call, Immediate, Reading
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.gcode.reply_kinds import kind_of_line
 from coordinator.modules.base import Build, Module
@@ -17,6 +17,7 @@ PREFIX = TextOption(name="default_prefix", help="Stands before a line, instead o
 class Respond(Module):
     """Its commands."""
 
+    KIND = "respond"
     SPEC = SectionSpec(
         "Lines that programs show to the user", (TYPE, PREFIX), unsupported=("enable_respond",)
     )
@@ -25,11 +26,9 @@ class Respond(Module):
         super().__init__(build)
         usual = PREFIXES[build.get(TYPE)]
         self._prefix = build.find(PREFIX) or usual
-        build.add_command(GCodeCommand("M118", "Show a line", self._echo, while_printing=True))
+        build.add_command("M118", "Show a line", self._echo, while_printing=True)
         build.add_command(
-            GCodeCommand(
-                "RESPOND", "Show MSG, after PREFIX or that of TYPE", self._respond, while_printing=True
-            )
+            "RESPOND", "Show MSG, after PREFIX or that of TYPE", self._respond, while_printing=True
         )
 
     def _echo(self, call: Call) -> Reading:

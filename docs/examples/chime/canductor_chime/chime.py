@@ -4,7 +4,7 @@ from typing import Final
 
 from coordinator.config.options import FloatOption, SectionSpec
 from coordinator.config.pins import PinOption
-from coordinator.gcode.commands import Call, GCodeCommand, Reading, Synchronized
+from coordinator.gcode.commands import Call, Reading, Synchronized
 from coordinator.gcode.parser import WordError, quoted
 from coordinator.modules.base import Build, Module
 from coordinator.support.values import Value
@@ -38,7 +38,7 @@ class Chime(Module):
         )
         self._rung = 0
         build.add_device(self._node, self._bell)
-        build.add_command(GCodeCommand("CHIME", "Ring the bell for LENGTH seconds", self._read))
+        build.add_command("CHIME", "Ring the bell for LENGTH seconds", self._read)
 
     def status(self) -> dict[str, Value]:
         """Report how often it rang."""
